@@ -1,0 +1,449 @@
+"""The messages of the controller, one struct each: SI units, REP-103 axes, REP-105 frames.
+
+Header data (source, incarnation, sequence, stamp) is not in these structs: the bus puts it
+round them (see `actors.runtime.envelope`). Angles are in (-pi, pi], x forward, y left, yaw
+counter-clockwise. A field named `*_f32` is a little-endian float32 array as bytes.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import msgspec
+
+
+class Message(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True):
+    """Base of all messages: immutable, and an unknown field makes the payload invalid."""
+
+
+# ---- robot: what a Summit XL driver publishes and takes --------------------------------------
+
+
+class Pose(Message, frozen=True):
+    """Planar pose of `base_link`."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+
+class Twist(Message, frozen=True):
+    """Planar velocity of `base_link` in its own axes."""
+
+    linear_mps: float
+    angular_radps: float
+
+
+class Odometry(Message, frozen=True):
+    """Wheel odometry: pose in `odom` (starts at the origin), velocity in `base_link`."""
+
+    pose: Pose
+    twist: Twist
+
+
+class Imu(Message, frozen=True):
+    """Inertial measurement in `base_link`; `yaw_rad` is the integrated heading."""
+
+    yaw_rad: float
+    yaw_rate_radps: float
+    accel_x_mps2: float
+    accel_y_mps2: float
+
+
+class GpsFix(Message, frozen=True):
+    """RTK-GPS position in `map` (local east-north), with velocity over ground in `map`."""
+
+    x_m: float
+    y_m: float
+    velocity_x_mps: float
+    velocity_y_mps: float
+    accuracy_m: float
+
+
+class LaserScan(Message, frozen=True):
+    """One sweep of the 2D laser in `base_link`; a range of `range_max_m` means no echo."""
+
+    angle_min_rad: float
+    angle_increment_rad: float
+    range_max_m: float
+    ranges_f32: bytes
+
+
+class LightSample(Message, frozen=True):
+    """Illuminance at the light sensor, which looks down at the ground ahead of the robot."""
+
+    illuminance_lux: float
+
+
+class BaseCommand(Message, frozen=True):
+    """Velocity for the base. The base stops by itself when these cease (dead man)."""
+
+    linear_mps: float
+    angular_radps: float
+
+
+class BrakeCommand(Message, frozen=True):
+    """Low-level brake. Engaged, it blocks the wheels whatever the velocity command says."""
+
+    engaged: bool
+    reason: str
+
+
+class BaseStatus(Message, frozen=True):
+    """State of the Summit XL layer. Wheels: front left, front right, rear left, rear right."""
+
+    brake_engaged: bool
+    dead_man_tripped: bool
+    command_age_s: float
+    wheel_speeds_radps: tuple[float, float, float, float]
+
+
+# ---- mission and control ---------------------------------------------------------------------
+
+
+class Mode(str, Enum):
+    """How a goal is reached (paper, section III)."""
+
+    TAXI = "taxi"
+    LIGHT_VERIFICATION = "light verification"
+
+
+class Goal(Message, frozen=True):
+    """One point of a mission, in `map`, and the mode in which to reach it."""
+
+    x_m: float
+    y_m: float
+    mode: Mode
+
+
+class MissionRequest(Message, frozen=True):
+    """A mission for the Mission Manager. The same `mission_id` twice is one mission."""
+
+    mission_id: str
+    name: str
+    goals: tuple[Goal, ...]
+
+
+class MissionPhase(str, Enum):
+    """State of a mission."""
+
+    IDLE = "idle"
+    RUNNING = "running"
+    PAUSED = "paused"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+class LightVerdict(str, Enum):
+    """Judgement on a light: below half its nominal intensity it is unserviceable (ICAO Annex 14)."""
+
+    OK = "ok"
+    DIM = "dim"
+    OUT = "out"
+
+
+class LightMeasurement(Message, frozen=True):
+    """One light measured in passing."""
+
+    light: str
+    intensity_cd: float
+    ratio: float
+    verdict: LightVerdict
+
+
+class MissionStatus(Message, frozen=True):
+    """Where the mission is. `step` is the index of the current goal; lights measured so far."""
+
+    mission_id: str
+    name: str
+    phase: MissionPhase
+    step: int
+    goals: tuple[Goal, ...]
+    step_times_s: tuple[float, ...]
+    lights: tuple[LightMeasurement, ...]
+    reason: str
+
+
+class GoalOrder(Message, frozen=True):
+    """The Mission Manager's current goal for the Graph Planner; `active` False means none."""
+
+    mission_id: str
+    step: int
+    goal: Goal
+    active: bool
+
+
+class Route(Message, frozen=True):
+    """Way to a goal: waypoints in `map`, first is the start; empty with a `reason` if none."""
+
+    mission_id: str
+    step: int
+    mode: Mode
+    active: bool
+    waypoints: tuple[tuple[float, float], ...]
+    reason: str
+
+
+class ControlPhase(str, Enum):
+    """What Osmosis Control is doing with its route."""
+
+    IDLE = "idle"
+    FOLLOWING = "following"
+    WAITING = "waiting"
+    ARRIVED = "arrived"
+
+
+class ControlStatus(Message, frozen=True):
+    """Progress along the route of (mission, step)."""
+
+    mission_id: str
+    step: int
+    phase: ControlPhase
+    waypoint: int
+    distance_to_go_m: float
+
+
+class Joystick(Message, frozen=True):
+    """Stick positions in [-1, 1] and the dead-man button."""
+
+    forward: float
+    left: float
+    dead_man: bool
+
+
+# ---- safety pilot, detection, recovery, manager ----------------------------------------------
+
+
+class PilotMode(str, Enum):
+    """Whose commands the Safety Pilot passes on."""
+
+    AUTO = "auto"
+    STOP = "stop"
+    TELEOPERATION = "teleoperation"
+
+
+class PilotOrder(Message, frozen=True):
+    """A recovery module's order to the Safety Pilot, in force while `engaged`."""
+
+    engaged: bool
+    mode: PilotMode
+    reason: str
+
+
+class PilotStatus(Message, frozen=True):
+    """What the Safety Pilot does and why: `reason` is empty while commands pass unchanged."""
+
+    mode: PilotMode
+    stopped: bool
+    reason: str
+    refused_commands: int
+
+
+class DetectionState(str, Enum):
+    """State of a detection module (paper, figure 4)."""
+
+    IDLE = "idle"
+    ACTIVE = "active"
+
+
+class DetectionReport(Message, frozen=True):
+    """State of one detection module; `nodes` names the failed nodes where that is the subject."""
+
+    state: DetectionState
+    reason: str
+    nodes: tuple[str, ...]
+    since_s: float
+
+
+class RecoveryState(str, Enum):
+    """State of a recovery module (paper, figure 4)."""
+
+    IDLE = "idle"
+    ACTIVATED = "activated"
+
+
+class RecoveryPhase(str, Enum):
+    """How far an activated recovery is: only `ACTING` must not be cut off."""
+
+    IDLE = "idle"
+    ACTING = "acting"
+    DONE = "done"
+    DEGRADED = "degraded"
+    FAILED = "failed"
+
+
+class RecoveryCommand(Message, frozen=True):
+    """The manager's wish for one recovery module, repeated until it is reported fulfilled."""
+
+    activate: bool
+    decision: int
+    nodes: tuple[str, ...]
+    reason: str
+
+
+class RecoveryReport(Message, frozen=True):
+    """State of one recovery module, for the decision it last obeyed."""
+
+    state: RecoveryState
+    phase: RecoveryPhase
+    decision: int
+    reason: str
+
+
+class DecisionRecord(Message, frozen=True):
+    """A decision with its certificate: rule is the block 1 to 4 of safety-first, 0 for no fault."""
+
+    decision: int
+    strategy: str
+    active: tuple[str, ...]
+    rule: int
+    recoveries: tuple[str, ...]
+    path: tuple[str, ...]
+    rejected: tuple[tuple[str, str], ...]
+    detected_s: float
+
+
+class ManagerStatus(Message, frozen=True):
+    """The manager's view, and by its regularity the proof that it lives."""
+
+    active: tuple[str, ...]
+    silent: tuple[str, ...]
+    activated: tuple[str, ...]
+    latched: tuple[str, ...]
+    strategy: str
+    decision: int
+
+
+class Reset(Message, frozen=True):
+    """Operator's word to release a latched recovery, e.g. the emergency stop."""
+
+    recovery: str
+    by: str
+
+
+# ---- runtime and supervision -----------------------------------------------------------------
+
+
+class Heartbeat(Message, frozen=True):
+    """Sent from the actor's own loop; `progress` counts what the mailbox has handled."""
+
+    pid: int
+    progress: int
+    period_s: float
+    rejected_payloads: int
+    overflowed: int
+
+
+class NodeState(str, Enum):
+    """State of a node's process as the supervisor sees it."""
+
+    STARTING = "starting"
+    RUNNING = "running"
+    CRASHED = "crashed"
+    STOPPED = "stopped"
+    WEDGED = "wedged"
+    GIVEN_UP = "given up"
+
+
+class NodeInfo(Message, frozen=True):
+    """One row of the supervisor's table."""
+
+    name: str
+    kind: str
+    pid: int
+    state: NodeState
+    incarnation: int
+    restarts: int
+
+
+class NodeTable(Message, frozen=True):
+    """All nodes of the system."""
+
+    nodes: tuple[NodeInfo, ...]
+
+
+class RespawnRequest(Message, frozen=True):
+    """A recovery module's wish to have a node's process killed, if it still is, and restarted."""
+
+    request: int
+    node: str
+    failed_incarnation: int
+    by: str
+
+
+class ProcessEvent(Message, frozen=True):
+    """Something happened to a process: crashed, stopped, wedged, respawned, refused, given up."""
+
+    node: str
+    event: str
+    pid: int
+    incarnation: int
+    by: str
+    detail: str
+
+
+class Injection(Message, frozen=True):
+    """A fault to inject where `topic` (key below `rampart/`) is published.
+
+    `mode`: drop, freeze, delay, corrupt. `set_fields` overwrites fields, `ramp_fields` adds
+    rate * elapsed seconds to them; both only with corrupt. `delay_s` only with delay.
+    """
+
+    injection: str
+    topic: str
+    mode: str
+    duration_s: float
+    delay_s: float
+    set_fields: dict[str, float]
+    ramp_fields: dict[str, float]
+
+
+class InjectionReport(Message, frozen=True):
+    """Where an injection took hold and how many messages it has changed so far."""
+
+    injection: str
+    node: str
+    affected: int
+    finished: bool
+
+
+class Diagnostic(Message, frozen=True):
+    """An error report: who, in what context, why, and what offended (OTP's four fields)."""
+
+    node: str
+    context: str
+    reason: str
+    offender: str
+    count: int
+
+
+# ---- world: for the judge and the tests, never for the controller ----------------------------
+
+
+class GroundTruth(Message, frozen=True):
+    """What really happens. Counters are cumulative, so a lost sample loses nothing."""
+
+    pose: Pose
+    twist: Twist
+    collisions: int
+    prohibited_s: float
+    obstacle_clearance_m: float
+    prohibited_clearance_m: float
+    real_time_factor: float
+
+
+class ObstacleCommand(Message, frozen=True):
+    """Makes a named obstacle of the airport appear at (x, y) in `map`, or go away."""
+
+    name: str
+    present: bool
+    x_m: float
+    y_m: float
+    radius_m: float
+
+
+class ObstacleList(Message, frozen=True):
+    """The obstacles that are there now, for the map on the operator's page."""
+
+    obstacles: tuple[ObstacleCommand, ...]
