@@ -7,14 +7,9 @@ counter-clockwise. A field named `*_f32` is a little-endian float32 array as byt
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 
-import msgspec
-
-
-class Message(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True):
-    """Base of all messages: immutable, and an unknown field makes the payload invalid."""
-
+from actors.runtime.messages import Diagnostic, Heartbeat, Injection, InjectionReport, Message  # noqa: F401
 
 # ---- robot: what a Summit XL driver publishes and takes --------------------------------------
 
@@ -101,7 +96,7 @@ class BaseStatus(Message, frozen=True):
 # ---- mission and control ---------------------------------------------------------------------
 
 
-class Mode(str, Enum):
+class Mode(StrEnum):
     """How a goal is reached (paper, section III)."""
 
     TAXI = "taxi"
@@ -124,7 +119,7 @@ class MissionRequest(Message, frozen=True):
     goals: tuple[Goal, ...]
 
 
-class MissionPhase(str, Enum):
+class MissionPhase(StrEnum):
     """State of a mission."""
 
     IDLE = "idle"
@@ -135,8 +130,8 @@ class MissionPhase(str, Enum):
     CANCELLED = "cancelled"
 
 
-class LightVerdict(str, Enum):
-    """Judgement on a light: below half its nominal intensity it is unserviceable (ICAO Annex 14)."""
+class LightVerdict(StrEnum):
+    """Judgement on a light: below half its nominal intensity it is dim (ICAO Annex 14, 10.4)."""
 
     OK = "ok"
     DIM = "dim"
@@ -185,7 +180,7 @@ class Route(Message, frozen=True):
     reason: str
 
 
-class ControlPhase(str, Enum):
+class ControlPhase(StrEnum):
     """What Osmosis Control is doing with its route."""
 
     IDLE = "idle"
@@ -215,7 +210,7 @@ class Joystick(Message, frozen=True):
 # ---- safety pilot, detection, recovery, manager ----------------------------------------------
 
 
-class PilotMode(str, Enum):
+class PilotMode(StrEnum):
     """Whose commands the Safety Pilot passes on."""
 
     AUTO = "auto"
@@ -240,7 +235,7 @@ class PilotStatus(Message, frozen=True):
     refused_commands: int
 
 
-class DetectionState(str, Enum):
+class DetectionState(StrEnum):
     """State of a detection module (paper, figure 4)."""
 
     IDLE = "idle"
@@ -256,14 +251,14 @@ class DetectionReport(Message, frozen=True):
     since_s: float
 
 
-class RecoveryState(str, Enum):
+class RecoveryState(StrEnum):
     """State of a recovery module (paper, figure 4)."""
 
     IDLE = "idle"
     ACTIVATED = "activated"
 
 
-class RecoveryPhase(str, Enum):
+class RecoveryPhase(StrEnum):
     """How far an activated recovery is: only `ACTING` must not be cut off."""
 
     IDLE = "idle"
@@ -325,17 +320,7 @@ class Reset(Message, frozen=True):
 # ---- runtime and supervision -----------------------------------------------------------------
 
 
-class Heartbeat(Message, frozen=True):
-    """Sent from the actor's own loop; `progress` counts what the mailbox has handled."""
-
-    pid: int
-    progress: int
-    period_s: float
-    rejected_payloads: int
-    overflowed: int
-
-
-class NodeState(str, Enum):
+class NodeState(StrEnum):
     """State of a node's process as the supervisor sees it."""
 
     STARTING = "starting"
@@ -381,41 +366,6 @@ class ProcessEvent(Message, frozen=True):
     incarnation: int
     by: str
     detail: str
-
-
-class Injection(Message, frozen=True):
-    """A fault to inject where `topic` (key below `rampart/`) is published.
-
-    `mode`: drop, freeze, delay, corrupt. `set_fields` overwrites fields, `ramp_fields` adds
-    rate * elapsed seconds to them; both only with corrupt. `delay_s` only with delay.
-    """
-
-    injection: str
-    topic: str
-    mode: str
-    duration_s: float
-    delay_s: float
-    set_fields: dict[str, float]
-    ramp_fields: dict[str, float]
-
-
-class InjectionReport(Message, frozen=True):
-    """Where an injection took hold and how many messages it has changed so far."""
-
-    injection: str
-    node: str
-    affected: int
-    finished: bool
-
-
-class Diagnostic(Message, frozen=True):
-    """An error report: who, in what context, why, and what offended (OTP's four fields)."""
-
-    node: str
-    context: str
-    reason: str
-    offender: str
-    count: int
 
 
 # ---- world: for the judge and the tests, never for the controller ----------------------------

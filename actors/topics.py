@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from actors import messages as m
 from actors.runtime.topic import Qos, Topic
+from actors.runtime.topics import DIAGNOSTIC, HEARTBEAT, INJECT, INJECTION_REPORT  # noqa: F401
 
 # Summit XL layer: a real robot's driver stands behind these keys just as well.
 ABSOLUTE_POSE = Topic("summit_xl/absolute_pose", m.Pose, Qos.SENSOR, 20, "map",
@@ -57,18 +58,11 @@ MANAGER_STATUS = Topic("manager/status", m.ManagerStatus, Qos.STATE, 10, "",
 RESET = Topic("manager/reset", m.Reset, Qos.COMMAND, 0, "", "Release a latched recovery.")
 
 # Runtime and supervision.
-HEARTBEAT = Topic("heartbeat/{name}", m.Heartbeat, Qos.STATE, 10, "",
-                  "Proof that the event loop of node {name} turns.")
 NODES = Topic("supervisor/nodes", m.NodeTable, Qos.STATE, 2, "", "The supervisor's node table.")
 RESPAWN = Topic("supervisor/respawn", m.RespawnRequest, Qos.COMMAND, 0, "",
                 "Ask for a node to be respawned.")
 PROCESS_EVENT = Topic("supervisor/event", m.ProcessEvent, Qos.COMMAND, 0, "",
                       "What happened to processes.")
-INJECT = Topic("inject/order", m.Injection, Qos.COMMAND, 0, "", "A fault to inject on a topic.")
-INJECTION_REPORT = Topic("inject/report", m.InjectionReport, Qos.COMMAND, 0, "",
-                         "How an injection took hold.")
-DIAGNOSTIC = Topic("diagnostic/{name}", m.Diagnostic, Qos.COMMAND, 0, "",
-                   "Error report of node {name}.")
 
 # World: ground truth is for the judge, never for the controller.
 TRUTH = Topic("world/truth", m.GroundTruth, Qos.STATE, 20, "map", "Ground truth.")

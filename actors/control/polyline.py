@@ -1,0 +1,190 @@
+"""Planar geometry of the control nodes: angles, polylines, laser points, the robot's hull.
+
+Frames follow REP-103 and REP-105: `map` for routes and poses, `base_link` (x forward, y left)
+for laser points. Along a polyline a point has the coordinates (s, n): arc length from the start
+and signed lateral offset, positive to the left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Point = tuple[float, float]
+Array = NDArray[np.float64]
+
+NO_POINTS: Array = np.zeros((0, 2))
+"""An empty set of laser points."""
+
+
+def wrap_angle(angle_rad: float) -> float:
+    """Return the angle in (-pi, pi]."""
+    wrapped = math.remainder(angle_rad, math.tau)
+    return math.pi if wrapped == -math.pi else wrapped
+
+
+@dataclass(frozen=True, slots=True)
+class Hull:
+    """The robot's footprint, a rectangle centred on `base_link` (Summit XL: 0.72 m by 0.614 m)."""
+
+    length_m: float = 0.72
+    width_m: float = 0.614
+
+    @property
+    def half_length_m(self) -> float:
+        """Distance from the centre to the front."""
+        return self.length_m / 2
+
+    @property
+    def half_width_m(self) -> float:
+        """Distance from the centre to a side."""
+        return self.width_m / 2
+
+    @property
+    def turning_radius_m(self) -> float:
+        """Radius of the circle swept when turning in place."""
+        return math.hypot(self.half_length_m, self.half_width_m)
+
+    def distance(self, points: Array) -> Array:
+        """Signed distance of points in `base_link` to the hull in metres, negative inside.
+
+        Args:
+            points: shape (..., 2).
+        """
+        beyond = np.abs(points) - (self.half_length_m, self.half_width_m)
+        outside = np.hypot(np.maximum(beyond[..., 0], 0.0), np.maximum(beyond[..., 1], 0.0))
+        inside = np.minimum(np.max(beyond, axis=-1), 0.0)
+        return np.asarray(outside + inside)
+
+
+def scan_points(
+    ranges_f32: bytes, angle_min_rad: float, angle_increment_rad: float, range_max_m: float
+) -> Array:
+    """Return the echoes of a laser sweep as points in `base_link`, shape (n, 2).
+
+    A range that is not finite, not positive or at `range_max_m` is no echo. A payload that is
+    not a whole number of float32 is cut to whole ones.
+    """
+    ranges = np.frombuffer(ranges_f32[: len(ranges_f32) // 4 * 4], dtype="<f4").astype(float)
+    angles = angle_min_rad + angle_increment_rad * np.arange(len(ranges))
+    echo = np.isfinite(ranges) & (ranges > 0.0) & (ranges < range_max_m * (1 - 1e-6))
+    return np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))[echo]
+
+
+def to_map(points: Array, x_m: float, y_m: float, yaw_rad: float) -> Array:
+    """Move points from `base_link` at the given pose into `map`."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.asarray(points @ np.array(((cos, sin), (-sin, cos))) + (x_m, y_m))
+
+
+@dataclass(frozen=True, slots=True)
+class Projection:
+    """Foot of a point on a polyline: arc length, lateral offset (left positive), its segment."""
+
+    s_m: float
+    n_m: float
+    segment: int
+
+
+class Polyline:
+    """A route as a chain of straight segments in `map`.
+
+    Args:
+        points: at least one point; repeated points are merged.
+
+    Raises:
+        ValueError: no points.
+    """
+
+    def __init__(self, points: Sequence[Point]) -> None:
+        if not points:
+            raise ValueError("polyline: points: got none, at least one is needed")
+        kept = [points[0]]
+        for point in points[1:]:
+            if math.dist(point, kept[-1]) > 1e-9:
+                kept.append(point)
+        self.points: tuple[Point, ...] = tuple(kept)
+        if len(kept) == 1:  # a segment of no extent keeps every formula below valid
+            kept = [kept[0], (kept[0][0] + 1e-9, kept[0][1])]
+        vertices = np.array(kept, dtype=float)
+        steps = np.diff(vertices, axis=0)
+        self._lengths = np.hypot(steps[:, 0], steps[:, 1])
+        self._starts = vertices[:-1]
+        self._directions = steps / self._lengths[:, None]
+        self._arc = np.concatenate(((0.0,), np.cumsum(self._lengths)))
+
+    @property
+    def length_m(self) -> float:
+        """Length of the whole polyline."""
+        return float(self._arc[-1])
+
+    @property
+    def end(self) -> Point:
+        """The last point."""
+        return self.points[-1]
+
+    def point_at(self, s_m: float) -> Point:
+        """Return the point at an arc length; beyond the ends the outer segments go on straight."""
+        index = self._segment_at(s_m)
+        x_m, y_m = self._starts[index] + self._directions[index] * (s_m - self._arc[index])
+        return float(x_m), float(y_m)
+
+    def heading_at(self, s_m: float) -> float:
+        """Return the direction of travel at an arc length, in `map`."""
+        direction = self._directions[self._segment_at(s_m)]
+        return math.atan2(direction[1], direction[0])
+
+    def smooth_heading_at(self, s_m: float, span_m: float = 0.6) -> float:
+        """Return the direction of travel, turning gradually within `span_m` of a corner."""
+        x_from, y_from = self.point_at(max(s_m - span_m, 0.0))
+        x_to, y_to = self.point_at(min(s_m, self.length_m) + span_m)
+        if math.hypot(x_to - x_from, y_to - y_from) < 1e-3:
+            return self.heading_at(s_m)
+        return math.atan2(y_to - y_from, x_to - x_from)
+
+    def _segment_at(self, s_m: float) -> int:
+        index = int(np.searchsorted(self._arc, s_m, side="right")) - 1
+        return min(max(index, 0), len(self._lengths) - 1)
+
+    def coordinates(self, points: Array, s_from_m: float, s_to_m: float) -> Array:
+        """Return (s, n) of points in `map`, shape (k, 2), by the nearest segment of a stretch.
+
+        The offset of a point beside a corner is its distance to the corner, with the side's sign.
+
+        Args:
+            points: shape (k, 2).
+            s_from_m: start of the stretch of route looked at.
+            s_to_m: end of that stretch; it is cut to the route.
+        """
+        low = self._segment_at(min(max(s_from_m, 0.0), self.length_m))
+        high = self._segment_at(min(max(s_to_m, 0.0), self.length_m - 1e-9)) + 1
+        high = max(high, low + 1)
+        along = self._directions[low:high]
+        relative = points[:, None, :] - self._starts[None, low:high, :]
+        ahead = np.einsum("ksi,si->ks", relative, along)
+        left = along[None, :, 0] * relative[:, :, 1] - along[None, :, 1] * relative[:, :, 0]
+        foot = np.clip(ahead, 0.0, self._lengths[None, low:high])
+        distance = np.hypot(ahead - foot, left)
+        best = np.argmin(distance, axis=1)
+        row = np.arange(len(points))
+        s = self._arc[low + best] + foot[row, best]
+        n = np.where(left[row, best] < 0.0, -1.0, 1.0) * distance[row, best]
+        return np.column_stack((s, n))
+
+    def project(self, x_m: float, y_m: float, near_s_m: float | None = None) -> Projection:
+        """Return the foot of a point.
+
+        Args:
+            x_m: position in `map`.
+            y_m: position in `map`.
+            near_s_m: earlier progress; the foot is then sought from 2 m before to 4 m after it,
+                so that a route which comes near itself again is not short-cut. None seeks
+                everywhere, which is how a respawned follower resumes.
+        """
+        reach = (0.0, self.length_m) if near_s_m is None else (near_s_m - 2.0, near_s_m + 4.0)
+        s, n = self.coordinates(np.array(((x_m, y_m),)), *reach)[0]
+        return Projection(float(s), float(n), self._segment_at(float(s)))

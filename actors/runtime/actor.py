@@ -1,0 +1,406 @@
+"""The actor: one mailbox, one message at a time, in three phases.
+
+Set-up opens the bus, subscribes, calls `on_start`. Running takes one item after the other from
+the mailbox: messages, timer ticks, changes of peers. Teardown calls `on_stop` and leaves the
+bus. Handlers are plain functions and run to their end before the next item, so an actor's state
+needs no lock and its code no `await`.
+
+A handler that raises ends the actor: the error is reported on `diagnostic/NAME`, `on_failure`
+is called, and the process exits non-zero so that its supervisor starts a fresh one. The
+heartbeat is an item of the same mailbox: a handler that never returns silences it, although the
+process and its liveliness token live on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, TypeVar
+
+import msgspec
+
+from actors.runtime.bus import Bus
+from actors.runtime.clock import Clock
+from actors.runtime.envelope import ArrivalGuard, Header, RejectedError, encode
+from actors.runtime.injection import FaultGate, Outgoing
+from actors.runtime.mailbox import Mailbox
+from actors.runtime.messages import Diagnostic, Heartbeat, Injection, InjectionReport
+from actors.runtime.topic import Qos, Topic
+from actors.runtime.topics import DIAGNOSTIC, HEARTBEAT, INJECT, INJECTION_REPORT
+
+__all__ = ["Actor", "Context", "Header", "every", "on"]
+
+F = TypeVar("F", bound=Callable[..., None])
+
+BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, DIAGNOSTIC, INJECTION_REPORT)
+"""What every actor publishes besides its own outputs."""
+
+_DIAGNOSTIC_PERIOD_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What an actor gets from whoever starts it.
+
+    Attributes:
+        name: the node's name, unique in the system.
+        incarnation: which life of the node this is, counted from 1.
+        clock: simulated time.
+        bus: this actor's access to the bus, not yet open.
+        parameters: the node's parameters from the system spec.
+        shared: read-only objects loaded once for the whole run ("system", "airport", ...).
+    """
+
+    name: str
+    incarnation: int
+    clock: Clock
+    bus: Bus
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    shared: Mapping[str, Any] = field(default_factory=dict)
+
+
+def on(topic: Topic[Any]) -> Callable[[F], F]:
+    """Declare a method as the handler of a topic: `handler(self, message, header)`."""
+
+    def mark(function: F) -> F:
+        function.__dict__.setdefault("_rampart_topics", []).append(topic)
+        return function
+
+    return mark
+
+
+def every(period_s: float) -> Callable[[F], F]:
+    """Declare a method to be called each `period_s` simulated seconds, first after one period."""
+
+    def mark(function: F) -> F:
+        function.__dict__["_rampart_period_s"] = period_s
+        return function
+
+    return mark
+
+
+class Timer:
+    """A pending `call_later`; `cancel` is harmless after it has run."""
+
+    __slots__ = ("_call", "_handle")
+
+    def __init__(self, call: Callable[[], None]) -> None:
+        self._call: Callable[[], None] | None = call
+        self._handle: asyncio.TimerHandle | None = None
+
+    def arm(self, handle: asyncio.TimerHandle) -> None:
+        """Keep the loop's handle."""
+        self._handle = handle
+
+    def cancel(self) -> None:
+        """Make sure the call does not happen (any more)."""
+        self._call = None
+        if self._handle is not None:
+            self._handle.cancel()
+
+    def fire(self) -> None:
+        """Make the call, unless it was cancelled while it waited in the mailbox."""
+        call, self._call = self._call, None
+        if call is not None:
+            call()
+
+
+class Actor:
+    """Base of every node, detection module, recovery module and manager.
+
+    Class attributes:
+        outputs: topics it publishes; publishing another one raises.
+        heartbeat_period_s: simulated seconds between heartbeats.
+    """
+
+    outputs: ClassVar[tuple[Topic[Any], ...]] = ()
+    heartbeat_period_s: float = 0.1
+    _handlers: ClassVar[tuple[tuple[Topic[Any], str], ...]] = ((INJECT, "_on_injection"),)
+    _periodic: ClassVar[tuple[tuple[float, str], ...]] = ()
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        handlers: dict[tuple[str, str], tuple[Topic[Any], str]] = {}
+        periodic: dict[str, float] = {}
+        for base in reversed(cls.__mro__):
+            for name, member in vars(base).items():
+                for topic in getattr(member, "_rampart_topics", ()):
+                    handlers[(topic.key, name)] = (topic, name)
+                if hasattr(member, "_rampart_period_s"):
+                    periodic[name] = member._rampart_period_s
+        cls._handlers = ((INJECT, "_on_injection"), *handlers.values())
+        cls._periodic = tuple((period, name) for name, period in periodic.items())
+
+    def __init__(self, context: Context) -> None:
+        self.context = context
+        self.name = context.name
+        self.clock = context.clock
+        self.parameters = context.parameters
+        self._bus = context.bus
+        self._guard = ArrivalGuard()
+        self._faults = FaultGate()
+        self._mailbox = Mailbox(on_overflow=self._overflowed)
+        self._sequence = 0
+        self._progress = 0
+        self._rejected = 0
+        self._timer_count = 0
+        self._stopping = False
+        self._timers: set[asyncio.TimerHandle] = set()
+        self._diagnostics: dict[str, tuple[float, int]] = {}
+        self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
+
+    # -- what a subclass may override -----------------------------------------------------------
+
+    @classmethod
+    def names(
+        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+    ) -> tuple[str, ...] | None:
+        """Which members of an input family the node `name` hears; None for all."""
+        return None
+
+    @classmethod
+    def output_names(
+        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+    ) -> tuple[str, ...] | None:
+        """Which members of an output family the node `name` publishes; None for any."""
+        return (name,)
+
+    @classmethod
+    def watches(cls, name: str, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003
+        """Nodes whose life and death `on_peer` reports."""
+        return ()
+
+    @classmethod
+    def inputs(cls) -> tuple[Topic[Any], ...]:
+        """Topics it has handlers for."""
+        return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
+
+    def on_start(self) -> None:
+        """Runs on the loop when the bus is open, before the first message. A raise ends it."""
+
+    def on_stop(self) -> None:
+        """Runs on the loop after the last item, bus still open, also after a failure."""
+
+    def on_failure(self, error: BaseException) -> None:
+        """Runs on the loop after a handler raised, before `on_stop`. A raise here is ignored."""
+
+    def on_peer(self, node: str, incarnation: int, alive: bool) -> None:
+        """Runs as a mailbox item when a watched node appears or vanishes."""
+
+    # -- what a subclass calls ------------------------------------------------------------------
+
+    def publish(
+        self, topic: Topic[Any], body: msgspec.Struct, stamp: float | None = None,
+        name: str | None = None,
+    ) -> None:
+        """Send a message.
+
+        Args:
+            topic: one of `outputs`.
+            body: message of the topic's type.
+            stamp: simulated time at which the content was true; now if omitted.
+            name: member of a topic family; this node's name if omitted.
+
+        Raises:
+            ValueError: the topic is not declared in `outputs`.
+        """
+        if topic.key not in self._may_publish:
+            raise ValueError(f"{type(self).__name__} publishes {topic.key}, "
+                             "which its outputs do not declare")
+        key = topic.at(name or self.name) if topic.is_family else topic.at()
+        now = self.clock.now()
+        try:
+            out = self._faults.apply(key, body, now if stamp is None else stamp, now)
+        except ValueError as error:
+            self.report_diagnostic("fault injection", str(error), key)
+            return
+        if out is None:
+            return
+        if out.delay_s > 0:
+            self.call_later(out.delay_s, lambda: self._send(topic, key, out))
+        else:
+            self._send(topic, key, out)
+
+    def call_later(self, delay_s: float, call: Callable[[], None]) -> Timer:
+        """Have `call` made as a mailbox item after `delay_s` simulated seconds."""
+        timer = Timer(call)
+        self._timer_count += 1
+        slot = f"later {self._timer_count}"
+        due = self.clock.source_time(self.clock.now() + delay_s)
+        timer.arm(self._at(due, lambda: self._mailbox.put_latest(slot, timer.fire)))
+        return timer
+
+    def report_diagnostic(self, context: str, reason: str, offender: str) -> None:
+        """Publish an error report, at most one a second per context and offender."""
+        slot = f"{context} {offender}"
+        last, count = self._diagnostics.get(slot, (-_DIAGNOSTIC_PERIOD_S, 0))
+        now = self.clock.now()
+        if now - last < _DIAGNOSTIC_PERIOD_S:
+            self._diagnostics[slot] = (last, count + 1)
+            return
+        self._diagnostics[slot] = (now, 0)
+        self.publish(DIAGNOSTIC, Diagnostic(self.name, context, reason, offender, count + 1))
+
+    def stop(self) -> None:
+        """End the actor after the items that already wait."""
+        self._mailbox.put_latest("stop", self._stop)
+
+    # -- the three phases -----------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Live from set-up to teardown.
+
+        Raises:
+            BusError: the bus could not be opened.
+            Exception: whatever a handler raised.
+        """
+        await self._bus.open()
+        try:
+            self._set_up()
+            while not self._stopping:
+                item = await self._mailbox.get()
+                item()
+                self._progress += 1
+        except asyncio.CancelledError:
+            raise
+        except Exception as error:
+            self._fail(error)
+            raise
+        finally:
+            await self._tear_down()
+
+    def _set_up(self) -> None:
+        for topic, method in self._handlers:
+            handler = getattr(self, method)
+            names = self.names(topic, self.name, self.parameters) if topic.is_family else None
+            keys = [topic.at(n) for n in names] if names is not None else [topic.pattern]
+            for key in keys:
+                self._bus.subscribe(topic, key, self._receiver(topic, handler))
+        for node in self.watches(self.name, self.parameters):
+            self._bus.watch(node, self._peer_changed)
+        self.on_start()
+        self._beat()
+        self._start_timer(self.heartbeat_period_s, "_beat")
+        for period_s, method in self._periodic:
+            self._start_timer(period_s, method)
+
+    async def _tear_down(self) -> None:
+        for handle in self._timers:
+            handle.cancel()
+        self._timers.clear()
+        try:
+            self.on_stop()
+        finally:
+            await self._bus.close()
+
+    def _stop(self) -> None:
+        self._stopping = True
+
+    def _fail(self, error: Exception) -> None:
+        try:
+            self._diagnostics.clear()
+            self.report_diagnostic("handler failed", f"{type(error).__name__}: {error}", self.name)
+            self.on_failure(error)
+        except Exception as second:  # the first error is the one that counts
+            error.add_note(f"and while reporting it: {second!r}")
+
+    # -- mail -----------------------------------------------------------------------------------
+
+    def _receiver(
+        self, topic: Topic[Any], handler: Callable[[Any, Header], None]
+    ) -> Callable[[str, bytes], None]:
+        def deliver(key: str, payload: bytes) -> None:
+            try:
+                admitted = self._guard.admit(topic, key, payload)
+            except RejectedError as reason:
+                self._rejected += 1
+                self.report_diagnostic("payload rejected", str(reason), key)
+                return
+            if admitted is None:
+                return
+            header, body = admitted
+            if topic.qos is Qos.COMMAND:
+                self._mailbox.put(lambda: handler(body, header))
+            else:
+                self._mailbox.put_latest(f"{key} {handler.__name__}",
+                                         lambda: handler(body, header))
+
+        return deliver
+
+    def _peer_changed(self, node: str, incarnation: int, alive: bool) -> None:
+        self._mailbox.put_latest(
+            f"peer {node} {incarnation} {alive}", lambda: self.on_peer(node, incarnation, alive))
+
+    def _overflowed(self, _item: Any) -> None:
+        self.report_diagnostic("mailbox full", "a command was refused", self.name)
+
+    def _send(self, topic: Topic[Any], key: str, out: Outgoing) -> None:
+        self._sequence += 1
+        header = Header(self.name, self.context.incarnation, self._sequence, out.stamp)
+        self._faults.remember(key, out)
+        self._bus.publish(topic, key, encode(header, out.body))
+
+    # -- timers ---------------------------------------------------------------------------------
+
+    def _at(self, when: float, call: Callable[[], None]) -> asyncio.TimerHandle:
+        loop = asyncio.get_running_loop()
+        handle: asyncio.TimerHandle
+
+        def fire() -> None:
+            self._timers.discard(handle)
+            call()
+
+        handle = loop.call_at(when, fire)
+        self._timers.add(handle)
+        return handle
+
+    def _start_timer(self, period_s: float, method: str) -> None:
+        call = getattr(self, method)
+        slot = f"timer {method}"
+
+        def schedule(due_s: float) -> None:
+            self._at(self.clock.source_time(due_s), lambda: tick(due_s))
+
+        def tick(due_s: float) -> None:
+            self._mailbox.put_latest(slot, call)
+            next_s = due_s + period_s
+            now = self.clock.now()
+            schedule(next_s if next_s > now else now + period_s)  # late: skip, do not catch up
+
+        schedule(self.clock.now() + period_s)
+
+    def _beat(self) -> None:
+        self.publish(HEARTBEAT, Heartbeat(
+            os.getpid(), self._progress, self.heartbeat_period_s, self._rejected,
+            self._mailbox.overflowed))
+
+    # -- fault injection ------------------------------------------------------------------------
+
+    def _on_injection(self, order: Injection, _header: Header) -> None:
+        if not self._publishes(order.topic):
+            return
+        reason = self._faults.order(order, self.clock.now())
+        self.publish(INJECTION_REPORT, InjectionReport(
+            order.injection, self.name, 0, bool(reason), reason))
+        if not reason:
+            self.call_later(order.duration_s, lambda: self._injection_over(order.injection))
+
+    def _injection_over(self, injection: str) -> None:
+        affected = self._faults.expire(injection)
+        self.publish(INJECTION_REPORT, InjectionReport(
+            injection, self.name, affected, True, ""))
+
+    def _publishes(self, key: str) -> bool:
+        for topic in (*self.outputs, *BASE_OUTPUTS):
+            if not topic.is_family and topic.key == key:
+                return True
+            if topic.is_family:
+                names = self.output_names(topic, self.name, self.parameters)
+                head, tail = topic.key.split("{name}")
+                member = key[len(head):len(key) - len(tail)] if tail else key[len(head):]
+                if key.startswith(head) and key.endswith(tail) and (
+                        names is None or member in names):
+                    return True
+        return False

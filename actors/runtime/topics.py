@@ -1,0 +1,14 @@
+"""Topics that every actor publishes or hears."""
+
+from __future__ import annotations
+
+from actors.runtime.messages import Diagnostic, Heartbeat, Injection, InjectionReport
+from actors.runtime.topic import Qos, Topic
+
+HEARTBEAT = Topic("heartbeat/{name}", Heartbeat, Qos.STATE, 10, "",
+                  "Proof that the event loop of node {name} turns.")
+DIAGNOSTIC = Topic("diagnostic/{name}", Diagnostic, Qos.COMMAND, 0, "",
+                   "Error report of node {name}.")
+INJECT = Topic("inject/order", Injection, Qos.COMMAND, 0, "", "A fault to inject on a topic.")
+INJECTION_REPORT = Topic("inject/report", InjectionReport, Qos.COMMAND, 0, "",
+                         "How an injection took hold.")

@@ -1,0 +1,75 @@
+"""Who talks with whom, computed from what the actor classes declare.
+
+Two nodes are partners if one publishes a key that the other hears, or one watches the other's
+life. A node dials its partners only, so a respawn costs a handful of connections, not one per
+process of the system.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from actors.runtime.actor import BASE_OUTPUTS, Actor
+from actors.runtime.topic import Topic
+from actors.runtime.topics import INJECT
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One actor of the system: its name, class and parameters."""
+
+    name: str
+    actor: type[Actor]
+    parameters: Mapping[str, Any]
+
+
+def published(member: Member) -> dict[str, tuple[str, ...] | None]:
+    """Return topic key → names of the family members published (None: any, or not a family)."""
+    return {
+        t.key: member.actor.output_names(t, member.name, member.parameters) if t.is_family else None
+        for t in (*member.actor.outputs, *BASE_OUTPUTS)
+    }
+
+
+def heard(member: Member) -> dict[str, tuple[str, ...] | None]:
+    """Return topic key → names of the family members heard (None: all, or not a family)."""
+    return {
+        t.key: member.actor.names(t, member.name, member.parameters) if t.is_family else None
+        for t in member.actor.inputs()
+        if t is not INJECT  # injections come from tools, which dial for themselves
+    }
+
+
+def partners(members: Iterable[Member]) -> dict[str, tuple[str, ...]]:
+    """Return for each node the nodes it shares a key or a watch with, in the given order."""
+    everyone = list(members)
+    out = {m.name: published(m) for m in everyone}
+    into = {m.name: heard(m) for m in everyone}
+    watched = {m.name: m.actor.watches(m.name, m.parameters) for m in everyone}
+
+    def feeds(a: str, b: str) -> bool:
+        return any(
+            key in into[b] and (names is None or (wanted := into[b][key]) is None
+                                or bool(set(names) & set(wanted)))
+            for key, names in out[a].items()
+        )
+
+    return {
+        a.name: tuple(
+            b.name for b in everyone
+            if b.name != a.name and (
+                feeds(a.name, b.name) or feeds(b.name, a.name)
+                or b.name in watched[a.name] or a.name in watched[b.name])
+        )
+        for a in everyone
+    }
+
+
+def topics_of(actor: type[Actor]) -> tuple[tuple[Topic[Any], ...], tuple[Topic[Any], ...]]:
+    """Return (inputs, outputs) of an actor class without what every actor has."""
+    return (
+        tuple(t for t in actor.inputs() if t is not INJECT),
+        tuple(actor.outputs),
+    )

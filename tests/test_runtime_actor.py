@@ -1,0 +1,224 @@
+"""Actors on both buses: what a node may rely on, whichever carries its messages."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+
+from actors import messages as m
+from actors import topics
+from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bus import Bus, BusError
+from actors.runtime.clock import Clock
+from actors.runtime.envelope import encode
+from actors.runtime.virtual_bus import Hub, VirtualBus
+from actors.runtime.zenoh_bus import ZenohBus, endpoint
+
+
+class Talker(Actor):
+    """Publishes poses on demand."""
+
+    outputs = (topics.POSE, topics.RESET)
+
+
+class Listener(Actor):
+    """Keeps what it hears."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.heard: list[tuple[m.Message, Header]] = []
+        self.peers: list[tuple[str, int, bool]] = []
+        self.ticks = 0
+
+    @classmethod
+    def watches(cls, name, parameters):
+        return ("talker",)
+
+    @on(topics.POSE)
+    def pose(self, message: m.Pose, header: Header) -> None:
+        self.heard.append((message, header))
+
+    @on(topics.RESET)
+    def reset(self, message: m.Reset, header: Header) -> None:
+        if message.by == "poison":
+            raise RuntimeError("poisoned")
+        self.heard.append((message, header))
+
+    @every(0.02)
+    def tick(self) -> None:
+        self.ticks += 1
+
+    def on_peer(self, node: str, incarnation: int, alive: bool) -> None:
+        self.peers.append((node, incarnation, alive))
+
+
+def free_ports(count: int) -> list[int]:
+    sockets = [socket.socket() for _ in range(count)]
+    for s in sockets:
+        s.bind(("127.0.0.1", 0))
+    ports = [s.getsockname()[1] for s in sockets]
+    for s in sockets:
+        s.close()
+    return ports
+
+
+MakeBus = Callable[[str, int], Bus]
+
+
+@pytest.fixture(params=["virtual", "zenoh"])
+def make_bus(request: pytest.FixtureRequest) -> MakeBus:
+    if request.param == "virtual":
+        hub = Hub()
+        return lambda name, incarnation: VirtualBus(hub, name, incarnation)
+    names = ("talker", "listener", "impostor", "third")
+    ports = dict(zip(names, free_ports(4), strict=True))
+    return lambda name, incarnation: ZenohBus(
+        name, incarnation, endpoint(ports[name]),
+        [endpoint(p) for n, p in ports.items() if n != name])
+
+
+@asynccontextmanager
+async def running(cls: type[Actor], name: str, make_bus: MakeBus, incarnation: int = 1,
+                  rate: float = 1.0) -> AsyncIterator[Actor]:
+    loop = asyncio.get_running_loop()
+    clock = Clock(loop.time(), rate, loop.time)
+    actor = cls(Context(name, incarnation, clock, make_bus(name, incarnation)))
+    task = asyncio.create_task(actor.run())
+    await eventually(lambda: actor._progress > 0 or task.done() or bool(actor._timers))
+    try:
+        yield actor
+    finally:
+        actor.stop()
+        await asyncio.wait_for(asyncio.gather(task, return_exceptions=True), 5)
+
+
+async def eventually(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
+    deadline = asyncio.get_running_loop().time() + timeout_s
+    while not condition():
+        assert asyncio.get_running_loop().time() < deadline, "it did not happen in time"
+        await asyncio.sleep(0.005)
+
+
+async def test_a_message_arrives_with_its_header(make_bus):
+    async with running(Listener, "listener", make_bus) as listener:
+        async with running(Talker, "talker", make_bus, incarnation=3) as talker:
+            await eventually(lambda: listener.peers == [("talker", 3, True)])
+            talker.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5), stamp=0.25)
+            await eventually(lambda: bool(listener.heard))
+            message, header = listener.heard[0]
+            assert message == m.Pose(1.0, 2.0, 0.5)
+            assert (header.source, header.incarnation, header.stamp) == ("talker", 3, 0.25)
+
+
+async def test_a_watched_peer_is_seen_to_come_and_go(make_bus):
+    async with running(Listener, "listener", make_bus) as listener:
+        async with running(Talker, "talker", make_bus, incarnation=7):
+            await eventually(lambda: ("talker", 7, True) in listener.peers)
+        await eventually(lambda: listener.peers[-1] == ("talker", 7, False))
+
+
+async def test_a_peer_that_lives_already_is_reported_to_a_late_watcher(make_bus):
+    async with running(Talker, "talker", make_bus):
+        async with running(Listener, "listener", make_bus) as listener:
+            await eventually(lambda: listener.peers == [("talker", 1, True)])
+
+
+async def test_garbage_is_counted_and_reported_and_the_actor_goes_on(make_bus):
+    async with running(Listener, "listener", make_bus) as listener:
+        async with running(Talker, "talker", make_bus) as talker:
+            await eventually(lambda: bool(listener.peers))
+            pose_then_text = encode(Header("talker", 1, 900, 0.0), m.Reset("RM1", "x"))
+            for garbage in (b"", b"\xff\x00 garbage", b"\x91" * 100_000, pose_then_text):
+                talker._bus.publish(topics.POSE, topics.POSE.at(), garbage)
+            await eventually(lambda: listener._rejected == 4)
+            talker.publish(topics.POSE, m.Pose(1.0, 0.0, 0.0))
+            await eventually(lambda: len(listener.heard) == 1)
+
+
+async def test_a_superseded_incarnation_is_refused(make_bus):
+    async with running(Listener, "listener", make_bus) as listener:
+        async with running(Talker, "talker", make_bus, incarnation=2) as talker:
+            await eventually(lambda: bool(listener.peers))
+            talker.publish(topics.POSE, m.Pose(2.0, 0.0, 0.0))
+            await eventually(lambda: len(listener.heard) == 1)
+            stale = encode(Header("talker", 1, 5, 0.0), m.Pose(1.0, 0.0, 0.0))
+            talker._bus.publish(topics.POSE, topics.POSE.at(), stale)
+            await eventually(lambda: listener._rejected == 1)
+            assert [body.x_m for body, _ in listener.heard] == [2.0]
+
+
+async def test_a_command_that_comes_twice_is_handled_once(make_bus):
+    async with running(Listener, "listener", make_bus) as listener:
+        async with running(Talker, "talker", make_bus) as talker:
+            await eventually(lambda: bool(listener.peers))
+            twice = encode(Header("talker", 1, 5, 0.0), m.Reset("RM1", "operator"))
+            talker._bus.publish(topics.RESET, topics.RESET.at(), twice)
+            talker._bus.publish(topics.RESET, topics.RESET.at(), twice)
+            talker.publish(topics.RESET, m.Reset("RM2", "operator"))
+            await eventually(lambda: any(b.recovery == "RM2" for b, _ in listener.heard))
+            assert [b.recovery for b, _ in listener.heard] == ["RM1", "RM2"]
+
+
+async def test_publishing_an_undeclared_topic_raises(make_bus):
+    async with running(Listener, "listener", make_bus) as listener:
+        with pytest.raises(ValueError, match="does not declare|do not declare"):
+            listener.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+
+
+async def test_a_handler_that_raises_ends_its_actor_only(make_bus):
+    clock = Clock(asyncio.get_running_loop().time())
+    victim = Listener(Context("listener", 1, clock, make_bus("listener", 1)))
+    task = asyncio.create_task(victim.run())
+    async with running(Talker, "talker", make_bus) as talker:
+        await eventually(lambda: bool(victim.peers))
+        talker.publish(topics.RESET, m.Reset("RM1", "poison"))
+        with pytest.raises(RuntimeError, match="poisoned"):
+            await asyncio.wait_for(task, 5)
+        talker.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+
+
+async def test_timers_run_at_the_rate_of_simulated_time(make_bus):
+    async with running(Listener, "listener", make_bus, rate=4.0) as fast:
+        start, ticks = fast.clock.now(), fast.ticks
+        await asyncio.sleep(0.25)
+        elapsed, ticked = fast.clock.now() - start, fast.ticks - ticks
+        assert elapsed > 0.9
+        assert ticked == pytest.approx(elapsed / 0.02, rel=0.5)
+
+
+async def test_a_port_in_use_is_one_clear_line():
+    (port,) = free_ports(1)
+    first = ZenohBus("talker", 1, endpoint(port), [])
+    await first.open()
+    try:
+        with pytest.raises(BusError, match=f"port in use: tcp/127.0.0.1:{port}"):
+            await ZenohBus("talker", 2, endpoint(port), []).open()
+    finally:
+        await first.close()
+
+
+@pytest.mark.parametrize(("mode", "expected"), [
+    ("drop", []),
+    ("freeze", [(0.0, 0.5)] * 3),
+    ("corrupt", [(99.0, 1.0), (99.0, 2.0), (99.0, 3.0)]),
+])
+async def test_an_injected_fault_changes_what_is_published(make_bus, mode, expected):
+    async with running(Listener, "listener", make_bus) as listener:
+        async with running(Talker, "talker", make_bus) as talker:
+            await eventually(lambda: bool(listener.peers))
+            talker.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0), stamp=0.5)
+            await eventually(lambda: len(listener.heard) == 1)
+            fault = m.Injection("i1", "localization/pose", mode, 60.0,
+                                set_fields={"x_m": 99.0} if mode == "corrupt" else {})
+            talker._on_injection(fault, Header("tool", 1, 1, 0.0))
+            for x in (1.0, 2.0, 3.0):
+                talker.publish(topics.POSE, m.Pose(x, 0.0, 0.0), stamp=x)
+                await asyncio.sleep(0.05)
+            talker._faults.expire("i1")
+            talker.publish(topics.POSE, m.Pose(7.0, 0.0, 0.0), stamp=4.0)
+            await eventually(lambda: listener.heard[-1][0].x_m == 7.0)
+            assert [(b.x_m, h.stamp) for b, h in listener.heard[1:-1]] == expected
