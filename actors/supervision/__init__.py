@@ -1,0 +1,1 @@
+"""Processes: starting, watching, killing and restarting them, and finding them from outside."""

@@ -1,0 +1,251 @@
+"""Core of the Safety Pilot: the last gate between anybody's command and the wheels.
+
+Whatever reaches the base was decided here, from what is known now: the recovery modules' orders,
+the manager's sign of life, the operator's stick, the last good command, the last scan. The gate
+never trusts its inputs to be there: each has an age, and what is too old counts against motion.
+
+The strictest engaged order wins: stop > teleoperation > auto. A fresh joystick pre-empts auto.
+In the paper's unprotected baseline (`Checks` all off) only three things are left: the last
+command is kept and repeated, obstacles stop the robot, the joystick pre-empts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from actors.control.polyline import NO_POINTS, Array
+from actors.control.swept_path import StoppingRoom, limited
+from actors.messages import PilotMode
+
+STRICTNESS = (PilotMode.AUTO, PilotMode.TELEOPERATION, PilotMode.STOP)
+"""Modes from the most permissive to the strictest; declared here, once."""
+
+_FUTURE_S = 0.1
+"""A stamp this far ahead of now is no clock jitter but wrong."""
+
+_SLOWED = 0.999
+"""Below this share of the command the reason says that obstacles slow the robot."""
+
+
+@dataclass(frozen=True, slots=True)
+class Checks:
+    """Which checks are in force; the system spec's layers switch them.
+
+    Args:
+        bounds: refuse commands beyond the limits or not finite.
+        freshness: refuse and drop stale commands.
+        sequence: refuse commands older than one already taken.
+        scan: stop without a fresh scan.
+        manager: stop without the manager's sign of life.
+    """
+
+    bounds: bool = True
+    freshness: bool = True
+    sequence: bool = True
+    scan: bool = True
+    manager: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class GateLimits:
+    """Bounds and ages.
+
+    Args:
+        max_linear_mps: largest speed, either direction.
+        max_angular_radps: largest turn rate, either direction.
+        command_timeout_s: age at which a command is stale.
+        scan_timeout_s: age at which a scan is.
+        joystick_timeout_s: silence after which the stick counts as released.
+        manager_timeout_s: silence after which the manager counts as dead.
+        settling_s: a gate that has just started (perhaps again) knows no orders yet; it lets
+            nothing pass before each recovery module has had time to repeat its own.
+        room: distances of the obstacle stop.
+    """
+
+    max_linear_mps: float = 1.0
+    max_angular_radps: float = 2.0
+    command_timeout_s: float = 0.5
+    scan_timeout_s: float = 0.5
+    joystick_timeout_s: float = 0.3
+    manager_timeout_s: float = 0.5
+    settling_s: float = 0.45
+    room: StoppingRoom = field(default_factory=StoppingRoom)
+
+
+@dataclass(frozen=True, slots=True)
+class Stamped:
+    """A velocity command with where it comes from: the header of its message."""
+
+    linear_mps: float
+    angular_radps: float
+    source: str
+    incarnation: int
+    sequence: int
+    stamp_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class GateOutput:
+    """What goes to the base. `stopped`: the gate, not the command, keeps the robot standing."""
+
+    linear_mps: float
+    angular_radps: float
+    mode: PilotMode
+    stopped: bool
+    reason: str
+
+
+@dataclass(slots=True)
+class _Line:
+    """State of one command source: auto or joystick."""
+
+    twist: tuple[float, float] | None = None
+    stamp_s: float = -math.inf
+    heard_s: float = -math.inf
+    newest: dict[str, tuple[int, int]] = field(default_factory=dict)
+    fault: str = ""
+
+
+class SafetyGate:
+    """Collects inputs, answers `output(now)`. All times in simulated seconds.
+
+    Args:
+        limits: bounds and ages.
+        checks: which of them are in force.
+        started_s: now.
+    """
+
+    def __init__(self, limits: GateLimits, checks: Checks, started_s: float) -> None:
+        self._limits = limits
+        self._checks = checks
+        self._started_s = started_s
+        self._orders: dict[str, tuple[PilotMode, str]] = {}
+        self._auto = _Line()
+        self._stick = _Line()
+        self._manager_heard_s = -math.inf
+        self._points: Array = NO_POINTS
+        self._scan_s = -math.inf
+        self.refused = 0
+
+    def order(self, recovery: str, engaged: bool, mode: PilotMode, reason: str) -> None:
+        """Take note of a recovery module's order; it is in force until that module ends it."""
+        if engaged:
+            self._orders[recovery] = (mode, reason)
+        else:
+            self._orders.pop(recovery, None)
+
+    def manager_alive(self, now: float) -> None:
+        """Take note of the manager's sign of life."""
+        self._manager_heard_s = now
+
+    def scan(self, points: Array, stamp_s: float) -> None:
+        """Take a scan: echoes in `base_link`, shape (n, 2), and when it was measured."""
+        self._points = points
+        self._scan_s = stamp_s
+
+    def command(self, command: Stamped, now: float) -> str:
+        """Offer Osmosis Control's command; return why it was refused, or ""."""
+        return self._take(self._auto, command, now)
+
+    def joystick(self, command: Stamped, now: float) -> str:
+        """Offer Teleoperation's command; return why it was refused, or ""."""
+        return self._take(self._stick, command, now)
+
+    def _take(self, line: _Line, command: Stamped, now: float) -> str:
+        position = (command.incarnation, command.sequence)
+        if self._checks.sequence:
+            newest = line.newest.get(command.source)
+            if newest is not None and position <= newest:
+                # The newer one that was taken before stays valid.
+                self.refused += 1
+                return (f"command {command.source}:{position[0]}/{position[1]} is out of sequence,"
+                        f" newest is {newest[0]}/{newest[1]}")
+            line.newest[command.source] = position
+        line.fault = self._fault(command, now)
+        if line.fault:
+            self.refused += 1
+            if self._checks.bounds:
+                line.twist = (0.0, 0.0)
+            return line.fault
+        line.twist = (command.linear_mps, command.angular_radps)
+        line.stamp_s = command.stamp_s
+        line.heard_s = now
+        return ""
+
+    def _fault(self, command: Stamped, now: float) -> str:
+        linear, angular = command.linear_mps, command.angular_radps
+        limits = self._limits
+        if not (math.isfinite(linear) and math.isfinite(angular)):
+            # Also in the baseline: no base can execute it, the last command goes on instead.
+            return f"command ({linear}, {angular}) is not finite"
+        if self._checks.bounds:
+            slack = 1.0 + 1e-6
+            if abs(linear) > limits.max_linear_mps * slack:
+                return f"command of {linear:.2f} m/s is beyond {limits.max_linear_mps:.2f} m/s"
+            if abs(angular) > limits.max_angular_radps * slack:
+                return (f"command of {angular:.2f} rad/s is beyond"
+                        f" {limits.max_angular_radps:.2f} rad/s")
+        if self._checks.freshness:
+            age_s = now - command.stamp_s
+            if not age_s <= limits.command_timeout_s:
+                return f"command is {age_s:.2f} s old, limit {limits.command_timeout_s:.2f} s"
+            if age_s < -_FUTURE_S:
+                return f"command is stamped {-age_s:.2f} s ahead of now"
+        return ""
+
+    @property
+    def mode(self) -> PilotMode:
+        """The strictest engaged order's mode, auto without any."""
+        modes = [mode for mode, _ in self._orders.values()]
+        return max(modes, key=STRICTNESS.index, default=PilotMode.AUTO)
+
+    def output(self, now: float) -> GateOutput:
+        """Return what the base is to do now."""
+        mode = self.mode
+        reason = self._forbidden(mode, now)
+        if reason:
+            return GateOutput(0.0, 0.0, mode, True, reason)
+        stick = now - self._stick.heard_s <= self._limits.joystick_timeout_s
+        if mode is PilotMode.TELEOPERATION and not stick:
+            return GateOutput(0.0, 0.0, mode, True, self._why(mode) or "waiting for the joystick")
+        line = self._stick if stick else self._auto
+        reason = self._unusable(line, now)
+        if reason or line.twist is None:
+            return GateOutput(0.0, 0.0, mode, True, reason or "no command yet")
+        linear, angular = limited(*line.twist, self._points, self._limits.room)
+        reason = "the joystick pre-empts" if stick and mode is PilotMode.AUTO else ""
+        stopped = (linear, angular) == (0.0, 0.0) != line.twist
+        if abs(linear) < abs(line.twist[0]) * _SLOWED or stopped:
+            reason = "obstacle: stopped" if linear == 0.0 else "obstacle: slowed down"
+        return GateOutput(linear, angular, mode, stopped, reason)
+
+    def _forbidden(self, mode: PilotMode, now: float) -> str:
+        """Why nobody's command may pass, or ""."""
+        limits = self._limits
+        if mode is PilotMode.STOP:
+            return self._why(mode) or "ordered to stop"
+        if self._checks.manager:
+            silence_s = now - self._manager_heard_s
+            if silence_s > limits.manager_timeout_s:
+                return "the manager is silent"
+            if now - self._started_s < limits.settling_s:
+                return "just started, orders may not have arrived yet"
+        if self._checks.scan and now - self._scan_s > limits.scan_timeout_s:
+            return "no fresh laser scan"
+        return ""
+
+    def _unusable(self, line: _Line, now: float) -> str:
+        """Why a line's last command may not be executed, or ""."""
+        if line.fault and self._checks.bounds:
+            return line.fault
+        if self._checks.freshness and line.twist is not None:
+            age_s = now - line.stamp_s
+            if age_s > self._limits.command_timeout_s:
+                return "no fresh command"
+        return ""
+
+    def _why(self, mode: PilotMode) -> str:
+        """The reasons of the orders for a mode."""
+        named = sorted(self._orders.items())
+        return "; ".join(f"{name}: {why}" for name, (wanted, why) in named if wanted is mode)

@@ -1,0 +1,69 @@
+"""DM2 and DM6: command not updated, localization not updated (paper, table I)."""
+
+from __future__ import annotations
+
+from actors import messages as m
+from actors import topics
+from actors.detection.freshness_monitor import FreshnessMonitor
+from actors.detection.module import DetectionModule, number
+from actors.runtime.actor import Context, Header, on
+
+
+class Freshness(DetectionModule):
+    """Active while a topic is stale. A subclass per topic, so that each hears only its own.
+
+    Parameters:
+        timeout_s: greatest admissible age of the content, s.
+        hold_s: how long it must be fresh again before the module is idle, s.
+        startup_grace_s: how long the first sample of a starting system may take, s. A respawned
+            module joins a running system: for it the timeout itself is the grace.
+    """
+
+    subject = ""
+    default_timeout_s = 0.5
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        timeout_s = number(self.parameters, "timeout_s", self.default_timeout_s)
+        grace_s = number(self.parameters, "startup_grace_s", 5.0)
+        first_life = context.incarnation == 1
+        self.monitor = FreshnessMonitor(
+            self.subject, timeout_s, number(self.parameters, "hold_s", 0.3), self.clock.now(),
+            max(grace_s, timeout_s) if first_life else timeout_s, known=first_life)
+
+    def on_start(self) -> None:
+        """Start waiting for the first sample."""
+        self.follow(self.monitor)
+
+    def sample(self, header: Header) -> None:
+        """Take note of a sample."""
+        self.monitor.heard(header.stamp, self.clock.now())
+        self.follow(self.monitor)
+
+
+class CommandFreshness(Freshness):
+    """DM2: Osmosis Control's command is not updated.
+
+    The default timeout is half of the 0.64 s in the authors' code: at 20 Hz that is six commands
+    in a row, and a robot at 1 m/s has travelled 0.3 m.
+    """
+
+    subject = "command"
+    default_timeout_s = 0.32
+
+    @on(topics.COMMAND)
+    def command(self, _message: m.Twist, header: Header) -> None:
+        """Hear a command."""
+        self.sample(header)
+
+
+class LocalizationFreshness(Freshness):
+    """DM6: the pose is not updated (1 s in the authors' code)."""
+
+    subject = "localization"
+    default_timeout_s = 0.5
+
+    @on(topics.POSE)
+    def pose(self, _message: m.Pose, header: Header) -> None:
+        """Hear a pose."""
+        self.sample(header)

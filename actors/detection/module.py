@@ -1,0 +1,173 @@
+"""What all detection modules have in common: the paper's two states, reports, exact timers.
+
+A detection module is a pure monitor (what it heard, and by when it must have heard more) and an
+actor round it. The actor hands events to the monitor, wakes it when its next deadline is due,
+and says on `detection/NAME` what the monitor found: at once when it changes, and at 5 Hz.
+
+Two subtleties, both about a module that was not there for a while:
+
+* A module that was itself stopped and goes on, or a machine that hung, finds every deadline
+  passed while the proof to the contrary still waits unread. So a wake-up that comes late is
+  repeated once, a little later, before anybody is accused.
+* A respawned module does not know yet whether the fault is there. Had it reported idle from its
+  first moment, the manager would let go of a robot whose fault persists. So from its second
+  life on it is silent until it knows, and the manager takes silence for activity.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+from actors import topics
+from actors.messages import DetectionReport, DetectionState
+from actors.runtime.actor import Actor, Context, every
+
+TRANSITIONS = {
+    DetectionState.IDLE: frozenset({DetectionState.ACTIVE}),
+    DetectionState.ACTIVE: frozenset({DetectionState.IDLE}),
+}
+"""The state machine of every detection module (paper, figure 4)."""
+
+LATE_S = 0.1
+"""A wake-up this much late means that the module itself did not run."""
+
+EXCUSE_S = 0.1
+"""How long a late module reads its mail before it judges: one period of the slowest input."""
+
+_SHORTEST_SLEEP_S = 1e-4
+"""Rounding must not make a timer that is due now come again now, for ever."""
+
+
+class IllegalTransitionError(RuntimeError):
+    """A state machine was asked for a step that its table does not have."""
+
+
+class Monitor(Protocol):
+    """The pure part of a detection module. Times are simulated seconds.
+
+    Attributes:
+        active: whether the fault is there.
+        reason: why; constant while nothing changes.
+        nodes: the failed nodes, where nodes are the subject.
+        known: False until the monitor has heard enough to say either.
+        due_s: when `expire` is to be called next; infinite if only an event can change anything.
+    """
+
+    @property
+    def active(self) -> bool: ...  # noqa: D102
+    @property
+    def reason(self) -> str: ...  # noqa: D102
+    @property
+    def nodes(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def known(self) -> bool: ...  # noqa: D102
+    @property
+    def due_s(self) -> float: ...  # noqa: D102
+
+    def expire(self, now_s: float) -> None:
+        """Draw the conclusions from the time that has passed without an event."""
+
+
+class DetectionModule(Actor):
+    """Base of DM1 to DM7.
+
+    A subclass either calls `activate` and `clear` itself, or has a `Monitor`, hands it what it
+    hears, and calls `follow(monitor)` after each event.
+    """
+
+    outputs = (topics.DETECTION,)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.state = DetectionState.IDLE
+        self._report = DetectionReport(DetectionState.IDLE, "", (), self.clock.now())
+        self._reports = context.incarnation == 1
+        self._monitor: Monitor | None = None
+        self._wake_s = math.inf
+        self._excused = False
+
+    # -- the state machine ----------------------------------------------------------------------
+
+    def activate(self, reason: str, nodes: tuple[str, ...] = ()) -> None:
+        """Go from idle to active, or, active already, renew reason and nodes; report a change."""
+        if self.state is DetectionState.ACTIVE:
+            if nodes != self._report.nodes:
+                self._tell(DetectionReport(self.state, reason, nodes, self._report.since_s))
+            return
+        self._enter(DetectionState.ACTIVE)
+        self._tell(DetectionReport(self.state, reason, nodes, self.clock.now()))
+
+    def clear(self) -> None:
+        """Go from active to idle and report it.
+
+        Raises:
+            IllegalTransitionError: it is idle.
+        """
+        self._enter(DetectionState.IDLE)
+        self._tell(DetectionReport(self.state, "", (), self.clock.now()))
+
+    def _enter(self, state: DetectionState) -> None:
+        if state not in TRANSITIONS[self.state]:
+            raise IllegalTransitionError(
+                f"{self.name}: no transition from {self.state} to {state}")
+        self.state = state
+
+    def _tell(self, report: DetectionReport) -> None:
+        self._report = report
+        self._reports = True
+        self.publish(topics.DETECTION, report)
+
+    @every(0.2)
+    def repeat(self) -> None:
+        """Say it again, for whoever has joined since."""
+        if self._reports:
+            self.publish(topics.DETECTION, self._report)
+
+    # -- the monitor ----------------------------------------------------------------------------
+
+    def follow(self, monitor: Monitor) -> None:
+        """Bring the state in line with the monitor, and see to it that its deadline is kept."""
+        self._monitor = monitor
+        if monitor.active:
+            self.activate(monitor.reason, monitor.nodes)
+        elif self.state is DetectionState.ACTIVE:
+            self.clear()
+        elif monitor.known and not self._reports:
+            self._tell(self._report)
+        self._sleep_until(monitor.due_s)
+
+    def _sleep_until(self, due_s: float) -> None:
+        # A deadline that has moved on does not cancel the timer: that one wakes, finds nothing
+        # due, and sleeps again. One timer per timeout, instead of one per message.
+        if due_s < self._wake_s:
+            self._wake_s = due_s
+            self.call_later(max(due_s - self.clock.now(), _SHORTEST_SLEEP_S), self._woken)
+
+    def _woken(self) -> None:
+        monitor = self._monitor
+        if monitor is None:
+            return
+        self._wake_s = math.inf
+        now_s = self.clock.now()
+        if now_s - monitor.due_s > LATE_S and not self._excused:
+            self._excused = True
+            self._wake_s = now_s + EXCUSE_S
+            self.call_later(EXCUSE_S, self._woken)
+            return
+        self._excused = False
+        monitor.expire(now_s)
+        self.follow(monitor)
+
+
+def number(parameters: Any, name: str, default: float) -> float:
+    """Return a non-negative finite number among a node's parameters.
+
+    Raises:
+        ValueError: it is none; the message names parameter and value.
+    """
+    value = parameters.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) \
+            or not (math.isfinite(value) and value >= 0):
+        raise ValueError(f"parameters.{name} = {value!r}: must be a number, 0 or more")
+    return float(value)

@@ -1,0 +1,128 @@
+"""Who of the watched nodes is dead, stopped or wedged.
+
+Three failures, two signs. A process that dies takes its liveliness token with it: seen at once.
+A process that is stopped, or whose loop hangs, keeps the token: only its heartbeat is missing.
+
+Lives are told apart by their incarnation. The death notice of an old life may arrive when the
+next one is already at work, and a heartbeat of the old one may arrive after its death notice;
+neither may be believed of the new life. Being back is proved by a heartbeat, not by a token: a
+process that exists does not work yet.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+_BEATS_OF_A_GHOST = 1
+"""How many heartbeats of a dead life can still be under way (it beats ten times a second)."""
+
+
+@dataclass(slots=True)
+class _Life:
+    """What is known of a watched node: its newest incarnation and how that one is."""
+
+    due_s: float
+    incarnation: int = 0
+    heard: bool = False
+    gone: bool = False
+    beats_since_gone: int = 0
+    failure: str = ""
+
+
+class WatchdogCore:
+    """Active while one of the nodes has failed; `nodes` names those.
+
+    Args:
+        nodes: the watched nodes.
+        timeout_s: a node without a heartbeat for so long has failed, s.
+        start_s: now.
+        grace_s: how long the first heartbeat of a node may take, s.
+        known: whether idle may be claimed before all nodes were heard.
+    """
+
+    def __init__(self, nodes: Iterable[str], timeout_s: float, start_s: float, grace_s: float,
+                 *, known: bool = True) -> None:
+        self.timeout_s = timeout_s
+        self._known = known
+        self._lives = {node: _Life(due_s=start_s + grace_s) for node in nodes}
+
+    @property
+    def active(self) -> bool:
+        """Whether a node has failed."""
+        return any(life.failure for life in self._lives.values())
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """The failed nodes."""
+        return tuple(node for node, life in self._lives.items() if life.failure)
+
+    @property
+    def reason(self) -> str:
+        """What happened to each failed node."""
+        return "; ".join(
+            f"{node}: {life.failure}" for node, life in self._lives.items() if life.failure)
+
+    @property
+    def known(self) -> bool:
+        """Whether each node was heard, or missed."""
+        return self._known or all(life.heard or life.failure for life in self._lives.values())
+
+    @property
+    def due_s(self) -> float:
+        """When the next heartbeat is overdue."""
+        return min((life.due_s for life in self._lives.values() if not life.failure),
+                   default=math.inf)
+
+    def beat(self, node: str, incarnation: int, now_s: float) -> None:
+        """Take note of a heartbeat."""
+        life = self._lives.get(node)
+        if life is None or incarnation < life.incarnation:
+            return
+        if incarnation > life.incarnation:
+            self._succeed(life, incarnation)
+        elif life.gone:
+            # Its token vanished and has not come back. One heartbeat may have been under way;
+            # more of them prove that the notice was wrong (a link that was cut and mended).
+            life.beats_since_gone += 1
+            if life.beats_since_gone <= _BEATS_OF_A_GHOST:
+                return
+        life.gone = False
+        life.heard = True
+        life.failure = ""
+        life.due_s = now_s + self.timeout_s
+
+    def peer(self, node: str, incarnation: int, alive: bool, now_s: float) -> None:
+        """Take note of a liveliness token that appears or vanishes."""
+        life = self._lives.get(node)
+        if life is None or incarnation < life.incarnation:
+            return
+        if alive:
+            if incarnation > life.incarnation:
+                first = life.incarnation == 0
+                self._succeed(life, incarnation)
+                if not first:  # at the very start the grace is longer, and still runs
+                    life.due_s = now_s + self.timeout_s
+            elif life.gone:
+                life.gone = False
+                life.due_s = now_s + self.timeout_s
+            return
+        life.incarnation = incarnation
+        life.gone = True
+        life.beats_since_gone = 0
+        life.failure = f"process of incarnation {incarnation} is gone"
+
+    def expire(self, now_s: float) -> None:
+        """Conclude from the time that has passed without a heartbeat."""
+        for life in self._lives.values():
+            if not life.failure and now_s >= life.due_s:
+                life.failure = f"no heartbeat for {self.timeout_s:g} s" if life.heard \
+                    else "never heard"
+
+    @staticmethod
+    def _succeed(life: _Life, incarnation: int) -> None:
+        """A new life begins. A failure stays until its first heartbeat."""
+        life.incarnation = incarnation
+        life.gone = False
+        life.heard = False

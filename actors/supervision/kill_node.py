@@ -1,0 +1,112 @@
+"""`kill-node`: fault injection from the shell. Finds a node's process in /proc and signals it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+
+from actors.supervision.process_title import RunProcess, find_processes
+
+SIGNALS = {
+    "KILL": signal.SIGKILL,
+    "STOP": signal.SIGSTOP,
+    "CONT": signal.SIGCONT,
+    "TERM": signal.SIGTERM,
+    "SEGV": signal.SIGSEGV,
+    "WEDGE": signal.SIGUSR2,
+}
+
+_EPILOG = """\
+signals:
+  KILL   the process is gone at once (default)
+  STOP   the process stands still, as under a debugger; CONT lets it go on
+  TERM   the process ends in order; its supervisor takes that for a crash all the same
+  SEGV   as if it had touched memory that is not there
+  WEDGE  the process lives, its event loop turns no more (SIGUSR2)
+
+examples:
+  kill-node osmosis_control                  kill it and watch it come back
+  kill-node localization --signal STOP       only its heartbeat shows that it is gone
+  kill-node --list                           what there is to kill
+A plain `kill -9 PID` or `pkill -9 -f osmosis_control` does the same.
+"""
+
+
+class _Refusal(Exception):  # noqa: N818 it ends the command, it is no fault of the program
+    """One line for the user."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command and return its exit code: 0 signalled, 2 bad usage or no such node."""
+    try:
+        _run(_parser().parse_args(arguments))
+    except _Refusal as refusal:
+        print(f"kill-node: {refusal}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="kill-node", description="Kill, stop or wedge a node of a running robot.",
+        epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("node", nargs="?", help="name of the node, e.g. osmosis_control")
+    parser.add_argument("--signal", default="KILL", type=str.upper, metavar="SIG",
+                        help="KILL (default), STOP, CONT, TERM, SEGV or WEDGE")
+    parser.add_argument("--port", type=int, help="base port of the run, if there are several")
+    parser.add_argument("--list", action="store_true", help="list the nodes of the run(s)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    return parser
+
+
+def _run(options: argparse.Namespace) -> None:
+    processes = find_processes(options.port)
+    if options.list:
+        _print_list(processes, as_json=options.json)
+        return
+    if options.node is None:
+        raise _Refusal("no node given; --list shows what there is")
+    if options.signal not in SIGNALS:
+        raise _Refusal(f"--signal {options.signal}: unknown signal; known: {', '.join(SIGNALS)}")
+    victim = _find(processes, options.node, options.port)
+    try:
+        os.kill(victim.pid, SIGNALS[options.signal])
+    except OSError as error:
+        raise _Refusal(f"{options.node} (pid {victim.pid}): {error.strerror}") from None
+    if options.json:
+        print(json.dumps({"node": options.node, "pid": victim.pid, "signal": options.signal,
+                          "incarnation": victim.incarnation}))
+    else:
+        print(f"{options.node} (pid {victim.pid}, incarnation {victim.incarnation}): "
+              f"{options.signal}")
+
+
+def _find(processes: list[RunProcess], node: str, port: int | None) -> RunProcess:
+    where = f" on port {port}" if port is not None else ""
+    if not processes:
+        raise _Refusal(f"no run found{where}; start one with `python launch.py`")
+    matches = [p for p in processes if node in p.names]
+    if not matches:
+        known = ", ".join(sorted({n for p in processes for n in p.names}))
+        raise _Refusal(f"unknown node {node!r}{where}; known: {known}")
+    if len({p.port for p in matches}) > 1:
+        ports = ", ".join(str(p.port) for p in matches)
+        raise _Refusal(f"{node}: in several runs; choose one with --port: {ports}")
+    return max(matches, key=lambda p: p.incarnation)
+
+
+def _print_list(processes: list[RunProcess], *, as_json: bool) -> None:
+    rows = [{"name": n, "pid": p.pid, "incarnation": p.incarnation, "port": p.port}
+            for p in processes for n in p.names]
+    if as_json:
+        print(json.dumps(rows))
+        return
+    for row in rows:
+        print(f"{row['port']:>6} {row['pid']:>8} #{row['incarnation']:<4} {row['name']}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

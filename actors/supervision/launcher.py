@@ -1,0 +1,266 @@
+"""The root of a run: starts spawners and supervisor, brings them back, and cleans up after all.
+
+The launcher owns the lifeline (see `lifeline`), is the subreaper of the run (orphans of a dead
+spawner become its children, so no zombie stays), and answers tools that look for the run. It is
+the last guard: the supervisor brings everybody back, the launcher brings back the supervisor.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from actors.messages import NodeTable
+from actors.supervision import run_info
+from actors.supervision.lifeline import kill_leftovers
+from actors.supervision.process_title import find_processes
+from actors.supervision.run_plan import SUPERVISOR, RunPlan
+from actors.supervision.spawner import NAMES, peer_is_same_user
+from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+
+LOAD_TIMEOUT_S = 60.0
+GUARD_PERIOD_S = 0.25
+STOP_TIMEOUT_S = 1.2
+SUPERVISOR_PATIENCE_S = 1.5
+"""A supervisor that has not published its table (every 0.5 s at rate 1) for so long is hung."""
+_PR_SET_CHILD_SUBREAPER = 36
+_ROOT = Path(__file__).resolve().parents[2]
+
+
+class LaunchError(Exception):
+    """The run cannot be started; the text is one line for the user."""
+
+
+def check_ports(first: int, count: int) -> None:
+    """Make sure that the run's ports are free on loopback.
+
+    Raises:
+        LaunchError: one is in use; the message names it.
+    """
+    for port in range(first, first + count):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError as error:
+                raise LaunchError(f"--port {first}: port {port} is in use ({error.strerror}); the "
+                                  f"run needs {first} to {first + count - 1}; choose another "
+                                  "--port") from None
+
+
+class Launcher:
+    """One run's processes. Use: `load`, then `start` on a running event loop, then `end`."""
+
+    def __init__(self, plan: RunPlan, title: str) -> None:
+        self.plan = plan
+        self.ports: dict[str, int] = {}
+        self.supervisor_incarnation = 0
+        self.known_incarnations: dict[str, int] = {}
+        self.on_restart: Callable[[str, int], None] = lambda _name, _incarnation: None
+        self._title = title
+        self._spawners = SpawnerClient(plan.base_port)
+        self._lifeline: tuple[int, int] = (-1, -1)
+        self._first: subprocess.Popen[bytes] | None = None
+        self._supervisor_pid = 0
+        self._supervisor_heard_s = 0.0
+        self._info: socket.socket | None = None
+        self._guard: asyncio.Task[None] | None = None
+
+    # -- start ----------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Start the first spawner, which then loads in the background."""
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        self._lifeline = os.pipe()
+        self._start_first_spawner()
+
+    def _start_first_spawner(self) -> None:
+        environment = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
+        environment["PYTHONPATH"] = os.pathsep.join(
+            [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+        self._first = subprocess.Popen(  # noqa: S603 our own interpreter and module
+            [sys.executable, "-m", "actors.supervision.spawner", str(self._lifeline[0])],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[self._lifeline[0]],
+            env=environment)
+        assert self._first.stdin is not None  # noqa: S101 for the type checker
+        self._first.stdin.write(msgspec.json.encode(self.plan))
+        self._first.stdin.close()
+
+    async def load(self) -> None:
+        """Wait until the first spawner has loaded the plan and check the ports.
+
+        Raises:
+            LaunchError: spec, airport or mission are unsound, or a port is in use.
+        """
+        assert self._first is not None  # noqa: S101
+        assert self._first.stdout is not None  # noqa: S101
+        try:
+            line = await asyncio.wait_for(
+                asyncio.to_thread(self._first.stdout.readline), LOAD_TIMEOUT_S)
+        except TimeoutError:
+            raise LaunchError(f"the spawner did not load within {LOAD_TIMEOUT_S:.0f} s") from None
+        text = line.decode().strip()
+        if text.startswith("error: "):
+            raise LaunchError(text.removeprefix("error: "))
+        if not text.startswith("{"):
+            raise LaunchError("the spawner ended while it loaded")
+        self.ports = msgspec.json.decode(text, type=dict[str, int])
+        check_ports(self.plan.base_port, len(self.ports))
+
+    async def start(self) -> None:
+        """Set simulated time 0 to now and start the second spawner and the supervisor.
+
+        Raises:
+            LaunchError: the spawner does not answer.
+        """
+        loop = asyncio.get_running_loop()
+        loop.add_signal_handler(signal.SIGCHLD, self._reap)
+        self.plan = msgspec.structs.replace(self.plan, origin_s=time.monotonic())
+        try:
+            self._spawners.set_origin(self.plan.origin_s)
+            self._spawners.fork((f"spawner_{NAMES[1]}",), 1)
+            self._start_supervisor()
+        except SpawnerUnavailableError as error:
+            raise LaunchError(str(error)) from None
+        self._answer_tools(loop)
+        self._guard = asyncio.create_task(self._keep_guards())
+
+    def _start_supervisor(self) -> None:
+        self.supervisor_incarnation += 1
+        self._supervisor_pid = self._spawners.fork(
+            (SUPERVISOR,), self.supervisor_incarnation, self.known_incarnations)
+        self._supervisor_heard_s = time.monotonic()
+
+    # -- guard ----------------------------------------------------------------------------------
+
+    def supervisor_heard(self, table: NodeTable) -> None:
+        """Note that the supervisor lives, and which incarnations it has reached."""
+        self._supervisor_heard_s = time.monotonic()
+        for row in table.nodes:
+            known = self.known_incarnations.get(row.name, 0)
+            self.known_incarnations[row.name] = max(known, row.incarnation)
+
+    async def _keep_guards(self) -> None:
+        # The pidfd wakes the guard the moment the supervisor dies; the period serves the rest.
+        while True:
+            await self._supervisor_gone(GUARD_PERIOD_S)
+            names = {n for p in find_processes(self.plan.base_port) for n in p.names}
+            for name in NAMES:
+                full = f"spawner_{name}"
+                if full not in names or not self._spawners.ping(name):
+                    self._bring_back(full)
+            silent = time.monotonic() - self._supervisor_heard_s > SUPERVISOR_PATIENCE_S
+            if SUPERVISOR in names and silent:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(self._supervisor_pid, signal.SIGKILL)
+            if SUPERVISOR not in names or silent:
+                self._bring_back(SUPERVISOR)
+
+    async def _supervisor_gone(self, timeout_s: float) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            pidfd = os.pidfd_open(self._supervisor_pid)
+        except (ProcessLookupError, OSError):
+            return
+        gone = loop.create_future()
+
+        def readable() -> None:
+            if not gone.done():
+                gone.set_result(None)
+
+        loop.add_reader(pidfd, readable)
+        try:
+            await asyncio.wait_for(gone, timeout_s)
+        except TimeoutError:
+            pass
+        finally:
+            loop.remove_reader(pidfd)
+            os.close(pidfd)
+
+    def _bring_back(self, name: str) -> None:
+        try:
+            if name == SUPERVISOR:
+                self._start_supervisor()
+                self.on_restart(name, self.supervisor_incarnation)
+            else:
+                self._spawners.fork((name,), 1)
+                self.on_restart(name, 0)
+        except SpawnerUnavailableError:
+            self._restart_first_spawner()
+
+    def _restart_first_spawner(self) -> None:
+        """Both spawners are gone: load everything once more, which takes a second or two."""
+        if self._first is not None and self._first.poll() is None:
+            return
+        self._start_first_spawner()
+        self.on_restart(f"spawner_{NAMES[0]}", 0)
+
+    def _reap(self) -> None:
+        with contextlib.suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+
+    # -- tools ----------------------------------------------------------------------------------
+
+    def _answer_tools(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._info = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._info.bind(run_info.address(self.plan.base_port))
+        self._info.listen(8)
+        self._info.setblocking(False)
+        loop.add_reader(self._info, self._answer_one)
+
+    def _answer_one(self) -> None:
+        if self._info is None:
+            return
+        with contextlib.suppress(OSError):
+            connection, _ = self._info.accept()
+            with connection:
+                if peer_is_same_user(connection):
+                    connection.send(msgspec.json.encode(self.info()))
+
+    def info(self) -> run_info.RunInfo:
+        """Return what tools need to know of this run."""
+        return run_info.RunInfo(
+            os.getpid(), self.plan.base_port, self.plan.rate, self.plan.origin_s,
+            self.plan.system_file, self.ports, self.plan.run_id, self.plan.hmi_port, self._title)
+
+    # -- end ------------------------------------------------------------------------------------
+
+    async def end(self) -> None:
+        """End all processes of the run: in order if the supervisor can, by force what is left."""
+        if self._guard is not None:
+            self._guard.cancel()
+            await asyncio.gather(self._guard, return_exceptions=True)
+        if self._supervisor_pid:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._supervisor_pid, signal.SIGTERM)
+            await self._supervisor_gone(STOP_TIMEOUT_S)
+        self.abort()
+        if self._info is not None:
+            asyncio.get_running_loop().remove_reader(self._info)
+            self._info.close()
+
+    def abort(self) -> None:
+        """End all processes of the run at once. Harmless when there are none."""
+        self._spawners.close()
+        for end in self._lifeline:
+            if end >= 0:
+                os.close(end)
+        self._lifeline = (-1, -1)
+        if self._first is not None and self._first.poll() is None:
+            self._first.kill()
+        deadline = time.monotonic() + 1.0
+        while kill_leftovers(self.plan.base_port) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        self._reap()

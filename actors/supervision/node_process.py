@@ -1,0 +1,102 @@
+"""What runs in a node's process after the fork: title, lifeline, signals, actors, exit code.
+
+SIGTERM asks the actors to end in order. SIGUSR2 wedges the event loop for good, process and
+liveliness token alive: the fault that only a heartbeat from the loop can show.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from actors.runtime.actor import Actor, Context
+from actors.runtime.bus import BusError
+from actors.runtime.clock import Clock
+from actors.runtime.zenoh_bus import ZenohBus
+from actors.supervision.lifeline import exit_with_launcher, kill_leftovers
+from actors.supervision.process_title import set_title
+from actors.supervision.run_plan import SUPERVISOR, Layout
+
+EXIT_OK = 0
+EXIT_FAILED = 1
+EXIT_BUS = 3
+
+
+def make_actor(
+    layout: Layout, name: str, incarnation: int, shared: Mapping[str, Any],
+    loop: asyncio.AbstractEventLoop,
+) -> Actor:
+    """Build one actor of the system with its bus, not yet running."""
+    member = layout.members[name]
+    clock = Clock(layout.plan.origin_s, layout.plan.rate, loop.time)
+    bus = ZenohBus(name, incarnation, layout.listen(name), layout.dial(name))
+    return member.actor(Context(name, incarnation, clock, bus, member.parameters, shared))
+
+
+def node_main(
+    layout: Layout, names: tuple[str, ...], incarnation: int, shared: Mapping[str, Any],
+    lifeline: int,
+) -> int:
+    """Run the actors of one process to their end and return the exit code."""
+    set_title(layout.plan.base_port, names, incarnation)
+    port = layout.plan.base_port
+    exit_with_launcher(lifeline, (lambda: kill_leftovers(port)) if SUPERVISOR in names else None)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is the launcher's to handle
+    signal.signal(signal.SIGUSR2, _wedge)
+    try:
+        asyncio.run(_live(layout, names, incarnation, shared))
+    except BusError as error:
+        _complain(f"{'+'.join(names)}: {error}")
+        return EXIT_BUS
+    except Exception as error:  # the last stop before the exit code: nothing may pass unseen
+        _complain(f"{'+'.join(names)} #{incarnation} failed: {type(error).__name__}: {error}")
+        _log_traceback(layout, names, incarnation)
+        return EXIT_FAILED
+    return EXIT_OK
+
+
+async def _live(
+    layout: Layout, names: tuple[str, ...], incarnation: int, shared: Mapping[str, Any]
+) -> None:
+    loop = asyncio.get_running_loop()
+    actors = [make_actor(layout, name, incarnation, shared, loop) for name in names]
+
+    def stop_all() -> None:
+        for actor in actors:
+            actor.stop()
+
+    loop.add_signal_handler(signal.SIGTERM, stop_all)
+    async with asyncio.TaskGroup() as group:
+        for actor in actors:
+            group.create_task(_run(actor))
+
+
+async def _run(actor: Actor) -> None:
+    await actor.run()
+
+
+def _wedge(_signal: int, _frame: Any) -> None:
+    while True:
+        time.sleep(3600)
+
+
+def _complain(line: str) -> None:
+    print("rampart: " + " ".join(line.split()), file=sys.stderr, flush=True)
+
+
+def _log_traceback(layout: Layout, names: tuple[str, ...], incarnation: int) -> None:
+    if not layout.plan.error_log:
+        return
+    try:
+        with Path(layout.plan.error_log).open("a", encoding="utf-8") as log:
+            log.write(f"--- {'+'.join(names)} #{incarnation} pid {os.getpid()}\n")
+            traceback.print_exc(file=log)
+    except OSError as error:
+        _complain(f"cannot write {layout.plan.error_log}: {error}")

@@ -1,0 +1,78 @@
+"""Names of processes as `ps` shows them, and the way back from a name to its process.
+
+The title is the registry: a restarted supervisor, `kill-node` and the clean-up after a killed
+launcher find a run's processes in /proc, with no file that could be stale and no bus that could
+be down. Format: `rampart[PORT] NAME #INCARNATION`; several actors in one process are `A+B`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import setproctitle
+
+_TITLE = re.compile(r"^rampart\[(\d+)\] ([\w+.-]+) #(\d+)")
+_STATE_STOPPED = ("T", "t")
+
+
+@dataclass(frozen=True, slots=True)
+class RunProcess:
+    """A process of a run as found in /proc."""
+
+    pid: int
+    port: int
+    names: tuple[str, ...]
+    incarnation: int
+
+
+def set_title(port: int, names: tuple[str, ...], incarnation: int) -> None:
+    """Name the calling process."""
+    setproctitle.setproctitle(f"rampart[{port}] {'+'.join(names)} #{incarnation}")
+    setproctitle.setthreadtitle("+".join(names)[:15])
+
+
+def parse_title(pid: int, title: str) -> RunProcess | None:
+    """Return what a process title says, or None if it is none of ours."""
+    match = _TITLE.match(title)
+    if match is None:
+        return None
+    return RunProcess(pid, int(match[1]), tuple(match[2].split("+")), int(match[3]))
+
+
+def find_processes(port: int | None = None) -> list[RunProcess]:
+    """Return the living processes of all runs of this user, or of the run on one base port.
+
+    Zombies are left out: they run no code and hold nothing.
+    """
+    mine = os.getuid()
+    found = []
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdecimal():
+            continue
+        try:
+            raw = (entry / "cmdline").read_bytes()
+            if not raw.startswith(b"rampart[") or entry.stat().st_uid != mine:
+                continue
+        except OSError:
+            continue  # it ended while we looked
+        process = parse_title(int(entry.name), raw.rstrip(b"\0").decode(errors="replace"))
+        if process and port in {None, process.port} and process_state(process.pid) not in "ZX":
+            found.append(process)
+    return sorted(found, key=lambda p: (p.port, p.pid))
+
+
+def process_state(pid: int) -> str:
+    """Return the state letter of /proc/PID/stat, or "X" if there is no such process."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return "X"
+    return stat.rpartition(")")[2].split()[0]
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether the process was stopped by a signal."""
+    return process_state(pid) in _STATE_STOPPED

@@ -1,0 +1,84 @@
+"""How a tool finds the runs on this machine: it asks the launchers.
+
+A launcher answers on an abstract unix socket, `rampart.PORT.launcher`, with one JSON object.
+The kernel lists such sockets in /proc/net/unix; nothing lies on a disk that could be stale.
+"""
+
+from __future__ import annotations
+
+import re
+import socket
+from pathlib import Path
+
+import msgspec
+
+_NAME = re.compile(r"@rampart\.(\d+)\.launcher$")
+_TIMEOUT_S = 1.0
+
+
+class RunInfo(msgspec.Struct, frozen=True):
+    """One run: where it is, what it runs, and when its simulated time began.
+
+    `nodes` maps node names to their Zenoh ports; `origin_s` is a reading of the machine's
+    monotonic clock.
+    """
+
+    pid: int
+    base_port: int
+    rate: float
+    origin_s: float
+    system_file: str
+    nodes: dict[str, int]
+    run_id: str
+    hmi_port: int
+    title: str
+
+
+class NoRunError(Exception):
+    """There is no run, or several and none was chosen; the text is one line for the user."""
+
+
+def address(port: int) -> str:
+    """Return the abstract socket address of the launcher of the run on a base port."""
+    return f"\0rampart.{port}.launcher"
+
+
+def find_runs() -> list[RunInfo]:
+    """Return all runs of this machine whose launcher answers."""
+    try:
+        table = Path("/proc/net/unix").read_text(encoding="utf-8")
+    except OSError:
+        return []
+    ports = {int(m[1]) for line in table.splitlines() if (m := _NAME.search(line))}
+    return [info for port in sorted(ports) if (info := _ask(port)) is not None]
+
+
+def find_run(port: int | None = None) -> RunInfo:
+    """Return the one run there is, or the one on a base port.
+
+    Raises:
+        NoRunError: there is none, or there are several and no port was given.
+    """
+    runs = find_runs()
+    if port is not None:
+        for run in runs:
+            if run.base_port == port:
+                return run
+        known = ", ".join(str(r.base_port) for r in runs) or "none"
+        raise NoRunError(f"--port {port}: no run there; runs found: {known}")
+    if not runs:
+        raise NoRunError("no run found; start one with `python launch.py`")
+    if len(runs) > 1:
+        listed = ", ".join(f"{r.base_port} ({r.title})" for r in runs)
+        raise NoRunError(f"several runs, choose one with --port: {listed}")
+    return runs[0]
+
+
+def _ask(port: int) -> RunInfo | None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.settimeout(_TIMEOUT_S)
+        try:
+            connection.connect(address(port))
+            return msgspec.json.decode(connection.recv(65536), type=RunInfo)
+        except (OSError, msgspec.MsgspecError):
+            return None

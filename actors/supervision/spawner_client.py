@@ -1,0 +1,112 @@
+"""The supervisor's and the launcher's side of the spawners: fork through whichever lives.
+
+A spawner that does not answer in time is killed before the other one is asked, so that no
+second process of the same incarnation can appear later.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import struct
+
+import msgspec
+
+from actors.supervision.spawner import (
+    MAX_DATAGRAM,
+    NAMES,
+    ForkRequest,
+    Ping,
+    Reply,
+    Request,
+    SetOrigin,
+    address,
+)
+
+ANSWER_TIMEOUT_S = 0.25
+"""A fork takes a millisecond; a spawner that needs this long is stopped or hung."""
+
+
+class SpawnerUnavailableError(Exception):
+    """No spawner answered."""
+
+
+class SpawnerClient:
+    """Talks to the spawners of the run on one base port. Blocking, a millisecond or so."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self._connections: dict[str, socket.socket] = {}
+
+    def fork(
+        self, names: tuple[str, ...], incarnation: int, known: dict[str, int] | None = None
+    ) -> int:
+        """Fork a process for the named actors and return its pid.
+
+        Raises:
+            SpawnerUnavailableError: no spawner could do it.
+        """
+        failures = []
+        for name in NAMES:
+            if names == (f"spawner_{name}",):
+                continue
+            reply = self.ask(name, ForkRequest(names, incarnation, known or {}))
+            if reply is not None and reply.child:
+                return reply.child
+            failures.append(f"spawner_{name}: {reply.error if reply else 'no answer'}")
+        raise SpawnerUnavailableError("; ".join(failures))
+
+    def ping(self, name: str) -> bool:
+        """Whether a spawner turns; one that hangs is killed."""
+        return self.ask(name, Ping()) is not None
+
+    def set_origin(self, origin_s: float) -> None:
+        """Tell the first spawner when simulated time starts."""
+        if self.ask(NAMES[0], SetOrigin(origin_s)) is None:
+            raise SpawnerUnavailableError("spawner_a: no answer")
+
+    def ask(self, name: str, request: Request) -> Reply | None:
+        """Send a request and return the reply, or None if the spawner is dead or was hung."""
+        for _ in range(2):  # a kept connection may be to a spawner that has been replaced
+            connection = self._connections.pop(name, None) or self._connect(name)
+            if connection is None:
+                return None
+            try:
+                connection.send(msgspec.json.encode(request))
+                data = connection.recv(MAX_DATAGRAM)
+            except TimeoutError:
+                _kill_peer(connection)
+                connection.close()
+                return None
+            except OSError:
+                data = b""
+            if data:
+                self._connections[name] = connection
+                return msgspec.json.decode(data, type=Reply)
+            connection.close()
+        return None
+
+    def close(self) -> None:
+        """Close the connections."""
+        for connection in self._connections.values():
+            connection.close()
+        self._connections.clear()
+
+    def _connect(self, name: str) -> socket.socket | None:
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        connection.settimeout(ANSWER_TIMEOUT_S)
+        try:
+            connection.connect(address(self._port, name))
+        except OSError:
+            connection.close()
+            return None
+        return connection
+
+
+def _kill_peer(connection: socket.socket) -> None:
+    pid, _, _ = struct.unpack("3i", connection.getsockopt(
+        socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)

@@ -1,0 +1,308 @@
+"""The supervisor: starts the processes, watches them three ways, kills and respawns them.
+
+* *Crashed*: the process's pidfd becomes readable, at once; this works for processes that are
+  not children, so a restarted supervisor adopts the living ones it finds in /proc.
+* *Stopped*: no heartbeat, and the kernel says the process is stopped (SIGSTOP).
+* *Wedged*: no heartbeat although the process runs: its event loop turns no more.
+
+What a recovery module owns (RM3, RM4) is respawned on that module's request, so that the FTM
+Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order,
+stop in reverse, SIGTERM before SIGKILL, a bounded restart intensity. What is given up on is not
+hidden: a silent detection module counts as active, a silent manager stops the Safety Pilot, a
+silent Safety Pilot trips the dead man.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import select
+import signal
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from actors import topics
+from actors.messages import Heartbeat, NodeInfo, NodeState, NodeTable, ProcessEvent, RespawnRequest
+from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.topic import Topic
+from actors.supervision.process_title import find_processes, is_stopped, process_state
+from actors.supervision.restart_policy import RestartPolicy
+from actors.supervision.run_plan import Layout, RunPlan, Unit
+from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+from manager.specification import Kind, SystemSpec
+
+STOP_GRACE_S = 0.5
+"""Wall seconds between SIGTERM and SIGKILL at the end of a run."""
+
+START_TIMEOUT_S = 3.0
+"""Wall seconds in which a new process must have sent its first heartbeat."""
+
+_RETRY_S = 0.05
+_DEAD = (NodeState.CRASHED, NodeState.GIVEN_UP)
+
+
+@dataclass(slots=True)
+class _Process:
+    """One process of the run as the supervisor knows it. Times are wall seconds."""
+
+    unit: Unit
+    policy: RestartPolicy = field(default_factory=RestartPolicy)
+    pid: int = 0
+    pidfd: int = -1
+    incarnation: int = 0
+    state: NodeState = NodeState.CRASHED
+    started_s: float = 0.0
+    heard_s: dict[str, float] = field(default_factory=dict)
+    respawning: bool = False
+
+
+class Supervisor(Actor):
+    """Keeps the processes of the run alive. Parameters: `nodes`, the names it watches."""
+
+    outputs = (topics.NODES, topics.PROCESS_EVENT)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self._plan: RunPlan = context.shared["plan"]
+        self._spec: SystemSpec = context.shared["system"]
+        self._layout = Layout(self._plan, self._spec)
+        self._spawner = SpawnerClient(self._plan.base_port)
+        self._processes = {u.name: _Process(u) for u in self._layout.units.values()}
+        for node, incarnation in context.shared.get("known_incarnations", {}).items():
+            if node in self._layout.unit_of:
+                self._processes[self._layout.unit_of[node]].incarnation = incarnation
+        self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
+        self._loop = asyncio.get_running_loop()
+
+    @classmethod
+    def names(
+        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+    ) -> tuple[str, ...] | None:
+        """Hear the heartbeats of the nodes that it starts."""
+        return tuple(parameters.get("nodes", ())) if topic is topics.HEARTBEAT else None
+
+    # -- start and stop -------------------------------------------------------------------------
+
+    def on_start(self) -> None:
+        """Adopt what lives, start what does not, in the order of the spec."""
+        living = {p.names: p for p in find_processes(self._plan.base_port)}
+        for process in self._processes.values():
+            found = living.get(tuple(n.name for n in process.unit.nodes))
+            if found is not None:
+                self._adopt(process, found.pid, found.incarnation)
+            elif self.context.incarnation == 1 or self._may_start(process):
+                self._spawn(process, by=self.name)
+        self._publish_table()
+
+    def on_stop(self) -> None:
+        """End all processes in reverse order: SIGTERM, then SIGKILL for those that linger."""
+        poll = select.poll()
+        waiting = {}
+        for process in reversed(self._processes.values()):
+            self._unwatch(process, close=False)
+            if process.pidfd >= 0 and process.state is not NodeState.CRASHED:
+                self._signal(process, signal.SIGTERM)
+                poll.register(process.pidfd, select.POLLIN)
+                waiting[process.pidfd] = process
+        deadline = time.monotonic() + STOP_GRACE_S
+        while waiting and (left := deadline - time.monotonic()) > 0:
+            for fd, _ in poll.poll(left * 1000):
+                poll.unregister(fd)
+                del waiting[fd]
+        for process in waiting.values():
+            self._signal(process, signal.SIGKILL)
+        self._spawner.close()
+
+    # -- what it hears --------------------------------------------------------------------------
+
+    @on(topics.HEARTBEAT)
+    def heartbeat(self, message: Heartbeat, header: Header) -> None:
+        """Note that a node's loop turns; adopt a process that was not known."""
+        process = self._processes[self._layout.unit_of[header.source]]
+        if header.incarnation > process.incarnation or (
+                header.incarnation == process.incarnation and process.pid != message.pid
+                and process.state in _DEAD):
+            self._adopt(process, message.pid, header.incarnation)
+        if header.incarnation != process.incarnation:
+            return
+        process.heard_s[header.source] = time.monotonic()
+        if process.state in (NodeState.STARTING, NodeState.STOPPED, NodeState.WEDGED):
+            resumed = process.state is not NodeState.STARTING
+            process.state = NodeState.RUNNING
+            self._event(process, "resumed" if resumed else "running", self.name)
+            self._publish_table()
+
+    @on(topics.RESPAWN)
+    def respawn(self, request: RespawnRequest, _header: Header) -> None:
+        """Kill what is left of a node and start it anew, once per failed incarnation."""
+        unit = self._layout.unit_of.get(request.node)
+        if unit is None:
+            self.publish(topics.PROCESS_EVENT, ProcessEvent(
+                request.node, "refused", 0, 0, request.by, f"no such node: {request.node!r}"))
+            return
+        process = self._processes[unit]
+        healthy = process.state in (NodeState.RUNNING, NodeState.STARTING)
+        if healthy and process.incarnation > request.failed_incarnation:
+            self._event(process, "respawned", request.by, "already")
+            return
+        if process.respawning:
+            return
+        self._respawn(process, request.by)
+
+    # -- watching -------------------------------------------------------------------------------
+
+    @every(0.1)
+    def check(self) -> None:
+        """Look for processes whose loops are silent."""
+        now = time.monotonic()
+        for process in self._processes.values():
+            if process.state is NodeState.STARTING:
+                if now - process.started_s > START_TIMEOUT_S:
+                    self._event(process, "wedged", self.name, "no heartbeat after its start")
+                    self._lost(process, NodeState.WEDGED)
+            elif process.state is NodeState.RUNNING:
+                silent = [n for n, at in process.heard_s.items() if now - at > self._timeout_s]
+                if silent:
+                    self._silent(process, silent)
+
+    @every(0.5)
+    def repeat(self) -> None:
+        """Repeat the node table for whoever joined late."""
+        self._publish_table()
+
+    def _silent(self, process: _Process, nodes: list[str]) -> None:
+        state = NodeState.STOPPED if is_stopped(process.pid) else NodeState.WEDGED
+        self._event(process, state.value, self.name, f"no heartbeat from {', '.join(nodes)}")
+        self._lost(process, state)
+
+    def _lost(self, process: _Process, state: NodeState) -> None:
+        process.state = state
+        self._publish_table()
+        if self._owns(process):
+            self._respawn(process, self.name)
+
+    def _exited(self, name: str, pidfd: int) -> None:
+        process = self._processes[name]
+        if process.pidfd != pidfd:
+            return
+        self._unwatch(process)
+        if process.respawning:
+            return
+        self._event(process, "crashed", self.name)
+        self._lost(process, NodeState.CRASHED)
+
+    def _owns(self, process: _Process) -> bool:
+        """Whether the supervisor itself brings the process back."""
+        return (self._spec.layers.supervisor_respawn
+                and process.unit.respawn == self.name
+                and process.unit.kind != Kind.WORLD.value)
+
+    def _may_start(self, process: _Process) -> bool:
+        """Whether a restarted supervisor starts what it does not find alive."""
+        return self._owns(process)
+
+    # -- acting ---------------------------------------------------------------------------------
+
+    def _respawn(self, process: _Process, by: str) -> None:
+        delay_s = process.policy.delay_s(time.monotonic())
+        self._unwatch(process, close=False)
+        self._signal(process, signal.SIGKILL)
+        if delay_s is None:
+            process.state = NodeState.GIVEN_UP
+            self._event(process, "given up", by, (
+                f"{process.policy.intensity} restarts in {process.policy.period_s:.0f} s"))
+            self._publish_table()
+            return
+        process.respawning = True
+        if delay_s > 0 or not self._is_gone(process):
+            # The port is free only when the old process is: a few more milliseconds.
+            self.call_later(max(delay_s, 0.002) * self.clock.rate,
+                            lambda: self._finish_respawn(process, by))
+        else:
+            self._finish_respawn(process, by)
+
+    def _finish_respawn(self, process: _Process, by: str) -> None:
+        if not self._is_gone(process):
+            self.call_later(0.002 * self.clock.rate, lambda: self._finish_respawn(process, by))
+            return
+        process.policy.restarted(time.monotonic())
+        self._spawn(process, by)
+
+    def _spawn(self, process: _Process, by: str) -> None:
+        names = tuple(n.name for n in process.unit.nodes)
+        incarnation = process.incarnation + 1
+        try:
+            pid = self._spawner.fork(names, incarnation)
+        except SpawnerUnavailableError as error:
+            self.report_diagnostic("fork", str(error), process.unit.name)
+            self.call_later(_RETRY_S * self.clock.rate, lambda: self._spawn(process, by))
+            process.respawning = True
+            return
+        first = process.incarnation == 0
+        process.respawning = False
+        self._watch(process, pid, incarnation)
+        process.state = NodeState.STARTING
+        process.started_s = time.monotonic()
+        self._event(process, "started" if first else "respawned", by)
+        self._publish_table()
+
+    def _adopt(self, process: _Process, pid: int, incarnation: int) -> None:
+        process.respawning = False
+        self._watch(process, pid, incarnation)
+        if process.pid:
+            process.state = NodeState.RUNNING
+            now = time.monotonic()
+            process.heard_s = {n.name: now for n in process.unit.nodes}
+            self._event(process, "adopted", self.name)
+
+    def _watch(self, process: _Process, pid: int, incarnation: int) -> None:
+        self._unwatch(process)
+        process.pid, process.incarnation, process.heard_s = pid, incarnation, {}
+        try:
+            process.pidfd = os.pidfd_open(pid)
+        except ProcessLookupError:
+            self._event(process, "crashed", self.name, "it ended before it could be watched")
+            self._lost(process, NodeState.CRASHED)
+            return
+        name, pidfd = process.unit.name, process.pidfd
+        self._loop.add_reader(pidfd, self._pidfd_readable, name, pidfd)
+
+    def _pidfd_readable(self, name: str, pidfd: int) -> None:
+        self._loop.remove_reader(pidfd)
+        self._mailbox.put_latest(f"exit {name} {pidfd}", lambda: self._exited(name, pidfd))
+
+    def _unwatch(self, process: _Process, *, close: bool = True) -> None:
+        if process.pidfd < 0:
+            return
+        self._loop.remove_reader(process.pidfd)
+        if close:
+            os.close(process.pidfd)
+            process.pidfd = -1
+
+    def _signal(self, process: _Process, number: signal.Signals) -> None:
+        if process.pidfd >= 0:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(process.pidfd, number)
+
+    def _is_gone(self, process: _Process) -> bool:
+        return process.pid == 0 or process_state(process.pid) in "XZ"
+
+    # -- what it says ---------------------------------------------------------------------------
+
+    def _event(self, process: _Process, event: str, by: str, detail: str = "") -> None:
+        for node in process.unit.nodes:
+            self.publish(topics.PROCESS_EVENT, ProcessEvent(
+                node.name, event, process.pid, process.incarnation, by, detail))
+
+    def _publish_table(self) -> None:
+        rows = [NodeInfo(self.name, Kind.SUPERVISION.value, os.getpid(), NodeState.RUNNING,
+                         self.context.incarnation, self.context.incarnation - 1)]
+        rows += [
+            NodeInfo(node.name, node.kind.value, p.pid, p.state, p.incarnation,
+                     max(0, p.incarnation - 1))
+            for p in self._processes.values() for node in p.unit.nodes
+        ]
+        self.publish(topics.NODES, NodeTable(tuple(rows)))

@@ -1,0 +1,114 @@
+"""From an image whose red pixels are prohibited to the area where the robot may be.
+
+The authors' samples are JPEGs: within a block (8 pixels) of an edge the red value rings about the
+threshold, so that the bare rule would add teeth of a metre and more to the pavement. In a JPEG a
+pixel that is plainly red therefore counts as red too. Lone pixels are outvoted by their
+neighbours, and islands and holes of a few pixels are dropped. What lies outside the image is
+prohibited.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+from PIL import Image, UnidentifiedImageError
+from shapely.geometry import MultiPolygon, Polygon
+
+from airport.errors import AirportError
+
+RED_THRESHOLD = 250
+"""A pixel with R above this is prohibited (authors' code)."""
+
+PLAINLY_RED = 128
+"""In a JPEG, a red value this much above green and blue is red blurred by compression."""
+
+SPECK_PIXELS = 12
+"""Islands and holes smaller than this are compression noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class MaskScale:
+    """Pixel column = columns_per_m * (x - left_m); row = rows_per_m * (top_m - y).
+
+    The defaults are the authors': 5.2 * (x + 80) and 4.6 * (80 - y).
+    """
+
+    columns_per_m: float = 5.2
+    rows_per_m: float = 4.6
+    left_m: float = -80.0
+    top_m: float = 80.0
+
+    def __post_init__(self) -> None:
+        if not (self.columns_per_m > 0 and self.rows_per_m > 0):
+            raise AirportError(
+                f"mask scale: pixels per metre: ({self.columns_per_m:g}, {self.rows_per_m:g}): "
+                "both must be positive"
+            )
+
+
+def allowed_area(path: Path, scale: MaskScale) -> Any:
+    """Return the area that is not red as a shapely (multi)polygon in `map`, m.
+
+    Raises:
+        AirportError: not an image, or all of it prohibited.
+    """
+    try:
+        with Image.open(path) as image:
+            lossy = image.format == "JPEG"
+            pixels = np.asarray(image.convert("RGB")).astype(np.int16)
+    except (OSError, UnidentifiedImageError):
+        raise AirportError(f"{path}: area image: unreadable: give a JPEG or PNG") from None
+    prohibited = pixels[:, :, 0] > RED_THRESHOLD
+    if lossy:
+        prohibited |= pixels[:, :, 0] - pixels[:, :, 1:].max(axis=2) > PLAINLY_RED
+    allowed = _without_lone_pixels(~prohibited)
+    if not allowed.any():
+        raise AirportError(f"{path}: area image: all pixels red: leave the pavement in other colour")
+    area = shapely.unary_union(_rectangles(allowed, scale))
+    pixel_m = max(1 / scale.columns_per_m, 1 / scale.rows_per_m)
+    speck_m2 = SPECK_PIXELS / (scale.columns_per_m * scale.rows_per_m)
+    return _without_specks(shapely.simplify(area, pixel_m).buffer(0), speck_m2)
+
+
+def _without_lone_pixels(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Majority vote of each pixel with its eight neighbours (a median filter)."""
+    padded = np.pad(allowed, 1, mode="edge").astype(np.int8)
+    rows, columns = allowed.shape
+    votes = sum(
+        padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)
+    )
+    return np.asarray(votes) >= 5
+
+
+def _rectangles(allowed: npt.NDArray[np.bool_], scale: MaskScale) -> list[Any]:
+    """One rectangle for each run of allowed pixels in a row, over all equal rows below it."""
+    steps = np.diff(np.pad(allowed, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    boxes: list[tuple[float, float, float, float]] = []
+    open_runs: dict[tuple[int, int], int] = {}
+    for row in range(len(allowed) + 1):
+        runs: set[tuple[int, int]] = set()
+        if row < len(allowed):
+            begins, ends = np.flatnonzero(steps[row] == 1), np.flatnonzero(steps[row] == -1)
+            runs = set(zip(begins.tolist(), ends.tolist(), strict=True))
+        for run in [run for run in open_runs if run not in runs]:
+            boxes.append((run[0], open_runs.pop(run), run[1], row))
+        for run in runs:
+            open_runs.setdefault(run, row)
+    c0, r0, c1, r1 = np.array(boxes, dtype=float).T
+    x0, x1 = (scale.left_m + c / scale.columns_per_m for c in (c0, c1))
+    y0, y1 = (scale.top_m - r / scale.rows_per_m for r in (r1, r0))
+    return list(shapely.box(x0, y0, x1, y1))
+
+
+def _without_specks(area: Any, speck_m2: float) -> Any:
+    parts = []
+    for part in shapely.get_parts(area):
+        if part.area >= speck_m2:
+            holes = [hole for hole in part.interiors if Polygon(hole).area >= speck_m2]
+            parts.append(Polygon(part.exterior, holes))
+    return parts[0] if len(parts) == 1 else MultiPolygon(parts)

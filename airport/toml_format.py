@@ -1,0 +1,254 @@
+"""The project's own airport format: one TOML file. `systems/airports/` holds examples."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import msgspec
+import shapely
+from shapely.geometry import LineString, Polygon
+from shapely.validation import explain_validity
+
+from airport.errors import AirportError, Problem
+from airport.model import (
+    GOAL_MODES,
+    Airport,
+    Building,
+    Light,
+    Mission,
+    MissionGoal,
+    ObstaclePreset,
+    ObstacleShape,
+    StartPose,
+    Surface,
+    union,
+)
+from airport.world import WorldTruth
+
+Point = tuple[float, float]
+SurfaceKind = Literal["runway", "taxiway", "apron", "area"]
+_CHOICES = {
+    "mode": GOAL_MODES,
+    "kind": get_args(SurfaceKind),
+    "shape": get_args(ObstacleShape),
+}
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of the file's tables: a misspelt key is an error, not silence."""
+
+
+class _Surface(_Table, frozen=True):
+    name: str
+    kind: SurfaceKind
+    polygon: list[Point] | None = None
+    centre_line: list[Point] | None = None
+    half_width_m: float | None = None
+
+
+class _Area(_Table, frozen=True):
+    name: str
+    polygon: list[Point]
+
+
+class _Row(_Table, frozen=True):
+    name: str
+    nominal_cd: float
+    first: Point | None = None
+    last: Point | None = None
+    count: int | None = None
+    positions: list[Point] | None = None
+
+
+class _Mission(_Table, frozen=True):
+    goals: list[MissionGoal]
+
+
+class _World(_Table, frozen=True):
+    light_factors: dict[str, float] = {}
+
+
+class _File(_Table, frozen=True):
+    name: str
+    start: StartPose
+    nodes: dict[str, Point]
+    edges: list[tuple[str, str]]
+    surface: list[_Surface]
+    fillet_radius_m: float = 0.0
+    prohibited: list[_Area] = []
+    building: list[Building] = []
+    row: list[_Row] = []
+    missions: dict[str, _Mission] = {}
+    obstacle: list[ObstaclePreset] = []
+    world: _World = _World()
+
+
+class _MissionFile(_Table, frozen=True):
+    name: str
+    goals: list[MissionGoal]
+
+
+def read_airport(path: Path) -> tuple[Airport, WorldTruth]:
+    """Read an airport and the truth about its lights; geometry is checked by the caller.
+
+    Raises:
+        AirportError: unreadable, not TOML, a wrong field, or a shape that is none.
+    """
+    file = _convert(path, _File)
+    name = str(path)
+    surfaces = tuple(_surface(part, i, name) for i, part in enumerate(file.surface))
+    prohibited = [
+        _polygon(area.polygon, f"prohibited[{i}].polygon", name)
+        for i, area in enumerate(file.prohibited)
+    ]
+    if file.fillet_radius_m < 0:
+        raise _error(name, "fillet_radius_m", file.fillet_radius_m, "must not be negative")
+    _unique(name, "surface", [part.name for part in file.surface])
+    _unique(name, "prohibited", [area.name for area in file.prohibited])
+    _unique(name, "building", [building.name for building in file.building])
+    _unique(name, "row", [row.name for row in file.row])
+    buildings = tuple(file.building)
+    for building in buildings:
+        if min(building.length_m, building.width_m, building.height_m) <= 0:
+            raise _error(name, f"building.{building.name}", "size", "sides must be positive")
+    allowed = union([part.polygon for part in surfaces], file.fillet_radius_m)
+    # A building stands on no pavement the robot may use, wherever it stands.
+    solid = [building.polygon for building in buildings]
+    allowed = allowed.difference(shapely.unary_union([*prohibited, *solid]))
+    lights = tuple(light for i, row in enumerate(file.row) for light in _lights(row, i, name))
+    airport = Airport(
+        name=file.name,
+        nodes=file.nodes,
+        edges=tuple(file.edges),
+        allowed=allowed,
+        start=file.start,
+        surfaces=surfaces,
+        buildings=buildings,
+        lights=lights,
+        missions={
+            key: Mission(key, tuple(mission.goals)) for key, mission in file.missions.items()
+        },
+        obstacles=tuple(file.obstacle),
+    )
+    return airport, _truth(file.world, airport, name)
+
+
+def read_mission(path: Path) -> Mission:
+    """Read a mission file: `name` and `goals` as in an airport file.
+
+    Raises:
+        AirportError: as `read_airport`.
+    """
+    file = _convert(path, _MissionFile)
+    return Mission(file.name, tuple(file.goals))
+
+
+def _convert(path: Path, kind: Any) -> Any:
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise AirportError(f"{path}: cannot be read: {error.strerror}: give a readable file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise AirportError(f"{path}: not TOML: {error}: see https://toml.io") from None
+    _finite(table, "", str(path))
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        message, _, where = str(error).partition(" - at ")
+        where = where.strip("`").removeprefix("$").lstrip(".") or "file"
+        choices = _CHOICES.get(where.rpartition(".")[2])
+        if choices and message.startswith("Invalid enum value"):
+            message = f"must be one of {', '.join(choices)}"
+        raise AirportError(f"{path}: {where}: {_at(table, where)}: {message}") from None
+
+
+def _at(table: Any, path: str) -> str:
+    """Return the value at a msgspec path as short text; the path may end beyond the data."""
+    value = table
+    for key in path.replace("[...]", "").replace("]", "").replace("[", ".").split("."):
+        if isinstance(value, dict) and key in value:
+            value = value[key]
+        elif isinstance(value, list) and key.isdigit() and int(key) < len(value):
+            value = value[int(key)]
+        else:
+            break
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _finite(value: Any, path: str, file: str) -> None:
+    """Refuse NaN and infinities anywhere: TOML can write both."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise _error(file, path.lstrip("."), value, "must be a finite number")
+    if isinstance(value, dict):
+        for key, part in value.items():
+            _finite(part, f"{path}.{key}", file)
+    elif isinstance(value, list):
+        for i, part in enumerate(value):
+            _finite(part, f"{path}[{i}]", file)
+
+
+def _surface(part: _Surface, i: int, file: str) -> Surface:
+    where = f"surface[{i}]"
+    if (part.polygon is None) == (part.centre_line is None):
+        raise _error(file, where, part.name, "give either polygon or centre_line, not both")
+    if part.polygon is not None:
+        shape = _polygon(part.polygon, f"{where}.polygon", file)
+        return Surface(part.name, part.kind, shape)
+    if part.centre_line is None or len(part.centre_line) < 2:
+        raise _error(file, f"{where}.centre_line", part.centre_line, "needs two points or more")
+    if part.half_width_m is None or part.half_width_m <= 0:
+        raise _error(file, f"{where}.half_width_m", part.half_width_m, "must be positive")
+    cap = "flat" if part.kind == "runway" else "round"
+    strip = LineString(part.centre_line).buffer(part.half_width_m, cap_style=cap)
+    return Surface(part.name, part.kind, strip)
+
+
+def _polygon(points: list[Point], where: str, file: str) -> Any:
+    if len(points) < 3:
+        raise _error(file, where, points, "a polygon needs three points or more")
+    shape = Polygon(points)
+    if not shape.is_valid or shape.area == 0:
+        raise _error(file, where, explain_validity(shape), "the outline must not cross itself")
+    return shape
+
+
+def _lights(row: _Row, i: int, file: str) -> list[Light]:
+    where = f"row[{i}]"
+    spaced = row.first is not None and row.last is not None and row.count is not None
+    if spaced == (row.positions is not None):
+        raise _error(file, where, row.name, "give either first, last and count, or positions")
+    points = row.positions or []
+    if row.first is not None and row.last is not None and row.count is not None:
+        if row.count < 2:
+            raise _error(file, f"{where}.count", row.count, "a row needs two lights or more")
+        (ax, ay), (bx, by), gaps = row.first, row.last, row.count - 1
+        points = [(ax + (bx - ax) * k / gaps, ay + (by - ay) * k / gaps) for k in range(row.count)]
+    return [
+        Light(f"{row.name}{k:02d}", row.name, x_m, y_m, row.nominal_cd)
+        for k, (x_m, y_m) in enumerate(points, start=1)
+    ]
+
+
+def _truth(world: _World, airport: Airport, file: str) -> WorldTruth:
+    known = {light.name for light in airport.lights}
+    for name, factor in world.light_factors.items():
+        where = f"world.light_factors.{name}"
+        if name not in known:
+            raise _error(file, where, repr(name), "unknown light; name one of a row, e.g. A01")
+        if not 0 <= factor <= 2:
+            raise _error(file, where, factor, "a share of the nominal intensity, 0 to 2")
+    return WorldTruth(dict(world.light_factors))
+
+
+def _unique(file: str, where: str, names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise _error(file, where, repr(name), "name given twice; names must be unique")
+
+
+def _error(file: str, where: str, value: object, remedy: str) -> AirportError:
+    return AirportError(Problem(where, str(value), remedy).line(file))

@@ -1,0 +1,264 @@
+"""Whether a system spec makes sense: names, cycles, the tree, the order, the time budget.
+
+One small validator per concern; each yields what it finds wrong as a `Finding`. They run in
+sequence and the first finding is the one reported, so a validator may rely on those before it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+from manager.budget import check, find_false_alarms
+from manager.fault_tree import FaultTreeError
+from manager.order import CycleError, PartialOrder, find_cycle
+from manager.schema import Hazard, Kind, SystemSpec
+from manager.strategies import STRATEGIES
+
+SUPERVISOR = "supervisor"
+RESERVED = frozenset({SUPERVISOR, "spawner", "launch"})
+
+
+class Finding(NamedTuple):
+    """Something wrong: where, what, and the offending value if one value is to blame."""
+
+    path: str
+    problem: str
+    value: tuple[Any, ...] = ()
+
+
+def find_nonsense(spec: SystemSpec) -> Finding | None:
+    """Return the first thing wrong with a spec that is well-typed, or None."""
+    for validator in VALIDATORS:
+        for finding in validator(spec):
+            return finding
+    return None
+
+
+def _unknown(path: str, value: str, what: str, known: Sequence[str]) -> Finding:
+    return Finding(path, f"unknown {what}; known: {', '.join(known) or 'none'}", (value,))
+
+
+def _names(spec: SystemSpec) -> Iterator[Finding]:
+    taken = dict.fromkeys(RESERVED, "reserved")
+    for table, modules in (("node", spec.nodes), ("detection", spec.detections),
+                           ("recovery", spec.recoveries)):
+        for index, module in enumerate(modules):
+            path = f"$.{table}[{index}].name"
+            if module.name in taken:
+                yield Finding(path, f"duplicate name, {taken[module.name]}; nodes, detection and "
+                                    "recovery modules share one namespace", (module.name,))
+            taken[module.name] = f"already at {path}"
+    count = Counter(mechanism.name for mechanism in spec.mechanisms)
+    for index, mechanism in enumerate(spec.mechanisms):
+        if count[mechanism.name] > 1:
+            yield Finding(f"$.mechanism[{index}].name", "duplicate mechanism", (mechanism.name,))
+
+
+def _nodes(spec: SystemSpec) -> Iterator[Finding]:
+    respawners = [SUPERVISOR, *(r.name for r in spec.recoveries)]
+    for index, node in enumerate(spec.nodes):
+        path = f"$.node[{index}]"
+        if node.kind in {Kind.DETECTION, Kind.RECOVERY}:
+            yield Finding(f"{path}.kind", f"belongs into [[{node.kind.value}]]", (node.kind.value,))
+        if node.respawn not in respawners:
+            yield _unknown(f"{path}.respawn", node.respawn, "recovery module", respawners)
+        if node.kind is Kind.MANAGER and node.respawn != SUPERVISOR:
+            yield Finding(f"{path}.respawn", "the manager cannot command its own recovery; only "
+                                             f"{SUPERVISOR!r} is right", (node.respawn,))
+
+
+def _detections(spec: SystemSpec) -> Iterator[Finding]:
+    nodes = [node.name for node in spec.nodes]
+    for index, detection in enumerate(spec.detections):
+        path = f"$.detection[{index}]"
+        parameters = detection.parameters
+        if "watch" in parameters:
+            watch = parameters["watch"]
+            if not isinstance(watch, list) or not watch or \
+                    not all(isinstance(name, str) for name in watch):
+                yield Finding(f"{path}.parameters.watch", "expected a list of node names", (watch,))
+                return
+            for place, name in enumerate(watch):
+                if name not in nodes:
+                    yield _unknown(f"{path}.parameters.watch[{place}]", name, "node", nodes)
+        for key in ("timeout_s", "margin_m"):
+            value = parameters.get(key, 1.0)
+            if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
+                yield Finding(f"{path}.parameters.{key}", "expected a number > 0", (value,))
+                return
+        if not detection.latency_s > 0:
+            yield Finding(f"{path}.within_s", "missing; say within how many seconds the module "
+                                              "detects, here or as parameters.timeout_s")
+
+
+def _mechanisms(spec: SystemSpec) -> Iterator[Finding]:
+    detections = [detection.name for detection in spec.detections]
+    recoveries = [recovery.name for recovery in spec.recoveries]
+    events = [event.name for event in spec.events]
+    for index, mechanism in enumerate(spec.mechanisms):
+        path = f"$.mechanism[{index}]"
+        if mechanism.detect not in detections:
+            yield _unknown(f"{path}.detect", mechanism.detect, "detection module", detections)
+        if mechanism.recover not in recoveries:
+            yield _unknown(f"{path}.recover", mechanism.recover, "recovery module", recoveries)
+        if mechanism.event not in events:
+            yield _unknown(f"{path}.event", mechanism.event, "event", events)
+    if not spec.mechanisms and (spec.detections or spec.recoveries):
+        yield Finding("$.mechanism", "missing; no mechanism joins detection to recovery")
+
+
+def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
+    names = [recovery.name for recovery in spec.recoveries]
+    for index, recovery in enumerate(spec.recoveries):
+        if recovery.escalate_to and recovery.escalate_to not in names:
+            yield _unknown(f"$.recovery[{index}].escalate_to", recovery.escalate_to,
+                           "recovery module", names)
+    cycle = find_cycle({r.name: [r.escalate_to] if r.escalate_to else [] for r in spec.recoveries})
+    if cycle:
+        yield Finding(f"$.recovery[{names.index(cycle[0])}].escalate_to",
+                      f"cycle {' > '.join(cycle)}; escalation must come to an end", (cycle[1],))
+
+
+def _reachability(spec: SystemSpec) -> Iterator[Finding]:
+    detecting = {mechanism.detect for mechanism in spec.mechanisms}
+    recovering = {mechanism.recover for mechanism in spec.mechanisms} | {
+        recovery.escalate_to for recovery in spec.recoveries}
+    for index, detection in enumerate(spec.detections):
+        if detection.name not in detecting:
+            yield Finding(f"$.detection[{index}].name", "unreachable: no mechanism uses this "
+                                                        "detection module", (detection.name,))
+    for index, recovery in enumerate(spec.recoveries):
+        if recovery.name not in recovering:
+            yield Finding(f"$.recovery[{index}].name", "unreachable: no mechanism and no escalation"
+                                                       " leads to this recovery", (recovery.name,))
+    watched = {(node, mechanism.recover) for mechanism in spec.mechanisms
+               for detection in spec.detections if detection.name == mechanism.detect
+               for node in detection.watch}
+    for index, node in enumerate(spec.nodes):
+        if node.respawn != SUPERVISOR and (node.name, node.respawn) not in watched:
+            yield Finding(f"$.node[{index}].respawn", f"node {node.name!r} is unreachable for "
+                          f"{node.respawn}: no detection module that {node.respawn} answers to "
+                          "watches it", (node.respawn,))
+
+
+def _fault_tree(spec: SystemSpec) -> Iterator[Finding]:
+    names = [event.name for event in spec.events]
+    for index, event in enumerate(spec.events):
+        path = f"$.event[{index}]"
+        if event.of and event.gate is None:
+            yield Finding(f"{path}.of", "inputs without a gate; add gate = 'or'", (event.of,))
+        for place, name in enumerate(event.of):
+            if name not in names:
+                yield _unknown(f"{path}.of[{place}]", name, "event", names)
+    try:
+        tree = spec.build_fault_tree()
+    except FaultTreeError as error:
+        index = len(names) - 1 - names[::-1].index(error.subject) if error.subject else -1
+        path = f"$.event[{index}]" if error.subject else "$.event"
+        yield Finding(path, str(error), (error.subject,) if error.subject else ())
+        return
+    mechanisms = [mechanism.name for mechanism in spec.mechanisms]
+    if not mechanisms:
+        return
+    try:
+        tree.derive_ftm_tree({m.name: m.event for m in spec.mechanisms})
+    except FaultTreeError as error:
+        if error.subject:
+            index = mechanisms.index(error.subject)
+            yield Finding(f"$.mechanism[{index}].event", f"{error.subject}: {error}",
+                          (spec.mechanisms[index].event,))
+        else:
+            yield Finding("$.mechanism", str(error))
+
+
+def _orders(spec: SystemSpec) -> Iterator[Finding]:
+    recoveries = [recovery.name for recovery in spec.recoveries]
+    if spec.strategy not in STRATEGIES:
+        yield _unknown("$.strategy", spec.strategy, "strategy", sorted(STRATEGIES))
+    if spec.order not in spec.orders:
+        yield _unknown("$.order", spec.order, "order", list(spec.orders))
+    for name, relation in spec.orders.items():
+        for upper, lowers in relation.items():
+            path = f"$.orders.{name}.{upper}"
+            if upper not in recoveries:
+                yield _unknown(path, upper, "recovery module", recoveries)
+            for place, lower in enumerate(lowers):
+                if lower not in recoveries:
+                    yield _unknown(f"{path}[{place}]", lower, "recovery module", recoveries)
+                if lower in lowers[:place]:
+                    yield Finding(f"{path}[{place}]", "duplicate", (lower,))
+        try:
+            spec.build_order(name)
+        except CycleError as error:
+            yield Finding(f"$.orders.{name}.{error.cycle[0]}",
+                          f"{error}; no recovery can be above itself",
+                          (list(relation[error.cycle[0]]),))
+
+
+def _order_against_tree(spec: SystemSpec) -> Iterator[Finding]:
+    if not spec.mechanisms:
+        return
+    order, tree = spec.build_order(), spec.build_ftm_tree()
+    recover = {mechanism.name: mechanism.recover for mechanism in spec.mechanisms}
+    for upper in tree.names:
+        for lower in tree.members(tree.below[tree.number[upper]]):
+            if order.is_above(recover[lower], recover[upper]):
+                yield Finding(
+                    f"$.orders.{spec.order}.{recover[lower]}",
+                    f"contradicts the FTMTree: {recover[lower]} of {lower} is above "
+                    f"{recover[upper]} of {upper}, but {upper} is above {lower}",
+                    (list(spec.orders[spec.order].get(recover[lower], ())),))
+    for index, recovery in enumerate(spec.recoveries):
+        if recovery.escalate_to and order.is_above(recovery.name, recovery.escalate_to):
+            yield Finding(f"$.recovery[{index}].escalate_to",
+                          f"{recovery.name} is above it in the order {spec.order!r}; escalation "
+                          "must not lead to less", (recovery.escalate_to,))
+    yield from _undelayed(spec, order, recover[tree.root])
+
+
+def _undelayed(spec: SystemSpec, order: PartialOrder, last_resort: str) -> Iterator[Finding]:
+    """The recovery of the FTMTree's root is the last resort: nothing may make it wait."""
+    contracts = spec.build_mechanisms()
+    names = [recovery.name for recovery in spec.recoveries]
+    for name in order.names:
+        if name != last_resort and contracts.overlap(name, last_resort) \
+                and not contracts.contracts[name].interruptible:
+            shared = contracts.contracts[name].claims & contracts.contracts[last_resort].claims
+            yield Finding(f"$.recovery[{names.index(name)}].claims",
+                          f"{last_resort}, the last resort, would have to wait for {name}, which "
+                          f"is not interruptible and claims {', '.join(sorted(shared))} as well",
+                          (sorted(contracts.contracts[name].claims),))
+
+
+def _budget(spec: SystemSpec) -> Iterator[Finding]:
+    robot = spec.robot
+    if robot.sensing_range_m <= robot.stop_distance_m:
+        yield Finding("$.robot.sensing_range_m", "obstacles must be seen before they are nearer "
+                      f"than stop_distance_m = {robot.stop_distance_m}", (robot.sensing_range_m,))
+    timing = spec.timing
+    if timing.release_hold_max_s < timing.release_hold_s:
+        yield Finding("$.timing.release_hold_max_s", "must be no less than release_hold_s = "
+                      f"{timing.release_hold_s}", (timing.release_hold_max_s,))
+    root = spec.build_ftm_tree().root if spec.mechanisms else ""
+    detections = {detection.name: detection for detection in spec.detections}
+    for index, mechanism in enumerate(spec.mechanisms):
+        if mechanism.against is Hazard.PARENT and mechanism.name == root:
+            yield Finding(f"$.mechanism[{index}].against", f"{root} is the root of the FTMTree and "
+                          "has no parent to be faster than", (mechanism.against.value,))
+        if mechanism.against is Hazard.INTRUSION and \
+                "margin_m" not in detections[mechanism.detect].parameters:
+            yield Finding(f"$.mechanism[{index}].against", f"{mechanism.detect} needs "
+                          "parameters.margin_m, the distance at which it warns",
+                          (mechanism.against.value,))
+    for path, value, problem in find_false_alarms(spec):
+        yield Finding(path, problem, (value,))
+    for budget in check(spec):
+        if not budget.fits:
+            yield Finding("$.timing", f"the time budget does not fit: {budget}")
+
+
+VALIDATORS: tuple[Callable[[SystemSpec], Iterator[Finding]], ...] = (
+    _names, _nodes, _detections, _recoveries, _mechanisms, _reachability, _fault_tree, _orders,
+    _order_against_tree, _budget)

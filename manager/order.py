@@ -1,0 +1,223 @@
+"""Partial orders and trees over names, as bitmasks.
+
+The strategy asks two questions of the FTMTree and of the RMGraph: *which member of this set is
+above all the others?* and *which element is the closest one above all of them?* (paper, section
+IV-A, `dom` and `low_com_dom`). Both are answered here with a handful of integer operations.
+
+The trick is the numbering. Elements are numbered along a linear extension of the order, the
+greater first, so whatever is above an element has a lower bit than the element itself. Then
+
+* the greatest element of a set, if there is one, can only be the set's lowest bit, and it is the
+  greatest iff no other bit of the set lies outside its down-set;
+* in a tree the common ancestors of a set form a chain, so the closest is the highest bit in the
+  intersection of the members' up-sets.
+
+`dom` is the *greatest element of the partial order*. The paper defines it by control flow ("every
+path from the root goes through"), but its own RMGraph examples hold only for the order: RM2 and
+RM5 both lead to RM3, so no path argument makes RM5 dominate it, yet dom{RM5, RM3, RM4} = RM5. On
+a tree the two definitions agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+
+class CycleError(ValueError):
+    """A relation that should be an order has a cycle.
+
+    Attributes:
+        cycle: The names along it; the first is repeated at the end.
+    """
+
+    def __init__(self, cycle: Sequence[str]) -> None:
+        self.cycle = tuple(cycle)
+        super().__init__(f"cycle {' > '.join(self.cycle)}")
+
+
+class UnknownElementError(ValueError):
+    """A name that is no element of the order."""
+
+
+def find_cycle(above: Mapping[str, Iterable[str]]) -> tuple[str, ...] | None:
+    """Return one cycle of a directed graph, first name repeated at the end, or None.
+
+    Depth first with an explicit stack, so a chain of thousands of events is no problem.
+    """
+    finished: set[str] = set()
+    for start in above:
+        if start in finished:
+            continue
+        trail = {start: None}  # a dict: ordered like the trail, and quick to look into
+        branches: list[Iterator[str]] = [iter(above[start])]
+        while trail:
+            child = next(branches[-1], None)
+            if child is None:
+                finished.add(trail.popitem()[0])
+                branches.pop()
+            elif child in trail:
+                names = list(trail)
+                return (*names[names.index(child):], child)
+            elif child not in finished and child in above:
+                trail[child] = None
+                branches.append(iter(above[child]))
+    return None
+
+
+class PartialOrder:
+    """A strict partial order, closed transitively when built.
+
+    Args:
+        names: All elements. Their sequence breaks ties in the numbering, so output is stable.
+        above: For an element, those it is above. Need not be transitively closed or reduced.
+
+    Raises:
+        CycleError: The relation has a cycle.
+        UnknownElementError: The relation mentions something that is not in `names`.
+    """
+
+    def __init__(self, names: Sequence[str], above: Mapping[str, Iterable[str]]) -> None:
+        relation = {name: tuple(above.get(name, ())) for name in names}
+        for upper in above:
+            for name in (upper, *above[upper]):
+                if name not in relation:
+                    raise UnknownElementError(f"unknown {name!r}; known: {', '.join(names)}")
+        cycle = find_cycle(relation)
+        if cycle:
+            raise CycleError(cycle)
+        self.names = _linear_extension(relation)
+        self.number = {name: bit for bit, name in enumerate(self.names)}
+        self.bit = {name: 1 << bit for name, bit in self.number.items()}
+        below = [0] * len(self.names)
+        for bit in range(len(self.names) - 1, -1, -1):
+            for lower in relation[self.names[bit]]:
+                below[bit] |= self.bit[lower] | below[self.number[lower]]
+        self.below = tuple(below)
+        self.up_set = tuple(
+            sum(1 << upper for upper in range(bit + 1) if upper == bit or below[upper] >> bit & 1)
+            for bit in range(len(self.names)))
+
+    def mask(self, names: Iterable[str]) -> int:
+        """Return the set of `names` as a bitmask; an unknown one raises UnknownElementError."""
+        mask = 0
+        try:
+            for name in names:
+                mask |= self.bit[name]
+        except KeyError as error:
+            raise UnknownElementError(
+                f"unknown {error.args[0]!r}; known: {', '.join(sorted(self.names))}") from None
+        return mask
+
+    def members(self, mask: int) -> tuple[str, ...]:
+        """Return the names in a bitmask, greater ones first."""
+        return tuple(name for bit, name in enumerate(self.names) if mask >> bit & 1)
+
+    def is_above(self, upper: str, lower: str) -> bool:
+        """Tell whether `upper` is strictly above `lower`."""
+        return bool(self.below[self.number[upper]] & self.bit[lower])
+
+    def greatest_in(self, mask: int) -> int:
+        """Return the number of the greatest element of a set, or -1 if it has none."""
+        lowest = mask & -mask
+        bit = lowest.bit_length() - 1
+        if bit < 0 or mask & ~(self.below[bit] | lowest):
+            return -1
+        return bit
+
+    def greatest(self, names: Iterable[str]) -> str | None:
+        """Return the member above all other members (`dom` of the paper), or None."""
+        bit = self.greatest_in(self.mask(names))
+        return None if bit < 0 else self.names[bit]
+
+    def maximal(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Return the members that no other member is above."""
+        mask = self.mask(names)
+        return tuple(name for name in self.members(mask)
+                     if not mask & self.up_set[self.number[name]] & ~self.bit[name])
+
+    def chain(self, upper: str, lower: str) -> tuple[str, ...]:
+        """Return a longest-to-read chain from `upper` down to `lower`, both included.
+
+        Each step goes to the nearest element below that still leads to `lower`, so nothing that
+        lies between two neighbours of the chain is skipped.
+
+        Raises:
+            ValueError: `upper` is neither `lower` nor above it.
+        """
+        if upper != lower and not self.is_above(upper, lower):
+            raise ValueError(f"{upper} is not above {lower}")
+        chain = [upper]
+        target = self.up_set[self.number[lower]]
+        while chain[-1] != lower:
+            between = self.below[self.number[chain[-1]]] & target
+            chain.append(self.names[(between & -between).bit_length() - 1])
+        return tuple(chain)
+
+
+class Tree(PartialOrder):
+    """A tree in which a parent is above its children.
+
+    Args:
+        parents: The parent of each element; exactly one, the root, has None.
+
+    Raises:
+        ValueError: Not exactly one root.
+        CycleError: Following the parents leads round in a circle.
+    """
+
+    def __init__(self, parents: Mapping[str, str | None]) -> None:
+        children: dict[str, list[str]] = {name: [] for name in parents}
+        for name, parent in parents.items():
+            if parent is not None:
+                if parent not in children:
+                    raise UnknownElementError(f"unknown parent {parent!r} of {name!r}")
+                children[parent].append(name)
+        super().__init__(tuple(parents), children)
+        roots = [name for name, parent in parents.items() if parent is None]
+        if len(roots) != 1:
+            raise ValueError(f"a tree has exactly one root, this has {len(roots)}: "
+                             f"{', '.join(roots) or 'none'}")
+        self.root = roots[0]
+        self.parents = dict(parents)
+
+    def children(self, name: str) -> tuple[str, ...]:
+        """Return the direct children of an element."""
+        return tuple(child for child in self.names if self.parents[child] == name)
+
+    def lowest_common_in(self, mask: int) -> int:
+        """Return the number of the closest element above or equal to all of a non-empty set."""
+        common = (1 << len(self.names)) - 1
+        while mask:
+            lowest = mask & -mask
+            common &= self.up_set[lowest.bit_length() - 1]
+            mask ^= lowest
+        return common.bit_length() - 1
+
+    def lowest_common_dominant(self, names: Iterable[str]) -> str:
+        """Return the closest element above or equal to all `names` (`low_com_dom` of the paper).
+
+        Raises:
+            ValueError: `names` is empty.
+        """
+        mask = self.mask(names)
+        if not mask:
+            raise ValueError("the empty set has no lowest common dominant")
+        return self.names[self.lowest_common_in(mask)]
+
+
+def _linear_extension(relation: Mapping[str, Iterable[str]]) -> tuple[str, ...]:
+    """Number an acyclic relation so that the upper comes first; ties keep declaration order."""
+    waiting = dict.fromkeys(relation, 0)
+    for lowers in relation.values():
+        for lower in set(lowers):
+            waiting[lower] += 1
+    extension: list[str] = []
+    ready = [name for name, count in waiting.items() if count == 0]
+    while ready:
+        name = ready.pop(0)
+        extension.append(name)
+        for lower in dict.fromkeys(relation[name]):
+            waiting[lower] -= 1
+            if waiting[lower] == 0:
+                ready.append(lower)
+    return tuple(extension)

@@ -1,0 +1,183 @@
+"""Reads the specification of a system; what a spec can say is in `manager.schema`.
+
+Reading happens in three steps, each with its own kind of error, and every error is one line that
+names file, path, value, and what would be right (`SpecificationError`):
+
+1. syntax and types: `tomllib`, then `msgspec`, strict, unknown fields forbidden;
+2. timing values left out are derived from the robot (`manager.budget`), and parameters that name
+   a timing value are replaced by it;
+3. sense: names, cycles, the tree, the order, the time budget (`manager.checks`).
+
+There is no file I/O here: the caller hands over the text, and the name to use in messages.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Iterator
+from enum import Enum
+from typing import Any
+
+import msgspec
+
+from manager.budget import derive_timeouts
+from manager.checks import find_nonsense
+from manager.mechanisms import RecoveryKind
+from manager.schema import (
+    AtLeast,
+    DetectionSpec,
+    EventSpec,
+    Hazard,
+    Kind,
+    Layers,
+    MechanismSpec,
+    NodeSpec,
+    RecoverySpec,
+    Robot,
+    SpecificationError,
+    SystemSpec,
+    Table,
+    Timing,
+)
+
+__all__ = [
+    "AtLeast", "DetectionSpec", "EventSpec", "Hazard", "Kind", "Layers", "MechanismSpec",
+    "NodeSpec", "RecoverySpec", "Robot", "SpecificationError", "SystemSpec", "Timing",
+    "parse_specification",
+]
+
+TABLES: dict[str, type[Table]] = {
+    "": SystemSpec, "robot": Robot, "timing": Timing, "layers": Layers, "node": NodeSpec,
+    "detection": DetectionSpec, "recovery": RecoverySpec, "mechanism": MechanismSpec,
+    "event": EventSpec, "gate": AtLeast,
+}
+
+ENUMS: dict[tuple[str, str], type[Enum]] = {
+    ("node", "kind"): Kind, ("recovery", "kind"): RecoveryKind, ("mechanism", "against"): Hazard,
+}
+
+
+def parse_specification(text: str, file: str) -> SystemSpec:
+    """Read a system spec and check it.
+
+    Args:
+        text: TOML.
+        file: Name to use in messages.
+
+    Returns:
+        The spec, with every timing value a number.
+
+    Raises:
+        SpecificationError: The text is no TOML, a field is missing, unknown or of the wrong type,
+            or the spec makes no sense.
+    """
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SpecificationError(file, "$", f"not valid TOML: {error}") from None
+    for path, value in _find_unwritable(document, "$"):
+        raise SpecificationError(file, path, "expected a finite number", value)
+    _check_orders(document.get("orders", {}), file)
+    try:
+        spec = msgspec.convert(document, SystemSpec)
+    except msgspec.ValidationError as error:
+        raise _explain(error, document, file) from None
+    spec = msgspec.structs.replace(spec, timing=derive_timeouts(spec.robot, spec.timing))
+    spec = _resolve_timing_names(spec, file)
+    finding = find_nonsense(spec)
+    if finding is not None:
+        raise SpecificationError(file, finding.path, finding.problem, *finding.value)
+    return spec
+
+
+def _find_unwritable(value: object, path: str) -> Iterator[tuple[str, float]]:
+    """Find inf and nan: TOML has them, but no time or distance is one."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield path, value
+    elif isinstance(value, dict):
+        for key, member in value.items():
+            yield from _find_unwritable(member, f"{path}.{key}")
+    elif isinstance(value, list):
+        for index, member in enumerate(value):
+            yield from _find_unwritable(member, f"{path}[{index}]")
+
+
+def _check_orders(orders: object, file: str) -> None:
+    """Check the shape of `[orders.*]` by hand: msgspec cannot name the key of a dict."""
+    if not isinstance(orders, dict):
+        raise SpecificationError(file, "$.orders", "expected a table of orders", orders)
+    for name, relation in orders.items():
+        if not isinstance(relation, dict):
+            raise SpecificationError(file, f"$.orders.{name}", "expected a table, recovery = "
+                                     "[recoveries that it is above]", relation)
+        for upper, lowers in relation.items():
+            if not isinstance(lowers, list) or not all(isinstance(x, str) for x in lowers):
+                raise SpecificationError(file, f"$.orders.{name}.{upper}",
+                                         "expected a list of recovery names", lowers)
+
+
+def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
+    """Replace names of timing values by the values, in `within_s` and in parameters `*_s`."""
+    times = msgspec.structs.asdict(spec.timing)
+
+    def resolve(value: Any, path: str) -> Any:
+        if not isinstance(value, str):
+            return value
+        if value not in times:
+            raise SpecificationError(file, path, "unknown timing value; a number or one of: "
+                                                 f"{', '.join(times)}", value)
+        return times[value]
+
+    def resolve_parameters(parameters: dict[str, Any], path: str) -> dict[str, Any]:
+        return {key: resolve(value, f"{path}.parameters.{key}") if key.endswith("_s") else value
+                for key, value in parameters.items()}
+
+    replace = msgspec.structs.replace
+    return replace(
+        spec,
+        nodes=tuple(
+            replace(node, parameters=resolve_parameters(node.parameters, f"$.node[{index}]"))
+            for index, node in enumerate(spec.nodes)),
+        detections=tuple(
+            replace(detection,
+                    within_s=resolve(detection.within_s, f"$.detection[{index}].within_s"),
+                    parameters=resolve_parameters(detection.parameters, f"$.detection[{index}]"))
+            for index, detection in enumerate(spec.detections)),
+        recoveries=tuple(
+            replace(recovery,
+                    parameters=resolve_parameters(recovery.parameters, f"$.recovery[{index}]"))
+            for index, recovery in enumerate(spec.recoveries)))
+
+
+def _explain(error: msgspec.ValidationError, document: dict[str, Any],
+             file: str) -> SpecificationError:
+    """Turn msgspec's words into ours: add the value, and what is known where names are wrong."""
+    problem, _, path = str(error).partition(" - at `")
+    path = path.rstrip("`") or "$"
+    steps = re.findall(r"\w+", path)
+    value: Any = document
+    for step in steps:
+        value = value[int(step)] if isinstance(value, list) else value[step]
+    words = [step for step in steps if not step.isdigit()]
+    table, field = ([""] * 2 + words)[-2:]
+
+    missing = re.search(r"missing required field `(\w+)`", problem)
+    unknown = re.search(r"unknown field `(.+?)`", problem)
+    if missing:
+        return SpecificationError(file, path, f"required field {missing[1]!r} is missing")
+    if unknown:
+        known = [f.encode_name for f in msgspec.structs.fields(TABLES[field])]
+        return SpecificationError(file, f"{path}.{unknown[1]}",
+                                  f"unknown field; known: {', '.join(known)}", value[unknown[1]])
+    if (table, field) in ENUMS:
+        known = [member.value for member in ENUMS[table, field]]
+        problem = f"unknown {field}; known: {', '.join(known)}"
+    elif field == "gate":
+        problem = "unknown gate; known: 'or', 'and', { at_least = k }"
+    elif "regex" in problem and field == "actor":
+        problem = "expected 'module:Class', e.g. 'actors.operator.hmi:Hmi'"
+    elif "regex" in problem:
+        problem = "expected a name: a letter, then letters, digits and underscores"
+    return SpecificationError(file, path, problem.replace("`", ""), value)

@@ -1,0 +1,150 @@
+"""The Summit XL's base: dimensions, skid-steer kinematics and its drive electronics.
+
+Skid steering: turning, all four tyres slip sideways. With equal wheel loads the lateral moment
+a * omega * a of the tyres (a: half wheelbase, b: half track) is balanced when the wheels of a side
+run at omega * (b + a^2 / b), for linear as well as for Coulomb friction. So the base has an
+effective track `SLIP_FACTOR` = 1 + (a / b)^2 times the real one, independent of speed (the same
+model as in Mandow et al., "Experimental kinematics for wheeled skid-steer mobile robots", 2007).
+
+The drive is pure: `Drive.update(now, dt)` returns wheel speeds; MuJoCo turns them into torques.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+LENGTH_M = 0.72
+WIDTH_M = 0.614
+HEIGHT_M = 0.416
+WHEEL_RADIUS_M = 0.1175
+WHEEL_X_M = 0.229
+WHEEL_Y_M = 0.235
+CIRCUMRADIUS_M = math.hypot(LENGTH_M, WIDTH_M) / 2
+SLIP_FACTOR = 1.0 + (WHEEL_X_M / WHEEL_Y_M) ** 2
+"""Effective over real track."""
+
+WheelSpeeds = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class DriveLimits:
+    """What the base's electronics allow (datasheet: 3 m/s).
+
+    Args:
+        linear_mps: speed a command is clipped to; well above the controller's own bound, so that
+            a wrong command value does harm unless somebody stops it.
+        angular_radps: the same for turning.
+        acceleration_mps2: speeding up.
+        deceleration_mps2: slowing down under command: the controlled stop.
+        brake_mps2: slowing down when braked, below what the tyres hold; then the wheels lock.
+        angular_acceleration_radps2: change of turning rate under command.
+        brake_radps2: slowing of turning when braked.
+    """
+
+    linear_mps: float = 3.0
+    angular_radps: float = 3.0
+    acceleration_mps2: float = 1.5
+    deceleration_mps2: float = 2.5
+    brake_mps2: float = 5.0
+    angular_acceleration_radps2: float = 4.0
+    brake_radps2: float = 12.0
+
+
+def wheel_speeds(linear_mps: float, angular_radps: float) -> WheelSpeeds:
+    """Return wheel speeds, rad/s, for a twist: front left, front right, rear left, rear right."""
+    side_mps = angular_radps * WHEEL_Y_M * SLIP_FACTOR
+    left = (linear_mps - side_mps) / WHEEL_RADIUS_M
+    right = (linear_mps + side_mps) / WHEEL_RADIUS_M
+    return (left, right, left, right)
+
+
+def twist_from_wheels(speeds: WheelSpeeds) -> tuple[float, float]:
+    """Return (linear m/s, angular rad/s) that the wheels stand for: what odometry believes."""
+    left = (speeds[0] + speeds[2]) / 2 * WHEEL_RADIUS_M
+    right = (speeds[1] + speeds[3]) / 2 * WHEEL_RADIUS_M
+    return (left + right) / 2, (right - left) / (2 * WHEEL_Y_M * SLIP_FACTOR)
+
+
+class Drive:
+    """Command, limits, ramps, dead man and brake.
+
+    Args:
+        limits: speeds and ramps.
+        dead_man_timeout_s: brake when the last valid command is older; None switches the dead
+            man off, so that the last command is kept for ever (the paper's unprotected baseline).
+    """
+
+    def __init__(self, limits: DriveLimits, dead_man_timeout_s: float | None) -> None:
+        if dead_man_timeout_s is not None and not dead_man_timeout_s > 0:
+            raise ValueError(f"dead_man_timeout_s: {dead_man_timeout_s}: must be positive or None")
+        self.limits = limits
+        self.dead_man_timeout_s = dead_man_timeout_s
+        self.brake_ordered = False
+        self.refused_commands = 0
+        self._wanted = (0.0, 0.0)
+        self._wanted_at_s = -math.inf
+        self._linear = 0.0
+        self._angular = 0.0
+        self._braking = False
+
+    def command(self, linear_mps: float, angular_radps: float, now_s: float) -> bool:
+        """Take a velocity command; one that is not finite is refused and does not count as fresh.
+
+        Returns:
+            Whether it was taken.
+        """
+        if not (math.isfinite(linear_mps) and math.isfinite(angular_radps)):
+            self.refused_commands += 1
+            return False
+        limits = self.limits
+        self._wanted = (
+            max(-limits.linear_mps, min(limits.linear_mps, linear_mps)),
+            max(-limits.angular_radps, min(limits.angular_radps, angular_radps)),
+        )
+        self._wanted_at_s = now_s
+        return True
+
+    def command_age_s(self, now_s: float) -> float:
+        """Age of the last valid command; infinite before the first."""
+        return now_s - self._wanted_at_s
+
+    def dead_man_tripped(self, now_s: float) -> bool:
+        """Whether the dead man brakes because commands have ceased."""
+        timeout_s = self.dead_man_timeout_s
+        return timeout_s is not None and self.command_age_s(now_s) > timeout_s + 1e-9
+
+    @property
+    def braking(self) -> bool:
+        """Whether the brake was on in the last update, ordered or by the dead man."""
+        return self._braking
+
+    @property
+    def locked(self) -> bool:
+        """Whether the wheels are blocked: braked, and the ramp has come to zero."""
+        return self._braking and self._linear == 0.0 and self._angular == 0.0
+
+    def update(self, now_s: float, dt_s: float) -> WheelSpeeds:
+        """Advance the ramps by `dt_s` and return the wheel speeds to servo to, rad/s."""
+        limits = self.limits
+        self._braking = self.brake_ordered or self.dead_man_tripped(now_s)
+        if self._braking:
+            self._linear = _towards(self._linear, 0.0, limits.brake_mps2 * dt_s)
+            self._angular = _towards(self._angular, 0.0, limits.brake_radps2 * dt_s)
+        else:
+            linear, angular = self._wanted
+            slowing = self._linear * linear <= 0 or abs(linear) < abs(self._linear)
+            rate = limits.deceleration_mps2 if slowing and self._linear else (
+                limits.acceleration_mps2
+            )
+            self._linear = _towards(self._linear, linear, rate * dt_s)
+            self._angular = _towards(
+                self._angular, angular, limits.angular_acceleration_radps2 * dt_s
+            )
+        return wheel_speeds(self._linear, self._angular)
+
+
+def _towards(value: float, goal: float, step: float) -> float:
+    if value < goal:
+        return min(goal, value + step)
+    return max(goal, value - step)

@@ -1,0 +1,341 @@
+"""The world: airport, Summit XL, obstacles, and the ground truth about them. Synchronous.
+
+Time is the caller's: `step_to(t)` advances the physics to t. Nothing here reads a clock, so the
+same world runs in real time and, many times faster, on a virtual clock.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import shapely
+
+from airport.model import Airport, rectangle
+from airport.world import WorldTruth
+from sim.robot import (
+    CIRCUMRADIUS_M,
+    LENGTH_M,
+    WIDTH_M,
+    Drive,
+    DriveLimits,
+    WheelSpeeds,
+)
+from sim.scene import Scene, Solid, WorldError
+from sim.sensors import (
+    Floats,
+    Gps,
+    GpsReading,
+    Imu,
+    ImuReading,
+    Laser,
+    LaserSpec,
+    LightSensor,
+    OdometryReading,
+    WheelOdometry,
+    wrap,
+)
+
+TICK_S = 0.01
+"""The drive electronics' period, and the grain of `step_to`."""
+
+TRUTH_PERIOD_S, CLOSE_TRUTH_PERIOD_S = 0.05, 0.02
+"""Ground truth is examined this often; the second when something is near."""
+
+NEAR_M = 0.3
+SAME_CONTACT_S = 0.5
+"""A contact with the same thing after a shorter break is the same collision."""
+
+LOCKED_DAMPING = 300.0
+"""Wheel damping, N m s/rad, when the brake blocks the wheels: creep below 1 mm/s in any push."""
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """Ground truth now; counters are cumulative.
+
+    `obstacle_clearance_m` is from the footprint to the nearest obstacle or building (inf if there
+    is none). `prohibited_clearance_m` is from the footprint to the prohibited area, negative when
+    a corner is in it; farther than 1 m away it is a lower bound.
+    """
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    linear_mps: float
+    angular_radps: float
+    collisions: int
+    prohibited_s: float
+    obstacle_clearance_m: float
+    prohibited_clearance_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class BaseState:
+    """What the base reports about itself."""
+
+    brake_engaged: bool
+    dead_man_tripped: bool
+    command_age_s: float
+    wheel_speeds_radps: WheelSpeeds
+
+
+class World:
+    """An airport with the robot in it.
+
+    Args:
+        airport: geometry, start pose, obstacle presets.
+        truth: what the lights really give.
+        seed: of all noise; the same seed and calls give the same world, bit for bit.
+        obstacles: how many of the airport's presets take part, the first ones first.
+        dead_man_timeout_s: see `sim.robot.Drive`.
+        limits: of the drive.
+        laser: field of view, range, number of rays.
+        start_s: time at which the world begins.
+        max_catch_up_s: the most that one `step_to` simulates. If the caller was held up longer,
+            the world has stood still meanwhile instead of holding it up further.
+
+    Raises:
+        WorldError: more obstacles asked for than the airport has presets.
+    """
+
+    def __init__(
+        self,
+        airport: Airport,
+        truth: WorldTruth | None = None,
+        seed: int = 0,
+        obstacles: int = 0,
+        *,
+        dead_man_timeout_s: float | None = 0.4,
+        limits: DriveLimits | None = None,
+        laser: LaserSpec | None = None,
+        start_s: float = 0.0,
+        max_catch_up_s: float = 1.0,
+    ) -> None:
+        if not 0 <= obstacles <= len(airport.obstacles):
+            raise WorldError(
+                f"obstacles: {obstacles}: {airport.name} has presets for 0 to "
+                f"{len(airport.obstacles)}"
+            )
+        self.airport = airport
+        self.time_s = start_s
+        self.skipped_s = 0.0
+        self._start_s = start_s
+        self._max_catch_up_s = max_catch_up_s
+        self._scene = Scene(airport)
+        self._model, self._data = self._scene.model, self._scene.data
+        self._steps_per_tick = round(TICK_S / self._model.opt.timestep)
+        self._ticks = 0
+        self._wheels = self._scene.wheel_joints
+        # A hinge's position is one further in qpos than in qvel: the free joint has 7 against 6.
+        self._wheel_positions = [dof + 1 for dof in self._wheels]
+        self._free_damping = self._model.dof_damping[self._wheels].copy()
+        self._locked = False
+        self._drive = Drive(limits or DriveLimits(), dead_man_timeout_s)
+        self.laser = laser or LaserSpec()
+        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
+        self._laser = Laser(self.laser, streams[0])
+        self._gps = Gps(streams[1])
+        self._imu = Imu(streams[2], self.pose[2], start_s)
+        self._light = LightSensor(airport, truth or WorldTruth(), streams[3])
+        self._odometry = WheelOdometry(self._wheel_angles(), start_s)
+        self._collisions = 0
+        self._contact_s: dict[str, float] = {}
+        self._prohibited_s = 0.0
+        self._obstacle_clearance_m = math.inf
+        self._prohibited_clearance_m = math.inf
+        self._examined_s = start_s
+        self._examine_at_s = start_s
+        self._waiting = list(airport.obstacles[:obstacles])
+        self._leaving: dict[str, float] = {}
+        self._bring_obstacles()
+        self._examine()
+
+    # -- actuators ------------------------------------------------------------------------------
+
+    def command(self, linear_mps: float, angular_radps: float) -> bool:
+        """Give the base a velocity command; returns False if it was refused as not finite."""
+        return self._drive.command(linear_mps, angular_radps, self.time_s)
+
+    def brake(self, engaged: bool) -> None:
+        """Engage or release the brake."""
+        self._drive.brake_ordered = engaged
+
+    # -- time -----------------------------------------------------------------------------------
+
+    def step_to(self, t_s: float) -> None:
+        """Advance to time `t_s` in ticks of 10 ms; a remainder waits for the next call.
+
+        Raises:
+            WorldError: time that is not finite.
+        """
+        if not math.isfinite(t_s):
+            raise WorldError(f"step_to: {t_s}: time must be finite")
+        behind_s = t_s - self.time_s
+        if behind_s > self._max_catch_up_s:
+            skip_s = math.floor((behind_s - self._max_catch_up_s) / TICK_S) * TICK_S
+            self.skipped_s += skip_s
+            self._set_time()
+        while self.time_s + TICK_S <= t_s + 1e-9:
+            self._tick()
+
+    def _set_time(self) -> None:
+        # From a tick count, so that rounding does not add up over a long mission.
+        self.time_s = self._start_s + self.skipped_s + self._ticks * TICK_S
+
+    def _tick(self) -> None:
+        self._data.ctrl[:] = self._drive.update(self.time_s, TICK_S)
+        if self._drive.locked != self._locked:
+            self._locked = self._drive.locked
+            self._model.dof_damping[self._wheels] = (
+                LOCKED_DAMPING if self._locked else self._free_damping
+            )
+        mujoco.mj_step(self._model, self._data, nstep=self._steps_per_tick)
+        self._ticks += 1
+        self._set_time()
+        if self._data.ncon != 4 or self._obstacle_clearance_m < NEAR_M:
+            self._count_contacts()
+        if self.time_s >= self._examine_at_s - 1e-9:
+            self._bring_obstacles()
+            self._examine()
+
+    # -- sensors --------------------------------------------------------------------------------
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """True pose of `base_link` in `map`: x m, y m, yaw rad. Also the absolute localization."""
+        x, y, _, qw, qx, qy, qz = self._data.qpos[:7].tolist()
+        return x, y, math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+
+    def scan(self) -> Floats:
+        """One sweep of the laser, m."""
+        return self._laser.scan(self._model, self._data, self.pose)
+
+    def gps(self) -> GpsReading:
+        """One GPS fix."""
+        x_m, y_m, _ = self.pose
+        vx, vy = self._data.qvel[:2].tolist()
+        return self._gps.read(x_m, y_m, vx, vy)
+
+    def imu(self) -> ImuReading:
+        """One IMU reading."""
+        vx, vy = self._data.qvel[:2].tolist()
+        return self._imu.read(self.time_s, self.pose[2], vx, vy)
+
+    def odometry(self) -> OdometryReading:
+        """Wheel odometry up to now."""
+        return self._odometry.read(self._wheel_angles(), self.time_s)
+
+    def light(self) -> float:
+        """One reading of the light sensor, lux."""
+        return self._light.read(self.pose)
+
+    def base_state(self) -> BaseState:
+        """Brake, dead man and wheel speeds."""
+        fl, fr, rl, rr = self._data.qvel[self._wheels].tolist()
+        return BaseState(
+            brake_engaged=self._drive.braking,
+            dead_man_tripped=self._drive.dead_man_tripped(self.time_s),
+            command_age_s=self._drive.command_age_s(self.time_s),
+            wheel_speeds_radps=(fl, fr, rl, rr),
+        )
+
+    def _wheel_angles(self) -> WheelSpeeds:
+        fl, fr, rl, rr = self._data.qpos[self._wheel_positions].tolist()
+        return fl, fr, rl, rr
+
+    # -- obstacles ------------------------------------------------------------------------------
+
+    @property
+    def obstacles(self) -> tuple[Solid, ...]:
+        """Obstacles present."""
+        return tuple(self._scene.present.values())
+
+    def add_obstacle(self, name: str, x_m: float, y_m: float, radius_m: float) -> None:
+        """Make an obstacle appear or move it; a preset's name keeps the preset's shape.
+
+        Raises:
+            WorldError: not finite, out of bounds, on the robot, or too many.
+        """
+        preset = self._scene.preset(name)
+        shape = preset.shape if preset else "cylinder"
+        x, y, yaw = self.pose
+        self._scene.put(
+            Solid(name, shape, x_m, y_m, radius_m), rectangle(x, y, yaw, LENGTH_M, WIDTH_M)
+        )
+        self._waiting = [waiting for waiting in self._waiting if waiting.name != name]
+        self._leaving.pop(name, None)
+        self._examine_at_s = self.time_s
+
+    def remove_obstacle(self, name: str) -> bool:
+        """Take an obstacle away, or keep a preset from appearing; returns whether it was there."""
+        self._waiting = [waiting for waiting in self._waiting if waiting.name != name]
+        self._leaving.pop(name, None)
+        self._examine_at_s = self.time_s
+        return self._scene.remove(name)
+
+    def _bring_obstacles(self) -> None:
+        """Let presets appear and go by their time windows."""
+        elapsed_s = self.time_s - self._start_s
+        for name in [name for name, until in self._leaving.items() if elapsed_s >= until]:
+            self.remove_obstacle(name)
+        x_m, y_m, _ = self.pose
+        for preset in list(self._waiting):
+            near_m = preset.appears_within_m
+            if elapsed_s < preset.present_from_s or (
+                near_m is not None and math.dist((x_m, y_m), (preset.x_m, preset.y_m)) > near_m
+            ):
+                continue
+            try:
+                self.add_obstacle(preset.name, preset.x_m, preset.y_m, preset.radius_m)
+            except WorldError:
+                continue  # The robot stands there now: it appears once the place is clear.
+            if preset.gone_after_s is not None:
+                self._leaving[preset.name] = elapsed_s + preset.gone_after_s
+
+    # -- ground truth ---------------------------------------------------------------------------
+
+    def truth(self) -> Truth:
+        """Ground truth; clearances are at most 50 ms old."""
+        x_m, y_m, yaw_rad = self.pose
+        vx, vy = self._data.qvel[:2].tolist()
+        return Truth(
+            x_m=x_m,
+            y_m=y_m,
+            yaw_rad=wrap(yaw_rad),
+            linear_mps=vx * math.cos(yaw_rad) + vy * math.sin(yaw_rad),
+            angular_radps=float(self._data.qvel[5]),
+            collisions=self._collisions,
+            prohibited_s=self._prohibited_s,
+            obstacle_clearance_m=self._obstacle_clearance_m,
+            prohibited_clearance_m=self._prohibited_clearance_m,
+        )
+
+    def _count_contacts(self) -> None:
+        for name in self._scene.touched():
+            last_s = self._contact_s.get(name, -math.inf)
+            if self.time_s - last_s > SAME_CONTACT_S:
+                self._collisions += 1
+            self._contact_s[name] = self.time_s
+
+    def _examine(self) -> None:
+        x_m, y_m, yaw_rad = self.pose
+        footprint = rectangle(x_m, y_m, yaw_rad, LENGTH_M, WIDTH_M)
+        self._obstacle_clearance_m = self._scene.clearance_m(footprint)
+        centre_m = self.airport.prohibited_distance_m(x_m, y_m)
+        if abs(centre_m) > 1.0:
+            self._prohibited_clearance_m = centre_m - CIRCUMRADIUS_M
+            inside = centre_m < 0
+        else:
+            corners = shapely.get_coordinates(footprint)[:4]
+            self._prohibited_clearance_m = float(
+                self.airport.prohibited_distances_m(corners).min()
+            )
+            inside = self.airport.footprint_in_prohibited(footprint)
+        if inside:
+            self._prohibited_s += self.time_s - self._examined_s
+        near = min(self._obstacle_clearance_m, self._prohibited_clearance_m) < NEAR_M
+        self._examined_s = self.time_s
+        self._examine_at_s = self.time_s + (CLOSE_TRUTH_PERIOD_S if near else TRUTH_PERIOD_S)
