@@ -84,10 +84,11 @@ class Laser:
             self._geoms, self._ranges, None, self.spec.rays, self.spec.range_max_m,
         )  # fmt: skip
         top_m = self.spec.range_max_m
-        none = (self._geoms < 0) | (self._ranges > top_m)
-        noise = self._rng.normal(0.0, self.spec.noise_m, self.spec.rays)
-        ranges = np.clip(self._ranges + noise, 0.0, top_m)
-        ranges[none] = top_m
+        ranges = self._rng.normal(0.0, self.spec.noise_m, self.spec.rays)
+        ranges += self._ranges
+        np.maximum(ranges, 0.0, out=ranges)
+        np.minimum(ranges, top_m, out=ranges)
+        ranges[self._geoms < 0] = top_m
         return ranges
 
 

@@ -13,16 +13,10 @@ import mujoco
 import numpy as np
 import shapely
 
-from airport.model import Airport, rectangle
+from airport.model import Airport
 from airport.world import WorldTruth
-from sim.robot import (
-    CIRCUMRADIUS_M,
-    LENGTH_M,
-    WIDTH_M,
-    Drive,
-    DriveLimits,
-    WheelSpeeds,
-)
+from sim.clearance import Clearance, Pose, footprint
+from sim.robot import CIRCUMRADIUS_M, Drive, DriveLimits, WheelSpeeds
 from sim.scene import Scene, Solid, WorldError
 from sim.sensors import (
     Floats,
@@ -57,8 +51,8 @@ class Truth:
     """Ground truth now; counters are cumulative.
 
     `obstacle_clearance_m` is from the footprint to the nearest obstacle or building (inf if there
-    is none). `prohibited_clearance_m` is from the footprint to the prohibited area, negative when
-    a corner is in it; farther than 1 m away it is a lower bound.
+    is none), `prohibited_clearance_m` from the footprint's nearest corner to the prohibited area,
+    negative in it. Both are exact below 1 m and lower bounds above (see `sim.clearance`).
     """
 
     x_m: float
@@ -144,6 +138,8 @@ class World:
         self._collisions = 0
         self._contact_s: dict[str, float] = {}
         self._prohibited_s = 0.0
+        self._near_obstacle = Clearance(lambda pose: self._scene.clearance_m(footprint(pose)))
+        self._near_prohibited = Clearance(self._prohibited_exactly)
         self._obstacle_clearance_m = math.inf
         self._prohibited_clearance_m = math.inf
         self._examined_s = start_s
@@ -204,7 +200,7 @@ class World:
     # -- sensors --------------------------------------------------------------------------------
 
     @property
-    def pose(self) -> tuple[float, float, float]:
+    def pose(self) -> Pose:
         """True pose of `base_link` in `map`: x m, y m, yaw rad. Also the absolute localization."""
         x, y, _, qw, qx, qy, qz = self._data.qpos[:7].tolist()
         return x, y, math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
@@ -261,20 +257,22 @@ class World:
         """
         preset = self._scene.preset(name)
         shape = preset.shape if preset else "cylinder"
-        x, y, yaw = self.pose
-        self._scene.put(
-            Solid(name, shape, x_m, y_m, radius_m), rectangle(x, y, yaw, LENGTH_M, WIDTH_M)
-        )
+        self._scene.put(Solid(name, shape, x_m, y_m, radius_m), footprint(self.pose))
         self._waiting = [waiting for waiting in self._waiting if waiting.name != name]
         self._leaving.pop(name, None)
-        self._examine_at_s = self.time_s
+        self._look_again()
 
     def remove_obstacle(self, name: str) -> bool:
         """Take an obstacle away, or keep a preset from appearing; returns whether it was there."""
         self._waiting = [waiting for waiting in self._waiting if waiting.name != name]
         self._leaving.pop(name, None)
-        self._examine_at_s = self.time_s
+        self._look_again()
         return self._scene.remove(name)
+
+    def _look_again(self) -> None:
+        """The obstacles have changed: what was known about the distance to them is void."""
+        self._near_obstacle.forget()
+        self._examine_at_s = self.time_s
 
     def _bring_obstacles(self) -> None:
         """Let presets appear and go by their time windows."""
@@ -321,21 +319,18 @@ class World:
             self._contact_s[name] = self.time_s
 
     def _examine(self) -> None:
-        x_m, y_m, yaw_rad = self.pose
-        footprint = rectangle(x_m, y_m, yaw_rad, LENGTH_M, WIDTH_M)
-        self._obstacle_clearance_m = self._scene.clearance_m(footprint)
-        centre_m = self.airport.prohibited_distance_m(x_m, y_m)
-        if abs(centre_m) > 1.0:
-            self._prohibited_clearance_m = centre_m - CIRCUMRADIUS_M
-            inside = centre_m < 0
-        else:
-            corners = shapely.get_coordinates(footprint)[:4]
-            self._prohibited_clearance_m = float(
-                self.airport.prohibited_distances_m(corners).min()
-            )
-            inside = self.airport.footprint_in_prohibited(footprint)
-        if inside:
+        pose = self.pose
+        self._obstacle_clearance_m = self._near_obstacle.measure(pose)
+        self._prohibited_clearance_m = self._near_prohibited.measure(pose)
+        if self._prohibited_clearance_m <= CIRCUMRADIUS_M and (
+            self.airport.footprint_in_prohibited(footprint(pose))
+        ):
             self._prohibited_s += self.time_s - self._examined_s
         near = min(self._obstacle_clearance_m, self._prohibited_clearance_m) < NEAR_M
         self._examined_s = self.time_s
         self._examine_at_s = self.time_s + (CLOSE_TRUTH_PERIOD_S if near else TRUTH_PERIOD_S)
+
+    def _prohibited_exactly(self, pose: Pose) -> float:
+        """Distance of the footprint's nearest corner to the prohibited area, m."""
+        corners = shapely.get_coordinates(footprint(pose))[:4]
+        return float(self.airport.prohibited_distances_m(corners).min())

@@ -38,7 +38,7 @@ class EscapeLimits:
     range_m: float = 3.0
     clearance_m: float = 0.4
     least_clearance_m: float = 0.28
-    max_deviation_m: float = 1.35
+    max_deviation_m: float = 1.3
     group_m: float = 1.3
     detour_m: float = 0.4
     yielding_m: float = 0.1

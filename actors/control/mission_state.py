@@ -140,8 +140,12 @@ def routed(state: MissionState, route: Route) -> MissionState:
 
 
 def measured(state: MissionState, light: LightMeasurement) -> MissionState:
-    """Keep the first measurement of each light of the mission under way."""
-    if state.phase not in ACTIVE or any(known.light == light.light for known in state.lights):
+    """Keep the first measurement of each light.
+
+    Also just after success: the last light's message may come after that of the last arrival.
+    """
+    known = any(other.light == light.light for other in state.lights)
+    if known or state.phase not in ACTIVE | {P.SUCCEEDED}:
         return state
     return msgspec.structs.replace(state, lights=(*state.lights, light))
 

@@ -10,12 +10,20 @@ against it (heading error, curves, obstacles, the goal), and changes within acce
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field as data_field
+from dataclasses import dataclass
 
 import numpy as np
 
 from actors.control.escape import Deviation, Escape, EscapeLimits
-from actors.control.polyline import Array, Hull, Point, Polyline, to_map, wrap_angle
+from actors.control.polyline import (
+    Array,
+    Hull,
+    Point,
+    Polyline,
+    Projection,
+    to_map,
+    wrap_angle,
+)
 from actors.control.potential_field import FieldGains, field
 
 
@@ -67,7 +75,11 @@ class Motion:
     distance_to_go_m: float
 
 
+Pose2 = tuple[float, float, float]
+"""Planar pose (x, y, yaw) in `map`."""
+
 STANDSTILL = (0.0, 0.0)
+"""The command of a robot that stands."""
 
 
 @dataclass(slots=True)
@@ -75,7 +87,7 @@ class Ramp:
     """Acceleration limits on a command: remembers the last one."""
 
     limits: MotionLimits
-    last: tuple[float, float] = data_field(default=STANDSTILL)
+    last: tuple[float, float] = STANDSTILL
 
     def towards(self, linear_mps: float, angular_radps: float, dt_s: float) -> tuple[float, float]:
         """Return the command nearest to the wish that the limits allow after `dt_s`."""
@@ -123,7 +135,8 @@ class PathFollower:
         self._hull = hull or Hull()
         self._limits = limits or MotionLimits()
         self._gains = gains or FieldGains()
-        self._escape = Escape(self._hull, escape or EscapeLimits())
+        self._room = escape or EscapeLimits()
+        self._escape = Escape(self._hull, self._room)
         self._ramp = Ramp(self._limits)
         self._s_m: float | None = None
         self._arrived = False
@@ -157,24 +170,16 @@ class PathFollower:
             to_map(points, x_m, y_m, yaw_rad), foot.s_m - 2.0, foot.s_m + 5.0
         )
         way = self._escape.update(echoes, foot.s_m, foot.n_m)
-        bearing = self._bearing(x_m, y_m, yaw_rad, foot.s_m, foot.n_m, way, points)
+        bearing = self._bearing((x_m, y_m, yaw_rad), foot, way, points)
         speed = self._speed(bearing, foot.s_m, direct_m, points) if way.possible else 0.0
         turn = limits.heading_gain_per_s * bearing if way.possible else 0.0
         linear, angular = self._ramp.towards(speed, turn, dt_s)
         waiting = linear == 0.0 and not way.possible
         return Motion(linear, angular, False, waiting, foot.segment, to_go_m)
 
-    def _bearing(
-        self,
-        x_m: float,
-        y_m: float,
-        yaw_rad: float,
-        s_m: float,
-        n_m: float,
-        way: Deviation,
-        points: Array,
-    ) -> float:
+    def _bearing(self, pose: Pose2, foot: Projection, way: Deviation, points: Array) -> float:
         """Direction of the field, relative to the robot's heading."""
+        (x_m, y_m, yaw_rad), s_m, n_m = pose, foot.s_m, foot.n_m
         aside_m = abs(way.offset_m - n_m)
         reach_m = self._limits.lookahead_m
         if aside_m > 0.05:
@@ -195,7 +200,12 @@ class PathFollower:
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         target_x, target_y = cos * dx + sin * dy, cos * dy - sin * dx
         field_x, field_y = field(target_x, target_y, points, self._hull, self._gains)
-        return math.atan2(field_y, field_x)
+        bearing = math.atan2(field_y, field_x)
+        along = wrap_angle(self._line.smooth_heading_at(s_m) - yaw_rad)
+        outwards = wrap_angle(bearing - along) * n_m > 0.0
+        if outwards and abs(n_m) > self._room.max_deviation_m:
+            return along  # the corridor's edge: repulsion may not push beyond it
+        return bearing
 
     def _beside(self, s_m: float, n_m: float, x_m: float, y_m: float) -> tuple[float, float]:
         """Vector in `map` from (x, y) to the point (s, n) of the route, at most to its end."""
@@ -209,7 +219,7 @@ class PathFollower:
         limits = self._limits
         if abs(bearing) > limits.turn_in_place_rad:
             return 0.0
-        top = limits.max_linear_mps
+        top, braking = limits.max_linear_mps, limits.deceleration_mps2
         curve = abs(wrap_angle(
             self._line.heading_at(min(s_m + 1.2 * limits.lookahead_m, self._line.length_m))
             - self._line.heading_at(s_m)
@@ -217,14 +227,12 @@ class PathFollower:
         speeds = [
             top * math.cos(bearing) ** 2,
             top * max(math.cos(min(curve, math.pi) / 2) ** 2, 0.35),
-            max(braking_speed(direct_m - limits.arrival_radius_m / 2, limits.deceleration_mps2), .2),
+            max(braking_speed(direct_m - limits.arrival_radius_m / 2, braking), 0.2),
         ]
         ahead = points[points[:, 0] > -self._hull.half_length_m]
         if len(ahead):
             nearest_m = float(self._hull.distance(ahead).min())
             free_m = free_ahead(points, self._hull, 0.08)
             speeds.append(max(0.35, 0.35 + 0.8 * (nearest_m - 0.2)))
-            speeds.append(
-                braking_speed(free_m - limits.obstacle_stop_m, limits.deceleration_mps2)
-            )
+            speeds.append(braking_speed(free_m - limits.obstacle_stop_m, braking))
         return min(speeds)

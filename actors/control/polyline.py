@@ -72,7 +72,8 @@ def scan_points(
     ranges = np.frombuffer(ranges_f32[: len(ranges_f32) // 4 * 4], dtype="<f4").astype(float)
     angles = angle_min_rad + angle_increment_rad * np.arange(len(ranges))
     echo = np.isfinite(ranges) & (ranges > 0.0) & (ranges < range_max_m * (1 - 1e-6))
-    return np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))[echo]
+    points = np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))
+    return np.asarray(points[echo])
 
 
 def to_map(points: Array, x_m: float, y_m: float, yaw_rad: float) -> Array:
@@ -173,7 +174,7 @@ class Polyline:
         row = np.arange(len(points))
         s = self._arc[low + best] + foot[row, best]
         n = np.where(left[row, best] < 0.0, -1.0, 1.0) * distance[row, best]
-        return np.column_stack((s, n))
+        return np.asarray(np.column_stack((s, n)))
 
     def project(self, x_m: float, y_m: float, near_s_m: float | None = None) -> Projection:
         """Return the foot of a point.

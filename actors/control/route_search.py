@@ -9,6 +9,7 @@ never overestimates on a graph whose edges are straight, so the route is a short
 from __future__ import annotations
 
 import heapq
+import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ class SearchLimits:
         start_reach_m: farthest distance of the robot from the graph.
         goal_reach_m: farthest distance of a goal from the graph; keep it within the pavement.
         approach_m: a start farther than this from the graph gets a leg of its own back to it.
+        cut_m: a goal at most this far from the graph is headed for directly; to a farther one
+            the robot turns off where it is nearest, so as to stay on the pavement.
         straight_m: a row whose inner points are within this of the straight line is straight.
     """
 
@@ -34,6 +37,7 @@ class SearchLimits:
     start_reach_m: float = 12.0
     goal_reach_m: float = 3.0
     approach_m: float = 2.0
+    cut_m: float = 1.0
     straight_m: float = 0.5
 
 
@@ -106,13 +110,16 @@ def plan_route(
     if path is None:
         where = f" with {len(closed)} edges blocked" if closed else ""
         return _none(f"no way in the graph from {_show(start)} to {_show(goal)}{where}")
-    path[-1] = goal
+    if joined[1].distance_m <= limits.cut_m:
+        path[-1] = goal
+    else:
+        path.append(goal)
     if joined[0].distance_m > limits.approach_m:
         path.insert(0, start)
     waypoints = _without_repeats(path)
     if straight:
         waypoints = _straightened(waypoints, limits.straight_m)
-    length_m = sum(math.dist(a, b) for a, b in zip(waypoints, waypoints[1:], strict=False))
+    length_m = sum(math.dist(a, b) for a, b in itertools.pairwise(waypoints))
     return PlannedRoute(tuple(waypoints), length_m, "")
 
 
@@ -157,7 +164,8 @@ def _search(
     nodes: Mapping[str, Point], edges: list[Edge], start: _Snap, goal: _Snap
 ) -> list[Point] | None:
     """A* between two snapped points. Temporary nodes are 0 (start) and 1 (goal)."""
-    places: dict[str | int, Point] = {**nodes, 0: start.point, 1: goal.point}
+    places: dict[str | int, Point] = {0: start.point, 1: goal.point}
+    places.update(nodes.items())
     ways: dict[str | int, list[str | int]] = {name: [] for name in places}
 
     def join(a: str | int, b: str | int) -> None:

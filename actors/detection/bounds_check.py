@@ -17,7 +17,6 @@ class BoundsCheck:
         max_linear_mps: top speed, m/s, forward and backward.
         max_angular_radps: top turn rate, rad/s, either way.
         hold_s: how long commands must have been good, s.
-        start_s: now.
         known_after_s: when idle may be claimed without a command heard; -inf for at once.
     """
 

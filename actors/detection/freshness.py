@@ -15,21 +15,20 @@ class Freshness(DetectionModule):
     Parameters:
         timeout_s: greatest admissible age of the content, s.
         hold_s: how long it must be fresh again before the module is idle, s.
-        startup_grace_s: how long the first sample of a starting system may take, s. A respawned
-            module joins a running system: for it the timeout itself is the grace.
+
+    The first sample of a starting system may take the spec's `startup_grace_s`. A respawned
+    module joins a running system: for it the timeout itself is the grace.
     """
 
     subject = ""
-    default_timeout_s = 0.5
+    default_timeout_s = 1.0
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         timeout_s = number(self.parameters, "timeout_s", self.default_timeout_s)
-        grace_s = number(self.parameters, "startup_grace_s", 5.0)
-        first_life = context.incarnation == 1
         self.monitor = FreshnessMonitor(
-            self.subject, timeout_s, number(self.parameters, "hold_s", 0.3), self.clock.now(),
-            max(grace_s, timeout_s) if first_life else timeout_s, known=first_life)
+            self.subject, timeout_s, number(self.parameters, "hold_s", 0.2), self.clock.now(),
+            self.grace_s(timeout_s), known=self.first_life)
 
     def on_start(self) -> None:
         """Start waiting for the first sample."""
@@ -42,14 +41,10 @@ class Freshness(DetectionModule):
 
 
 class CommandFreshness(Freshness):
-    """DM2: Osmosis Control's command is not updated.
-
-    The default timeout is half of the 0.64 s in the authors' code: at 20 Hz that is six commands
-    in a row, and a robot at 1 m/s has travelled 0.3 m.
-    """
+    """DM2: Osmosis Control's command is not updated (0.64 s in the authors' code)."""
 
     subject = "command"
-    default_timeout_s = 0.32
+    default_timeout_s = 0.64
 
     @on(topics.COMMAND)
     def command(self, _message: m.Twist, header: Header) -> None:
@@ -61,7 +56,7 @@ class LocalizationFreshness(Freshness):
     """DM6: the pose is not updated (1 s in the authors' code)."""
 
     subject = "localization"
-    default_timeout_s = 0.5
+    default_timeout_s = 1.0
 
     @on(topics.POSE)
     def pose(self, _message: m.Pose, header: Header) -> None:

@@ -35,6 +35,9 @@ LATE_S = 0.1
 EXCUSE_S = 0.1
 """How long a late module reads its mail before it judges: one period of the slowest input."""
 
+DEFAULT_GRACE_S = 5.0
+"""How long a starting system may take, if no spec says."""
+
 _SHORTEST_SLEEP_S = 1e-4
 """Rounding must not make a timer that is due now come again now, for ever."""
 
@@ -82,17 +85,26 @@ class DetectionModule(Actor):
         super().__init__(context)
         self.state = DetectionState.IDLE
         self._report = DetectionReport(DetectionState.IDLE, "", (), self.clock.now())
-        self._reports = context.incarnation == 1
+        self.first_life = context.incarnation == 1
+        self._reports = self.first_life
         self._monitor: Monitor | None = None
         self._wake_s = math.inf
         self._excused = False
 
+    def grace_s(self, timeout_s: float) -> float:
+        """Return how long the first input may take, s."""
+        if not self.first_life:
+            return timeout_s
+        system = self.context.shared.get("system")
+        startup_s = DEFAULT_GRACE_S if system is None else system.timing.startup_grace_s
+        return max(timeout_s, number(self.parameters, "startup_grace_s", startup_s))
+
     # -- the state machine ----------------------------------------------------------------------
 
     def activate(self, reason: str, nodes: tuple[str, ...] = ()) -> None:
-        """Go from idle to active, or, active already, renew reason and nodes; report a change."""
+        """Go from idle to active; when active already, renew reason and nodes. Report changes."""
         if self.state is DetectionState.ACTIVE:
-            if nodes != self._report.nodes:
+            if (reason, nodes) != (self._report.reason, self._report.nodes):
                 self._tell(DetectionReport(self.state, reason, nodes, self._report.since_s))
             return
         self._enter(DetectionState.ACTIVE)

@@ -18,19 +18,18 @@ class Watchdog(DetectionModule):
 
     Parameters:
         watch: names of the nodes.
-        heartbeat_timeout_s: a node without a heartbeat for so long has failed, s.
-        startup_grace_s: how long the first heartbeats of a starting system may take, s. A
-            respawned module joins a running system: for it the timeout itself is the grace.
+        timeout_s: a node without a heartbeat for so long has failed, s.
+
+    The first heartbeats of a starting system may take the spec's `startup_grace_s`. A respawned
+    module joins a running system: for it the timeout itself is the grace.
     """
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        timeout_s = number(self.parameters, "heartbeat_timeout_s", 0.35)
-        grace_s = number(self.parameters, "startup_grace_s", 5.0)
-        first_life = context.incarnation == 1
+        timeout_s = number(self.parameters, "timeout_s", 0.5)
         self.monitor = WatchdogCore(
             watched_nodes(self.parameters), timeout_s, self.clock.now(),
-            max(grace_s, timeout_s) if first_life else timeout_s, known=first_life)
+            self.grace_s(timeout_s), known=self.first_life)
 
     @classmethod
     def names(

@@ -14,7 +14,7 @@ import shapely
 
 from airport.model import Airport
 
-FRAME_M = 8.0
+FRAME_M = 4.0
 """Strip of prohibited ground that is drawn round the airport."""
 
 _DECIMALS = 2

@@ -160,7 +160,8 @@ class Launcher:
                 full = f"spawner_{name}"
                 if full not in names or not self._spawners.ping(name):
                     self._bring_back(full)
-            silent = time.monotonic() - self._supervisor_heard_s > SUPERVISOR_PATIENCE_S
+            patience_s = SUPERVISOR_PATIENCE_S / min(1.0, self.plan.rate)
+            silent = time.monotonic() - self._supervisor_heard_s > patience_s
             if SUPERVISOR in names and silent:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(self._supervisor_pid, signal.SIGKILL)

@@ -31,10 +31,10 @@ export class AirportMap {
     this.drawn = {};
     const [x0, y0, x1, y1] = map ? map.bounds_m : [-50, -50, 50, 50];
     this.svg.setAttribute("viewBox", `${x0} ${-y1} ${x1 - x0} ${y1 - y0}`);
-    const hatch = make("pattern", { id: "hatch", width: 1.6, height: 1.6,
+    const hatch = make("pattern", { id: "hatch", width: 1, height: 1,
       patternUnits: "userSpaceOnUse", patternTransform: "rotate(45)" }, make("defs", {}, this.svg));
-    make("rect", { class: "hatch-ground", width: 1.6, height: 1.6 }, hatch);
-    make("line", { class: "hatch-line", y2: 1.6 }, hatch);
+    make("rect", { class: "hatch-ground", width: 1, height: 1 }, hatch);
+    make("line", { class: "hatch-line", y2: 1 }, hatch);
     const ground = make("g", { transform: "scale(1,-1)" }, this.svg);
     if (map) this.drawGround(map, ground);
     this.edges = make("g", {}, this.svg);

@@ -1,0 +1,37 @@
+# Everything a newcomer needs. `make run` and `make test` set up what is missing by themselves.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: run test lint setup clean requirements
+
+run: setup
+	$(BIN)/python launch.py
+
+test: setup
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m mypy
+	$(BIN)/python -m pytest
+
+lint: setup
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m mypy
+
+setup: .venv/installed
+
+.venv/installed: requirements.txt pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "rampart needs Python 3.11 or later; $(PYTHON) is $$($(PYTHON) -V)" >&2; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
+	@touch $@
+
+# Pins without hashes and without index lines, so that any index can serve them.
+requirements: setup
+	$(BIN)/python -m pip install --quiet pip-tools
+	$(BIN)/python -m piptools compile --quiet --strip-extras --no-emit-index-url \
+		--no-emit-trusted-host --no-emit-find-links --no-emit-options --no-header \
+		--no-annotate --extra dev --output-file requirements.txt pyproject.toml
+
+clean:
+	rm -rf .venv build dist reports *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,114 @@
+"""Safety Pilot: the last gate before the base."""
+
+from __future__ import annotations
+
+import math
+
+from actors import topics
+from actors.control.polyline import scan_points
+from actors.control.safety_gate import GateOutput, SafetyGate, Stamped
+from actors.control.settings import checks_of, gate_of
+from actors.messages import (
+    BaseCommand,
+    LaserScan,
+    ManagerStatus,
+    PilotMode,
+    PilotOrder,
+    PilotStatus,
+    Twist,
+)
+from actors.runtime.actor import Actor, Context, Header, every, on
+
+_PERIOD_S = 0.05
+
+
+class SafetyPilot(Actor):
+    """Wires `SafetyGate` to its topics.
+
+    A command and an order act at once; the timer repeats what is in force, so that the base's
+    dead man is fed and everything that expires does.
+    """
+
+    outputs = (topics.BASE_COMMAND, topics.PILOT_STATUS)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        system = context.shared["system"]
+        self._gate = SafetyGate(gate_of(system), checks_of(system), context.clock.now())
+        self._sent_s = -math.inf
+        self._last = GateOutput(0.0, 0.0, PilotMode.AUTO, True, "just started")
+
+    @on(topics.COMMAND)
+    def command(self, message: Twist, header: Header) -> None:
+        """Offer Osmosis Control's command to the gate and act on the answer at once."""
+        refused = self._gate.command(_stamped(message, header), self.clock.now())
+        self._note(refused, header)
+        self._act()
+
+    @on(topics.TELEOP_COMMAND)
+    def joystick(self, message: Twist, header: Header) -> None:
+        """Offer the operator's command to the gate and act on the answer at once."""
+        refused = self._gate.joystick(_stamped(message, header), self.clock.now())
+        self._note(refused, header)
+        self._act()
+
+    @on(topics.SCAN)
+    def scan(self, message: LaserScan, header: Header) -> None:
+        """Keep the latest scan, as points."""
+        points = scan_points(
+            message.ranges_f32,
+            message.angle_min_rad,
+            message.angle_increment_rad,
+            message.range_max_m,
+        )
+        self._gate.scan(points, header.stamp)
+
+    @on(topics.PILOT_ORDER)
+    def order(self, message: PilotOrder, header: Header) -> None:
+        """Obey a recovery module; a change acts at once."""
+        before = self._gate.mode
+        self._gate.order(header.source, message.engaged, message.mode, message.reason)
+        if self._gate.mode is not before:
+            self._act()
+
+    @on(topics.MANAGER_STATUS)
+    def manager(self, _message: ManagerStatus, _header: Header) -> None:
+        """Hear that the manager lives."""
+        self._gate.manager_alive(self.clock.now())
+
+    @every(_PERIOD_S)
+    def repeat(self) -> None:
+        """Repeat the command in force, unless one has just gone out."""
+        if self.clock.now() - self._sent_s > 0.8 * _PERIOD_S:
+            self._act()
+
+    @every(0.2)
+    def repeat_status(self) -> None:
+        """Repeat the status for whoever joined late."""
+        self._tell()
+
+    def _act(self) -> None:
+        now = self.clock.now()
+        before, self._last = self._last, self._gate.output(now)
+        self._sent_s = now
+        self.publish(
+            topics.BASE_COMMAND, BaseCommand(self._last.linear_mps, self._last.angular_radps))
+        shown = (before.mode, before.stopped, before.reason)
+        if shown != (self._last.mode, self._last.stopped, self._last.reason):
+            self._tell()
+
+    def _tell(self) -> None:
+        last = self._last
+        self.publish(topics.PILOT_STATUS, PilotStatus(
+            last.mode, last.stopped, last.reason, self._gate.refused))
+
+    def _note(self, refused: str, header: Header) -> None:
+        if refused:
+            self.report_diagnostic("command refused", refused, header.source)
+
+
+def _stamped(message: Twist, header: Header) -> Stamped:
+    return Stamped(
+        message.linear_mps, message.angular_radps,
+        header.source, header.incarnation, header.sequence, header.stamp,
+    )

@@ -1,0 +1,64 @@
+"""From the system spec to the settings of the control cores: one place, no numbers of its own.
+
+What a spec does not say (gains, look-ahead distances) keeps the default of its core.
+"""
+
+from __future__ import annotations
+
+from actors.control.path_follower import MotionLimits
+from actors.control.polyline import Hull
+from actors.control.safety_gate import Checks, GateLimits
+from actors.control.swept_path import StoppingRoom
+from manager.specification import SystemSpec
+
+COMFORT_MPS2 = 0.8
+"""Acceleration and braking that the controller plans with; the pilot counts on the robot's own."""
+
+
+def hull_of(system: SystemSpec) -> Hull:
+    """Return the robot's footprint."""
+    return Hull(system.robot.length_m, system.robot.width_m)
+
+
+def motion_of(system: SystemSpec) -> MotionLimits:
+    """Return what Osmosis Control asks of the robot at most."""
+    robot = system.robot
+    return MotionLimits(
+        max_linear_mps=robot.top_speed_mps,
+        max_angular_radps=robot.top_turn_rate_radps,
+        acceleration_mps2=min(COMFORT_MPS2, robot.acceleration_mps2),
+        deceleration_mps2=min(COMFORT_MPS2, robot.braking_mps2),
+    )
+
+
+def gate_of(system: SystemSpec) -> GateLimits:
+    """Return the bounds and ages that the Safety Pilot enforces."""
+    robot, timing = system.robot, system.timing
+    room = StoppingRoom(
+        hull=hull_of(system),
+        top_speed_mps=robot.top_speed_mps,
+        stop_distance_m=robot.stop_distance_m,
+        lateral_distance_m=robot.lateral_distance_m,
+        deceleration_mps2=robot.braking_mps2,
+        reaction_s=timing.control_period_s + timing.actuation_s,
+    )
+    return GateLimits(
+        max_linear_mps=robot.top_speed_mps,
+        max_angular_radps=robot.top_turn_rate_radps,
+        command_timeout_s=timing.command_timeout_s,
+        scan_timeout_s=timing.command_timeout_s,
+        manager_timeout_s=timing.manager_timeout_s,
+        room=room,
+    )
+
+
+def checks_of(system: SystemSpec) -> Checks:
+    """Return which of the Safety Pilot's checks the spec's layers leave in force."""
+    checks = system.layers.safety_pilot_checks
+    return Checks(
+        bounds=checks,
+        freshness=checks,
+        sequence=checks,
+        scan=checks,
+        manager=system.layers.manager_watch and system.layers.ftm,
+    )

@@ -1,0 +1,81 @@
+"""When is a run over? Pure: fed with what the observer hears, asked once in a while.
+
+A run ends when the mission has ended, when it was lost (the Mission Manager forgot it), when
+nothing has progressed for the patience of the person who started it, or when the world is gone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from actors.messages import ControlStatus, MissionPhase, MissionStatus
+
+SETTLE_S = 1.5
+"""After the mission's end the robot gets this long to come to rest, and the records to arrive."""
+
+LOST_AFTER_S = 3.0
+ACCEPT_WITHIN_S = 30.0
+WORLD_SILENT_S = 3.0
+_STEP_TOWARDS_GOAL_M = 0.5
+
+
+@dataclass(slots=True)
+class RunEnd:
+    """Decides the end of one run. Times are simulated seconds.
+
+    Args:
+        patience_s: longest time without progress: no new step, no light measured, and not half
+            a metre nearer to the goal.
+    """
+
+    patience_s: float
+    _mission_id: str = ""
+    _progress: tuple[int, int] = (-1, -1)
+    _nearest_m: float = float("inf")
+    _progress_at_s: float = 0.0
+    _over_at_s: float | None = None
+    _over: str = ""
+    _lost_at_s: float | None = None
+    _truth_at_s: float | None = None
+
+    def mission(self, status: MissionStatus, now_s: float) -> None:
+        """Take the mission's state."""
+        running = status.phase not in (MissionPhase.IDLE,)
+        if self._mission_id and status.mission_id != self._mission_id:
+            self._lost_at_s = self._lost_at_s or now_s
+            return
+        self._lost_at_s = None
+        if not running:
+            return
+        self._mission_id = status.mission_id
+        progress = (status.step, len(status.lights))
+        if progress != self._progress:
+            self._progress, self._progress_at_s = progress, now_s
+            self._nearest_m = float("inf")
+        if status.phase in (MissionPhase.SUCCEEDED, MissionPhase.FAILED, MissionPhase.CANCELLED):
+            if self._over_at_s is None:
+                self._over_at_s = now_s
+            self._over = status.reason or f"mission {status.phase.value}"
+
+    def control(self, status: ControlStatus, now_s: float) -> None:
+        """Take the progress along the route."""
+        if status.distance_to_go_m < self._nearest_m - _STEP_TOWARDS_GOAL_M:
+            self._nearest_m, self._progress_at_s = status.distance_to_go_m, now_s
+
+    def truth(self, now_s: float) -> None:
+        """Note that the world turns."""
+        self._truth_at_s = now_s
+
+    def ended(self, now_s: float) -> str | None:
+        """Return why the run is over, or None while it goes on."""
+        if self._over_at_s is not None and now_s - self._over_at_s >= SETTLE_S:
+            return self._over
+        if self._truth_at_s is not None and now_s - self._truth_at_s > WORLD_SILENT_S:
+            return "the world is gone: no ground truth from the simulator"
+        if self._lost_at_s is not None and now_s - self._lost_at_s > LOST_AFTER_S:
+            return "mission lost: the Mission Manager came back without it"
+        if not self._mission_id and now_s > ACCEPT_WITHIN_S:
+            return f"no mission was accepted within {ACCEPT_WITHIN_S:.0f} s"
+        if self._over_at_s is None and now_s - self._progress_at_s > self.patience_s:
+            return f"no progress for {self.patience_s:.0f} s"
+        return None
