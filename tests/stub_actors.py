@@ -1,12 +1,67 @@
-"""Actors that only live, for tests of supervision."""
+"""A system whose every actor only lives: the real supervision with nothing to supervise for."""
 
 from __future__ import annotations
 
+import os
+import re
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
 from actors import topics
 from actors.runtime.actor import Actor
+from actors.supervision.launcher import Launcher
+from actors.supervision.run_plan import RunPlan
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 class Idler(Actor):
     """Beats its heart and does nothing else."""
 
     outputs = (topics.POSE,)
+
+
+def write_stub_system(directory: Path) -> Path:
+    """Write the shipped system with every actor replaced by an `Idler`."""
+    text = (ROOT / "systems" / "osmosis.toml").read_text(encoding="utf-8")
+    file = directory / "stub.toml"
+    file.write_text(re.sub(r'^actor = "[^"]+"', 'actor = "stub_actors:Idler"', text,
+                           flags=re.MULTILINE), encoding="utf-8")
+    return file
+
+
+def free_base_port(count: int = 40) -> int:
+    """Return the first of `count` consecutive free ports."""
+    for base in range(20_000 + os.getpid() % 1000 * 20, 60_000, count):
+        try:
+            for port in range(base, base + count):
+                with socket.socket() as probe:
+                    probe.bind(("127.0.0.1", port))
+        except OSError:
+            continue
+        return base
+    raise RuntimeError("no free ports")
+
+
+def stub_plan(system: Path, **changes: object) -> RunPlan:
+    """Return a plan that runs the stub system."""
+    values: dict[str, object] = dict(
+        run_id="stub", base_port=free_base_port(), rate=1.0, seed=1, system_file=str(system),
+        strategy="", airport="vallombre", mission="AB", obstacles=0, ftm=True, hmi_port=0)
+    return RunPlan(**{**values, **changes})  # type: ignore[arg-type]
+
+
+@asynccontextmanager
+async def launched(plan: RunPlan) -> AsyncIterator[Launcher]:
+    """Start a run without observer and end it."""
+    os.environ["PYTHONPATH"] = str(ROOT / "tests")
+    launcher = Launcher(plan, "test")
+    launcher.begin()
+    try:
+        await launcher.load()
+        await launcher.start()
+        yield launcher
+    finally:
+        await launcher.end()

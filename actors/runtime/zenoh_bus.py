@@ -14,7 +14,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import zenoh
@@ -46,10 +46,8 @@ def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
         "listen/endpoints": [listen] if listen else [],
         "listen/exit_on_failure": True,
         "connect/endpoints": list(dial),
-        "connect/timeout_ms": 0,
+        "connect/timeout_ms": 0,  # one attempt: who is not there yet will dial us
         "connect/exit_on_failure": False,
-        "connect/retry": {
-            "period_init_ms": 500, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
@@ -72,12 +70,12 @@ class ZenohBus:
     """
 
     def __init__(
-        self, node: str, incarnation: int, listen: str | None, dial: Sequence[str]
+        self, node: str, incarnation: int, listen: str | None, dial: Iterable[str]
     ) -> None:
         self._node = node
         self._incarnation = incarnation
         self._listen = listen
-        self._dial = dial
+        self._dial = tuple(dial)
         self._session: zenoh.Session | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._arrived: deque[Callable[[], None]] = deque()

@@ -165,6 +165,7 @@ class Launcher:
             if SUPERVISOR in names and silent:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(self._supervisor_pid, signal.SIGKILL)
+                await self._supervisor_gone(GUARD_PERIOD_S)  # its port is free only then
             if SUPERVISOR not in names or silent:
                 self._bring_back(SUPERVISOR)
 
@@ -202,8 +203,11 @@ class Launcher:
 
     def _restart_first_spawner(self) -> None:
         """Both spawners are gone: load everything once more, which takes a second or two."""
-        if self._first is not None and self._first.poll() is None:
-            return
+        if self._first is not None:
+            if self._first.poll() is None:
+                return
+            if self._first.stdout is not None:
+                self._first.stdout.close()
         self._start_first_spawner()
         self.on_restart(f"spawner_{NAMES[0]}", 0)
 
@@ -259,8 +263,11 @@ class Launcher:
             if end >= 0:
                 os.close(end)
         self._lifeline = (-1, -1)
-        if self._first is not None and self._first.poll() is None:
+        if self._first is not None:
             self._first.kill()
+            self._first.wait()
+            if self._first.stdout is not None:
+                self._first.stdout.close()
         deadline = time.monotonic() + 1.0
         while kill_leftovers(self.plan.base_port) and time.monotonic() < deadline:
             time.sleep(0.01)

@@ -73,13 +73,13 @@ async def _live(
             actor.stop()
 
     loop.add_signal_handler(signal.SIGTERM, stop_all)
-    async with asyncio.TaskGroup() as group:
-        for actor in actors:
-            group.create_task(_run(actor))
-
-
-async def _run(actor: Actor) -> None:
-    await actor.run()
+    tasks = [asyncio.create_task(actor.run()) for actor in actors]
+    try:
+        await asyncio.gather(*tasks)
+    finally:  # one actor's failure ends the others of its process too
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _wedge(_signal: int, _frame: Any) -> None:

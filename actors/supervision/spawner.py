@@ -223,6 +223,7 @@ def main() -> int:
     try:
         spawner.open()
         print(msgspec.json.encode(layout.port_of).decode(), flush=True)
+        os.dup2(2, 1)  # nobody reads the pipe from here on
         spawner.serve()
     except OSError as error:
         if error.errno == errno.EADDRINUSE:

@@ -1,0 +1,240 @@
+"""Real processes, really killed: what supervision promises whatever the nodes do."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+from stub_actors import ROOT, launched, stub_plan, write_stub_system
+
+from actors import topics
+from actors.messages import NodeTable, ProcessEvent, RespawnRequest
+from actors.runtime.actor import Actor, Context, Header, on
+from actors.runtime.clock import Clock
+from actors.runtime.zenoh_bus import ZenohBus, endpoint
+from actors.supervision.kill_node import main as kill_node
+from actors.supervision.launcher import Launcher, LaunchError
+from actors.supervision.process_title import find_processes
+from actors.supervision.restart_policy import RestartPolicy
+from actors.supervision.run_info import find_runs
+
+pytestmark = pytest.mark.processes
+
+
+class Witness(Actor):
+    """Hears what the supervisor says, and may ask it to respawn a node, as RM3 does."""
+
+    outputs = (topics.RESPAWN,)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.launcher: Launcher = context.shared["launcher"]
+        self.events: list[ProcessEvent] = []
+        self.table = NodeTable(())
+
+    @on(topics.PROCESS_EVENT)
+    def event(self, message: ProcessEvent, header: Header) -> None:
+        self.events.append(message)
+
+    @on(topics.NODES)
+    def nodes(self, message: NodeTable, header: Header) -> None:
+        self.table = message
+        self.launcher.supervisor_heard(message)
+
+    def state(self, node: str) -> tuple[str, int]:
+        return next(((r.state.value, r.incarnation) for r in self.table.nodes if r.name == node),
+                    ("unknown", 0))
+
+    def pid(self, node: str) -> int:
+        return next(r.pid for r in self.table.nodes if r.name == node)
+
+    def saw(self, node: str, event: str) -> bool:
+        return any(e.node == node and e.event == event for e in self.events)
+
+
+@asynccontextmanager
+async def running(tmp_path, **changes) -> AsyncIterator[tuple[Launcher, Witness]]:
+    async with launched(stub_plan(write_stub_system(tmp_path), **changes)) as launcher:
+        port = launcher.ports.pop("observer")  # the place of the launcher's own observer
+        bus = ZenohBus("observer", 1, endpoint(port), map(endpoint, launcher.ports.values()))
+        clock = Clock(launcher.plan.origin_s)
+        witness = Witness(Context("observer", 1, clock, bus, {}, {"launcher": launcher}))
+        task = asyncio.create_task(witness.run())
+        try:
+            await eventually(lambda: len(witness.table.nodes) == 22 and all(
+                r.state.value == "running" for r in witness.table.nodes), 20)
+            yield launcher, witness
+        finally:
+            witness.stop()
+            await task
+
+
+async def eventually(condition: Callable[[], bool], timeout_s: float = 10) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        await asyncio.sleep(0.01)
+
+
+def process(port: int, name: str) -> int | None:
+    found = [p for p in find_processes(port) if name in p.names]
+    return max(found, key=lambda p: p.incarnation).pid if found else None
+
+
+async def test_a_process_that_dies_stops_or_wedges_is_told_apart_and_comes_back(tmp_path):
+    async with running(tmp_path) as (_, witness):
+        for node, number, event in (("DM1", signal.SIGKILL, "crashed"),
+                                    ("DM2", signal.SIGSEGV, "crashed"),
+                                    ("RM1", signal.SIGTERM, "crashed"),
+                                    ("DM3", signal.SIGSTOP, "stopped"),
+                                    ("safety_pilot", signal.SIGUSR2, "wedged")):
+            os.kill(witness.pid(node), number)
+            await eventually(lambda n=node: witness.state(n) == ("running", 2))
+            assert witness.saw(node, event)
+
+
+async def test_a_node_of_a_recovery_module_waits_for_its_request(tmp_path):
+    async with running(tmp_path) as (_, witness):
+        os.kill(witness.pid("osmosis_control"), signal.SIGKILL)
+        await eventually(lambda: witness.state("osmosis_control") == ("crashed", 1))
+        await asyncio.sleep(0.3)
+        assert witness.state("osmosis_control") == ("crashed", 1)
+        request = RespawnRequest(1, "osmosis_control", 1, "RM3")
+        for _ in range(3):  # the same request again changes nothing
+            witness.publish(topics.RESPAWN, request)
+        await eventually(lambda: witness.state("osmosis_control") == ("running", 2))
+        witness.publish(topics.RESPAWN, request)
+        await asyncio.sleep(0.2)
+        assert witness.state("osmosis_control") == ("running", 2)
+
+
+async def test_a_request_for_an_unknown_node_is_refused(tmp_path):
+    async with running(tmp_path) as (_, witness):
+        witness.publish(topics.RESPAWN, RespawnRequest(1, "nobody", 1, "RM3"))
+        await eventually(lambda: witness.saw("nobody", "refused"))
+
+
+async def test_the_supervisor_comes_back_and_adopts_the_living(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        before = {r.name: r.pid for r in witness.table.nodes if r.name != "supervisor"}
+        for number in (signal.SIGKILL, signal.SIGSTOP):
+            generation = launcher.supervisor_incarnation
+            os.kill(process(launcher.plan.base_port, "supervisor"), number)
+            await eventually(lambda g=generation: witness.state("supervisor")[1] == g + 1)
+            await eventually(lambda: all(r.state.value == "running" for r in witness.table.nodes))
+        after = {r.name: r.pid for r in witness.table.nodes if r.name != "supervisor"}
+        assert after == before
+
+
+async def test_a_node_that_dies_together_with_the_supervisor_gets_a_new_incarnation(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        os.kill(process(launcher.plan.base_port, "supervisor"), signal.SIGKILL)
+        os.kill(witness.pid("DM4"), signal.SIGKILL)
+        await eventually(lambda: witness.state("DM4") == ("running", 2))
+
+
+async def test_nodes_come_back_whatever_happens_to_the_spawners(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        for victims, number in ((["spawner_a"], signal.SIGKILL), (["spawner_b"], signal.SIGKILL),
+                                (["spawner_a"], signal.SIGSTOP),
+                                (["spawner_a", "spawner_b"], signal.SIGKILL)):
+            incarnation = witness.state("DM1")[1]
+            old = {v: process(port, v) for v in victims}
+            for pid in old.values():
+                os.kill(pid, number)
+            os.kill(witness.pid("DM1"), signal.SIGKILL)
+            await eventually(lambda i=incarnation: witness.state("DM1") == ("running", i + 1), 20)
+            await eventually(lambda o=old: all(
+                process(port, v) not in {None, p} for v, p in o.items()), 20)
+
+
+async def test_an_orderly_end_leaves_no_process(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        os.kill(witness.pid("DM5"), signal.SIGSTOP)
+        assert await asyncio.to_thread(find_runs)
+    assert find_processes(port) == []
+
+
+async def test_a_killed_launcher_leaves_nothing_within_two_seconds(tmp_path):
+    system = write_stub_system(tmp_path)
+    plan = stub_plan(system)
+    script = (
+        "import asyncio, sys; from stub_actors import *\n"
+        "async def main():\n"
+        f"    async with launched(stub_plan({str(system)!r}, base_port={plan.base_port})):\n"
+        "        await asyncio.sleep(60)\n"
+        "asyncio.run(main())\n")
+    child = subprocess.Popen(
+        [sys.executable, "-c", script],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"})
+    try:
+        await eventually(lambda: len(find_processes(plan.base_port)) == 24, 20)
+        await asyncio.sleep(0.5)
+        os.kill(process(plan.base_port, "DM5"), signal.SIGSTOP)  # cannot read its lifeline
+        os.kill(process(plan.base_port, "DM6"), signal.SIGUSR2)
+    finally:
+        child.kill()
+        child.wait()
+    await eventually(lambda: find_processes(plan.base_port) == [], 2.0)
+    assert not [r for r in find_runs() if r.base_port == plan.base_port]
+
+
+async def test_a_port_in_use_is_refused_before_anything_starts(tmp_path):
+    plan = stub_plan(write_stub_system(tmp_path))
+    with socket.socket() as squatter:
+        squatter.bind(("127.0.0.1", plan.base_port + 3))
+        squatter.listen()
+        launcher = Launcher(plan, "test")
+        launcher.begin()
+        with pytest.raises(LaunchError, match=f"port {plan.base_port + 3} is in use"):
+            await launcher.load()
+        await launcher.end()
+    assert find_processes(plan.base_port) == []
+
+
+async def test_an_unsound_spec_is_one_line(tmp_path):
+    system = write_stub_system(tmp_path)
+    system.write_text(system.read_text().replace('detect = "DM3"', 'detect = "DM9"'))
+    launcher = Launcher(stub_plan(system), "test")
+    launcher.begin()
+    with pytest.raises(LaunchError, match=r"stub\.toml.*DM9") as caught:
+        await launcher.load()
+    assert "\n" not in str(caught.value)
+    await launcher.end()
+
+
+async def test_kill_node_signals_one_node_and_names_what_it_does_not_know(tmp_path, capsys):
+    async with running(tmp_path) as (launcher, witness):
+        port = str(launcher.plan.base_port)
+        assert kill_node(["DM1", "--port", port]) == 0
+        await eventually(lambda: witness.state("DM1") == ("running", 2))
+        for arguments, words in (
+                (["DM99", "--port", port], "unknown node 'DM99'"),
+                (["DM1", "--signal", "HUG", "--port", port], "unknown signal"),
+                (["DM1", "--port", "1"], "no run found on port 1"),
+                (["--port", port], "no node given")):
+            assert kill_node(arguments) == 2
+            error = capsys.readouterr().err
+            assert words in error
+            assert error.count("\n") == 1
+
+
+def test_restarts_are_free_at_first_then_slower_then_given_up():
+    policy = RestartPolicy(intensity=6, period_s=10.0, backoff_s=0.1, backoff_max_s=0.25)
+    delays = []
+    for _ in range(6):
+        delays.append(policy.delay_s(0.0))
+        policy.restarted(0.0)
+    assert delays == [0.0, 0.0, 0.0, 0.1, 0.2, 0.25]
+    assert policy.delay_s(0.0) is None
+    assert policy.delay_s(10.1) == 0.0
