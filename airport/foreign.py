@@ -1,6 +1,6 @@
 """The formats of the paper's authors: graph as JSON, missions as lines, area as an image.
 
-    blagnac.graph      {"nodes": [{"id": "N1", "x": 24, "y": -62}, ...], "edges": [["N1", "N2"], ...]}
+    blagnac.graph      {"nodes": [{"id": "N1", "x": 24, "y": -62}], "edges": [["N1", "N2"]]}
     MISSION_A.miss     x=20,y=-57,taxi=1      one goal a line; taxi=0 is light verification
     blagnac_area.jpg   red pixels (R > 250) are prohibited; see `airport.mask`
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -120,9 +119,8 @@ def read_mission(path: Path) -> Mission:
 
 def _goal(line: str, where: str) -> MissionGoal:
     found = [_FIELD.fullmatch(part) for part in line.split(",")]
-    fields = dict(match.groups() for match in found if match)
-    names = Counter(match.group(1) for match in found if match)
-    if not all(found) or names != Counter(("x", "y", "taxi")):
+    fields = {match.group(1): match.group(2) for match in found if match}
+    if len(found) != 3 or fields.keys() != {"x", "y", "taxi"}:
         raise AirportError(f"{where}: {line.strip()!r}: must be like x=20,y=-57,taxi=1")
     if fields["taxi"] not in ("0", "1"):
         raise AirportError(f"{where}: taxi={fields['taxi']}: 1 is taxi, 0 light verification")
@@ -176,6 +174,8 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise AirportError(f"{path}: cannot be read: {error.strerror}: give a readable file") from None
+        raise AirportError(
+            f"{path}: cannot be read: {error.strerror}: give a readable file"
+        ) from None
     except UnicodeDecodeError:
         raise AirportError(f"{path}: not text: it must be UTF-8") from None

@@ -90,7 +90,7 @@ def _load(name_or_path: str | Path, scale: MaskScale | None) -> tuple[Airport, W
         warnings.append(problem.line(path.name))
     if not airport.lights:
         warnings.append(f"{path.name}: lights: none: nothing will be measured")
-    return dataclasses.replace(airport, warnings=tuple(warnings)), truth
+    return dataclasses.replace(airport, warnings=tuple(warnings), source=str(path)), truth
 
 
 def _find(name_or_path: str | Path) -> Path:

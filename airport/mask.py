@@ -68,7 +68,7 @@ def allowed_area(path: Path, scale: MaskScale) -> Any:
         prohibited |= pixels[:, :, 0] - pixels[:, :, 1:].max(axis=2) > PLAINLY_RED
     allowed = _without_lone_pixels(~prohibited)
     if not allowed.any():
-        raise AirportError(f"{path}: area image: all pixels red: leave the pavement in other colour")
+        raise AirportError(f"{path}: area image: all of it red: pavement must not be red")
     area = shapely.unary_union(_rectangles(allowed, scale))
     pixel_m = max(1 / scale.columns_per_m, 1 / scale.rows_per_m)
     speck_m2 = SPECK_PIXELS / (scale.columns_per_m * scale.rows_per_m)

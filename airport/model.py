@@ -146,6 +146,7 @@ class Airport:
         missions: missions by name.
         obstacles: presets, the first ones are used first.
         warnings: what was tolerated at load, one line each.
+        source: the file it was read from; empty if it was made in memory.
     """
 
     name: str
@@ -159,6 +160,7 @@ class Airport:
     missions: Mapping[str, Mission] = field(default_factory=dict)
     obstacles: tuple[ObstaclePreset, ...] = ()
     warnings: tuple[str, ...] = ()
+    source: str = ""
 
     def __post_init__(self) -> None:
         shapely.prepare(self.allowed)
@@ -229,7 +231,8 @@ class Airport:
         py -= share * dy
         distances = np.sqrt((px * px + py * py).min(axis=1))
         inside = shapely.contains_xy(self.allowed, at[:, 0], at[:, 1])
-        return np.where(inside, distances, -distances)
+        signed: npt.NDArray[np.float64] = np.where(inside, distances, -distances)
+        return signed
 
     @cached_property
     def _boundary(self) -> tuple[npt.NDArray[np.float64], ...]:

@@ -150,7 +150,9 @@ def _convert(path: Path, kind: Any) -> Any:
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise AirportError(f"{path}: cannot be read: {error.strerror}: give a readable file") from None
+        raise AirportError(
+            f"{path}: cannot be read: {error.strerror}: give a readable file"
+        ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise AirportError(f"{path}: not TOML: {error}: see https://toml.io") from None
     _finite(table, "", str(path))

@@ -30,11 +30,21 @@ strategy to walk out of the trap.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import msgspec
 
 from manager import detection_track, recovery_track
+from manager.arbiter_state import (
+    DecisionMade,
+    DetectionHeard,
+    DetectionRestarted,
+    Input,
+    Output,
+    RecoveryHeard,
+    ResetAnswered,
+    ResetAsked,
+    State,
+    Tick,
+)
 from manager.decision import NOTHING_ACTIVE, Decision, Strategy
 from manager.detection_track import DetectionRules, DetectionTrack
 from manager.escalation import escalate
@@ -44,121 +54,14 @@ from manager.recovery_track import Command, Phase, RecoveryTrack
 from manager.schema import SystemSpec
 from manager.strategies import find_strategy
 
+__all__ = [
+    "Arbiter", "Command", "DecisionMade", "DetectionHeard", "DetectionRestarted", "Input",
+    "Output", "Phase", "RecoveryHeard", "ResetAnswered", "ResetAsked", "State", "Tick",
+    "build_arbiter",
+]
 
-class DetectionHeard(msgspec.Struct, frozen=True, tag=True):
-    """Input: a report of a detection module; `since_s` is when it took that state."""
-
-    detection: str
-    active: bool
-    reason: str = ""
-    nodes: tuple[str, ...] = ()
-    since_s: float = 0.0
-
-
-class DetectionRestarted(msgspec.Struct, frozen=True, tag=True):
-    """Input: a detection module's process has died and is being respawned."""
-
-    detection: str
-
-
-class RecoveryHeard(msgspec.Struct, frozen=True, tag=True):
-    """Input: a report of a recovery module, for the decision it last obeyed."""
-
-    recovery: str
-    activated: bool
-    phase: Phase
-    decision: int
-    reason: str = ""
-
-
-class ResetAsked(msgspec.Struct, frozen=True, tag=True):
-    """Input: somebody asks to release a latched recovery."""
-
-    recovery: str
-    by: str = ""
-
-
-class Tick(msgspec.Struct, frozen=True, tag=True):
-    """Input: nothing but time has passed."""
-
-
-Input = DetectionHeard | DetectionRestarted | RecoveryHeard | ResetAsked | Tick
-
-
-class DecisionMade(msgspec.Struct, frozen=True, tag=True):
-    """Output: a decision with its certificate, as it is carried out.
-
-    Attributes:
-        number: Counts up; commands refer to it.
-        decision: The strategy's, but `recoveries` are those that the arbiter takes after
-            escalation and latching, and `rejected` says so.
-        detected_s: When the youngest of its causes was detected.
-    """
-
-    number: int
-    decision: Decision
-    detected_s: float
-
-
-class ResetAnswered(msgspec.Struct, frozen=True, tag=True):
-    """Output: a reset was granted, or refused for a reason."""
-
-    recovery: str
-    granted: bool
-    reason: str
-
-
-Output = Command | DecisionMade | ResetAnswered
-
-
-class State(msgspec.Struct, frozen=True):
-    """Everything the arbiter knows.
-
-    Attributes:
-        detections: One track for each detection module, in the sequence of the registry.
-        recoveries: One track for each recovery module, likewise.
-        number: Of the last decision.
-        decision: The last decision, as carried out.
-        started_s: When the arbiter started.
-        oriented: It has heard everybody, or has waited long enough; adoption is over.
-    """
-
-    detections: tuple[DetectionTrack, ...]
-    recoveries: tuple[RecoveryTrack, ...]
-    number: int
-    decision: Decision
-    started_s: float
-    oriented: bool = False
-
-    @property
-    def desired(self) -> dict[str, Command]:
-        """What every recovery module is to do; repeat it until it is obeyed, and after."""
-        return {track.name: track.command for track in self.recoveries}
-
-    @property
-    def active(self) -> tuple[str, ...]:
-        """Names of the active mechanisms."""
-        return self.decision.active
-
-    @property
-    def silent(self) -> tuple[str, ...]:
-        """Names of the detection modules that count as active because they are silent."""
-        return tuple(track.name for track in self.detections if track.silent)
-
-    @property
-    def activated(self) -> tuple[str, ...]:
-        """Names of the recovery modules that are under orders, draining ones included."""
-        return tuple(track.name for track in self.recoveries if track.wanted)
-
-    @property
-    def draining(self) -> tuple[str, ...]:
-        """Names of the recovery modules that are superseded and finishing their action."""
-        return tuple(track.name for track in self.recoveries if track.draining)
-
-    @property
-    def latched(self) -> tuple[str, ...]:
-        """Names of the recovery modules that stay until they are reset."""
-        return tuple(track.name for track in self.recoveries if track.latched)
+MEMORY = 4096
+"""Answers of the strategy to remember; seven mechanisms have 128 active sets."""
 
 
 class Arbiter:
@@ -181,6 +84,7 @@ class Arbiter:
         self.rules = rules
         self._detection = {name: i for i, name in enumerate(mechanisms.detections)}
         self._recovery = {name: i for i, name in enumerate(mechanisms.recoveries)}
+        self._decisions: dict[tuple[str, ...], Decision] = {}
         self._detections_for = {
             recovery: frozenset(mechanisms.detect[ftm] for ftm in mechanisms.names
                                 if mechanisms.recover[ftm] == recovery)
@@ -230,6 +134,10 @@ class Arbiter:
                 answers = (answer,)
         state = self._pass_time(state, now)
         state, outputs = self._settle(state, now)
+        if isinstance(event, RecoveryHeard) and not event.activated:
+            command = state.desired.get(event.recovery)
+            if command is not None and command.activate and command not in outputs:
+                outputs = (command, *outputs)  # it was respawned, or has not got the order yet
         return state, outputs + answers
 
     def _with_detection(self, state: State, track: DetectionTrack) -> State:
@@ -295,6 +203,8 @@ class Arbiter:
         contract = self.mechanisms.contracts[track.name]
         if not track.wanted or now - track.ordered_s <= contract.deadline_s:
             return track
+        if not active and not track.draining:
+            return track  # latched or adopted: there is nothing to escalate for
         failure = ""
         if track.unfinished:
             failure = f"not done within {contract.deadline_s:g} s"
@@ -314,7 +224,7 @@ class Arbiter:
     def _choose(self, state: State) -> tuple[Decision, Decision]:
         """Return the decision after escalation, and that after latching on top of it."""
         active = self.mechanisms.detected_by(t.name for t in state.detections if t.active)
-        decision = self.strategy(active, self.mechanisms, self.tree, self.order)
+        decision = self._decide(active)
         failures = {t.name: t.failure for t in state.recoveries if t.failure}
         if failures:
             decision = escalate(decision, failures, self.mechanisms, self.tree)
@@ -332,29 +242,119 @@ class Arbiter:
             decision, recoveries=winners or (safest.name,),
             rejected=decision.rejected + tuple((name, f"{safest.name} {why}") for name in losers))
 
+    def _decide(self, active: tuple[str, ...]) -> Decision:
+        """Ask the strategy, which is pure: the answer to a question asked before is known."""
+        if active not in self._decisions:
+            if len(self._decisions) >= MEMORY:
+                self._decisions.clear()
+            self._decisions[active] = self.strategy(
+                active, self.mechanisms, self.tree, self.order)
+        return self._decisions[active]
+
     def _settle(self, state: State, now: float) -> tuple[State, tuple[Output, ...]]:
         """Decide, then command: release what is not chosen, activate what is."""
         _, decision = self._choose(state)
         chosen = decision.recoveries
-        causes = {name: self._cause(state, name) for name in chosen}
-        changed = decision != state.decision
-        again = any(self._is_new(self._track(state, name), *causes[name]) for name in chosen)
-        outputs: list[Output] = []
-        if changed or again:
+        fresh = decision != state.decision or any(
+            self._has_new_cause(state, self._track(state, name)) for name in chosen)
+        if fresh:
             state = msgspec.structs.replace(state, number=state.number + 1, decision=decision)
-        for track in state.recoveries:
-            if track.wanted and track.name not in chosen:
-                after = self._release(track, chosen, state.number)
+        outputs: list[Output] = []
+        for before in state.recoveries:
+            if before.wanted and before.name not in chosen:
+                after = self._release(before, chosen, state.number)
                 state = self._with_recovery(state, after)
-                if not after.wanted:
+                if after.command != before.command:
                     outputs.append(after.command)
         for name in chosen:
             before = self._track(state, name)
-            after = self._activate(state, before, *causes[name], now)
+            after = self._activate(state, before, now)
             state = self._with_recovery(state, after)
-            lost = after.activated is False and before.wanted and self._lost(before, after)
-            if after.command != before.command or lost:
+            if after.command != before.command:
                 outputs.append(after.command)
-        if changed or again:
-            outputs.append(DecisionMade(state.number, decision, self._detected_s(state, now)))
+        if fresh:
+            detected_s = max((t.since_s for t in state.detections if t.active), default=now)
+            outputs.append(DecisionMade(state.number, decision, detected_s))
         return state, tuple(outputs)
+
+    def _track(self, state: State, recovery: str) -> RecoveryTrack:
+        return state.recoveries[self._recovery[recovery]]
+
+    def _causes(self, state: State, recovery: str) -> list[DetectionTrack]:
+        """Return the active detection modules that a recovery answers to.
+
+        One that was chosen for another's sake, by block 4 or by escalation, answers to all.
+        """
+        active = [track for track in state.detections if track.active]
+        own = [track for track in active if track.name in self._detections_for[recovery]]
+        return own or active
+
+    def _has_new_cause(self, state: State, track: RecoveryTrack) -> bool:
+        """Tell whether a recovery under orders has to be ordered again.
+
+        Only a repair has to: it is an action, and there is more to repair. A forward recovery is
+        a state, which is in force already.
+        """
+        if not track.wanted or not self.mechanisms.contracts[track.name].kind.repairs:
+            return False
+        return any((cause.name, cause.rises) not in track.cause
+                   or not set(cause.nodes) <= set(track.command.nodes)
+                   for cause in self._causes(state, track.name))
+
+    def _release(self, track: RecoveryTrack, chosen: tuple[str, ...], number: int
+                 ) -> RecoveryTrack:
+        """Release a recovery, or let it drain."""
+        if track.unfinished and not self.mechanisms.contracts[track.name].interruptible:
+            in_the_way = any(self.mechanisms.overlap(track.name, name) for name in chosen)
+            if not track.failure or (track.acknowledged and not in_the_way):
+                return msgspec.structs.replace(track, draining=True)
+        reason = f"superseded by {', '.join(chosen)}" if chosen else "the cause is gone"
+        return msgspec.structs.replace(
+            track, command=Command(track.name, False, number, reason=reason), cause=frozenset(),
+            acknowledged=False, draining=False, adopted=False)
+
+    def _activate(self, state: State, track: RecoveryTrack, now: float) -> RecoveryTrack:
+        """Activate a recovery, order it again if need be, or let it wait for another to drain."""
+        ordered_s = now
+        if track.wanted:
+            if not self._has_new_cause(state, track):
+                return msgspec.structs.replace(track, draining=False)
+            if not track.acknowledged:
+                ordered_s = track.ordered_s  # it has been deaf since then
+        elif any(self._blocks(other, track.name, state.decision.recoveries)
+                 for other in state.recoveries):
+            return track
+        causes = self._causes(state, track.name)
+        nodes = tuple(dict.fromkeys(node for cause in causes for node in cause.nodes))
+        reason = "; ".join(f"{cause.name}: {cause.reason}" if cause.reason else cause.name
+                           for cause in causes)
+        return msgspec.structs.replace(
+            track, command=Command(track.name, True, state.number, nodes, reason),
+            ordered_s=ordered_s, cause=frozenset((cause.name, cause.rises) for cause in causes),
+            acknowledged=False, draining=False, adopted=False,
+            latched=track.latched or self.mechanisms.contracts[track.name].latched)
+
+    def _blocks(self, other: RecoveryTrack, name: str, chosen: tuple[str, ...]) -> bool:
+        """Tell whether a recovery has to wait for another to drain."""
+        if other.name in chosen or not other.unfinished or other.failure:
+            return False
+        return self.mechanisms.overlap(name, other.name) \
+            or not self.order.is_above(name, other.name)
+
+
+def build_arbiter(spec: SystemSpec, strategy: str = "") -> Arbiter:
+    """Build the arbiter of a system.
+
+    Args:
+        spec: The system.
+        strategy: Name of a strategy; "" for the one that the spec names.
+
+    Raises:
+        UnknownStrategyError: No such strategy.
+    """
+    timing = spec.timing
+    return Arbiter(
+        spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order(),
+        find_strategy(strategy or spec.strategy),
+        DetectionRules(timing.detection_silence_timeout_s, timing.startup_grace_s,
+                       timing.release_hold_s, timing.release_hold_max_s))

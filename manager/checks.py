@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from manager.budget import check, find_false_alarms
+from manager.budget import braking_distance_m, check, find_false_alarms
 from manager.fault_tree import FaultTreeError
 from manager.order import CycleError, PartialOrder, find_cycle
 from manager.schema import Hazard, Kind, SystemSpec
@@ -42,14 +42,16 @@ def _unknown(path: str, value: str, what: str, known: Sequence[str]) -> Finding:
 
 def _names(spec: SystemSpec) -> Iterator[Finding]:
     taken = dict.fromkeys(RESERVED, "reserved")
-    for table, modules in (("node", spec.nodes), ("detection", spec.detections),
-                           ("recovery", spec.recoveries)):
-        for index, module in enumerate(modules):
-            path = f"$.{table}[{index}].name"
-            if module.name in taken:
-                yield Finding(path, f"duplicate name, {taken[module.name]}; nodes, detection and "
-                                    "recovery modules share one namespace", (module.name,))
-            taken[module.name] = f"already at {path}"
+    modules = [(f"$.node[{i}]", node.name, node.process) for i, node in enumerate(spec.nodes)]
+    modules += [(f"$.detection[{i}]", d.name, d.process) for i, d in enumerate(spec.detections)]
+    modules += [(f"$.recovery[{i}]", r.name, r.process) for i, r in enumerate(spec.recoveries)]
+    for path, name, process in modules:
+        if name in taken:
+            yield Finding(f"{path}.name", f"duplicate name, {taken[name]}; nodes, detection and "
+                                          "recovery modules share one namespace", (name,))
+        taken[name] = f"already at {path}.name"
+        if process in RESERVED:
+            yield Finding(f"{path}.process", "reserved; nothing else can live in it", (process,))
     count = Counter(mechanism.name for mechanism in spec.mechanisms)
     for index, mechanism in enumerate(spec.mechanisms):
         if count[mechanism.name] > 1:
@@ -232,15 +234,25 @@ def _undelayed(spec: SystemSpec, order: PartialOrder, last_resort: str) -> Itera
                           (sorted(contracts.contracts[name].claims),))
 
 
-def _budget(spec: SystemSpec) -> Iterator[Finding]:
-    robot = spec.robot
+def _timing(spec: SystemSpec) -> Iterator[Finding]:
+    robot, timing = spec.robot, spec.timing
+    braking_m = braking_distance_m(robot, robot.top_speed_mps)
+    for field in ("corridor_clearance_m", "stop_distance_m"):
+        room_m = getattr(robot, field)
+        if room_m <= braking_m:
+            yield Finding(f"$.robot.{field}", f"too little to brake in; from top_speed_mps the "
+                          f"robot takes {braking_m:.3f} m", (room_m,))
     if robot.sensing_range_m <= robot.stop_distance_m:
         yield Finding("$.robot.sensing_range_m", "obstacles must be seen before they are nearer "
                       f"than stop_distance_m = {robot.stop_distance_m}", (robot.sensing_range_m,))
-    timing = spec.timing
     if timing.release_hold_max_s < timing.release_hold_s:
         yield Finding("$.timing.release_hold_max_s", "must be no less than release_hold_s = "
                       f"{timing.release_hold_s}", (timing.release_hold_max_s,))
+    for path, value, problem in find_false_alarms(spec):
+        yield Finding(path, problem, (value,))
+
+
+def _budget(spec: SystemSpec) -> Iterator[Finding]:
     root = spec.build_ftm_tree().root if spec.mechanisms else ""
     detections = {detection.name: detection for detection in spec.detections}
     for index, mechanism in enumerate(spec.mechanisms):
@@ -252,13 +264,17 @@ def _budget(spec: SystemSpec) -> Iterator[Finding]:
             yield Finding(f"$.mechanism[{index}].against", f"{mechanism.detect} needs "
                           "parameters.margin_m, the distance at which it warns",
                           (mechanism.against.value,))
-    for path, value, problem in find_false_alarms(spec):
-        yield Finding(path, problem, (value,))
+    for index, detection in enumerate(spec.detections):
+        margin_m = detection.parameters.get("margin_m", 0.0)
+        if margin_m >= spec.robot.corridor_clearance_m:
+            yield Finding(f"$.detection[{index}].parameters.margin_m", "would raise false alarms; "
+                          "it must be below corridor_clearance_m = "
+                          f"{spec.robot.corridor_clearance_m:g}", (margin_m,))
     for budget in check(spec):
         if not budget.fits:
             yield Finding("$.timing", f"the time budget does not fit: {budget}")
 
 
 VALIDATORS: tuple[Callable[[SystemSpec], Iterator[Finding]], ...] = (
-    _names, _nodes, _detections, _recoveries, _mechanisms, _reachability, _fault_tree, _orders,
+    _timing, _names, _nodes, _detections, _recoveries, _mechanisms, _reachability, _fault_tree, _orders,
     _order_against_tree, _budget)

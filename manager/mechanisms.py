@@ -8,14 +8,14 @@ share a recovery: FTM2 and FTM3 both stop the robot with RM2.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from enum import Enum
+from enum import StrEnum
 
 import msgspec
 
 from manager.order import UnknownElementError
 
 
-class RecoveryKind(str, Enum):
+class RecoveryKind(StrEnum):
     """How a recovery gets rid of an error (Avizienis, Laprie, Randell, Landwehr 2004)."""
 
     FORWARD = "forward"

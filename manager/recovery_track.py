@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 
 import msgspec
 
 
-class Phase(str, Enum):
+class Phase(StrEnum):
     """How far an activated recovery is; the values are those of its reports on the bus."""
 
     IDLE = "idle"
@@ -102,7 +102,7 @@ def report(track: RecoveryTrack, now: float, *, activated: bool, phase: Phase, d
         if acknowledged and phase is Phase.FAILED and not track.failure:
             after = replace(after, failure=reason or "it reports failure")
         return after
-    if track.acknowledged:
+    if track.acknowledged and not track.draining:
         # It was at work and is idle now: it was respawned. Being done earlier earns it the whole
         # deadline; dying half-way does not, or a crash loop would never be found out.
         finished = track.phase is not Phase.ACTING

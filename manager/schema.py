@@ -9,7 +9,7 @@ is checked by type alone: unknown fields, wrong types, names that are no names, 
 from __future__ import annotations
 
 import math
-from enum import Enum
+from enum import StrEnum
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -142,7 +142,7 @@ class Layers(Table, frozen=True):
     ftm: bool = True
 
 
-class Kind(str, Enum):
+class Kind(StrEnum):
     """What a node is, which decides who guards it and who brings it back."""
 
     CONTROL = "control"
@@ -224,7 +224,7 @@ class RecoverySpec(Table, frozen=True):
     parameters: dict[str, Any] = {}
 
 
-class Hazard(str, Enum):
+class Hazard(StrEnum):
     """What a mechanism races against; `manager.budget` has the physics."""
 
     DRIFT = "drift"

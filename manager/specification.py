@@ -134,17 +134,21 @@ def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
         return {key: resolve(value, f"{path}.parameters.{key}") if key.endswith("_s") else value
                 for key, value in parameters.items()}
 
+    def resolve_detection(detection: DetectionSpec, path: str) -> DetectionSpec:
+        parameters = resolve_parameters(detection.parameters, path)
+        within_s = resolve(detection.within_s, f"{path}.within_s")
+        if isinstance(within_s, float) and math.isnan(within_s):
+            within_s = parameters.get("timeout_s", within_s)
+        return replace(detection, within_s=within_s, parameters=parameters)
+
     replace = msgspec.structs.replace
     return replace(
         spec,
         nodes=tuple(
             replace(node, parameters=resolve_parameters(node.parameters, f"$.node[{index}]"))
             for index, node in enumerate(spec.nodes)),
-        detections=tuple(
-            replace(detection,
-                    within_s=resolve(detection.within_s, f"$.detection[{index}].within_s"),
-                    parameters=resolve_parameters(detection.parameters, f"$.detection[{index}]"))
-            for index, detection in enumerate(spec.detections)),
+        detections=tuple(resolve_detection(detection, f"$.detection[{index}]")
+                         for index, detection in enumerate(spec.detections)),
         recoveries=tuple(
             replace(recovery,
                     parameters=resolve_parameters(recovery.parameters, f"$.recovery[{index}]"))

@@ -23,6 +23,9 @@ SPARE_OBSTACLES = 6
 OBSTACLE_HALF_HEIGHT_M = 0.6
 PRESENT_GROUP, ABSENT_GROUP, SOLID_GROUP = 3, 4, 3
 COLLIDES_WITH_CHASSIS = 2
+NOTHING_M = 1000.0
+"""Clearance where there is nothing at all: finite, so that it can be written as JSON."""
+
 _PARKED_Z_M = -10.0
 
 
@@ -90,10 +93,6 @@ class Scene:
         self.present: dict[str, Solid] = {}
         self._buildings = [building.polygon for building in airport.buildings]
         self.base = self.model.body("base").id
-        self.wheel_joints = [
-            self.model.joint(name).dofadr[0]
-            for name in ("front_left", "front_right", "rear_left", "rear_right")
-        ]
         self._names = {
             self.model.geom(i).id: self.model.geom(i).name for i in range(self.model.ngeom)
         }
@@ -181,8 +180,10 @@ class Scene:
         self.outlines = shapely.unary_union(outlines) if outlines else None
 
     def clearance_m(self, footprint: Any) -> float:
-        """Distance from a footprint to the nearest obstacle or building; inf if there is none."""
-        return math.inf if self.outlines is None else float(self.outlines.distance(footprint))
+        """Distance from a footprint to the nearest obstacle or building; NOTHING_M without."""
+        if self.outlines is None:
+            return NOTHING_M
+        return float(self.outlines.distance(footprint))
 
     def touched(self) -> set[str]:
         """Names of the geoms that the chassis touches now."""

@@ -23,6 +23,23 @@ from sim.scene import SOLID_GROUP
 Floats = npt.NDArray[np.float64]
 
 
+class Noise:
+    """Standard normal numbers, drawn in blocks: one call of the generator costs as much as 100."""
+
+    BLOCK = 256
+
+    def __init__(self, rng: np.random.Generator, width: int) -> None:
+        self._rng = rng
+        self._width = width
+        self._rows: list[list[float]] = []
+
+    def take(self) -> list[float]:
+        """Return the next `width` numbers."""
+        if not self._rows:
+            self._rows = self._rng.normal(size=(self.BLOCK, self._width)).tolist()
+        return self._rows.pop()
+
+
 @dataclass(frozen=True, slots=True)
 class LaserSpec:
     """The 2D laser, above `base_link`, so its ranges are from the robot's centre.
@@ -62,8 +79,10 @@ class Laser:
     def __init__(self, spec: LaserSpec, rng: np.random.Generator) -> None:
         self.spec = spec
         self._rng = rng
+        self._noise: Floats = np.empty((0, spec.rays))
         angles = spec.angle_min_rad + spec.angle_increment_rad * np.arange(spec.rays)
-        self._cos, self._sin = np.cos(angles), np.sin(angles)
+        self._body = np.column_stack((np.cos(angles), np.sin(angles), np.zeros(spec.rays)))
+        self._turn = np.eye(3)
         self._rays = np.zeros((spec.rays, 3))
         self._flat = self._rays.reshape(-1)
         self._geoms = np.zeros(spec.rays, dtype=np.int32)
@@ -76,16 +95,19 @@ class Laser:
         """Return one sweep, m, from the first to the last ray."""
         x_m, y_m, yaw_rad = pose
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        self._rays[:, 0] = self._cos * cos - self._sin * sin
-        self._rays[:, 1] = self._sin * cos + self._cos * sin
-        self._origin[0], self._origin[1] = x_m, y_m
+        self._turn[0, :2] = cos, sin
+        self._turn[1, :2] = -sin, cos
+        np.dot(self._body, self._turn, out=self._rays)
+        self._origin[:2] = x_m, y_m
         mujoco.mj_multiRay(
             model, data, self._origin, self._flat, self._groups, True, -1,
             self._geoms, self._ranges, None, self.spec.rays, self.spec.range_max_m,
         )  # fmt: skip
         top_m = self.spec.range_max_m
-        ranges = self._rng.normal(0.0, self.spec.noise_m, self.spec.rays)
-        ranges += self._ranges
+        if not len(self._noise):
+            self._noise = self._rng.normal(0.0, self.spec.noise_m, (64, self.spec.rays))
+        ranges: Floats = self._ranges + self._noise[-1]
+        self._noise = self._noise[:-1]
         np.maximum(ranges, 0.0, out=ranges)
         np.minimum(ranges, top_m, out=ranges)
         ranges[self._geoms < 0] = top_m
@@ -110,11 +132,11 @@ class Gps:
     VELOCITY_SIGMA_MPS = 0.03
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._rng = rng
+        self._noise = Noise(rng, 4)
 
     def read(self, x_m: float, y_m: float, vx_mps: float, vy_mps: float) -> GpsReading:
         """Return a fix for the true position and velocity in `map`."""
-        n = self._rng.normal(size=4).tolist()
+        n = self._noise.take()
         return GpsReading(
             x_m + self.POSITION_SIGMA_M * n[0],
             y_m + self.POSITION_SIGMA_M * n[1],
@@ -145,7 +167,7 @@ class Imu:
     ACCELERATION_SIGMA_MPS2 = 0.05
 
     def __init__(self, rng: np.random.Generator, yaw_rad: float, now_s: float) -> None:
-        self._rng = rng
+        self._noise = Noise(rng, 3)
         self._bias = float(rng.normal(0.0, self.RATE_BIAS_SIGMA_RADPS))
         self._heading = yaw_rad
         self._last = (now_s, yaw_rad, 0.0, 0.0)
@@ -156,7 +178,7 @@ class Imu:
         """Return a reading for the true heading and velocity (in `map`)."""
         then_s, then_yaw, then_vx, then_vy = self._last
         dt_s = now_s - then_s
-        n = self._rng.normal(size=3).tolist()
+        n = self._noise.take()
         if dt_s <= 0:
             return ImuReading(self._heading, self._bias + self.RATE_SIGMA_RADPS * n[0], 0.0, 0.0)
         self._last = (now_s, yaw_rad, vx_mps, vy_mps)
@@ -229,21 +251,21 @@ class LightSensor:
 
     def __init__(self, airport: Airport, truth: WorldTruth, rng: np.random.Generator) -> None:
         real = truth.intensity_cd(airport)
-        self._rng = rng
-        self._x = np.array([light.x_m for light in airport.lights])
-        self._y = np.array([light.y_m for light in airport.lights])
-        self._intensity = np.array([real[light.name] for light in airport.lights])
+        self._noise = Noise(rng, 2)
+        self._x = np.array([light.x_m for light in airport.lights], dtype=float)
+        self._y = np.array([light.y_m for light in airport.lights], dtype=float)
+        self._intensity = np.array([real[light.name] for light in airport.lights], dtype=float)
 
     def illuminance_lux(self, pose: tuple[float, float, float]) -> float:
         """Return the true illuminance from all lights at the sensor, without noise."""
         x_m, y_m = sensor_position(*pose)
         h = SENSOR_HEIGHT_M
         square = (self._x - x_m) ** 2 + (self._y - y_m) ** 2 + h * h
-        return float((self._intensity * h / (square * np.sqrt(square))).sum())
+        return h * float(np.dot(self._intensity, square**-1.5))
 
     def read(self, pose: tuple[float, float, float]) -> float:
         """Return a reading, lux, never negative."""
-        share, floor = self._rng.normal(size=2).tolist()
+        share, floor = self._noise.take()
         clean = self.illuminance_lux(pose) + self.AMBIENT_LUX
         return max(0.0, clean * (1 + self.NOISE_SHARE * share) + self.NOISE_LUX * floor)
 

@@ -38,7 +38,12 @@ TICK_S = 0.01
 TRUTH_PERIOD_S, CLOSE_TRUTH_PERIOD_S = 0.05, 0.02
 """Ground truth is examined this often; the second when something is near."""
 
+NEVER_S = 1e6
+"""Age that is reported for a command before the first one."""
+
 NEAR_M = 0.3
+"""Nearer than this, things are looked at more often."""
+
 SAME_CONTACT_S = 0.5
 """A contact with the same thing after a shorter break is the same collision."""
 
@@ -50,9 +55,10 @@ LOCKED_DAMPING = 300.0
 class Truth:
     """Ground truth now; counters are cumulative.
 
-    `obstacle_clearance_m` is from the footprint to the nearest obstacle or building (inf if there
-    is none), `prohibited_clearance_m` from the footprint's nearest corner to the prohibited area,
-    negative in it. Both are exact below 1 m and lower bounds above (see `sim.clearance`).
+    `obstacle_clearance_m` is from the footprint to the nearest obstacle or building
+    (`sim.scene.NOTHING_M` if there is none), `prohibited_clearance_m` from the footprint's nearest
+    corner to the prohibited area, negative in it. Both are exact below 1 m and lower bounds above
+    (see `sim.clearance`).
     """
 
     x_m: float
@@ -122,10 +128,13 @@ class World:
         self._model, self._data = self._scene.model, self._scene.data
         self._steps_per_tick = round(TICK_S / self._model.opt.timestep)
         self._ticks = 0
-        self._wheels = self._scene.wheel_joints
-        # A hinge's position is one further in qpos than in qvel: the free joint has 7 against 6.
-        self._wheel_positions = [dof + 1 for dof in self._wheels]
-        self._free_damping = self._model.dof_damping[self._wheels].copy()
+        # Views into MuJoCo's memory, kept because each look-up by name costs as much as a reading.
+        # The free joint of the base comes first: 7 positions, 6 velocities; then the wheels.
+        self._base_q, self._base_v = self._data.qpos[:7], self._data.qvel[:6]
+        self._wheel_q, self._wheel_v = self._data.qpos[7:11], self._data.qvel[6:10]
+        self._servos = self._data.ctrl
+        self._damping = self._model.dof_damping[6:10]
+        self._free_damping = self._damping.copy()
         self._locked = False
         self._drive = Drive(limits or DriveLimits(), dead_man_timeout_s)
         self.laser = laser or LaserSpec()
@@ -151,9 +160,15 @@ class World:
 
     # -- actuators ------------------------------------------------------------------------------
 
-    def command(self, linear_mps: float, angular_radps: float) -> bool:
-        """Give the base a velocity command; returns False if it was refused as not finite."""
-        return self._drive.command(linear_mps, angular_radps, self.time_s)
+    def command(
+        self, linear_mps: float, angular_radps: float, stamp_s: float | None = None
+    ) -> bool:
+        """Give the base a velocity command; returns False if it was refused as not finite.
+
+        For the dead man the command is as old as its stamp says; without one it is from now.
+        """
+        stamp_s = self.time_s if stamp_s is None else stamp_s
+        return self._drive.command(linear_mps, angular_radps, stamp_s)
 
     def brake(self, engaged: bool) -> None:
         """Engage or release the brake."""
@@ -182,12 +197,10 @@ class World:
         self.time_s = self._start_s + self.skipped_s + self._ticks * TICK_S
 
     def _tick(self) -> None:
-        self._data.ctrl[:] = self._drive.update(self.time_s, TICK_S)
+        self._servos[:] = self._drive.update(self.time_s, TICK_S)
         if self._drive.locked != self._locked:
             self._locked = self._drive.locked
-            self._model.dof_damping[self._wheels] = (
-                LOCKED_DAMPING if self._locked else self._free_damping
-            )
+            self._damping[:] = LOCKED_DAMPING if self._locked else self._free_damping
         mujoco.mj_step(self._model, self._data, nstep=self._steps_per_tick)
         self._ticks += 1
         self._set_time()
@@ -202,7 +215,7 @@ class World:
     @property
     def pose(self) -> Pose:
         """True pose of `base_link` in `map`: x m, y m, yaw rad. Also the absolute localization."""
-        x, y, _, qw, qx, qy, qz = self._data.qpos[:7].tolist()
+        x, y, _, qw, qx, qy, qz = self._base_q.tolist()
         return x, y, math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
 
     def scan(self) -> Floats:
@@ -212,12 +225,12 @@ class World:
     def gps(self) -> GpsReading:
         """One GPS fix."""
         x_m, y_m, _ = self.pose
-        vx, vy = self._data.qvel[:2].tolist()
+        vx, vy, *_ = self._base_v.tolist()
         return self._gps.read(x_m, y_m, vx, vy)
 
     def imu(self) -> ImuReading:
         """One IMU reading."""
-        vx, vy = self._data.qvel[:2].tolist()
+        vx, vy, *_ = self._base_v.tolist()
         return self._imu.read(self.time_s, self.pose[2], vx, vy)
 
     def odometry(self) -> OdometryReading:
@@ -230,16 +243,16 @@ class World:
 
     def base_state(self) -> BaseState:
         """Brake, dead man and wheel speeds."""
-        fl, fr, rl, rr = self._data.qvel[self._wheels].tolist()
+        fl, fr, rl, rr = self._wheel_v.tolist()
         return BaseState(
             brake_engaged=self._drive.braking,
             dead_man_tripped=self._drive.dead_man_tripped(self.time_s),
-            command_age_s=self._drive.command_age_s(self.time_s),
+            command_age_s=max(0.0, min(NEVER_S, self._drive.command_age_s(self.time_s))),
             wheel_speeds_radps=(fl, fr, rl, rr),
         )
 
     def _wheel_angles(self) -> WheelSpeeds:
-        fl, fr, rl, rr = self._data.qpos[self._wheel_positions].tolist()
+        fl, fr, rl, rr = self._wheel_q.tolist()
         return fl, fr, rl, rr
 
     # -- obstacles ------------------------------------------------------------------------------
@@ -298,13 +311,13 @@ class World:
     def truth(self) -> Truth:
         """Ground truth; clearances are at most 50 ms old."""
         x_m, y_m, yaw_rad = self.pose
-        vx, vy = self._data.qvel[:2].tolist()
+        vx, vy, *_ = self._base_v.tolist()
         return Truth(
             x_m=x_m,
             y_m=y_m,
             yaw_rad=wrap(yaw_rad),
             linear_mps=vx * math.cos(yaw_rad) + vy * math.sin(yaw_rad),
-            angular_radps=float(self._data.qvel[5]),
+            angular_radps=float(self._base_v[5]),
             collisions=self._collisions,
             prohibited_s=self._prohibited_s,
             obstacle_clearance_m=self._obstacle_clearance_m,

@@ -9,6 +9,8 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+import msgspec
+
 from actors import topics
 from actors.runtime.actor import Actor
 from actors.supervision.launcher import Launcher
@@ -47,10 +49,9 @@ def free_base_port(count: int = 40) -> int:
 
 def stub_plan(system: Path, **changes: object) -> RunPlan:
     """Return a plan that runs the stub system."""
-    values: dict[str, object] = dict(
-        run_id="stub", base_port=free_base_port(), rate=1.0, seed=1, system_file=str(system),
-        strategy="", airport="vallombre", mission="AB", obstacles=0, ftm=True, hmi_port=0)
-    return RunPlan(**{**values, **changes})  # type: ignore[arg-type]
+    plan = RunPlan("stub", free_base_port(), 1.0, 1, str(system), "", "vallombre", "AB", 0,
+                   ftm=True, hmi_port=0)
+    return msgspec.structs.replace(plan, **changes)
 
 
 @asynccontextmanager

@@ -23,7 +23,9 @@ class EscapeLimits:
     """Room for the escape, in metres.
 
     Args:
-        range_m: how far ahead along the route, from the robot's centre, obstacles count.
+        range_m: how far ahead along the route, from the robot's centre, an escape begins.
+        depth_m: how far beyond it echoes are taken into account: a side chosen by the tip of an
+            obstacle would be the wrong one for its body.
         clearance_m: preferred distance of the hull's side to an obstacle.
         least_clearance_m: smallest distance accepted where the corridor is narrow.
         max_deviation_m: largest offset from the route. With 2.5 m of pavement on each side it
@@ -36,6 +38,7 @@ class EscapeLimits:
     """
 
     range_m: float = 3.0
+    depth_m: float = 1.5
     clearance_m: float = 0.4
     least_clearance_m: float = 0.28
     max_deviation_m: float = 1.3
@@ -84,7 +87,7 @@ class Escape:
             self.offset_m = min(max(n_m, -reach), reach)
         travelled_m = max(s_m - self._s_m, 0.0)
         self._s_m = max(s_m, self._s_m)
-        near = self._relevant(echoes, s_m)
+        near = self._with_bodies(self._relevant(echoes, s_m), s_m, n_m)
         offset_m, possible = self._choose(near, s_m, n_m)
         if self.side == 0:
             step_m = self._limits.return_slope * travelled_m
@@ -99,9 +102,28 @@ class Escape:
         behind_m = self._hull.half_length_m + 0.15
         ahead = echoes[:, 0] - s_m
         width = self._limits.max_deviation_m + self._hull.half_width_m + self._limits.clearance_m
-        keep = (ahead > -behind_m) & (ahead < self._limits.range_m) & (np.abs(echoes[:, 1]) < width)
+        far_m = self._limits.range_m + self._limits.depth_m
+        keep = (ahead > -behind_m) & (ahead < far_m) & (np.abs(echoes[:, 1]) < width)
         kept = echoes[keep]
         return np.asarray(kept[np.argsort(kept[:, 0], kind="stable")])
+
+    def _with_bodies(self, near: Array, s_m: float, n_m: float) -> Array:
+        """Add, at the line, the unseen body of what is being passed.
+
+        Beside an obstacle only its flank shows. An echo between the robot and the line belongs
+        to something whose far side may reach the line, so the line is not free before it is
+        behind.
+        """
+        if abs(n_m) < self._hull.half_width_m:
+            return near
+        aside = near[:, 1] * math.copysign(1.0, n_m)
+        upto_m = max(s_m + self._hull.length_m, self._until_m + 0.3 if self.side else -math.inf)
+        flank = near[(aside > 0.0) & (aside < abs(n_m)) & (near[:, 0] < upto_m)]
+        if len(flank) == 0:
+            return near
+        bodies = np.column_stack((flank[:, 0], np.zeros(len(flank))))
+        joint = np.concatenate((near, bodies))
+        return np.asarray(joint[np.argsort(joint[:, 0], kind="stable")])
 
     def _gap(self, near: Array, s_m: float, n_m: float) -> float:
         lane = np.abs(near[:, 1] - n_m) < self._hull.half_width_m + self._limits.least_clearance_m
@@ -111,7 +133,8 @@ class Escape:
     def _choose(self, near: Array, s_m: float, n_m: float) -> tuple[float, bool]:
         """Return offset and whether there is a way; keep or pick the side."""
         keep_off_m = self._hull.half_width_m + self._limits.least_clearance_m
-        if self._is_free(near, 0.0, keep_off_m):
+        line = near[near[:, 0] - s_m < self._limits.range_m]
+        if self._is_free(line, 0.0, keep_off_m):
             self.side = 0
             self._until_m = -math.inf
             return 0.0, True

@@ -78,7 +78,8 @@ def intrusion(fix: Fix, distance_m: ProhibitedDistance, limits: FenceLimits,
     if here_m < 0:
         return "the robot is inside the prohibited area"
     if here_m <= radius_m:
-        return f"the robot is {here_m:.2f} m from the prohibited area, {radius_m:.2f} m is the least"
+        return (f"the robot is {here_m:.2f} m from the prohibited area, "
+                f"{radius_m:.2f} m is the least")
     speed_mps = math.hypot(fix.velocity_x_mps, fix.velocity_y_mps)
     length_m = stopping_distance_m(speed_mps, limits)
     if here_m - length_m > radius_m:  # wherever it goes: most fixes end here

@@ -17,11 +17,12 @@ Two subtleties, both about a module that was not there for a while:
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from actors import topics
 from actors.messages import DetectionReport, DetectionState
 from actors.runtime.actor import Actor, Context, every
+from actors.runtime.topic import Topic
 
 TRANSITIONS = {
     DetectionState.IDLE: frozenset({DetectionState.ACTIVE}),
@@ -79,14 +80,14 @@ class DetectionModule(Actor):
     hears, and calls `follow(monitor)` after each event.
     """
 
-    outputs = (topics.DETECTION,)
+    outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.DETECTION,)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.state = DetectionState.IDLE
         self._report = DetectionReport(DetectionState.IDLE, "", (), self.clock.now())
         self.first_life = context.incarnation == 1
-        self._reports = self.first_life
+        self._told = False
         self._monitor: Monitor | None = None
         self._wake_s = math.inf
         self._excused = False
@@ -127,13 +128,13 @@ class DetectionModule(Actor):
 
     def _tell(self, report: DetectionReport) -> None:
         self._report = report
-        self._reports = True
+        self._told = True
         self.publish(topics.DETECTION, report)
 
     @every(0.2)
     def repeat(self) -> None:
         """Say it again, for whoever has joined since."""
-        if self._reports:
+        if self._told or self.first_life:
             self.publish(topics.DETECTION, self._report)
 
     # -- the monitor ----------------------------------------------------------------------------
@@ -145,7 +146,7 @@ class DetectionModule(Actor):
             self.activate(monitor.reason, monitor.nodes)
         elif self.state is DetectionState.ACTIVE:
             self.clear()
-        elif monitor.known and not self._reports:
+        elif monitor.known and not self._told:
             self._tell(self._report)
         self._sleep_until(monitor.due_s)
 

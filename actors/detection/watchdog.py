@@ -55,7 +55,8 @@ class Watchdog(DetectionModule):
     @on(topics.HEARTBEAT)
     def heartbeat(self, _message: m.Heartbeat, header: Header) -> None:
         """Hear that a loop turns."""
-        self.monitor.beat(header.source, header.incarnation, self.clock.now())
+        self.monitor.beat(header.source, header.incarnation, header.stamp,
+                          self.clock.now())
         self.follow(self.monitor)
 
 

@@ -15,9 +15,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-_BEATS_OF_A_GHOST = 1
-"""How many heartbeats of a dead life can still be under way (it beats ten times a second)."""
-
 
 @dataclass(slots=True)
 class _Life:
@@ -26,8 +23,7 @@ class _Life:
     due_s: float
     incarnation: int = 0
     heard: bool = False
-    gone: bool = False
-    beats_since_gone: int = 0
+    gone_s: float | None = None
     failure: str = ""
 
 
@@ -75,20 +71,16 @@ class WatchdogCore:
         return min((life.due_s for life in self._lives.values() if not life.failure),
                    default=math.inf)
 
-    def beat(self, node: str, incarnation: int, now_s: float) -> None:
-        """Take note of a heartbeat."""
+    def beat(self, node: str, incarnation: int, stamp_s: float, now_s: float) -> None:
+        """Take note of a heartbeat that was sent at `stamp_s`."""
         life = self._lives.get(node)
         if life is None or incarnation < life.incarnation:
             return
         if incarnation > life.incarnation:
             self._succeed(life, incarnation)
-        elif life.gone:
-            # Its token vanished and has not come back. One heartbeat may have been under way;
-            # more of them prove that the notice was wrong (a link that was cut and mended).
-            life.beats_since_gone += 1
-            if life.beats_since_gone <= _BEATS_OF_A_GHOST:
-                return
-        life.gone = False
+        elif life.gone_s is not None and stamp_s <= life.gone_s:
+            return  # sent before it died, and under way since
+        life.gone_s = None
         life.heard = True
         life.failure = ""
         life.due_s = now_s + self.timeout_s
@@ -104,13 +96,11 @@ class WatchdogCore:
                 self._succeed(life, incarnation)
                 if not first:  # at the very start the grace is longer, and still runs
                     life.due_s = now_s + self.timeout_s
-            elif life.gone:
-                life.gone = False
-                life.due_s = now_s + self.timeout_s
+            else:
+                life.gone_s = None
             return
         life.incarnation = incarnation
-        life.gone = True
-        life.beats_since_gone = 0
+        life.gone_s = now_s
         life.failure = f"process of incarnation {incarnation} is gone"
 
     def expire(self, now_s: float) -> None:
@@ -124,5 +114,5 @@ class WatchdogCore:
     def _succeed(life: _Life, incarnation: int) -> None:
         """A new life begins. A failure stays until its first heartbeat."""
         life.incarnation = incarnation
-        life.gone = False
+        life.gone_s = None
         life.heard = False

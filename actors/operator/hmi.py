@@ -27,7 +27,7 @@ class Hmi(Actor):
     """The operator's node.
 
     Shared objects: "run_id" (text, required for a mission), "mission" (the mission the run starts
-    with, or None), "airport" (for the map and its missions), "hmi_port" (or None: no page; the
+    with, or None), "airport" (for the map and its missions), "hmi_port" (0 or None: no page; the
     parameter `port` has precedence).
     """
 
@@ -42,7 +42,7 @@ class Hmi(Actor):
         first = first_request(run_id, mission.name, _goals(mission)) if mission else None
         self._submission = Submission(run_id, context.incarnation, self.clock.now(), first)
         self._state = HmiState()
-        self._port: int | None = self.parameters.get("port", shared.get("hmi_port"))
+        self._port: int = self.parameters.get("port", shared.get("hmi_port")) or 0
         self._server: PageServer | None = None
         self._starting: asyncio.Task[None] | None = None
 
@@ -54,7 +54,7 @@ class Hmi(Actor):
     def on_start(self) -> None:
         """Send the mission, and open the page's port; the robot drives without the page."""
         self._submit()
-        if self._port is None:
+        if not self._port:
             return
         try:
             self._server = PageServer(

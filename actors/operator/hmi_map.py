@@ -37,7 +37,7 @@ class AirportDrawing(msgspec.Struct, frozen=True):
         name: of the airport.
         bounds_m: (min x, min y, max x, max y) of the drawing.
         prohibited: SVG path of the prohibited area within the bounds (fill rule evenodd).
-        surfaces: kind and SVG path of each piece of pavement.
+        surfaces: kind and SVG path of each piece of pavement; runways last, thus on top.
         buildings: name and SVG path of each building.
         nodes: graph node name to (x, y).
         edges: (x1, y1, x2, y2) of each edge of the graph.
@@ -63,7 +63,8 @@ def draw(airport: Airport) -> AirportDrawing:
         name=airport.name,
         bounds_m=(x0 - FRAME_M, y0 - FRAME_M, x1 + FRAME_M, y1 + FRAME_M),
         prohibited=svg_path(airport.prohibited_polygon(FRAME_M)),
-        surfaces=tuple((s.kind, svg_path(s.polygon)) for s in airport.surfaces),
+        surfaces=tuple((s.kind, svg_path(s.polygon)) for s in sorted(
+            airport.surfaces, key=lambda surface: surface.kind == "runway")),
         buildings=tuple((b.name, svg_path(b.polygon)) for b in airport.buildings),
         nodes={name: (float(x), float(y)) for name, (x, y) in airport.nodes.items()},
         edges=tuple((*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges),

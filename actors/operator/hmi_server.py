@@ -47,7 +47,8 @@ _FILES = {
 }
 _HEADERS = {
     "cache-control": "no-cache",
-    "content-security-policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'",
+    "content-security-policy": (
+        "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'"),
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
 }

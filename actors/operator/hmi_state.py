@@ -21,6 +21,9 @@ LOG_LINES = 60
 STALE_S = 1.5
 """A state that was not heard for so long is shown as stale (simulated seconds)."""
 
+_ROUTINE = ("started", "running")
+_GOOD_NEWS = ("respawned", "resumed", "adopted")
+
 
 class HmiState:
     """The operator's picture of the system, as far as the HMI has heard of it."""
@@ -86,11 +89,13 @@ class HmiState:
         })
 
     def process_event(self, event: m.ProcessEvent, now_s: float) -> None:
-        """Log what happened to a process."""
-        by = f" by {event.by}" if event.by else ""
+        """Log what happened to a process; that all start at the start is no news."""
+        if event.event in _ROUTINE:
+            return
+        by = f" by {event.by}" if event.event == "respawned" and event.by else ""
         detail = f": {event.detail}" if event.detail else ""
-        good = event.event in ("respawned", "started", "continued", "adopted")
-        self.log(now_s, "clear" if good else "fault", f"{event.node} {event.event}{by}{detail}")
+        kind = "clear" if event.event in _GOOD_NEWS else "fault"
+        self.log(now_s, kind, f"{event.node} {event.event}{by}{detail}")
 
     def diagnostic(self, report: m.Diagnostic, now_s: float) -> None:
         """Log an error report of a node."""

@@ -149,7 +149,7 @@ function safety(s) {
   if (!pilot) pill("pilot-mode", "warn", "Safety Pilot not heard");
   else if (s.pilot.stale) pill("pilot-mode", "warn", "Safety Pilot silent");
   else pill("pilot-mode", pilot.stopped ? "bad" : pilot.mode === "auto" ? "good" : "warn",
-    pilot.stopped ? `${pilot.mode}, stopped` : pilot.mode);
+    pilot.stopped ? (pilot.mode === "stop" ? "stopped" : `${pilot.mode}, stopped`) : pilot.mode);
   $("pilot-reason").textContent = pilot ? pilot.reason || "Commands pass unchanged." : "";
   manager(s.manager);
   $("detections").replaceChildren(...s.detections.map((d) => {
@@ -186,7 +186,8 @@ function manager(heard) {
 const STATES = { running: "good", starting: "warn", stopped: "bad", wedged: "bad", crashed: "bad", "given up": "bad" };
 
 function nodes(heard) {
-  const rows = heard ? heard.value.nodes : [];
+  const troubled = (n) => (n.state === "running" ? 1 : 0);
+  const rows = heard ? heard.value.nodes.slice().sort((a, b) => troubled(a) - troubled(b)) : [];
   const up = rows.filter((n) => n.state === "running").length;
   $("nodes-count").textContent = heard ? `${up} of ${rows.length} running${heard.stale ? " · supervisor silent" : ""}` : "supervisor not heard";
   $("nodes").replaceChildren(...rows.map((n) => {

@@ -1,0 +1,232 @@
+"""What all recovery modules have in common: states, obedience, reports.
+
+A recovery module does what the FTM Manager last told it, and says on `recovery/NAME/state` how
+far it is: at once when that changes, and at 5 Hz.
+
+* *The same command again is one command.* The manager repeats what it wants; only a new decision
+  number is a new order, given because the cause has come back.
+* *Never cut off half-way.* A release that arrives while the module is acting is obeyed as soon as
+  the action is finished, has reached its degraded mode, or has failed.
+* *A respawned module starts idle.* The manager, who hears that, commands it again.
+
+Everything happens in the handler of the command itself, first the action, then the report:
+nothing between a decision and its effect waits for a timer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from actors import topics
+from actors.messages import RecoveryCommand, RecoveryPhase, RecoveryReport, RecoveryState
+from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.topic import Topic
+from manager.schema import SystemSpec
+
+_P = RecoveryPhase
+_ENDS = frozenset({_P.DONE, _P.DEGRADED, _P.FAILED})
+
+TRANSITIONS = {
+    _P.IDLE: frozenset({_P.ACTING}),
+    _P.ACTING: _ENDS,
+    _P.DONE: frozenset({_P.ACTING, _P.FAILED, _P.IDLE}),
+    _P.DEGRADED: frozenset({_P.ACTING, _P.FAILED, _P.IDLE}),
+    _P.FAILED: frozenset({_P.ACTING, _P.DONE, _P.DEGRADED, _P.IDLE}),
+}
+"""The state machine of every recovery module: idle, or activated (paper, figure 4) in one of four
+phases. There is no way from acting to idle: that would be cutting it off. Late success may follow
+failure.
+"""
+
+DEFAULT_DEADLINE_S = 2.0
+"""From command to done, if no spec says."""
+
+LATE_S = 0.1
+"""A deadline noticed this much late says that the module itself did not run."""
+
+_EPSILON_S = 1e-6
+
+
+class IllegalTransitionError(RuntimeError):
+    """A state machine was asked for a step that its table does not have."""
+
+
+class RecoveryModule(Actor):
+    """Base of RM1 to RM5.
+
+    A subclass says what it does: `act` on each order, `let_go` when released. It calls
+    `succeed`, `degrade` or `fail` when it knows how the action went. The deadline is the one in
+    the contract that the system spec gives for this module.
+    """
+
+    outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.RECOVERY,)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.phase = RecoveryPhase.IDLE
+        self.decision = 0
+        self.ordered_s = -math.inf
+        self.deadline_s = self._contract_deadline_s()
+        self._reason = ""
+        self._due_s = math.inf
+        self._excused = False
+        self._release: RecoveryCommand | None = None
+        self._told: RecoveryReport | None = None
+
+    def _contract_deadline_s(self) -> float:
+        system: SystemSpec | None = self.context.shared.get("system")
+        contracts = system.recoveries if system else ()
+        return next((c.deadline_s for c in contracts if c.name == self.name), DEFAULT_DEADLINE_S)
+
+    @classmethod
+    def names(
+        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+    ) -> tuple[str, ...] | None:
+        """Hear the commands to itself."""
+        return (name,) if topic is topics.RECOVERY_COMMAND else None
+
+    @property
+    def state(self) -> RecoveryState:
+        """Idle or activated."""
+        return RecoveryState.IDLE if self.phase is RecoveryPhase.IDLE else RecoveryState.ACTIVATED
+
+    @property
+    def activated(self) -> bool:
+        """Whether it is activated."""
+        return self.phase is not RecoveryPhase.IDLE
+
+    def on_start(self) -> None:
+        """Say at once that it is there."""
+        self._tell()
+
+    # -- what a subclass says -------------------------------------------------------------------
+
+    def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
+        """Take the action.
+
+        Called with the phase acting for a first order; again, in whatever phase it is, for each
+        repetition (it may name further nodes) and for a new order (`renewed`).
+        """
+        raise NotImplementedError
+
+    def let_go(self) -> None:
+        """Hand control back."""
+        raise NotImplementedError
+
+    def stay_idle(self) -> None:
+        """React to a release that finds it idle."""
+
+    def unfinished(self) -> str:
+        """What is still to be done, for the report of a missed deadline; "" for no more words."""
+        return ""
+
+    def repeat(self) -> None:
+        """Do what is to be done five times a second."""
+
+    # -- how the action went --------------------------------------------------------------------
+
+    def succeed(self, reason: str = "") -> None:
+        """Report the action done."""
+        self._end(RecoveryPhase.DONE, reason)
+
+    def degrade(self, reason: str = "") -> None:
+        """Report that the degraded mode is reached."""
+        self._end(RecoveryPhase.DEGRADED, reason)
+
+    def fail(self, reason: str) -> None:
+        """Report failure."""
+        self._end(RecoveryPhase.FAILED, reason)
+
+    def resume(self, reason: str = "") -> None:
+        """Be acting again, with the whole deadline ahead."""
+        self._begin(reason)
+        self._tell_change()
+
+    def _begin(self, reason: str) -> None:
+        self._excused = False
+        self._due_s = self.clock.now() + self.deadline_s
+        self.call_later(self.deadline_s, self._check_deadline)
+        if self.phase is not RecoveryPhase.ACTING:
+            self._enter(RecoveryPhase.ACTING, reason)
+
+    def _end(self, phase: RecoveryPhase, reason: str) -> None:
+        if self.phase is phase:
+            return
+        self._enter(phase, reason)
+        self._tell_change()
+        release, self._release = self._release, None
+        if release is not None:
+            self._obey_release(release)
+
+    # -- obedience ------------------------------------------------------------------------------
+
+    @on(topics.RECOVERY_COMMAND)
+    def command(self, message: RecoveryCommand, _header: Header) -> None:
+        """Obey the manager."""
+        if message.activate:
+            self._release = None
+            self._obey_order(message)
+        elif not self.activated:
+            self.stay_idle()
+        elif self.phase is RecoveryPhase.ACTING:
+            self._release = message
+        else:
+            self._obey_release(message)
+
+    def _obey_order(self, message: RecoveryCommand) -> None:
+        renewed = self.activated and message.decision != self.decision
+        self.decision = message.decision
+        if not self.activated:
+            self.ordered_s = self.clock.now()
+            self._begin(message.reason)
+            self.act(message, renewed=False)
+        else:
+            self.act(message, renewed=renewed)
+        self._tell_change()
+
+    def _obey_release(self, message: RecoveryCommand) -> None:
+        self.decision = message.decision
+        self._enter(RecoveryPhase.IDLE, message.reason)
+        self._due_s = math.inf
+        self.let_go()
+        self._tell_change()
+
+    def _check_deadline(self) -> None:
+        late_s = self.clock.now() - self._due_s
+        if self.phase is not RecoveryPhase.ACTING or late_s < -_EPSILON_S:
+            return
+        if late_s > LATE_S and not self._excused:  # it was stopped itself: read the mail first
+            self._excused = True
+            self.call_later(LATE_S, self._check_deadline)
+        else:
+            rest = self.unfinished()
+            self.fail(f"not done within {self.deadline_s:g} s{f': {rest}' if rest else ''}")
+
+    def _enter(self, phase: RecoveryPhase, reason: str) -> None:
+        if phase not in TRANSITIONS[self.phase]:
+            raise IllegalTransitionError(
+                f"{self.name}: no transition from {self.phase} to {phase}")
+        self.phase = phase
+        self._reason = reason
+
+    # -- reports --------------------------------------------------------------------------------
+
+    @property
+    def report(self) -> RecoveryReport:
+        """What it has to say at the moment."""
+        return RecoveryReport(self.state, self.phase, self.decision, self._reason)
+
+    def _tell(self) -> None:
+        self._told = self.report
+        self.publish(topics.RECOVERY, self._told)
+
+    def _tell_change(self) -> None:
+        if self.report != self._told:
+            self._tell()
+
+    @every(0.2)
+    def _repeat(self) -> None:
+        self.repeat()
+        self._tell()

@@ -1,0 +1,165 @@
+"""The FTM Manager: the arbiter as an actor.
+
+All decisions are the arbiter's. The actor hands it what detection and recovery modules report,
+in the handler of that very message, and sends the commands that come out before the handler
+returns: between a detection and its recovery no timer is waited for. Timers only repeat what is
+in force, show that the manager lives, and let the arbiter notice silence.
+
+The manager keeps nothing on disk. One that was killed finds out what is in force from the
+recovery modules themselves, and adopts it; until it knows, it releases nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from actors import messages as m
+from actors import topics
+from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.topic import Topic
+from manager.arbiter import (
+    DecisionMade,
+    DetectionHeard,
+    Input,
+    RecoveryHeard,
+    ResetAnswered,
+    ResetAsked,
+    State,
+    Tick,
+    build_arbiter,
+)
+from manager.recovery_track import Command, Phase
+from manager.schema import SystemSpec
+
+DECISIONS_PER_LIFE = 10_000
+"""Each incarnation numbers its decisions from a multiple of this."""
+
+ABSENCE_S = 0.3
+"""Three ticks missed: the manager itself was stopped, or the machine hung."""
+
+
+class FtmManager(Actor):
+    """Hears all detection and recovery modules, commands the recovery modules.
+
+    Parameters:
+        strategy: name of a strategy; that of the system spec if left out.
+    """
+
+    outputs = (topics.RECOVERY_COMMAND, topics.DECISION, topics.MANAGER_STATUS)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        system: SystemSpec = context.shared["system"]
+        self._strategy = str(self.parameters.get("strategy", "")) or system.strategy
+        self._arbiter = build_arbiter(system, self._strategy)
+        now_s = self.clock.now()
+        self.arbiter_state = self._arbiter.initial(
+            now_s, (context.incarnation - 1) * DECISIONS_PER_LIFE)
+        self._ran_s = now_s
+        self._shown: m.ManagerStatus | None = None
+
+    @classmethod
+    def output_names(
+        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]
+    ) -> tuple[str, ...] | None:
+        """Command any recovery module."""
+        if topic is topics.RECOVERY_COMMAND:
+            return None
+        return super().output_names(topic, name, parameters)
+
+    def on_start(self) -> None:
+        """Say at once that the manager lives."""
+        self._show()
+
+    # -- what it hears --------------------------------------------------------------------------
+
+    @on(topics.DETECTION)
+    def detection(self, message: m.DetectionReport, header: Header) -> None:
+        """Hear a detection module."""
+        self._step(DetectionHeard(
+            header.source, message.state is m.DetectionState.ACTIVE, message.reason,
+            message.nodes, message.since_s))
+
+    @on(topics.RECOVERY)
+    def recovery(self, message: m.RecoveryReport, header: Header) -> None:
+        """Hear a recovery module."""
+        self._step(RecoveryHeard(
+            header.source, message.state is m.RecoveryState.ACTIVATED, Phase(message.phase.value),
+            message.decision, message.reason))
+
+    @on(topics.RESET)
+    def reset(self, message: m.Reset, _header: Header) -> None:
+        """Hear the operator release a latched recovery."""
+        self._step(ResetAsked(message.recovery, message.by))
+
+    @every(0.1)
+    def tick(self) -> None:
+        """Let time pass, and show that the manager lives."""
+        self._step(Tick())
+        self._show()
+
+    @every(0.2)
+    def repeat(self) -> None:
+        """Repeat what is wanted, for recovery modules that were respawned."""
+        state = self.arbiter_state
+        for command in state.desired.values():
+            # One that has just started does not know yet what is in force: it releases nothing.
+            if command.activate or state.oriented:
+                self._command(command)
+
+    # -- what it does ---------------------------------------------------------------------------
+
+    def _step(self, event: Input) -> None:
+        now_s = self.clock.now()
+        missed_s = now_s - self._ran_s - ABSENCE_S
+        self._ran_s = now_s
+        state = self.arbiter_state
+        if missed_s > 0:
+            state = forgive_absence(state, missed_s)
+        self.arbiter_state, outputs = self._arbiter.step(state, event, now_s)
+        for output in outputs:
+            match output:
+                case Command():
+                    self._command(output)
+                case DecisionMade():
+                    self._publish_decision(output)
+                case ResetAnswered(granted=False):
+                    self.report_diagnostic("reset refused", output.reason, output.recovery)
+        if self._status() != self._shown:
+            self._show()
+
+    def _command(self, command: Command) -> None:
+        self.publish(topics.RECOVERY_COMMAND, m.RecoveryCommand(
+            command.activate, command.decision, command.nodes, command.reason),
+            name=command.recovery)
+
+    def _publish_decision(self, made: DecisionMade) -> None:
+        decision = made.decision
+        self.publish(topics.DECISION, m.DecisionRecord(
+            made.number, self._strategy, decision.active, decision.rule, decision.recoveries,
+            decision.path, decision.rejected, made.detected_s))
+
+    def _status(self) -> m.ManagerStatus:
+        state = self.arbiter_state
+        return m.ManagerStatus(state.active, state.silent, state.activated, state.latched,
+                               self._strategy, state.number)
+
+    def _show(self) -> None:
+        self._shown = self._status()
+        self.publish(topics.MANAGER_STATUS, self._shown)
+
+
+def forgive_absence(state: State, missed_s: float) -> State:
+    """Return the state of an arbiter for which `missed_s` of its time did not pass.
+
+    A manager that was stopped and goes on has heard nobody meanwhile, and that is not their
+    fault: their reports wait unread. Taken for silence, it would be an emergency stop.
+    """
+    replace = msgspec.structs.replace
+    return replace(
+        state,
+        detections=tuple(replace(t, heard_s=t.heard_s + missed_s) for t in state.detections),
+        recoveries=tuple(replace(t, ordered_s=t.ordered_s + missed_s) for t in state.recoveries))

@@ -1,0 +1,125 @@
+"""What goes into the arbiter, what comes out of it, and what it knows in between."""
+
+from __future__ import annotations
+
+import msgspec
+
+from manager.decision import Decision
+from manager.detection_track import DetectionTrack
+from manager.recovery_track import Command, Phase, RecoveryTrack
+
+
+class DetectionHeard(msgspec.Struct, frozen=True, tag=True):
+    """Input: a report of a detection module; `since_s` is when it took that state."""
+
+    detection: str
+    active: bool
+    reason: str = ""
+    nodes: tuple[str, ...] = ()
+    since_s: float = 0.0
+
+
+class DetectionRestarted(msgspec.Struct, frozen=True, tag=True):
+    """Input: a detection module's process has died and is being respawned."""
+
+    detection: str
+
+
+class RecoveryHeard(msgspec.Struct, frozen=True, tag=True):
+    """Input: a report of a recovery module, for the decision it last obeyed."""
+
+    recovery: str
+    activated: bool
+    phase: Phase
+    decision: int
+    reason: str = ""
+
+
+class ResetAsked(msgspec.Struct, frozen=True, tag=True):
+    """Input: somebody asks to release a latched recovery."""
+
+    recovery: str
+    by: str = ""
+
+
+class Tick(msgspec.Struct, frozen=True, tag=True):
+    """Input: nothing but time has passed."""
+
+
+Input = DetectionHeard | DetectionRestarted | RecoveryHeard | ResetAsked | Tick
+
+
+class DecisionMade(msgspec.Struct, frozen=True, tag=True):
+    """Output: a decision with its certificate, as it is carried out.
+
+    Attributes:
+        number: Counts up; commands refer to it.
+        decision: The strategy's, but `recoveries` are those that the arbiter takes after
+            escalation and latching, and `rejected` says so.
+        detected_s: When the youngest of its causes was detected.
+    """
+
+    number: int
+    decision: Decision
+    detected_s: float
+
+
+class ResetAnswered(msgspec.Struct, frozen=True, tag=True):
+    """Output: a reset was granted, or refused for a reason."""
+
+    recovery: str
+    granted: bool
+    reason: str
+
+
+Output = Command | DecisionMade | ResetAnswered
+
+
+class State(msgspec.Struct, frozen=True):
+    """Everything the arbiter knows.
+
+    Attributes:
+        detections: One track for each detection module, in the sequence of the registry.
+        recoveries: One track for each recovery module, likewise.
+        number: Of the last decision.
+        decision: The last decision, as carried out.
+        started_s: When the arbiter started.
+        oriented: It has heard everybody, or has waited long enough; adoption is over.
+    """
+
+    detections: tuple[DetectionTrack, ...]
+    recoveries: tuple[RecoveryTrack, ...]
+    number: int
+    decision: Decision
+    started_s: float
+    oriented: bool = False
+
+    @property
+    def desired(self) -> dict[str, Command]:
+        """What every recovery module is to do; repeat it until it is obeyed, and after."""
+        return {track.name: track.command for track in self.recoveries}
+
+    @property
+    def active(self) -> tuple[str, ...]:
+        """Names of the active mechanisms."""
+        return self.decision.active
+
+    @property
+    def silent(self) -> tuple[str, ...]:
+        """Names of the detection modules that count as active because they are silent."""
+        return tuple(track.name for track in self.detections if track.silent)
+
+    @property
+    def activated(self) -> tuple[str, ...]:
+        """Names of the recovery modules that are under orders, draining ones included."""
+        return tuple(track.name for track in self.recoveries if track.wanted)
+
+    @property
+    def draining(self) -> tuple[str, ...]:
+        """Names of the recovery modules that are superseded and finishing their action."""
+        return tuple(track.name for track in self.recoveries if track.draining)
+
+    @property
+    def latched(self) -> tuple[str, ...]:
+        """Names of the recovery modules that stay until they are reset."""
+        return tuple(track.name for track in self.recoveries if track.latched)

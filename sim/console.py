@@ -1,0 +1,138 @@
+"""What a run tells on the terminal: one line per event, and a live line where there is a tty."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any, TextIO
+
+from actors.messages import (
+    DecisionRecord,
+    DetectionReport,
+    DetectionState,
+    Diagnostic,
+    GroundTruth,
+    LightVerdict,
+    MissionPhase,
+    MissionStatus,
+    PilotStatus,
+    ProcessEvent,
+)
+from actors.runtime.actor import Header
+from actors.supervision.run_plan import RunPlan
+from airport.model import Mission
+from sim.report import RunRecord
+
+_QUIET_EVENTS = frozenset({"started", "running", "adopted"})
+
+
+class Console:
+    """Writes the story of a run to a stream as it happens."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._live = stream.isatty()
+        self._live_text = ""
+        self._step = -1
+        self._phase: MissionPhase | None = None
+        self._lights: dict[str, LightVerdict] = {}
+        self._detections: dict[str, DetectionState] = {}
+        self._mission: MissionStatus | None = None
+        self._pilot = ""
+        self._last_live_s = 0.0
+
+    def banner(self, airport: str, mission: Mission, plan: RunPlan, strategy: str) -> None:
+        """Say what is about to run and how to disturb it."""
+        mode = strategy if plan.ftm else "no fault tolerance"
+        self._print(f"Rampart: mission {mission.name} ({len(mission.goals)} goals) on {airport}, "
+                    f"{mode}, rate {plan.rate:g}")
+        if plan.hmi_port:
+            self._print(f"Operator's page: http://127.0.0.1:{plan.hmi_port}/")
+        self._print("Try from another shell: kill-node osmosis_control")
+
+    def take(self, message: Any, header: Header) -> None:
+        """Take one message of the run."""
+        at = header.stamp
+        if isinstance(message, MissionStatus):
+            self._take_mission(message, at)
+        elif isinstance(message, ProcessEvent):
+            if message.event not in _QUIET_EVENTS:
+                detail = f" ({message.detail})" if message.detail else ""
+                self.line(at, f"{message.node} {message.event}, incarnation "
+                          f"{message.incarnation}{detail}")
+        elif isinstance(message, DetectionReport):
+            self._take_detection(message, header)
+        elif isinstance(message, DecisionRecord):
+            what = " and ".join(message.recoveries) or "nothing to recover"
+            block = f", block {message.rule}" if message.rule else ""
+            self.line(at, f"decision {message.decision}: {what}{block}"
+                      + (f" for {', '.join(message.active)}" if message.active else ""))
+        elif isinstance(message, Diagnostic):
+            self.line(at, f"{message.node}: {message.context}: {message.reason} "
+                      f"[{message.offender}]")
+        elif isinstance(message, PilotStatus):
+            self._pilot = message.reason if message.stopped else ""
+        elif isinstance(message, GroundTruth):
+            self._show_live(message, at)
+
+    def line(self, at_s: float, text: str) -> None:
+        """Write one line with its simulated time."""
+        self._print(f"[{at_s:7.2f} s] {text}")
+
+    def close(self) -> None:
+        """Take the live line away."""
+        self._clear()
+
+    def conclusion(self, record: RunRecord, report: Path) -> None:
+        """Say how it ended."""
+        self._print(record.conclusion())
+        self._print(f"Report: {report}")
+
+    def _take_mission(self, status: MissionStatus, at: float) -> None:
+        self._mission = status
+        if status.phase is not self._phase:
+            self._phase = status.phase
+            reason = f": {status.reason}" if status.reason else ""
+            self.line(at, f"mission {status.name or '-'} {status.phase.value}{reason}")
+        if status.phase is MissionPhase.RUNNING and status.step != self._step:
+            self._step = status.step
+            if status.step < len(status.goals):
+                goal = status.goals[status.step]
+                self.line(at, f"goal {status.step + 1}/{len(status.goals)}: ({goal.x_m:g}, "
+                          f"{goal.y_m:g}), {goal.mode.value}")
+        for light in status.lights:
+            if light.light not in self._lights:
+                self._lights[light.light] = light.verdict
+                if light.verdict is not LightVerdict.OK:
+                    self.line(at, f"light {light.light} is {light.verdict.value} "
+                              f"({light.ratio:.0%} of nominal)")
+
+    def _take_detection(self, report: DetectionReport, header: Header) -> None:
+        before = self._detections.get(header.source, DetectionState.IDLE)
+        self._detections[header.source] = report.state
+        if report.state is not before:
+            what = report.reason if report.state is DetectionState.ACTIVE else "clear"
+            self.line(header.stamp, f"{header.source}: {what}")
+
+    def _show_live(self, truth: GroundTruth, at: float) -> None:
+        if not self._live or at - self._last_live_s < 0.25:
+            return
+        self._last_live_s = at
+        m = self._mission
+        step = f"goal {m.step + 1}/{len(m.goals)}" if m and m.goals else "no mission"
+        self._clear()
+        text = (f"{at:7.1f} s  {step}  ({truth.pose.x_m:6.1f}, {truth.pose.y_m:6.1f})  "
+                f"{truth.twist.linear_mps:4.2f} m/s  {len(self._lights)} lights  {self._pilot}")
+        self._live_text = text[: shutil.get_terminal_size().columns - 1]
+        self._stream.write(self._live_text)
+        self._stream.flush()
+
+    def _clear(self) -> None:
+        if self._live_text:
+            self._stream.write("\r\x1b[K")
+            self._live_text = ""
+
+    def _print(self, text: str) -> None:
+        self._clear()
+        self._stream.write(text + "\n")
+        self._stream.flush()

@@ -1,0 +1,178 @@
+"""The inspection report of a run: one self-contained HTML page, and the same as JSON.
+
+The page needs nothing but itself: style and map are inline, there is no script, it can be printed
+and mailed. All text that came over the bus is escaped.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import msgspec
+
+from sim.report_record import Interval, LightResult, RunRecord, RunRecorder
+
+__all__ = ["RunRecord", "RunRecorder", "render", "write_report"]
+
+BELIEVED_APART_M = 1.0
+"""Where localization reported the robot is drawn too if it was this far from the truth."""
+
+_LANES = {
+    "injection": "Injected", "down": "Node down", "detection": "Detected",
+    "recovery": "Recovery", "stop": "Stopped",
+}
+_TICKS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 3600)
+
+
+def write_report(run: RunRecord, directory: str | Path) -> tuple[Path, Path]:
+    """Write `inspection-RUN.html` and `.json` into a directory, which is made if need be.
+
+    Both appear complete or not at all.
+
+    Returns:
+        The paths of the HTML and the JSON file.
+
+    Raises:
+        OSError: the directory cannot be written.
+    """
+    folder = Path(directory)
+    folder.mkdir(parents=True, exist_ok=True)
+    stem = "inspection-" + (re.sub(r"[^A-Za-z0-9._-]+", "-", run.run_id) or "run")
+    html, data = folder / f"{stem}.html", folder / f"{stem}.json"
+    write_atomically(data, msgspec.json.format(msgspec.json.encode(run), indent=2))
+    write_atomically(html, render(run).encode())
+    return html, data
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file so that a reader sees the old or the new one, never a half.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            os.fchmod(file.fileno(), 0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def render(run: RunRecord) -> str:
+    """Return the HTML page."""
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters.update(clock=clock, metres=metres)
+    template = environment.from_string(
+        Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
+    x0, y0, x1, y1 = _bounds(run)
+    measured = [light for light in run.lights if light.verdict != "not measured"]
+    return template.render(
+        run=run,
+        view_box=f"{x0:g} {-y1:g} {x1 - x0:g} {y1 - y0:g}",
+        track=_points(run.track),
+        believed=_points(run.believed) if _apart(run) else "",
+        rows=_rows(run.lights),
+        counts={verdict: sum(light.verdict == verdict for light in run.lights)
+                for verdict in ("ok", "dim", "out", "not measured")},
+        measured=len(measured),
+        lanes=_lanes(run),
+        ticks=_ticks(run.duration_s),
+        headline=headline(run),
+    )
+
+
+def headline(run: RunRecord) -> str:
+    """Return the result of the run in one sentence."""
+    faulty = [light.name for light in run.lights if light.verdict in ("dim", "out")]
+    missing = sum(light.verdict == "not measured" for light in run.lights)
+    if run.safety == "unsafe":
+        return "The robot was not safe in this run."
+    if run.mission == "fail":
+        return "The mission was not completed; the robot stayed safe."
+    if not run.lights:
+        return "The mission was completed. This airport has no lights to inspect."
+    parts = [f"{len(faulty)} of {len(run.lights)} lights need attention: {', '.join(faulty)}"
+             if faulty else "no light needs attention"]
+    if missing:
+        parts.append(f"{missing} {'was' if missing == 1 else 'were'} not on the way")
+    return f"The mission was completed; {'; '.join(parts)}."
+
+
+def clock(seconds: float | None) -> str:
+    """Return simulated seconds as minutes:seconds."""
+    if seconds is None or not math.isfinite(seconds):
+        return "–"  # noqa: RUF001 - typography for people
+    minutes, rest = divmod(round(seconds, 1), 60)
+    return f"{int(minutes)}:{rest:04.1f}"
+
+
+def metres(value: float | None) -> str:
+    """Return a distance for people."""
+    return "–" if value is None else f"{value:.2f} m"  # noqa: RUF001
+
+
+def _bounds(run: RunRecord) -> tuple[float, float, float, float]:
+    """Return the airport's bounds, widened to the whole track: an unsafe robot may leave them."""
+    x0, y0, x1, y1 = run.airport.bounds_m
+    xs = [p[1] for p in run.track]
+    ys = [p[2] for p in run.track]
+    return (min([x0, *(x - 2 for x in xs)]), min([y0, *(y - 2 for y in ys)]),
+            max([x1, *(x + 2 for x in xs)]), max([y1, *(y + 2 for y in ys)]))
+
+
+def _points(track: Sequence[tuple[float, float, float]]) -> str:
+    return " ".join(f"{x:g},{-y:g}" for _, x, y in track)
+
+
+def _apart(run: RunRecord) -> bool:
+    """Tell whether localization was somewhere far from all places where the robot really was."""
+    real = [p[1:] for p in run.track]
+    return bool(real) and any(
+        min(math.dist(p[1:], q) for q in real) > BELIEVED_APART_M for p in run.believed[::3])
+
+
+def _rows(lights: Sequence[LightResult]) -> dict[str, list[LightResult]]:
+    rows: dict[str, list[LightResult]] = {}
+    for light in lights:
+        rows.setdefault(light.row, []).append(light)
+    return rows
+
+
+def _lanes(run: RunRecord) -> list[dict[str, Any]]:
+    """Return the timeline's lanes: a name and its bars in percent of the run."""
+    whole_s = max(run.duration_s, 1e-9)
+
+    def bar(interval: Interval) -> dict[str, Any]:
+        left = min(100.0, 100 * max(interval.from_s, 0) / whole_s)
+        width = min(100.0 - left, 100 * (interval.to_s - interval.from_s) / whole_s)
+        return {"left": round(left, 3), "width": round(max(width, 0), 3), "title": (
+            f"{interval.name} {clock(interval.from_s)} to {clock(interval.to_s)}"
+            + (f": {interval.reason}" if interval.reason else ""))}
+
+    lanes: dict[tuple[str, str], dict[str, Any]] = {}
+    for kind, label in _LANES.items():
+        for interval in sorted((i for i in run.intervals if i.lane == kind),
+                               key=lambda i: (i.name, i.from_s)):
+            name = interval.reason if kind == "injection" else interval.name
+            lane = lanes.setdefault((kind, name), {
+                "kind": kind, "label": label, "name": name, "bars": []})
+            lane["bars"].append(bar(interval))
+    return list(lanes.values())
+
+
+def _ticks(duration_s: float) -> list[dict[str, Any]]:
+    step_s = next((t for t in _TICKS if duration_s / t <= 10), 7200)
+    count = int(duration_s // step_s) if duration_s > 0 else 0
+    return [{"left": round(100 * i * step_s / duration_s, 3), "text": clock(i * step_s)[:-2]}
+            for i in range(count + 1) if duration_s > 0]

@@ -1,0 +1,95 @@
+"""What the tests of the manager share: the shipped system, and an arbiter with a clock to turn."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import systems
+from manager.arbiter import (
+    Command,
+    DecisionMade,
+    DetectionHeard,
+    DetectionRestarted,
+    Phase,
+    RecoveryHeard,
+    ResetAnswered,
+    ResetAsked,
+    Tick,
+    build_arbiter,
+)
+from manager.specification import SystemSpec, parse_specification
+
+OSMOSIS = (Path(systems.__file__).parent / "osmosis.toml").read_text(encoding="utf-8")
+DMS = ("DM1", "DM2", "DM3", "DM4", "DM5", "DM6", "DM7")
+RMS = ("RM1", "RM2", "RM3", "RM4", "RM5")
+
+
+@cache
+def osmosis() -> SystemSpec:
+    return parse_specification(OSMOSIS, "systems/osmosis.toml")
+
+
+class Bench:
+    """An arbiter, a clock that moves when told, and everything the arbiter has put out."""
+
+    def __init__(self, spec: SystemSpec | None = None, *, oriented: bool = True) -> None:
+        self.arbiter = build_arbiter(spec or osmosis())
+        self.now = 0.0
+        self.state = self.arbiter.initial(0.0)
+        self.log = []
+        if oriented:
+            for dm in DMS:
+                self.idle(dm)
+            for rm in RMS:
+                self.report(rm, Phase.IDLE)
+            self.log.clear()
+
+    def send(self, event) -> list:
+        self.state, outputs = self.arbiter.step(self.state, event, self.now)
+        self.log.extend(outputs)
+        return list(outputs)
+
+    def active(self, dm: str, *nodes: str) -> list:
+        return self.send(DetectionHeard(dm, True, f"{dm} says so", nodes, self.now))
+
+    def idle(self, dm: str) -> list:
+        return self.send(DetectionHeard(dm, False, "", (), self.now))
+
+    def report(self, rm: str, phase: Phase, decision: int | None = None) -> list:
+        """Report as a module does that has obeyed its last command (or that decision)."""
+        number = self.state.desired[rm].decision if decision is None else decision
+        return self.send(RecoveryHeard(rm, phase is not Phase.IDLE, phase, number))
+
+    def restarted(self, dm: str) -> list:
+        return self.send(DetectionRestarted(dm))
+
+    def reset(self, rm: str) -> ResetAnswered:
+        return next(o for o in self.send(ResetAsked(rm, "the tower"))
+                    if isinstance(o, ResetAnswered))
+
+    def wait(self, seconds: float, *, hearing: tuple[str, ...] = DMS) -> list:
+        """Let time pass in steps of 50 ms, while `hearing` repeat what they said last."""
+        outputs = []
+        for _ in range(round(seconds / 0.05)):
+            self.now = round(self.now + 0.05, 6)
+            outputs += self.send(Tick())
+            for track in self.state.detections:
+                if track.name in hearing:
+                    outputs += self.send(DetectionHeard(
+                        track.name, track.reported, track.reason, track.nodes, track.since_s))
+        return outputs
+
+    @property
+    def orders(self) -> str:
+        """Recoveries under orders, draining ones in brackets."""
+        return " ".join(f"({t.name})" if t.draining else t.name
+                        for t in self.state.recoveries if t.wanted)
+
+    @property
+    def decisions(self) -> list[DecisionMade]:
+        return [output for output in self.log if isinstance(output, DecisionMade)]
+
+
+def commands(outputs: list) -> list[tuple[str, bool]]:
+    return [(o.recovery, o.activate) for o in outputs if isinstance(o, Command)]

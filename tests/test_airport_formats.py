@@ -1,0 +1,256 @@
+"""Airports and missions from files: ours, the paper authors', and broken ones."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from airport.errors import AirportError
+from airport.formats import load_airport, load_mission, load_world
+from airport.mask import MaskScale
+
+TOML = """
+name = "Field"
+edges = [["S", "T"]]
+[start]
+x_m = 0.0
+y_m = 0.0
+yaw_rad = 0.0
+[nodes]
+S = [0.0, 0.0]
+T = [30.0, 0.0]
+[[surface]]
+name = "Runway"
+kind = "runway"
+centre_line = [[-3, 0], [33, 0]]
+half_width_m = 3.0
+[[row]]
+name = "R"
+nominal_cd = 200.0
+first = [2.0, 0.0]
+last = [10.0, 0.0]
+count = 3
+[missions.M]
+goals = [{ x_m = 30.0, y_m = 0.0, mode = "light verification" }]
+[[obstacle]]
+name = "drum"
+shape = "cylinder"
+x_m = 15.0
+y_m = 0.0
+radius_m = 0.4
+[world.light_factors]
+R02 = 0.25
+"""
+
+SCALE = MaskScale(columns_per_m=10, rows_per_m=10, left_m=0, top_m=12)
+GRAPH = {
+    "nodes": [{"id": "N1", "x": 2, "y": 6}, {"id": "N2", "x": 10, "y": 6.0}],
+    "edges": [["N1", "N2"]],
+}
+
+
+def write_toml(folder: Path, text: str) -> Path:
+    path = folder / "field.toml"
+    path.write_text(text)
+    return path
+
+
+def write_foreign(folder: Path, graph=None, mission="x=9.5,y=6,taxi=1\n\nx=3,y=6.25,taxi=0\n",
+                  image="field_area.png"):  # fmt: skip
+    """A red image of 12 x 12 m with a green strip from y = 4 to 8 m, x = 1 to 11 m."""
+    pixels = np.zeros((120, 120, 3), dtype=np.uint8)
+    pixels[..., 0] = 255
+    pixels[40:80, 10:110] = (0, 255, 0)
+    pixels[20, 60] = pixels[60, 60] = (251, 255, 0)  # a speck in each colour's ground
+    pixels[20, 60, 0] = 0
+    Image.fromarray(pixels).save(folder / image, quality=75)
+    (folder / "field.graph").write_text(json.dumps(graph or GRAPH))
+    (folder / "MISSION_A.miss").write_text(mission)
+    return folder
+
+
+def refusal(call, *args) -> str:
+    with pytest.raises(AirportError) as caught:
+        call(*args)
+    line = str(caught.value)
+    assert "\n" not in line
+    return line
+
+
+def test_our_own_format_gives_lights_missions_obstacles_and_pavement(tmp_path):
+    airport = load_airport(write_toml(tmp_path, TOML))
+    assert [(light.name, light.x_m) for light in airport.lights] == [
+        ("R01", 2.0), ("R02", 6.0), ("R03", 10.0)]  # fmt: skip
+    assert airport.missions["M"].goals[0].mode == "light verification"
+    assert airport.obstacles[0].name == "drum"
+    assert airport.prohibited_distance_m(15, 1) == pytest.approx(2.0)
+    assert airport.warnings == ()
+    assert load_airport(airport.source).name == "Field"
+
+
+def test_the_truth_about_lights_is_read_apart_from_the_airport(tmp_path):
+    path = write_toml(tmp_path, TOML)
+    airport, truth = load_airport(path), load_world(path)
+    assert [light.nominal_cd for light in airport.lights] == [200, 200, 200]
+    assert truth.intensity_cd(airport) == {"R01": 200, "R02": 50, "R03": 200}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('["S", "T"]]', '["S", "X"]]', "edges[0]: 'X': unknown node; name one from nodes"),
+        ("T = [30.0, 0.0]", "T = [nan, 0.0]", "nodes.T[0]: nan: must be a finite number"),
+        ("T = [30.0, 0.0]", "T = [30.0, 20.0]", "in the prohibited area; put it on the pavement"),
+        ("T = [30.0, 0.0]", "S = [30.0, 0.0]", "not TOML: "),
+        ("T = [30.0, 0.0]", 'T = [30.0, "0.0"]', "nodes"),
+        ('"light verification"', '"drive"', "mode: 'drive': must be one of taxi, light verif"),
+        ("x_m = 30.0, y", "x_m = 39.0, y", "missions.M.goals[0]: (39, 0): 9.0 m from the graph"),
+        ("half_width_m = 3.0", "half_width_m = -3.0", "surface[0].half_width_m: -3.0: must be pos"),
+        ("half_width_m = 3.0", "half_widht_m = 3.0", "unknown field `half_widht_m`"),
+        ("centre_line = [[-3, 0], [33, 0]]", "polygon = [[0,0],[9,9],[9,0],[0,9]]",
+         "surface[0].polygon: Self-intersection"),
+        ("centre_line = [[-3, 0], [33, 0]]", "polygon = [[0,0],[9,9]]", "three points or more"),
+        ("centre_line = [[-3, 0], [33, 0]]", "", "give either polygon or centre_line"),
+        ("last = [10.0, 0.0]", "last = [10.0, 5.0]", "row.R03: (10, 5): off the pavement"),
+        ("count = 3", "", "row[0]: R: give either first, last and count, or positions"),
+        ("R02 = 0.25", "R09 = 0.25", "world.light_factors.R09: 'R09': unknown light"),
+        ("R02 = 0.25", "R02 = -1.0", "world.light_factors.R02: -1.0: a share"),
+        ('shape = "cylinder"', 'shape = "cone"', "shape: 'cone': must be one of cylinder, box"),
+        ("radius_m = 0.4", "radius_m = 0.4\nheight = 2", "unknown field `height`"),
+        ('name = "Field"', "", "missing required field `name`"),
+        ("[[surface]]", '[[surface]]\nname = "Runway"\nkind = "apron"\n'
+         "polygon = [[0,0],[1,0],[0,1]]\n[[surface]]", "surface: 'Runway': name given twice"),
+    ],
+)  # fmt: skip
+def test_a_broken_airport_is_refused_in_one_line_with_file_field_and_value(
+    tmp_path, old, new, expected
+):
+    assert old in TOML
+    path = write_toml(tmp_path, TOML.replace(old, new, 1))
+    line = refusal(load_airport, path)
+    assert line.startswith(f"{path}: ")
+    assert expected in line
+
+
+@pytest.mark.parametrize("image", ["field_area.png", "field_area.jpg"])
+def test_the_authors_formats_load_as_an_airport_of_ones_own(tmp_path, image):
+    airport = load_airport(write_foreign(tmp_path, image=image), SCALE)
+    assert airport.nodes == {"N1": (2.0, 6.0), "N2": (10.0, 6.0)}
+    goals = airport.missions["A"].goals
+    assert [(g.x_m, g.y_m, g.mode) for g in goals] == [
+        (9.5, 6.0, "taxi"), (3.0, 6.25, "light verification")]  # fmt: skip
+    assert (airport.start.x_m, airport.start.y_m, airport.start.yaw_rad) == (2.0, 6.0, 0.0)
+    # The strip is 40 m2; specks of one pixel are gone; the edge is right to about a pixel.
+    assert airport.allowed.geom_type in ("Polygon", "MultiPolygon")
+    assert airport.allowed.area == pytest.approx(40, abs=3)
+    assert airport.prohibited_distance_m(6, 6) == pytest.approx(2.0, abs=0.15)
+    assert airport.prohibited_distance_m(6, 10) < 0
+    assert airport.prohibited_distance_m(-5, 6) < 0
+    assert airport.warnings == ("field.graph: lights: none: nothing will be measured",)
+
+
+def test_the_default_scale_of_an_image_is_the_authors(tmp_path):
+    write_foreign(tmp_path, {"nodes": [{"id": "N1", "x": -70, "y": 67}], "edges": []},
+                  "x=-70,y=67,taxi=1")  # fmt: skip
+    airport = load_airport(tmp_path)
+    west, south, east, north = airport.bounds_m
+    # columns 10 to 110 = 5.2 * (x + 80), rows 40 to 80 = 4.6 * (80 - y)
+    assert (west, east) == pytest.approx((10 / 5.2 - 80, 110 / 5.2 - 80), abs=0.3)
+    assert (south, north) == pytest.approx((80 - 80 / 4.6, 80 - 40 / 4.6), abs=0.3)
+
+
+def test_jpeg_ringing_beside_an_edge_does_not_widen_the_pavement(tmp_path):
+    pixels = np.zeros((120, 120, 3), dtype=np.uint8)
+    pixels[..., 0] = 255
+    for row in range(120):  # a slanted edge crosses blocks everywhere
+        pixels[row, 20 + row // 3 : 80 + row // 3] = (0, 255, 0)
+    Image.fromarray(pixels).save(tmp_path / "field_area.jpg", quality=60)
+    (tmp_path / "field.graph").write_text(
+        json.dumps({"nodes": [{"id": "N", "x": 7, "y": 6}], "edges": []}))  # fmt: skip
+    airport = load_airport(tmp_path, SCALE)
+    assert airport.allowed.area == pytest.approx(72, rel=0.03)
+
+
+def test_a_node_in_the_red_of_a_foreign_airport_is_a_warning_not_a_refusal(tmp_path):
+    graph = {"nodes": [*GRAPH["nodes"], {"id": "N3", "x": 10, "y": 10}],
+             "edges": [["N1", "N2"], ["N2", "N3"]]}  # fmt: skip
+    airport = load_airport(write_foreign(tmp_path, graph), SCALE)
+    assert any("nodes.N3: (10, 10): in the prohibited area" in w for w in airport.warnings)
+
+
+@pytest.mark.parametrize(
+    ("graph", "expected"),
+    [
+        ({"nodes": [], "edges": []}, "nodes: empty"),
+        ({"nodes": [{"id": "N1", "x": 1}], "edges": []}, "nodes[0].y: None: must be a finite"),
+        ({"nodes": [{"id": "N1", "x": 1, "y": True}], "edges": []}, "nodes[0].y: True"),
+        ({"nodes": [{"x": 1, "y": 1}], "edges": []}, "nodes[0]: {'x': 1, 'y': 1}: must be"),
+        ({"nodes": [GRAPH["nodes"][0]] * 2, "edges": []}, "nodes[1].id: 'N1': given twice"),
+        ({"nodes": GRAPH["nodes"], "edges": [["N1", "N9"]]}, "edges[0]: 'N9': unknown node"),
+        ({"nodes": GRAPH["nodes"], "edges": ["N1"]}, "edges[0]: N1: must be"),
+        ({"nodes": GRAPH["nodes"]}, "needs the lists nodes and edges"),
+        ({"nodes": GRAPH["nodes"], "edges": []}, "missions.A.goals[0]: (9.5, 6): no way there"),
+    ],
+)
+def test_a_broken_graph_file_is_refused_in_one_line(tmp_path, graph, expected):
+    write_foreign(tmp_path, graph)
+    assert expected in refusal(load_airport, tmp_path / "field.graph", SCALE)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("x=1,y=2", "line 1: 'x=1,y=2': must be like x=20,y=-57,taxi=1"),
+        ("\nx=1,y=2,taxi=2", "line 2: taxi=2: 1 is taxi, 0 light verification"),
+        ("x=1,y=abc,taxi=1", "line 1: y: 'abc': must be a finite number of metres"),
+        ("x=nan,y=1,taxi=1", "line 1: x: 'nan': must be a finite"),
+        ("x=1,x=1,taxi=1", "must be like"),
+        ("x=1,y=1,taxi=1,y=2", "must be like"),
+        ("\n \n", "goals: empty"),
+        ("x=50,y=6,taxi=1", "40.0 m from the graph"),
+    ],
+)
+def test_a_broken_mission_file_is_refused_in_one_line(tmp_path, text, expected):
+    airport = load_airport(write_foreign(tmp_path), SCALE)
+    path = tmp_path / "MISSION_B.miss"
+    path.write_text(text)
+    assert expected in refusal(load_mission, path, airport)
+
+
+def test_missions_load_by_name_and_from_both_kinds_of_file(tmp_path):
+    airport = load_airport(write_foreign(tmp_path), SCALE)
+    assert load_mission("A", airport) is airport.missions["A"]
+    assert load_mission(tmp_path / "MISSION_A.miss", airport) == airport.missions["A"]
+    own = tmp_path / "own.toml"
+    own.write_text('name = "O"\ngoals = [{ x_m = 4, y_m = 6, mode = "taxi" }]')
+    assert load_mission(own, airport).name == "O"
+    assert "no such mission, there are: A" in refusal(load_mission, "B", airport)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (lambda f: (f / "field_area.png").unlink(), "area image: none: need exactly one"),
+        (lambda f: (f / "field_area.png").write_bytes(b"no"), "area image: unreadable"),
+        (lambda f: (f / "field.graph").write_text("{"), "not JSON"),
+        (lambda f: (f / "field.graph").unlink(), "need exactly one .toml or .graph"),
+        (lambda f: Image.new("RGB", (120, 120), (255, 0, 0)).save(f / "field_area.png"),
+         "all of it red"),
+    ],
+)  # fmt: skip
+def test_a_folder_that_is_no_airport_says_what_is_missing(tmp_path, spoil, expected):
+    spoil(write_foreign(tmp_path))
+    assert expected in refusal(load_airport, tmp_path, SCALE)
+
+
+def test_an_unknown_airport_name_gets_a_suggestion():
+    assert "did you mean 'vallombre'?" in refusal(load_airport, "valombre")
+    assert "file: missing" in refusal(load_airport, "no/such.toml")
+
+
+def test_a_scale_that_is_not_positive_is_refused():
+    assert "both must be positive" in refusal(MaskScale, 0.0)

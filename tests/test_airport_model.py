@@ -1,0 +1,150 @@
+"""Airport geometry and the checks that an airport must pass to be loaded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from airport.checks import mission_problems, problems
+from airport.errors import AirportError
+from airport.model import (
+    Airport,
+    Light,
+    Mission,
+    MissionGoal,
+    ObstaclePreset,
+    StartPose,
+    rectangle,
+)
+
+# A square ring of pavement: outer 20 m, with a prohibited island of 8 m in the middle.
+RING = shapely.box(0, 0, 20, 20).difference(shapely.box(6, 6, 14, 14))
+NODES = {"SW": (3.0, 3.0), "SE": (17.0, 3.0), "NE": (17.0, 17.0), "NW": (3.0, 17.0)}
+EDGES = (("SW", "SE"), ("SE", "NE"), ("NE", "NW"))
+
+
+def airport(**changes) -> Airport:
+    made = Airport("Ring", NODES, EDGES, RING, StartPose(3, 3, 0))
+    return replace(made, **changes)
+
+
+def findings(made: Airport) -> list[str]:
+    return [f"{found.field}: {found.remedy}" for found in problems(made)]
+
+
+@pytest.mark.parametrize(
+    ("point", "distance_m"),
+    [
+        ((3, 10), 3.0),  # middle of the western corridor
+        ((1, 1), 1.0),
+        ((5.5, 10), 0.5),  # close to the island
+        ((10, 10), -4.0),  # middle of the island
+        ((-2, 10), -2.0),  # out in the grass
+        ((-3, -4), -5.0),  # nearest is the corner
+    ],
+)
+def test_distance_to_the_prohibited_area_is_positive_outside_it_and_negative_inside(
+    point, distance_m
+):
+    assert airport().prohibited_distance_m(*point) == pytest.approx(distance_m)
+
+
+@given(st.floats(-30, 50), st.floats(-30, 50))
+def test_distance_to_the_prohibited_area_agrees_with_geos(x, y):
+    point = shapely.Point(x, y)
+    expected = RING.boundary.distance(point) * (1 if RING.contains(point) else -1)
+    assert airport().prohibited_distance_m(x, y) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_footprint_is_in_the_prohibited_area_as_soon_as_one_corner_is():
+    made = airport()
+    assert not made.footprint_in_prohibited(rectangle(0.5, 10, 0, 0.72, 0.614))
+    assert made.footprint_in_prohibited(rectangle(0.35, 10, 0, 0.72, 0.614))
+    # The centre is 0.45 m from the edge: straight it fits, turned its corner is over.
+    assert not made.footprint_in_prohibited(rectangle(0.45, 10, math.pi / 2, 0.72, 0.614))
+    assert made.footprint_in_prohibited(rectangle(0.45, 10, 0.7, 0.72, 0.614))
+
+
+def test_the_prohibited_polygon_and_the_allowed_area_share_no_ground():
+    made = airport()
+    assert made.prohibited_polygon().intersection(made.allowed).area == pytest.approx(0)
+    assert made.prohibited_polygon(1.0).area == pytest.approx(22 * 22 - RING.area)
+
+
+def test_the_nearest_place_on_the_graph_may_be_in_the_middle_of_an_edge():
+    found = airport().nearest_on_graph(10, 4)
+    assert ({found.a, found.b}, found.x_m, found.y_m) == ({"SW", "SE"}, 10, 3)
+    assert found.distance_m == pytest.approx(1)
+
+
+def test_a_sound_airport_has_no_problems():
+    assert findings(airport()) == []
+
+
+GOAL_FAR = Mission("M", (MissionGoal(10, 10, "taxi"),))
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"nodes": {}, "edges": ()}, "nodes: a graph needs at least one node"),
+        ({"edges": (("SW", "XX"),)}, "edges[0]: unknown node"),
+        ({"edges": (("SW", "SW"),)}, "edges[0]: an edge joins two different nodes"),
+        ({"edges": (*EDGES, ("SE", "SW"))}, "edges: edge given twice"),
+        ({"nodes": {**NODES, "SW": (math.nan, 0)}}, "nodes.SW: coordinates must be finite"),
+        ({"nodes": {**NODES, "NW": (10.0, 10.0)}}, "nodes.NW: in the prohibited area"),
+        ({"edges": (*EDGES, ("SW", "NE"))}, "edges[3]: passes through the prohibited area"),
+        ({"nodes": {**NODES, "SE": (17.0, 0.2), "SW": (3.0, 0.2)}, "start": StartPose(3, 2, 0)},
+         "edges[0]: nearer to the prohibited area than"),
+        ({"start": StartPose(10, 10, 0)}, "start: in the prohibited area"),
+        ({"start": StartPose(3, 3, math.inf)}, "start: the start pose must be finite"),
+        ({"start": StartPose(3, 10, 0), "nodes": {"NE": (17.0, 17.0)}, "edges": ()},
+         "start: 15.7 m from the graph"),
+        ({"lights": (Light("L1", "L", 10, 10, 200),)}, "row.L1: off the pavement"),
+        ({"lights": (Light("L1", "L", 3, 3, 0),)}, "row.L1.nominal_cd: the nominal intensity"),
+        ({"lights": (Light("L1", "L", 3, 3, 1), Light("L1", "L", 4, 3, 1))},
+         "row: two lights of this name"),
+        ({"obstacles": (ObstaclePreset("o", "box", 10, 3, 9),)}, "obstacle.o.radius_m: must be in"),
+        ({"obstacles": (ObstaclePreset("o", "box", 3.2, 3, 0.3),)}, "obstacle.o: stands on the"),
+        ({"obstacles": (ObstaclePreset("o", "box", 10, 3, 0.3, gone_after_s=-1),)},
+         "obstacle.o.gone_after_s: must not be negative"),
+        ({"obstacles": (ObstaclePreset("o", "box", 10, 3, 0.3),) * 2},
+         "obstacle: two obstacles of this name"),
+        ({"allowed": shapely.Polygon()}, "surface: the airport needs pavement"),
+    ],
+)  # fmt: skip
+def test_each_fault_of_an_airport_is_found_and_named(changes, expected):
+    assert any(line.startswith(expected) for line in findings(airport(**changes)))
+
+
+@pytest.mark.parametrize(
+    ("goals", "expected"),
+    [
+        ((), "missions.M: a mission needs at least one goal"),
+        ((MissionGoal(3, 25, "taxi"),), "missions.M.goals[0]: 8.0 m from the graph"),
+        ((MissionGoal(3, 3, "fly"),), "missions.M.goals[0].mode: must be one of"),
+        ((MissionGoal(math.nan, 3, "taxi"),), "missions.M.goals[0]: coordinates must be finite"),
+        ((MissionGoal(7, 5, "taxi"), MissionGoal(6.4, 6.0, "taxi")),
+         "missions.M.goals[1]: in the prohibited area"),
+    ],
+)  # fmt: skip
+def test_each_fault_of_a_mission_is_found_and_named(goals, expected):
+    found = [f"{p.field}: {p.remedy}" for p in mission_problems(Mission("M", goals), airport())]
+    assert any(line.startswith(expected) for line in found)
+
+
+def test_a_goal_on_a_part_of_the_graph_without_connection_is_found():
+    made = airport(edges=(("SW", "SE"), ("NE", "NW")))
+    mission = Mission("M", (MissionGoal(17, 3, "taxi"), MissionGoal(17, 17, "taxi")))
+    assert [p.field for p in mission_problems(mission, made)] == ["missions.M.goals[1]"]
+
+
+def test_asking_for_a_mission_that_is_not_there_names_those_that_are():
+    made = airport(missions={"A": GOAL_FAR})
+    with pytest.raises(AirportError, match=r"^Ring: missions: 'B': no such mission, there are: A$"):
+        made.mission("B")

@@ -1,0 +1,138 @@
+"""What the rest of the system relies on in the shipped airport."""
+
+from __future__ import annotations
+
+import heapq
+import math
+
+import pytest
+import shapely
+from shapely.geometry import LineString
+
+from airport.formats import load_airport, load_world, shipped_airports
+from airport.photometry import (
+    SENSOR_FORWARD_M,
+    SENSOR_HEIGHT_M,
+    illuminance_lux,
+    intensity_from_illuminance,
+    sensor_position,
+)
+
+AIRPORT = load_airport("vallombre")
+
+
+def shortest_m(a: str, b: str, without: frozenset[str] = frozenset()) -> float:
+    done, todo = {a: 0.0}, [(0.0, a)]
+    while todo:
+        so_far_m, node = heapq.heappop(todo)
+        if node == b:
+            return so_far_m
+        for other, length_m in AIRPORT.neighbours[node]:
+            if frozenset((node, other)) == without:
+                continue
+            if so_far_m + length_m < done.get(other, math.inf):
+                done[other] = so_far_m + length_m
+                heapq.heappush(todo, (done[other], other))
+    return math.inf
+
+
+def route_m(mission: str) -> float:
+    at, total_m = AIRPORT.nearest_node(AIRPORT.start.x_m, AIRPORT.start.y_m)[0], 0.0
+    for goal in AIRPORT.missions[mission].goals:
+        node, off_m = AIRPORT.nearest_node(goal.x_m, goal.y_m)
+        total_m += shortest_m(at, node) + off_m
+        at = node
+    return total_m
+
+
+def test_it_ships_and_loads_without_warnings():
+    assert "vallombre" in shipped_airports()
+    assert AIRPORT.warnings == ()
+
+
+def test_mission_ab_takes_less_than_200_s_at_the_robots_average_speed():
+    assert set(AIRPORT.missions) == {"A", "B", "AB"}
+    assert route_m("AB") / 0.85 < 190
+
+
+def test_mission_ab_ends_in_the_start_area():
+    last = AIRPORT.missions["AB"].goals[-1]
+    assert math.dist((last.x_m, last.y_m), (AIRPORT.start.x_m, AIRPORT.start.y_m)) < 3
+
+
+@pytest.mark.parametrize("row", ["A", "B"])
+def test_each_row_has_ten_lights_or_more_about_4_m_apart_on_the_graphs_edges(row):
+    lights = [light for light in AIRPORT.lights if light.row == row]
+    assert len(lights) >= 10
+    for one, two in zip(lights, lights[1:], strict=False):
+        assert math.dist((one.x_m, one.y_m), (two.x_m, two.y_m)) == pytest.approx(4.0, abs=0.1)
+    for light in lights:
+        assert AIRPORT.nearest_on_graph(light.x_m, light.y_m).distance_m < 0.05
+
+
+def test_light_verification_legs_pass_over_every_light_of_the_row():
+    goals = AIRPORT.missions["AB"].goals
+    legs = [(a, b) for a, b in zip(goals, goals[1:], strict=False)
+            if b.mode == "light verification"]  # fmt: skip
+    lines = [LineString([(a.x_m, a.y_m), (b.x_m, b.y_m)]) for a, b in legs]
+    for light in AIRPORT.lights:
+        nearest = min(line.distance(shapely.Point(light.x_m, light.y_m)) for line in lines)
+        assert nearest < 0.05
+
+
+def test_three_lights_are_out_and_three_are_dim():
+    factors = load_world("vallombre").light_factors
+    assert sum(f == 0 for f in factors.values()) == 3
+    assert sum(0 < f < 0.5 for f in factors.values()) == 3
+
+
+def test_every_edge_has_2_5_m_of_pavement_on_either_side():
+    for a, b in AIRPORT.edges:
+        line = LineString([AIRPORT.nodes[a], AIRPORT.nodes[b]])
+        # Measured on the middle, away from the rounded ends of runways and dead ends.
+        middle = shapely.ops.substring(line, 0.25, 0.75, normalized=True)
+        assert AIRPORT.allowed.boundary.distance(middle) >= 2.45, (a, b)
+
+
+def test_there_is_another_way_whichever_edge_is_closed():
+    for a, b in AIRPORT.edges:
+        assert shortest_m(a, b, frozenset((a, b))) < math.inf, (a, b)
+
+
+def test_four_obstacles_can_be_passed_and_the_fifth_blocks_a_runway_for_a_while():
+    assert len(AIRPORT.obstacles) >= 5
+    for preset in AIRPORT.obstacles[:4]:
+        assert AIRPORT.nearest_on_graph(preset.x_m, preset.y_m).distance_m < 0.5
+        # A passage as wide as the robot plus 0.3 m on either side remains on one side at least.
+        room_m = AIRPORT.prohibited_distance_m(preset.x_m, preset.y_m) - preset.radius_m
+        assert room_m > 0.614 + 2 * 0.3
+        assert preset.gone_after_s is None
+    blocker = AIRPORT.obstacles[4]
+    assert blocker.appears_within_m
+    assert blocker.gone_after_s
+
+
+def test_buildings_leave_the_pavement_of_the_graph_free():
+    for building in AIRPORT.buildings:
+        for a, b in AIRPORT.edges:
+            line = LineString([AIRPORT.nodes[a], AIRPORT.nodes[b]])
+            assert building.polygon.distance(line) > 2.0
+
+
+@pytest.mark.parametrize("distance_m", [0.0, 0.1, 0.35, 0.7])
+@pytest.mark.parametrize("intensity_cd", [0.0, 60.0, 200.0])
+def test_photometry_and_its_inverse_agree(distance_m, intensity_cd):
+    lux = illuminance_lux(intensity_cd, distance_m)
+    assert intensity_from_illuminance(lux, distance_m) == pytest.approx(intensity_cd)
+
+
+def test_photometry_follows_the_inverse_square_and_the_cosine_law():
+    assert illuminance_lux(200, 0.0) == pytest.approx(200 / SENSOR_HEIGHT_M**2)
+    # As far sideways as high: twice the square of the distance, cosine 1 / sqrt 2.
+    expected = 200 / (2 * SENSOR_HEIGHT_M**2) / math.sqrt(2)
+    assert illuminance_lux(200, SENSOR_HEIGHT_M) == pytest.approx(expected)
+    assert illuminance_lux(200, 4.0) < 0.001 * illuminance_lux(200, 0.0)
+
+
+def test_the_light_sensor_is_ahead_of_the_robot_in_the_direction_it_faces():
+    assert sensor_position(1, 2, math.pi / 2) == pytest.approx((1, 2 + SENSOR_FORWARD_M))

@@ -1,0 +1,89 @@
+"""Virtual time for tests of actors: an event loop that jumps to its next timer.
+
+`run(scenario)` calls the coroutine function on such a loop; `System` starts actors on one hub.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
+
+from actors.runtime.actor import Actor, Context
+from actors.runtime.clock import Clock
+from actors.runtime.virtual_bus import Hub, VirtualBus
+
+A = TypeVar("A", bound=Actor)
+T = TypeVar("T")
+
+
+class VirtualLoop(asyncio.SelectorEventLoop):
+    """A loop whose time stands still while it works, and jumps when it would wait."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._now = 0.0
+
+    def time(self) -> float:
+        return self._now
+
+    def jump(self, seconds: float) -> None:
+        """Let time pass unseen, as for a process that is stopped."""
+        self._now += seconds
+
+    def _run_once(self) -> None:
+        if not self._ready and self._scheduled:
+            self._now = max(self._now, self._scheduled[0]._when)
+        super()._run_once()
+
+
+def run(scenario: Callable[[], Coroutine[Any, Any, T]]) -> T:
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        return runner.run(scenario())
+
+
+class System:
+    """Actors on one virtual hub, and the means to kill and respawn them."""
+
+    def __init__(self, **shared: Any) -> None:
+        self.hub = Hub()
+        self.shared = shared
+        loop = asyncio.get_running_loop()
+        self.clock = Clock(loop.time(), source=loop.time)
+        self.incarnations: dict[str, int] = {}
+        self.tasks: dict[str, asyncio.Task[None]] = {}
+
+    async def __aenter__(self) -> System:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for name in list(self.tasks):
+            await self.kill(name)
+
+    def start(self, name: str, cls: type[A], **parameters: Any) -> A:
+        """Start an actor, or its next incarnation."""
+        life = self.incarnations[name] = self.incarnations.get(name, 0) + 1
+        actor = cls(Context(name, life, self.clock, VirtualBus(self.hub, name, life),
+                            parameters, self.shared))
+        self.tasks[name] = asyncio.create_task(actor.run())
+        return actor
+
+    async def kill(self, name: str) -> None:
+        """End an actor as SIGKILL would: its token vanishes, it says nothing more."""
+        task = self.tasks.pop(name)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    async def settle(self) -> None:
+        """Let everything happen that needs no time."""
+        before = self.clock.now()
+        for _ in range(60):
+            await asyncio.sleep(0)
+        assert self.clock.now() == before, "time has passed"
+
+
+async def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
+    deadline = asyncio.get_running_loop().time() + timeout_s
+    while not condition():
+        assert asyncio.get_running_loop().time() < deadline, "it did not happen in time"
+        await asyncio.sleep(0.005)
