@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -35,6 +37,10 @@ _CHOICES = {
     "kind": get_args(SurfaceKind),
     "shape": get_args(ObstacleShape),
 }
+_KEY = re.compile(r"\[[^]]*\]|[^.[]+")
+_TYPE_NAMES = {
+    str: "str", int: "int", float: "float", bool: "bool", list: "array", dict: "object"
+}  # fmt: skip
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -160,25 +166,45 @@ def _convert(path: Path, kind: Any) -> Any:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
         message, _, where = str(error).partition(" - at ")
-        where = where.strip("`").removeprefix("$").lstrip(".") or "file"
+        where = where.strip("`").removeprefix("$").lstrip(".")
+        remedy = message
         choices = _CHOICES.get(where.rpartition(".")[2])
         if choices and message.startswith("Invalid enum value"):
-            message = f"must be one of {', '.join(choices)}"
-        raise AirportError(f"{path}: {where}: {_at(table, where)}: {message}") from None
+            remedy = f"must be one of {', '.join(choices)}"
+        where, value = _locate(table, where, message)
+        raise AirportError(f"{path}: {where}: {value}: {remedy}") from None
 
 
-def _at(table: Any, path: str) -> str:
-    """Return the value at a msgspec path as short text; the path may end beyond the data."""
-    value = table
-    for key in path.replace("[...]", "").replace("]", "").replace("[", ".").split("."):
-        if isinstance(value, dict) and key in value:
-            value = value[key]
-        elif isinstance(value, list) and key.isdigit() and int(key) < len(value):
-            value = value[int(key)]
-        else:
-            break
+def _locate(table: Any, path: str, message: str) -> tuple[str, str]:
+    """Return path and value of an offending field, the value as short text.
+
+    Where a table has free keys msgspec's path says `[...]`: the first key is taken whose value
+    fits the message, by itself or by its type.
+    """
+    found = list(_resolve(table, "", _KEY.findall(path)))
+    fitting = [
+        (where, value)
+        for where, value in found
+        if f"{value!r}" in message or f"got `{_TYPE_NAMES.get(type(value), '')}`" in message
+    ]
+    where, value = (fitting or found)[0]
     text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return where.lstrip(".") or "file", text if len(text) <= 60 else text[:57] + "..."
+
+
+def _resolve(value: Any, where: str, keys: list[str]) -> Iterator[tuple[str, Any]]:
+    """Yield every (path, value) that a path with wildcards can mean; it may end beyond the data."""
+    key = keys[0] if keys else ""
+    index = key.strip("[]")
+    if key == "[...]" and isinstance(value, dict):
+        for name, part in value.items():
+            yield from _resolve(part, f"{where}.{name}", keys[1:])
+    elif key.startswith("[") and isinstance(value, list) and index.isdigit():
+        yield from _resolve(value[int(index)], where + key, keys[1:])
+    elif isinstance(value, dict) and key in value:
+        yield from _resolve(value[key], f"{where}.{key}", keys[1:])
+    elif not keys or key != "[...]":
+        yield where + "".join(f".{rest}" for rest in keys), value
 
 
 def _finite(value: Any, path: str, file: str) -> None:

@@ -276,5 +276,5 @@ def _budget(spec: SystemSpec) -> Iterator[Finding]:
 
 
 VALIDATORS: tuple[Callable[[SystemSpec], Iterator[Finding]], ...] = (
-    _timing, _names, _nodes, _detections, _recoveries, _mechanisms, _reachability, _fault_tree, _orders,
-    _order_against_tree, _budget)
+    _timing, _names, _nodes, _detections, _recoveries, _mechanisms, _reachability, _fault_tree,
+    _orders, _order_against_tree, _budget)

@@ -48,13 +48,19 @@ def _line_of_succession(recovery: str, sakes: Iterable[str], failures: Mapping[s
                         mechanisms: Mechanisms, tree: Tree) -> list[str]:
     """Return a recovery and its successors up to the first that has not failed."""
     tried = [recovery]
-    mechanism: str | None = tree.lowest_common_dominant(sakes)
+    wanting = tuple(sakes)
+    # Above a mechanism that wants the recovery is its parent; above several of them, none of which
+    # is above the others, is their lowest common dominant itself.
+    closest = tree.lowest_common_dominant(wanting)
+    above = list(reversed(tree.chain(tree.root, closest)))
+    if closest in wanting:
+        above.pop(0)
     while tried[-1] in failures:
-        following = mechanisms.contracts[tried[-1]].escalate_to
-        while mechanism is not None and (not following or following in tried):
-            mechanism = tree.parents[mechanism]
-            following = mechanisms.recover[mechanism] if mechanism is not None else ""
-        if not following or following in tried:
+        named = mechanisms.contracts[tried[-1]].escalate_to
+        candidates = [named] if named else []
+        candidates += [mechanisms.recover[mechanism] for mechanism in above]
+        following = next((name for name in candidates if name not in tried), None)
+        if following is None:
             break
         tried.append(following)
     return tried

@@ -8,6 +8,7 @@ import math
 import pytest
 import shapely
 from shapely.geometry import LineString
+from shapely.ops import substring
 
 from airport.formats import load_airport, load_world, shipped_airports
 from airport.photometry import (
@@ -90,7 +91,7 @@ def test_every_edge_has_2_5_m_of_pavement_on_either_side():
     for a, b in AIRPORT.edges:
         line = LineString([AIRPORT.nodes[a], AIRPORT.nodes[b]])
         # Measured on the middle, away from the rounded ends of runways and dead ends.
-        middle = shapely.ops.substring(line, 0.25, 0.75, normalized=True)
+        middle = substring(line, 0.25, 0.75, normalized=True)
         assert AIRPORT.allowed.boundary.distance(middle) >= 2.45, (a, b)
 
 

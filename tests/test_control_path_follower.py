@@ -41,7 +41,7 @@ def test_an_obstacle_exactly_on_the_line_is_passed(radius_m):
     assert motion.arrived
     assert world.least_clearance_m >= 0.25
     assert world.deviation(LINE) <= 1.4
-    x, y = world.track[-1]
+    y = world.track[-1][1]
     assert abs(y) < 0.05, "and the robot is back on the line"
 
 
@@ -146,10 +146,10 @@ def test_the_side_is_kept_although_the_other_looks_better_now():
     ahead = np.array(((2.0, -0.05), (2.0, 0.0), (2.0, 0.05)))
     first = escape.update(ahead, 0.0, 0.0)
     assert first.offset_m < 0.0, "the right, when both are equal"
-    second = escape.update(ahead + (0.0, -0.1), 0.2, -0.1)
+    second = escape.update(ahead + np.array((0.0, -0.1)), 0.2, -0.1)
     assert second.offset_m < 0.0
     fresh = Escape(HULL, EscapeLimits())
-    assert fresh.update(ahead + (0.0, -0.3), 0.2, 0.0).offset_m > 0.0
+    assert fresh.update(ahead + np.array((0.0, -0.3)), 0.2, 0.0).offset_m > 0.0
 
 
 def test_behind_the_obstacle_the_offset_shrinks_with_the_way_gone():

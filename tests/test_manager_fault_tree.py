@@ -1,6 +1,7 @@
 """Fault trees: gates, what is no tree, and the FTMTree read off it."""
 
 import pytest
+
 from manager.fault_tree import Event, FaultTree, FaultTreeError
 
 
@@ -33,7 +34,7 @@ def test_an_event_propagates_through_several_gates():
 def test_the_parent_of_a_mechanism_is_the_nearest_one_above_however_far():
     events = tree(top=(1, "x y"), x=(1, "p"), p=(1, "q"), q=(1, "a"))
     ftms = events.derive_ftm_tree({"F1": "top", "F2": "p", "F3": "a", "F4": "y"})
-    assert {"F1": None, "F2": "F1", "F3": "F2", "F4": "F1"} == ftms.parents
+    assert ftms.parents == {"F1": None, "F2": "F1", "F3": "F2", "F4": "F1"}
 
 
 def test_a_shared_event_is_fine_while_its_mechanism_has_one_parent():

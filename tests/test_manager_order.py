@@ -1,10 +1,13 @@
 """Orders and trees: the paper's examples, and Warshall's closure as an oracle."""
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from manager.order import CycleError, PartialOrder, Tree, UnknownElementError, find_cycle
 from manager_bench import osmosis
+
+from manager.order import CycleError, PartialOrder, Tree, UnknownElementError, find_cycle
 
 RM_ORDER = osmosis().build_order()
 FTM_TREE = osmosis().build_ftm_tree()
@@ -44,8 +47,9 @@ def test_low_com_dom_as_in_the_paper(names, lowest):
 
 
 def test_the_ftm_tree_is_the_one_of_figure_8():
-    assert {"FTM1": None, "FTM2": "FTM1", "FTM3": "FTM1", "FTM6": "FTM1", "FTM4": "FTM2",
-            "FTM5": "FTM2", "FTM7": "FTM6"} == FTM_TREE.parents
+    assert FTM_TREE.parents == {
+        "FTM1": None, "FTM2": "FTM1", "FTM3": "FTM1", "FTM6": "FTM1", "FTM4": "FTM2",
+        "FTM5": "FTM2", "FTM7": "FTM6"}
     assert FTM_TREE.root == "FTM1"
     assert set(FTM_TREE.children("FTM2")) == {"FTM4", "FTM5"}
 
@@ -91,7 +95,7 @@ def test_the_empty_set_has_no_lowest_common_dominant():
 
 def test_a_chain_of_thousands_is_no_problem():
     names = [f"n{i}" for i in range(5000)]
-    assert find_cycle({a: [b] for a, b in zip(names, names[1:], strict=False)}) is None
+    assert find_cycle({a: [b] for a, b in pairwise(names)}) is None
 
 
 NAMES = "abcdefg"

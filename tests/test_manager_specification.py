@@ -3,12 +3,13 @@
 import ast
 from pathlib import Path
 
-import manager
 import msgspec
 import pytest
+from manager_bench import OSMOSIS, osmosis
+
+import manager
 from manager.schema import Kind
 from manager.specification import SpecificationError, parse_specification
-from manager_bench import OSMOSIS, osmosis
 
 FILE = "systems/osmosis.toml"
 
@@ -42,7 +43,7 @@ def test_the_shipped_system_is_the_papers():
 
 
 def test_each_actor_has_a_process_of_its_own_unless_told_otherwise():
-    assert {name: 1 for name in osmosis().processes()} == {
+    assert dict.fromkeys(osmosis().processes(), 1) == {
         name: len(actors) for name, actors in osmosis().processes().items()}
     assert len(osmosis().actors()) == 9 + 7 + 5
     shared = parse_specification(edit((
@@ -80,8 +81,8 @@ def test_gates_can_be_and_or_at_least():
         'gate = "or"\nof = ["localization_estimation_error"',
         'gate = "and"\nof = ["localization_estimation_error"')), FILE)
     required = {e.name: e.required for e in spec.events}
-    assert (2, 2, 1) == tuple(required[name] for name in (
-        "command_not_updated", "localization_error", "erroneous_command"))
+    assert tuple(required[name] for name in (
+        "command_not_updated", "localization_error", "erroneous_command")) == (2, 2, 1)
 
 
 FTM2 = 'name = "FTM2"\ndetect = "DM2"\nrecover = "RM2"\nevent = "command_not_updated"\n'
@@ -197,10 +198,11 @@ REFUSED = {
     # fault tree
     "unknown input": ([(PROHIBITED, PROHIBITED.replace("erroneous_graph", "bad_luck"))],
                       ["$.event[0].of[0] = 'bad_luck': unknown event; known: moving"]),
-    "cycle of events": ([('name = "control_node_crash"\n',
-                          'name = "control_node_crash"\ngate = "or"\nof = ["erroneous_command"]\n')],
-                        ["$.event[3]", "cycle erroneous_command > command_not_updated > "
-                                       "control_node_crash > erroneous_command"]),
+    "cycle of events": (
+        [('name = "control_node_crash"\n',
+          'name = "control_node_crash"\ngate = "or"\nof = ["erroneous_command"]\n')],
+        ["$.event[3]", "cycle erroneous_command > command_not_updated > control_node_crash > "
+                       "erroneous_command"]),
     "empty gate": ([(STALE, 'gate = "or"')],
                    ["$.event[8] = 'command_not_updated': gate without inputs"]),
     "empty and-gate": ([(STALE, 'gate = "and"\nof = []')],
@@ -229,7 +231,8 @@ REFUSED = {
     "recovery above itself": ([('RM5 = ["RM3", "RM4"]', 'RM5 = ["RM5"]')], ["cycle RM5 > RM5"]),
     "order that contradicts the tree": (
         [('RM1 = ["RM2", "RM5"]\nRM2 = ["RM3", "RM4"]', "RM1 = ['RM5']\nRM3 = ['RM2']")],
-        ["$.orders.safer.RM3 = ['RM2']: contradicts the FTMTree: RM3 of FTM4 is above RM2 of FTM2"]),
+        ["$.orders.safer.RM3 = ['RM2']: contradicts the FTMTree: RM3 of FTM4 is above RM2 of "
+         "FTM2"]),
     "cycle of escalations": (
         [('escalate_to = "RM2"', 'escalate_to = "RM4"'),
          ('kind = "masking"', 'kind = "masking"\nescalate_to = "RM3"')],
@@ -257,8 +260,9 @@ REFUSED = {
         ["$.timing.heartbeat_timeout_s = 0.2: would raise false alarms; at least 0.300 s"]),
     "a respawn that is too slow": ([("respawn_s = 0.4", "respawn_s = 0.6")],
                                    ["$.timing.heartbeat_timeout_s", "would raise false alarms"]),
-    "a robot that is too fast": ([("top_speed_mps = 1.0", "top_speed_mps = 2.5")],
-                                 ["$.robot.corridor_clearance_m = 1.5: too little to brake in", "1.562 m"]),
+    "a robot that is too fast": (
+        [("top_speed_mps = 1.0", "top_speed_mps = 2.5")],
+        ["$.robot.corridor_clearance_m = 1.5: too little to brake in", "1.562 m"]),
     "intrusion without a margin": ([("parameters = { margin_m = 0.6 }", "")],
                                    ["$.mechanism[0].against = 'intrusion': DM1 needs"]),
     "a root that races its parent": ([('against = "intrusion"', 'against = "parent"')],
@@ -299,7 +303,7 @@ def test_no_event_at_all_is_refused():
 def test_the_error_carries_its_parts():
     with pytest.raises(SpecificationError) as caught:
         parse_specification(edit(('detect = "DM3"', 'detect = "DM9"')), FILE)
-    assert (FILE, "$.mechanism[2].detect") == (caught.value.file, caught.value.path)
+    assert (caught.value.file, caught.value.path) == (FILE, "$.mechanism[2].detect")
     assert caught.value.problem.startswith("unknown detection module")
 
 

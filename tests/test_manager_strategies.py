@@ -1,8 +1,10 @@
 """Safety-first against an oracle written from the paper's words, for all 127 active sets."""
 
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import pytest
+from manager_bench import osmosis
+
 from manager.order import UnknownElementError
 from manager.strategies import (
     STRATEGIES,
@@ -11,7 +13,6 @@ from manager.strategies import (
     find_strategy,
     register,
 )
-from manager_bench import osmosis
 
 SPEC = osmosis()
 MECHANISMS, TREE, ORDER = SPEC.build_mechanisms(), SPEC.build_ftm_tree(), SPEC.build_order()
@@ -109,7 +110,7 @@ def test_two_mechanisms_that_share_a_recovery_run_it_by_block_3(active, executed
 
 def test_nothing_active_means_nothing_to_do():
     decision = decide([], MECHANISMS, TREE, ORDER)
-    assert (0, ()) == (decision.rule, decision.recoveries)
+    assert (decision.rule, decision.recoveries) == (0, ())
 
 
 @pytest.mark.parametrize("active", ALL_SETS, ids=lambda s: "+".join(sorted(s)))
@@ -118,7 +119,7 @@ def test_the_certificate_holds_for_every_active_set(active):
     decision = decide(active, MECHANISMS, TREE, ORDER)
     for chain in decision.path:
         links = chain.split(" > ")
-        for upper, lower in zip(links, links[1:], strict=False):
+        for upper, lower in pairwise(links):
             assert dominates_in_tree(upper, lower) if upper.startswith("FTM") \
                 else (upper, lower) in IS_SAFER
     if decision.rule in {2, 4}:
@@ -132,7 +133,7 @@ def test_the_certificate_holds_for_every_active_set(active):
 
 def test_the_certificate_reads_like_an_explanation():
     decision = decide(["FTM2", "FTM6", "FTM5"], MECHANISMS, TREE, ORDER)
-    assert ("FTM1 > FTM2", "FTM1 > FTM2 > FTM5", "FTM1 > FTM6") == decision.path
+    assert decision.path == ("FTM1 > FTM2", "FTM1 > FTM2 > FTM5", "FTM1 > FTM6")
     assert ("RM5", "does not dominate RM2") in decision.rejected
 
 

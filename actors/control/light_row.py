@@ -84,23 +84,22 @@ class LightRow:
             self._ramp.last = STANDSTILL
             return Motion(0.0, 0.0, True, False, len(line.points) - 1, 0.0)
 
+        braking = self._motion.deceleration_mps2
+        cruise = min(limits.speed_mps, self._motion.max_linear_mps)
         free_m = self._free(x_m, y_m, yaw_rad, points, foot.s_m)
-        self._free_for_s = self._free_for_s + dt_s if free_m > limits.stop_distance_m else 0.0
-        waiting = self._free_for_s < limits.clear_s and self._ramp.last[0] == 0.0
+        allowed = braking_speed(free_m - limits.stop_distance_m, braking)
+        self._free_for_s = self._free_for_s + dt_s if allowed >= cruise else 0.0
+        if self._free_for_s < limits.clear_s:
+            allowed = min(allowed, self._ramp.last[0])  # an echo that comes and goes is there
+        waiting = allowed == 0.0
         bearing = self._bearing(x_m, y_m, yaw_rad, foot.s_m)
         speed = 0.0
-        if not waiting and abs(bearing) < self._motion.turn_in_place_rad:
-            deceleration = self._motion.deceleration_mps2
-            speed = min(
-                min(limits.speed_mps, self._motion.max_linear_mps) * math.cos(bearing) ** 2,
-                max(braking_speed(to_go_m, deceleration), 0.15),
-                braking_speed(free_m - limits.stop_distance_m, deceleration),
-            )
+        if abs(bearing) < self._motion.turn_in_place_rad:
+            approach = max(braking_speed(to_go_m, braking), 0.15)
+            speed = min(cruise * math.cos(bearing) ** 2, approach, allowed)
         turn = 0.0 if waiting else self._motion.heading_gain_per_s * bearing
         linear, angular = self._ramp.towards(speed, turn, dt_s)
-        if waiting:
-            angular = 0.0
-        return Motion(linear, angular, False, waiting, foot.segment, to_go_m)
+        return Motion(linear, angular, False, waiting and linear == 0.0, foot.segment, to_go_m)
 
     def _bearing(self, x_m: float, y_m: float, yaw_rad: float, s_m: float) -> float:
         x_to, y_to = self._line.point_at(s_m + self._limits.lookahead_m)

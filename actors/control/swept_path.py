@@ -98,11 +98,11 @@ def _arc(
     if path_m == 0.0:
         yaw = np.linspace(0.0, turn_rad, 9)
         return np.zeros(9), np.zeros(9), yaw
-    count = 2 + math.ceil(path_m / 0.06)
-    length = np.linspace(0.0, path_m, count)
-    turned = angular_radps * length / abs(linear_mps)
     limit = max(abs(turn_rad), abs(angular_radps) * 1.0)
-    yaw = np.clip(turned, -limit, limit)
+    turned = min(abs(angular_radps) * path_m / abs(linear_mps), limit)
+    count = 2 + math.ceil(path_m / 0.06 + turned / 0.15)
+    length = np.linspace(0.0, path_m, count)
+    yaw = np.clip(angular_radps * length / abs(linear_mps), -limit, limit)
     step = path_m / (count - 1) * math.copysign(1.0, linear_mps)
     middle = (yaw[:-1] + yaw[1:]) / 2
     x = np.concatenate(((0.0,), np.cumsum(step * np.cos(middle))))
@@ -115,11 +115,14 @@ def limited(
 ) -> tuple[float, float]:
     """Return the command, slowed down as far as the echoes ask for; zero if nothing is free.
 
-    Steps are a twentieth of the commanded speed. Turning is given up last, backing never invented.
+    Steps are a twentieth of the commanded speed. Turning is slowed after that, and given up last.
     """
     if is_free(linear_mps, angular_radps, points, room):
         return linear_mps, angular_radps
     for share in np.linspace(0.95, 0.0, 20):
         if is_free(float(linear_mps * share), angular_radps, points, room):
             return float(linear_mps * share), angular_radps
+    for share in (0.5, 0.25):
+        if is_free(0.0, angular_radps * share, points, room):
+            return 0.0, angular_radps * share
     return 0.0, 0.0

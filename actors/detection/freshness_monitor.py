@@ -12,8 +12,8 @@ import math
 class FreshnessMonitor:
     """Active while the newest content is older than the timeout.
 
-    It becomes idle again once content has been fresh for `hold_s` without interruption, so a
-    source that stutters does not make it flap.
+    It becomes idle again with a sample that comes after content has been fresh for `hold_s`
+    without interruption. So neither a single sample nor a source that stutters makes it flap.
 
     Args:
         subject: what is monitored, for the reason: "command".
@@ -46,12 +46,7 @@ class FreshnessMonitor:
     @property
     def due_s(self) -> float:
         """When time alone changes the finding."""
-        stale_s = self._stale_s
-        if not self.active:
-            return stale_s
-        if self._fresh_since_s is None:
-            return math.inf
-        return min(stale_s, self._fresh_since_s + self.hold_s)
+        return math.inf if self.active and self._fresh_since_s is None else self._stale_s
 
     @property
     def _stale_s(self) -> float:
@@ -75,8 +70,10 @@ class FreshnessMonitor:
             return
         if self._fresh_since_s is None:
             self._fresh_since_s = now_s
-        elif now_s - self._fresh_since_s >= self.hold_s:
-            self._clear()
+        elif now_s >= self._fresh_since_s + self.hold_s:
+            self.active = False
+            self.reason = ""
+            self._fresh_since_s = None
 
     def expire(self, now_s: float) -> None:
         """Conclude from the time that has passed."""
@@ -86,11 +83,3 @@ class FreshnessMonitor:
                 self.active = True
                 self.reason = f"{self.subject} not updated for {self.timeout_s:g} s" \
                     if self._newest_s > -math.inf else f"{self.subject} never heard"
-        elif self.active and self._fresh_since_s is not None \
-                and now_s - self._fresh_since_s >= self.hold_s:
-            self._clear()
-
-    def _clear(self) -> None:
-        self.active = False
-        self.reason = ""
-        self._fresh_since_s = None

@@ -1,0 +1,1 @@
+"""The operator's side: the HMI with its page, and teleoperation."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 class RestartPolicy:
     """Sliding window of restarts of one process. Times are in seconds of the caller's clock."""
 
-    intensity: int = 30
+    intensity: int = 50
     period_s: float = 60.0
     backoff_s: float = 0.05
     backoff_max_s: float = 2.0

@@ -16,7 +16,7 @@ import msgspec
 from actors.runtime.actor import Actor
 from actors.runtime.wiring import Member, partners
 from actors.runtime.zenoh_bus import endpoint
-from manager.specification import Layers, NodeSpec, SystemSpec, parse_specification
+from manager.specification import Kind, Layers, NodeSpec, SystemSpec, parse_specification
 
 SUPERVISOR = "supervisor"
 OBSERVER = "observer"
@@ -111,6 +111,23 @@ def load_class(path: str) -> type[Actor]:
     return found
 
 
+def actor_parameters(plan: RunPlan, spec: SystemSpec, node: NodeSpec) -> dict[str, Any]:
+    """Return a node's parameters: what follows from plan and spec, then what the spec says.
+
+    A recovery module that respawns gets the nodes that name it; the world gets the run's seed,
+    obstacles, and the dead man of the robot's base.
+    """
+    derived: dict[str, Any] = {}
+    if node.kind is Kind.RECOVERY:
+        own = tuple(n.name for n in spec.nodes if n.respawn == node.name)
+        derived = {"nodes": own} if own else {}
+    elif node.kind is Kind.WORLD:
+        derived = {"seed": plan.seed, "obstacles": plan.obstacles,
+                   "dead_man": spec.layers.dead_man,
+                   "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
+    return {**derived, **node.parameters}
+
+
 class Layout:
     """Everything derived from plan and spec: units, ports, partners.
 
@@ -131,7 +148,8 @@ class Layout:
         ]
         self.members: dict[str, Member] = {
             m.name: m for m in (*own, *(
-                Member(n.name, load_class(n.actor), n.parameters) for n in spec.actors()))}
+                Member(n.name, load_class(n.actor), actor_parameters(plan, spec, n))
+                for n in spec.actors()))}
         self.port_of: dict[str, int] = {
             name: plan.base_port + i for i, name in enumerate(self.members)}
         self._partners = partners(self.members.values())

@@ -1,0 +1,130 @@
+"""DM1: the robot that would not stop before the grass, and a GPS that is silent."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from detection_timeline import play, table
+from hypothesis import given
+from hypothesis import strategies as st
+
+from actors.detection.fence_monitor import FenceMonitor
+from actors.detection.freshness_monitor import FreshnessMonitor
+from actors.detection.geofence import FenceLimits, Fix, intrusion, stopping_distance_m
+
+LIMITS = FenceLimits(half_diagonal_m=0.473, reaction_s=0.3, braking_mps2=2.0)
+ACCURACY_M = 0.05
+HALF_LANE_M = 2.5
+
+
+def lane(_x_m: float, y_m: float) -> float:
+    """Signed distance to the grass on both sides of a lane along x, 5 m wide."""
+    return HALF_LANE_M - abs(y_m)
+
+
+def fix(y_m: float, speed_mps: float, course_deg: float, x_m: float = 0.0) -> Fix:
+    course = math.radians(course_deg)
+    return Fix(x_m, y_m, speed_mps * math.cos(course), speed_mps * math.sin(course), ACCURACY_M)
+
+
+@pytest.mark.parametrize(("y_m", "speed_mps", "course_deg", "alarm"), **table({
+    "along the middle of the lane": (0.0, 1.0, 0.0, False),
+    "standing in the middle": (0.0, 0.0, 0.0, False),
+    "a little across the lane, from the middle": (0.0, 1.0, 30.0, False),
+    "straight at the edge, from the middle: there is room yet": (0.0, 1.0, 90.0, False),
+    "skirting an obstacle 1.5 m aside, along the edge": (1.5, 1.0, 0.0, False),
+    "skirting it, nearly parallel, outward": (1.5, 1.0, 20.0, False),
+    "skirting it, on the way back": (1.5, 1.0, -45.0, False),
+    "swinging out to skirt it": (1.0, 1.0, 45.0, False),
+    "skirting it slowly, any course": (1.5, 0.4, 90.0, False),
+    "straight at the edge, no room left": (1.5, 1.0, 90.0, True),
+    "straight at the edge from 1 m aside": (1.0, 1.0, 90.0, False),
+    "running away from the middle at 3 m/s": (0.0, 3.0, 60.0, True),
+    "standing with a corner nearly on the grass": (2.0, 0.0, 0.0, True),
+    "the same, driving away from it": (2.0, 0.5, -90.0, True),
+    "standing on the grass": (2.6, 0.0, 0.0, True),
+    "standing as near as is allowed": (1.95, 0.0, 0.0, False),
+}))
+def test_alarm_in_a_lane_of_5_m(y_m, speed_mps, course_deg, alarm):
+    assert bool(intrusion(fix(y_m, speed_mps, course_deg), lane, LIMITS)) is alarm
+
+
+def test_stopping_distance_is_reaction_and_braking():
+    assert stopping_distance_m(1.0, LIMITS) == pytest.approx(0.3 + 0.25)
+    assert stopping_distance_m(0.0, LIMITS) == 0.0
+
+
+def test_a_corner_in_the_way_is_found_though_both_ends_of_the_path_are_clear():
+    def post(x_m: float, y_m: float) -> float:
+        return math.hypot(x_m - 0.6, y_m - 0.5) - 0.05
+
+    assert "would touch" in intrusion(fix(0.0, 2.0, 0.0), post, LIMITS)
+    assert intrusion(fix(0.0, 2.0, 180.0), post, LIMITS) == ""
+
+
+@given(y_m=st.floats(-2.4, 2.4), speed_mps=st.floats(0.0, 3.0), course_deg=st.floats(-180, 180))
+def test_a_robot_that_brakes_at_the_alarm_never_touches_the_grass(y_m, speed_mps, course_deg):
+    """Drive on in a straight line until the first alarm, react, brake: the footprint stays off."""
+    course = math.radians(course_deg)
+    step_s = 0.1
+    position = y_m
+    if intrusion(fix(position, speed_mps, course_deg), lane, LIMITS):
+        return  # it starts too near; there is nothing to prevent any more
+    for _ in range(200):
+        position += speed_mps * math.sin(course) * step_s
+        if intrusion(fix(position, speed_mps, course_deg), lane, LIMITS):
+            break
+    else:
+        assert abs(math.sin(course)) * speed_mps < 0.2
+        return
+    # The alarm came with this fix; its reaction time includes the period since the last one.
+    rest_s = LIMITS.reaction_s - step_s
+    stop = position + math.sin(course) * (
+        speed_mps * rest_s + speed_mps**2 / (2 * LIMITS.braking_mps2))
+    assert lane(0.0, stop) >= LIMITS.half_diagonal_m
+
+
+def fence() -> FenceMonitor:
+    return FenceMonitor(lane, LIMITS, FreshnessMonitor("GPS", 0.3, 0.2, 0.0, 0.5), hold_s=0.3)
+
+
+# m in the middle, e at the edge, c cleared by less than the hysteresis; n a fix of no numbers,
+# o the first fix once more, b a fix with a bad accuracy
+FIXES = {
+    "m": fix(0.0, 1.0, 0.0), "o": fix(0.0, 1.0, 0.0), "e": fix(2.0, 0.0, 0.0),
+    "c": fix(1.95, 0.0, 0.0), "n": Fix(math.nan, 0.0, 0.0, 0.0, 0.05),
+    "b": Fix(0.0, 0.0, 0.0, 0.0, 4.0), "w": Fix(0.0, 0.0, 0.0, 0.0, -1.0),
+}
+
+
+@pytest.mark.parametrize(("events", "expected"), **table({
+    "on the lane": ("mmmm", "----"),
+    "near the edge but never too near": ("mccc", "----"),
+    "at the edge, at once": ("mmem", "--AA"),
+    "back on the lane for long enough": ("memmmm", "-AAAA-"),
+    "back by less than the hysteresis": ("mecccccc", "-AAAAAAA"),
+    "at the edge twice": ("memmmmemmmm", "-AAAA-AAAA-"),
+    "no fix ever": ("......", "-----A"),
+    "the fixes cease, and come again": ("mm.....mmm", "----AAAAA-"),
+    "fixes without numbers are none": ("mnnnnn", "---AAA"),
+    "a negative accuracy is none": ("mwwwww", "---AAA"),
+    "a frozen receiver": ("moooooo", "---AAAA"),
+    "a receiver that has lost its accuracy is no barrier": ("mb", "-A"),
+    "at the edge, then blind": ("e.....", "AAAAAA"),
+}))
+def test_fence_timeline(events, expected):
+    monitor = fence()
+
+    def handle(event: str, now_s: float) -> None:
+        monitor.fix(FIXES[event], 0.0 if event == "o" else now_s, now_s)
+
+    assert play(monitor, handle, events) == expected
+
+
+def test_the_reason_tells_what_was_found_first():
+    monitor = fence()
+    monitor.fix(FIXES["e"], 0.0, 0.0)
+    monitor.fix(fix(3.0, 0.0, 0.0), 0.1, 0.1)
+    assert monitor.reason == \
+        "the robot is 0.50 m from the prohibited area, 0.52 m is the least"

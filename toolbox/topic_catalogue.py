@@ -1,0 +1,177 @@
+"""Everything there is to know about the topics: what they carry, who publishes, who reads."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+
+from actors import topics
+from actors.messages import Message
+from actors.runtime.actor import BASE_OUTPUTS, Actor
+from actors.runtime.topic import ROOT, Qos, Topic
+from actors.runtime.topics import INJECT
+from actors.runtime.wiring import topics_of
+from actors.supervision.run_plan import OBSERVER, OBSERVER_CLASS, SUPERVISOR, SUPERVISOR_CLASS, load_class
+from manager.specification import SystemSpec
+from toolbox.output import UsageError, unknown
+
+MAILBOX = {
+    Qos.SENSOR: "latest wins",
+    Qos.STATE: "latest wins",
+    Qos.COMMAND: "queued, bounded",
+}
+"""How a topic's messages wait at their reader (see `actors.runtime.mailbox`)."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class TopicUse:
+    """A topic with the nodes that publish and read it."""
+
+    topic: Topic[Any]
+    publishers: tuple[str, ...]
+    readers: tuple[str, ...]
+
+
+def uses(spec: SystemSpec) -> list[TopicUse]:
+    """Return all topics with their publishers and readers in a system.
+
+    Raises:
+        UsageError: the spec names an actor class that does not exist.
+    """
+    members = [(SUPERVISOR, SUPERVISOR_CLASS), (OBSERVER, OBSERVER_CLASS),
+               *((node.name, node.actor) for node in spec.actors())]
+    wired: list[tuple[str, tuple[Topic[Any], ...], tuple[Topic[Any], ...]]] = []
+    for name, path in members:
+        inputs, outputs = topics_of(_class(name, path))
+        wired.append((name, inputs, outputs))
+    return [TopicUse(topic, _publishers(topic, wired), _readers(topic, wired))
+            for topic in topics.ALL]
+
+
+def resolve(key: str) -> tuple[Topic[Any], str]:
+    """Return topic and full key expression for a key as a user types it.
+
+    A family may be given as `detection/DM1`, `detection/{name}` or `detection/*`; the leading
+    `rampart/` may be left out.
+
+    Raises:
+        UsageError: no topic has this key.
+    """
+    short = key.removeprefix("/").removeprefix(f"{ROOT}/")
+    for topic in topics.ALL:
+        if not topic.is_family:
+            if short == topic.key:
+                return topic, topic.at()
+            continue
+        head, tail = topic.key.split("{name}")
+        member = short[len(head):len(short) - len(tail)]
+        if short == f"{head}{member}{tail}" and member and "/" not in member:
+            if member in ("{name}", "*"):
+                return topic, topic.pattern
+            return topic, topic.at(member)
+    raise unknown("topic", key, (topic.key for topic in topics.ALL))
+
+
+def fields(kind: type[msgspec.Struct]) -> list[tuple[str, str]]:
+    """Return name and type of each field of a message, as text."""
+    return [(f.name, _type_name(f.type)) for f in msgspec.structs.fields(kind)]
+
+
+def markdown(spec: SystemSpec) -> str:
+    """Return `topics.md`: the contract of every key, for people."""
+    lines = [
+        "# Topics",
+        "",
+        "The contract of every Zenoh key. Written from `actors/topics.py` and the actor classes "
+        f"of `systems/{spec.name}.toml` by `rampart topic list --markdown`; a test keeps it true.",
+        "",
+        f"All keys are below `{ROOT}/`. A payload is a msgpack array `[source, incarnation, "
+        "sequence, stamp, body]`: which node, which life of it, how many-th message of that life, "
+        "the simulated time in seconds at which the content was true, and the message. Units are "
+        "SI and stand in the field names; frames follow REP-105, axes REP-103. Rates are in "
+        "simulated time; 0 means on event.",
+        "",
+        "- **sensor**: the newest sample counts; at the reader the latest wins.",
+        "- **state**: like sensor, and repeated at its rate even without change.",
+        "- **command**: each message counts; queued at the reader, bounded, an overflow is "
+        "reported.",
+        "",
+        "| key | message | QoS | rate | frame | publishers | readers |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    table = uses(spec)
+    for use in table:
+        t = use.topic
+        lines.append(
+            f"| `{t.key}` | [{t.type.__name__}](#{t.type.__name__.lower()}) | {t.qos.value} | "
+            f"{_rate(t)} | {f'`{t.frame}`' if t.frame else ''} | {', '.join(use.publishers)} | "
+            f"{', '.join(use.readers)} |")
+    lines += ["", "## What each key is for", ""]
+    lines += [f"- `{use.topic.key}`: {use.topic.doc} Waits at its reader: "
+              f"{MAILBOX[use.topic.qos]}." for use in table]
+    lines += ["", "## Messages", ""]
+    for kind in _messages(use.topic for use in table):
+        lines += [f"### {kind.__name__}", "", _summary(kind), ""]
+        lines += [f"- `{name}`: {type_name}" for name, type_name in fields(kind)]
+        lines.append("")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _publishers(topic: Topic[Any], wired: list[Any]) -> tuple[str, ...]:
+    if topic in BASE_OUTPUTS:
+        return ("every node",)
+    found = tuple(name for name, _, outputs in wired if topic in outputs)
+    return found or ("tools",)
+
+
+def _readers(topic: Topic[Any], wired: list[Any]) -> tuple[str, ...]:
+    if topic is INJECT:
+        return ("every node",)
+    return tuple(name for name, inputs, _ in wired if topic in inputs)
+
+
+def _class(name: str, path: str) -> type[Actor]:
+    try:
+        return load_class(path)
+    except ValueError as error:
+        raise UsageError(f"node {name}: {error}") from None
+
+
+def _rate(topic: Topic[Any]) -> str:
+    return f"{topic.rate_hz:g} Hz" if topic.rate_hz else "on event"
+
+
+def _messages(used: Iterable[Topic[Any]]) -> list[type[msgspec.Struct]]:
+    """Return the message types of topics and those nested in them, each once."""
+    found: dict[type[msgspec.Struct], None] = {}
+
+    def visit(kind: Any) -> None:
+        if isinstance(kind, type) and issubclass(kind, Message):
+            if kind not in found:
+                found[kind] = None
+                for f in msgspec.structs.fields(kind):
+                    visit(f.type)
+            return
+        for part in getattr(kind, "__args__", ()):
+            visit(part)
+
+    for topic in used:
+        visit(topic.type)
+    return list(found)
+
+
+def _summary(kind: type[Any]) -> str:
+    return " ".join((kind.__doc__ or "").split())
+
+
+def _type_name(kind: Any) -> str:
+    arguments = getattr(kind, "__args__", ())
+    if not arguments:
+        if isinstance(kind, type) and hasattr(kind, "__members__"):
+            return " | ".join(f'"{member.value}"' for member in kind)
+        return str(getattr(kind, "__name__", kind))
+    inner = ", ".join("..." if a is Ellipsis else _type_name(a) for a in arguments)
+    return f"{getattr(kind, '__origin__', kind).__name__}[{inner}]"
