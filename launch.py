@@ -15,9 +15,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from actors.messages import ControlStatus, GroundTruth, MissionStatus, NodeTable
 from actors.runtime.actor import Context, Header
 from actors.runtime.clock import Clock
+from actors.runtime.topic import Topic
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher, LaunchError
 from actors.supervision.run_plan import DEFAULT_PORT, OBSERVER, RunPlan, load_system
@@ -28,7 +31,8 @@ from manager.strategies import STRATEGIES
 from sim.console import Console
 from sim.judge import Judge
 from sim.observer import JudgeSink, Observer
-from sim.report import RunRecorder, write_report
+from sim.report import write_report
+from sim.report_record import RunRecord, RunRecorder
 from sim.run_end import RunEnd
 
 ROOT = Path(__file__).resolve().parent
@@ -111,10 +115,9 @@ class Run:
         self.directory = Path(options.report or ROOT / "reports" / (
             time.strftime("%Y%m%d-%H%M%S-") + self.mission.name))
         self.directory.mkdir(parents=True, exist_ok=True)
-        self.launcher = Launcher(RunPlan(**{
-            **{f: getattr(plan, f) for f in plan.__struct_fields__},
-            "airport": airport_name, "mission": mission_name,
-            "error_log": str(self.directory / "errors.log")}),
+        self.launcher = Launcher(
+            msgspec.structs.replace(plan, airport=airport_name, mission=mission_name,
+                                    error_log=str(self.directory.resolve() / "errors.log")),
             f"{self.mission.name} on {self.airport.name}")
         self.judge = Judge(self.mission.goals)
         self.end = RunEnd(options.patience)
@@ -147,15 +150,17 @@ class Run:
     async def _observe(self) -> int:
         plan = self.launcher.plan
         clock = Clock(plan.origin_s, plan.rate)
-        recorder = RunRecorder(self.airport, self.mission, self.spec, plan)
+        recorder = RunRecorder(
+            plan.run_id, self.airport, self.mission, seed=plan.seed, rate=plan.rate,
+            strategy=self.spec.strategy if plan.ftm else "")
         self.launcher.on_restart = lambda name, _: self.console.line(
             clock.now(), f"{name} brought back")
 
-        def to_launcher(message: Any, _header: Header) -> None:
+        def to_launcher(_topic: Topic[Any], message: Any, _header: Header) -> None:
             if isinstance(message, NodeTable):
                 self.launcher.supervisor_heard(message)
 
-        def to_end(message: Any, _header: Header) -> None:
+        def to_end(_topic: Topic[Any], message: Any, _header: Header) -> None:
             if isinstance(message, MissionStatus):
                 self.end.mission(message, clock.now())
             elif isinstance(message, ControlStatus):
@@ -165,7 +170,7 @@ class Run:
 
         ports = dict(self.launcher.ports)
         bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()))
-        sinks = [to_launcher, to_end, JudgeSink(self.judge), recorder.take, self.console.take]
+        sinks = [to_launcher, to_end, JudgeSink(self.judge), recorder.feed, self.console.take]
         observer = Observer(Context(OBSERVER, 1, clock, bus, {}, {"sinks": sinks}))
         task = asyncio.create_task(observer.run())
         self.console.banner(self.airport.name, self.mission, plan, self.spec.strategy)
@@ -184,15 +189,28 @@ class Run:
 
     def _conclude(self, recorder: RunRecorder, now_s: float, why: str) -> int:
         verdict = self.judge.verdict()
-        record = recorder.conclude(verdict, now_s, why)
+        reasons = () if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}")
+        record = recorder.record(
+            "success" if verdict.success else "fail", "safe" if verdict.safe else "unsafe",
+            reasons, now_s)
         html, data = write_report(record, self.directory)
         self.console.conclusion(record, html)
         if self._options.json:
-            print(json.dumps({**record.summary(), "report": str(html), "record": str(data)}),
-                  flush=True)
+            print(json.dumps(_summary(record, html, data)), flush=True)
         if not verdict.safe:
             return EXIT_UNSAFE
         return EXIT_SUCCESS if verdict.success else EXIT_FAILED
+
+
+def _summary(record: RunRecord, html: Path, data: Path) -> dict[str, Any]:
+    """Return what scripts rely on: the last line of stdout with --json."""
+    return {
+        "mission": record.mission, "safety": record.safety, "reasons": list(record.reasons),
+        "duration_s": round(record.duration_s, 2),
+        "lights": [msgspec.to_builtins(light) for light in record.lights],
+        "decisions": [msgspec.to_builtins(decision) for decision in record.decisions],
+        "restarts": record.restarts, "report": str(html), "record": str(data),
+    }
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -19,9 +19,11 @@ from actors.messages import (
     ProcessEvent,
 )
 from actors.runtime.actor import Header
+from actors.runtime.topic import Topic
 from actors.supervision.run_plan import RunPlan
 from airport.model import Mission
-from sim.report import RunRecord
+from sim.report import headline
+from sim.report_record import RunRecord
 
 _QUIET_EVENTS = frozenset({"started", "running", "adopted"})
 
@@ -50,7 +52,7 @@ class Console:
             self._print(f"Operator's page: http://127.0.0.1:{plan.hmi_port}/")
         self._print("Try from another shell: kill-node osmosis_control")
 
-    def take(self, message: Any, header: Header) -> None:
+    def take(self, _topic: Topic[Any], message: Any, header: Header) -> None:
         """Take one message of the run."""
         at = header.stamp
         if isinstance(message, MissionStatus):
@@ -85,7 +87,11 @@ class Console:
 
     def conclusion(self, record: RunRecord, report: Path) -> None:
         """Say how it ended."""
-        self._print(record.conclusion())
+        self._print(f"Mission {record.mission_name}: {record.mission}, {record.safety}, "
+                    f"{record.duration_s:.1f} s simulated, {record.distance_m:.0f} m driven.")
+        self._print(headline(record))
+        for reason in record.reasons:
+            self._print(f"  {reason}")
         self._print(f"Report: {report}")
 
     def _take_mission(self, status: MissionStatus, at: float) -> None:

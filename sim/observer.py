@@ -1,7 +1,7 @@
 """The observer: lives in the launcher's process and hears what the run's story is made of.
 
 It controls nothing. Whoever wants the story (judge, report, console, launcher) is a sink: a
-function of message and header, called on the observer's loop in order of arrival.
+function of topic, message and header, called on the observer's loop in order of arrival.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ from typing import Any
 from actors import topics
 from actors.messages import GroundTruth, MissionPhase, MissionStatus
 from actors.runtime.actor import Actor, Context, Header, on
+from actors.runtime.topic import Topic
+from actors.runtime.topics import INJECT
 from sim.judge import Judge, Sample
 
-Sink = Callable[[Any, Header], None]
+Sink = Callable[[Topic[Any], Any, Header], None]
 
 
 class Observer(Actor):
@@ -23,9 +25,12 @@ class Observer(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self._sinks: list[Sink] = list(context.shared.get("sinks", ()))
+        self._topic_of = {topic.type: topic for topic in self.inputs() if topic is not INJECT}
 
     @on(topics.MISSION_STATUS)
     @on(topics.CONTROL_STATUS)
+    @on(topics.LIGHT_MEASURED)
+    @on(topics.POSE)
     @on(topics.PILOT_STATUS)
     @on(topics.DETECTION)
     @on(topics.RECOVERY)
@@ -39,8 +44,9 @@ class Observer(Actor):
     @on(topics.OBSTACLES)
     def heard(self, message: Any, header: Header) -> None:
         """Pass one message on."""
+        topic = self._topic_of[type(message)]  # each topic heard here has a type of its own
         for sink in self._sinks:
-            sink(message, header)
+            sink(topic, message, header)
 
 
 class JudgeSink:
@@ -50,7 +56,7 @@ class JudgeSink:
         self._judge = judge
         self._mode = ""
 
-    def __call__(self, message: Any, header: Header) -> None:
+    def __call__(self, _topic: Topic[Any], message: Any, header: Header) -> None:
         """Take one message; those that are neither truth nor mission status do not matter."""
         if isinstance(message, MissionStatus):
             running = message.phase is MissionPhase.RUNNING and message.step < len(message.goals)

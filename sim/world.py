@@ -48,7 +48,7 @@ SAME_CONTACT_S = 0.5
 """A contact with the same thing after a shorter break is the same collision."""
 
 LOCKED_DAMPING = 300.0
-"""Wheel damping, N m s/rad, when the brake blocks the wheels: creep below 1 mm/s in any push."""
+"""Wheel damping, N m s/rad, when the brake blocks the wheels: all that moves then is the tyres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,6 +220,10 @@ class World:
 
     def scan(self) -> Floats:
         """One sweep of the laser, m."""
+        # The clearance is from the footprint's edge, the laser in its middle: nothing in range
+        # needs no rays. It may be one look old, in which the robot moves less than the radius.
+        if self._obstacle_clearance_m > self.laser.range_max_m:
+            return np.full(self.laser.rays, self.laser.range_max_m)
         return self._laser.scan(self._model, self._data, self.pose)
 
     def gps(self) -> GpsReading:

@@ -9,7 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from actors import messages as m
+from actors import topics
 from actors.detection.module import Monitor
+from actors.runtime.actor import Actor, Context, Header, on
 
 SLOT_S = 0.1
 Handler = Callable[[str, float], None]
@@ -38,3 +41,27 @@ def wake(monitor: Monitor, until_s: float) -> None:
 def table(cases: dict[str, tuple[Any, ...]]) -> dict[str, Any]:
     """Arguments for `pytest.mark.parametrize` from sentences to cases."""
     return {"argvalues": list(cases.values()), "ids": list(cases)}
+
+
+class Source(Actor):
+    """Publishes commands and poses when told."""
+
+    outputs = (topics.COMMAND, topics.POSE)
+
+
+class Ear(Actor):
+    """Keeps all detection reports with the time of their arrival."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.heard: list[tuple[float, m.DetectionReport]] = []
+
+    @on(topics.DETECTION)
+    def detection(self, message: m.DetectionReport, _header: Header) -> None:
+        self.heard.append((self.clock.now(), message))
+
+    @property
+    def states(self) -> list[str]:
+        """States in sequence, repetitions left out."""
+        states = [report.state.value for _, report in self.heard]
+        return [s for i, s in enumerate(states) if i == 0 or states[i - 1] != s]

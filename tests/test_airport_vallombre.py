@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from itertools import pairwise
 
 import pytest
 import shapely
@@ -65,7 +66,7 @@ def test_mission_ab_ends_in_the_start_area():
 def test_each_row_has_ten_lights_or_more_about_4_m_apart_on_the_graphs_edges(row):
     lights = [light for light in AIRPORT.lights if light.row == row]
     assert len(lights) >= 10
-    for one, two in zip(lights, lights[1:], strict=False):
+    for one, two in pairwise(lights):
         assert math.dist((one.x_m, one.y_m), (two.x_m, two.y_m)) == pytest.approx(4.0, abs=0.1)
     for light in lights:
         assert AIRPORT.nearest_on_graph(light.x_m, light.y_m).distance_m < 0.05
@@ -73,7 +74,7 @@ def test_each_row_has_ten_lights_or_more_about_4_m_apart_on_the_graphs_edges(row
 
 def test_light_verification_legs_pass_over_every_light_of_the_row():
     goals = AIRPORT.missions["AB"].goals
-    legs = [(a, b) for a, b in zip(goals, goals[1:], strict=False)
+    legs = [(a, b) for a, b in pairwise(goals)
             if b.mode == "light verification"]  # fmt: skip
     lines = [LineString([(a.x_m, a.y_m), (b.x_m, b.y_m)]) for a, b in legs]
     for light in AIRPORT.lights:

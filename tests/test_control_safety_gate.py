@@ -239,7 +239,7 @@ def test_the_baseline_keeps_only_repetition_obstacle_stop_and_joystick():
     (np.array(((0.30, 0.36),)), 0.0, 1.0, "stopped"),
     (np.array(((0.30, 0.36),)), 0.0, -1.0, "free"),
     (np.array(((-0.45, 0.0),)), -0.5, 0.0, "stopped"),
-    (np.array(((0.8, 0.9),)), 0.8, 1.5, "slower"),
+    (np.array(((0.6, 0.7),)), 0.8, 1.5, "slower"),
 ], ids=["nothing", "wall far", "wall near", "wall at once", "away from it", "slowly towards it",
         "turn in place", "flank passed", "corner brushed", "turn into it", "turn away from it",
         "something behind", "in the bend"])
@@ -290,5 +290,5 @@ def test_an_obstacle_that_appears_1_2_m_ahead_is_not_touched(speed):
     assert 0.1 < world.least_clearance_m < 0.35
     changes = np.abs(np.diff(speeds))
     assert changes.max() <= 1.5 * DT_S + 1e-9
-    crossings = np.count_nonzero(np.diff(np.sign(np.diff(speeds))) > 1)
-    assert crossings <= 2, "slowed down gradually, no bang-bang"
+    assert len({round(v, 1) for v in speeds}) >= 5, "gradually, no bang-bang"
+    assert np.diff(speeds).max() <= 0.1

@@ -6,7 +6,7 @@ import asyncio
 import math
 
 import pytest
-from detection_timeline import play, table
+from detection_timeline import Ear, Source, play, table
 from virtual_loop import System, VirtualLoop, run
 
 from actors import messages as m
@@ -14,7 +14,6 @@ from actors import topics
 from actors.detection.freshness import CommandFreshness, LocalizationFreshness
 from actors.detection.freshness_monitor import FreshnessMonitor
 from actors.detection.module import EXCUSE_S, DetectionModule, IllegalTransitionError
-from actors.runtime.actor import Actor, Context, Header, on
 from actors.runtime.wiring import Member, heard
 
 # f fresh sample, o the first sample once more, d delayed by 1 s, + stamped 100 s ahead, n no number
@@ -67,30 +66,6 @@ def test_it_becomes_active_exactly_when_the_age_reaches_the_timeout():
     monitor.expire(1.28)
     assert monitor.active
     assert monitor.reason == "command not updated for 0.3 s"
-
-
-class Source(Actor):
-    """Publishes commands and poses when told."""
-
-    outputs = (topics.COMMAND, topics.POSE)
-
-
-class Ear(Actor):
-    """Keeps all detection reports with the time of their arrival."""
-
-    def __init__(self, context: Context) -> None:
-        super().__init__(context)
-        self.heard: list[tuple[float, m.DetectionReport]] = []
-
-    @on(topics.DETECTION)
-    def detection(self, message: m.DetectionReport, _header: Header) -> None:
-        self.heard.append((self.clock.now(), message))
-
-    @property
-    def states(self) -> list[str]:
-        """States in sequence, repetitions left out."""
-        states = [report.state.value for _, report in self.heard]
-        return [s for i, s in enumerate(states) if i == 0 or states[i - 1] != s]
 
 
 def test_the_actor_reports_at_once_and_repeats_at_5_hz():
@@ -195,7 +170,8 @@ def test_an_illegal_transition_names_both_states():
         async with System() as system:
             module = system.start("DM9", DetectionModule)
             await system.settle()
-            with pytest.raises(IllegalTransitionError, match="DM9: no transition from idle to idle"):
+            error = "DM9: no transition from idle to idle"
+            with pytest.raises(IllegalTransitionError, match=error):
                 module.clear()
             module.activate("a fault", ("a",))
             module.activate("two faults", ("a", "b"))

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 
 import pytest
-from detection_timeline import play, table
+from detection_timeline import Ear, Source, play, table
 from hypothesis import given
 from hypothesis import strategies as st
+from shapely.geometry import box
+from virtual_loop import System, run, shipped_system
 
+from actors import messages as m
+from actors import topics
+from actors.detection.bounds import Bounds
 from actors.detection.fence_monitor import FenceMonitor
 from actors.detection.freshness_monitor import FreshnessMonitor
 from actors.detection.geofence import FenceLimits, Fix, intrusion, stopping_distance_m
+from actors.detection.prohibited_area import ProhibitedArea, half_diagonal_m
+from actors.runtime.actor import Actor
+from actors.runtime.wiring import Member, heard
+from airport.model import Airport, StartPose
 
 LIMITS = FenceLimits(half_diagonal_m=0.473, reaction_s=0.3, braking_mps2=2.0)
 ACCURACY_M = 0.05
@@ -128,3 +138,78 @@ def test_the_reason_tells_what_was_found_first():
     monitor.fix(fix(3.0, 0.0, 0.0), 0.1, 0.1)
     assert monitor.reason == \
         "the robot is 0.50 m from the prohibited area, 0.52 m is the least"
+
+
+class Receiver(Actor):
+    """A GPS receiver that says what it is told."""
+
+    outputs = (topics.GPS,)
+
+
+def lane_airport() -> Airport:
+    return Airport("lane", {"a": (0.0, 0.0), "b": (40.0, 0.0)}, (("a", "b"),),
+                   box(-5.0, -HALF_LANE_M, 45.0, HALF_LANE_M), StartPose(0.0, 0.0, 0.0))
+
+
+def test_the_actor_warns_in_time_by_the_margins_of_the_shipped_system():
+    async def scenario() -> None:
+        spec = shipped_system()
+        async with System(system=spec, airport=lane_airport()) as system:
+            ear = system.start("ear", Ear)
+            gps = system.start("gps", Receiver)
+            detection = next(d for d in spec.detections if d.name == "DM1")
+            system.start("DM1", ProhibitedArea, **detection.parameters)
+            y_m = 0.0
+            for _ in range(20):  # along the lane, then straight at its edge with top speed
+                gps.publish(topics.GPS, m.GpsFix(0.0, 0.0, 1.0, 0.0, 0.05))
+                await asyncio.sleep(0.1)
+            assert ear.states == ["idle"]
+            while ear.states == ["idle"]:
+                y_m += 0.1
+                gps.publish(topics.GPS, m.GpsFix(20.0, y_m, 0.0, 1.0, 0.05))
+                await asyncio.sleep(0.1)
+            room_m = HALF_LANE_M - y_m - half_diagonal_m(spec.robot)
+            timing = spec.timing
+            brakes_m = 1.0 / (2 * spec.robot.braking_mps2)
+            assert room_m >= timing.arbitration_s + timing.actuation_s + brakes_m
+            assert room_m < 0.8
+
+    run(scenario)
+
+
+def test_the_actor_is_active_when_gps_falls_silent():
+    async def scenario() -> None:
+        async with System(system=shipped_system(), airport=lane_airport()) as system:
+            ear = system.start("ear", Ear)
+            gps = system.start("gps", Receiver)
+            system.start("DM1", ProhibitedArea, margin_m=0.6)
+            for _ in range(5):
+                gps.publish(topics.GPS, m.GpsFix(0.0, 0.0, 1.0, 0.0, 0.05))
+                await asyncio.sleep(0.1)
+            await asyncio.sleep(0.35)
+            assert ear.states == ["idle"]
+            await asyncio.sleep(0.1)
+            assert ear.states == ["idle", "active"]
+            assert ear.heard[-1][1].reason == "GPS not updated for 0.5 s"
+
+    run(scenario)
+
+
+def test_the_actor_hears_gps_and_nothing_else_of_the_robot():
+    assert set(heard(Member("DM1", ProhibitedArea, {}))) == {"summit_xl/gps"}
+
+
+def test_nonsense_on_the_command_is_reported_with_the_first_message():
+    async def scenario() -> None:
+        async with System(system=shipped_system()) as system:
+            ear = system.start("ear", Ear)
+            source = system.start("source", Source)
+            system.start("DM3", Bounds)
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            await system.settle()
+            assert ear.states == ["idle"]
+            source.publish(topics.COMMAND, m.Twist(5.0, 0.0))
+            await system.settle()
+            assert ear.states == ["idle", "active"]
+
+    run(scenario)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from detection_timeline import play, table
-from test_detection_freshness import Ear
+from detection_timeline import Ear, play, table
 from virtual_loop import System, run
 
 from actors import messages as m

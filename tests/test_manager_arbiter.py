@@ -109,6 +109,15 @@ def test_a_less_safe_recovery_waits_even_if_it_claims_something_else():
     assert commands(bench.report("RM2", DONE)) == [("RM2", False), ("RM3", True)]
 
 
+def test_a_safer_recovery_waits_for_one_that_claims_the_same():
+    bench = Bench(edited(RM2={"claims": frozenset({"actuation", "processes"})}))
+    bench.active("DM4", "osmosis_control")
+    bench.report("RM3", ACTING)
+    assert commands(bench.active("DM2")) == []
+    assert bench.orders == "(RM3)"
+    assert commands(bench.report("RM3", DONE)) == [("RM3", False), ("RM2", True)]
+
+
 def test_an_interruptible_recovery_is_released_at_once():
     bench = Bench(edited(RM2={"interruptible": True}))
     bench.active("DM2")
@@ -269,6 +278,25 @@ def test_the_same_node_crashing_again_is_respawned_again():
     assert bench.state.desired["RM3"].decision == 2
 
 
+def test_a_crash_long_after_the_order_is_a_new_cause_and_no_failure_of_the_old():
+    bench = Bench()
+    bench.active("DM4", "osmosis_control")
+    bench.report("RM3", DONE)
+    bench.wait(2.8)
+    bench.idle("DM4")
+    bench.wait(0.4)
+    assert commands(bench.active("DM4", "osmosis_control")) == [("RM3", True)]
+
+
+def test_another_node_crashing_right_at_the_deadline_is_no_failure_either():
+    bench = Bench(edited(RM3={"deadline_s": 0.5}))
+    bench.active("DM4", "osmosis_control")
+    bench.report("RM3", DONE)
+    bench.now = 0.6
+    assert commands(bench.active("DM4", "graph_planner")) == [("RM3", True)]
+    assert bench.state.desired["RM3"].nodes == ("graph_planner",)
+
+
 def test_one_node_fewer_is_no_new_order():
     bench = Bench()
     bench.active("DM4", "osmosis_control", "graph_planner")
@@ -334,6 +362,34 @@ def test_a_dead_recovery_module_is_noticed_by_the_deadline():
     bench.active("DM2")
     bench.wait(2.1)
     assert bench.orders == "RM1"
+
+
+def test_new_causes_do_not_excuse_a_deaf_recovery_module():
+    bench = Bench()
+    for _ in range(8):
+        bench.active("DM4", "osmosis_control")
+        bench.wait(0.2)
+        bench.idle("DM4")
+        bench.wait(0.2)
+    assert "RM2" in bench.orders
+
+
+def test_a_dead_recovery_module_that_is_no_longer_needed_is_released_at_its_deadline():
+    bench = Bench()
+    bench.active("DM2")
+    bench.idle("DM2")
+    bench.wait(1.9)
+    assert bench.orders == "(RM2)"
+    bench.wait(0.2)
+    assert bench.orders == ""
+
+
+def test_a_repair_that_is_escalated_to_is_told_the_nodes():
+    bench = Bench(edited(RM3={"escalate_to": "RM4"}))
+    bench.active("DM4", "osmosis_control")
+    bench.report("RM3", FAILED)
+    assert bench.state.desired["RM4"].activate
+    assert bench.state.desired["RM4"].nodes == ("osmosis_control",)
 
 
 def test_a_late_respawn_is_let_be_and_its_late_success_counts():

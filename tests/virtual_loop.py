@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
+import systems
 from actors.runtime.actor import Actor, Context
 from actors.runtime.clock import Clock
 from actors.runtime.virtual_bus import Hub, VirtualBus
+from manager.specification import SystemSpec, parse_specification
 
 A = TypeVar("A", bound=Actor)
 T = TypeVar("T")
@@ -40,6 +44,13 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 def run(scenario: Callable[[], Coroutine[Any, Any, T]]) -> T:
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
         return runner.run(scenario())
+
+
+@cache
+def shipped_system() -> SystemSpec:
+    """Return the spec of the shipped system."""
+    path = Path(systems.__file__).parent / "osmosis.toml"
+    return parse_specification(path.read_text(), path.name)
 
 
 class System:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
+from enum import Enum
 from typing import Any
 
 import msgspec
@@ -14,7 +15,13 @@ from actors.runtime.actor import BASE_OUTPUTS, Actor
 from actors.runtime.topic import ROOT, Qos, Topic
 from actors.runtime.topics import INJECT
 from actors.runtime.wiring import topics_of
-from actors.supervision.run_plan import OBSERVER, OBSERVER_CLASS, SUPERVISOR, SUPERVISOR_CLASS, load_class
+from actors.supervision.run_plan import (
+    OBSERVER,
+    OBSERVER_CLASS,
+    SUPERVISOR,
+    SUPERVISOR_CLASS,
+    load_class,
+)
 from manager.specification import SystemSpec
 from toolbox.output import UsageError, unknown
 
@@ -170,7 +177,7 @@ def _summary(kind: type[Any]) -> str:
 def _type_name(kind: Any) -> str:
     arguments = getattr(kind, "__args__", ())
     if not arguments:
-        if isinstance(kind, type) and hasattr(kind, "__members__"):
+        if isinstance(kind, type) and issubclass(kind, Enum):
             return " | ".join(f'"{member.value}"' for member in kind)
         return str(getattr(kind, "__name__", kind))
     inner = ", ".join("..." if a is Ellipsis else _type_name(a) for a in arguments)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import itertools
 import statistics
 from collections import deque
 from typing import Any
@@ -46,7 +47,8 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
     parser = subverbs.add_parser(
         "info", formatter_class=formatter, help="the contract of one topic (needs no run)",
         description="Show type, fields, QoS, publishers and readers of a topic.",
-        epilog="examples:\n  rampart topic info control/command\n  rampart topic info detection/DM1")
+        epilog="examples:\n  rampart topic info control/command\n"
+               "  rampart topic info detection/DM1")
     parser.add_argument("key", metavar="KEY")
     parser.add_argument("--system", metavar="FILE", help="system spec; default the shipped one")
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -197,7 +199,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
 
 def rate_of(times_s: list[float]) -> dict[str, Any]:
     """Return rate and spread of arrival times, as `ros2 topic hz` gives them (pure)."""
-    gaps = [b - a for a, b in zip(times_s, times_s[1:], strict=False)]
+    gaps = [b - a for a, b in itertools.pairwise(times_s)]
     if not gaps:
         return {"rate_hz": None, "min_s": None, "max_s": None, "std_dev_s": None,
                 "window": len(times_s)}

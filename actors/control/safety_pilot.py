@@ -78,8 +78,8 @@ class SafetyPilot(Actor):
 
     @every(_PERIOD_S)
     def repeat(self) -> None:
-        """Repeat the command in force, unless one has just gone out."""
-        if self.clock.now() - self._sent_s > 0.8 * _PERIOD_S:
+        """Repeat the command in force, unless fresh ones go out at this rate anyway."""
+        if self.clock.now() - self._sent_s > 1.2 * _PERIOD_S:
             self._act()
 
     @every(0.2)

@@ -19,6 +19,9 @@ from actors.control.polyline import Array, Hull
 _NEARER_M = 0.01
 """Laser noise: a smaller approach is none."""
 
+_CRAWL_MPS = 0.08
+"""Slowed down below this the robot stands, else it would twitch with the laser's noise."""
+
 
 @dataclass(frozen=True, slots=True)
 class StoppingRoom:
@@ -75,6 +78,8 @@ def is_free(linear_mps: float, angular_radps: float, points: Array, room: Stoppi
         points: laser echoes in `base_link`, shape (n, 2).
         room: what has to be free.
     """
+    if abs(linear_mps) < 1e-6:
+        linear_mps = 0.0
     margin_m = room.beside_m(linear_mps)
     path_m = max(room.ahead_m(linear_mps) - margin_m, 0.0) if linear_mps else 0.0
     reach_m = room.hull.turning_radius_m + path_m + margin_m
@@ -120,8 +125,13 @@ def limited(
     if is_free(linear_mps, angular_radps, points, room):
         return linear_mps, angular_radps
     for share in np.linspace(0.95, 0.0, 20):
-        if is_free(float(linear_mps * share), angular_radps, points, room):
-            return float(linear_mps * share), angular_radps
+        slower_mps = float(linear_mps * share)
+        if abs(slower_mps) < _CRAWL_MPS:
+            break
+        if is_free(slower_mps, angular_radps, points, room):
+            return slower_mps, angular_radps
+    if is_free(0.0, angular_radps, points, room):
+        return 0.0, angular_radps
     for share in (0.5, 0.25):
         if is_free(0.0, angular_radps * share, points, room):
             return 0.0, angular_radps * share

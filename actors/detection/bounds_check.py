@@ -53,7 +53,7 @@ class BoundsCheck:
         elif self.active:
             if self._good_since_s is None:
                 self._good_since_s = now_s
-            if now_s >= self._good_since_s + self.hold_s:
+            if now_s >= self._good_since_s + self.hold_s - 1e-9:
                 self.active = False
                 self.reason = ""
                 self._good_since_s = None

@@ -70,6 +70,6 @@ class FenceMonitor:
         elif self._intrusion:
             if self._safe_since_s is None:
                 self._safe_since_s = now_s
-            if now_s >= self._safe_since_s + self._hold_s:
+            if now_s >= self._safe_since_s + self._hold_s - 1e-9:
                 self._intrusion = ""
                 self._safe_since_s = None

@@ -70,7 +70,7 @@ class FreshnessMonitor:
             return
         if self._fresh_since_s is None:
             self._fresh_since_s = now_s
-        elif now_s >= self._fresh_since_s + self.hold_s:
+        elif now_s >= self._fresh_since_s + self.hold_s - 1e-9:
             self.active = False
             self.reason = ""
             self._fresh_since_s = None

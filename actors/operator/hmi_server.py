@@ -127,11 +127,12 @@ class PageServer:
 
     def stop(self) -> None:
         """Stop listening and say goodbye to the pages; harmless when not started."""
-        self._socket.close()
-        if self._server is None:
+        listening = getattr(self._server, "servers", [])
+        if self._server is None or not listening:
+            self._socket.close()
             return
-        for server in self._server.servers:
-            server.close()
+        for server in listening:
+            server.close()  # closes the socket too
         for connection in list(self._server.server_state.connections):
             connection.shutdown()
 

@@ -1,0 +1,107 @@
+"""What the operator's page is told."""
+
+import json
+import math
+
+import msgspec
+
+from actors import messages as m
+from actors.operator.hmi_map import draw
+from actors.operator.hmi_state import STALE_S, TRACK_POINTS, HmiState
+from actors.operator.hmi_words import decision_in_words
+from airport.formats import load_airport
+
+
+def shown(state: HmiState, now_s: float = 0.0) -> dict:
+    return json.loads(msgspec.json.encode(state.snapshot(now_s)))
+
+
+def test_a_snapshot_of_nothing_heard_is_complete():
+    snapshot = shown(HmiState(), 1.0)
+    assert snapshot["time_s"] == 1.0
+    assert snapshot["pose"] is snapshot["mission"] is snapshot["nodes"] is None
+    assert snapshot["events"] == snapshot["detections"] == snapshot["route"] == []
+
+
+def test_a_state_not_heard_for_a_while_is_stale():
+    state = HmiState()
+    state.keep("pilot", m.PilotStatus(m.PilotMode.AUTO, False, "", 0), 10.0)
+    assert shown(state, 10.0 + STALE_S)["pilot"]["stale"] is False
+    assert shown(state, 10.1 + STALE_S)["pilot"]["stale"] is True
+
+
+def test_the_track_has_a_point_where_the_robot_has_moved_and_a_limit():
+    state = HmiState()
+    for i in range(3 * TRACK_POINTS):
+        state.pose(m.Pose(i * 0.1, 0.0, 0.0), 0.05 * i)
+    assert len(state.track) == TRACK_POINTS
+    gaps = [b[0] - a[0] for a, b in zip(state.track, list(state.track)[1:], strict=False)]
+    assert min(gaps) > 0.24
+
+
+def test_a_corrupt_pose_neither_breaks_the_track_nor_the_json():
+    state = HmiState()
+    state.pose(m.Pose(math.nan, math.inf, 0.0), 1.0)
+    assert not state.track
+    assert shown(state, 1.0)["pose"]["value"]["x_m"] is None
+
+
+def test_a_detection_is_logged_when_it_begins_and_when_it_ends():
+    state = HmiState()
+    active, idle = m.DetectionState.ACTIVE, m.DetectionState.IDLE
+    for at_s, which in enumerate([idle, idle, active, active, idle, idle]):
+        report = m.DetectionReport(which, "stale" if which is active else "", (), 0.0)
+        state.detection("DM2", report, float(at_s))
+    assert [(e["t"], e["kind"], e["text"]) for e in shown(state)["events"]] == [
+        (2.0, "fault", "DM2 detects: stale"), (4.0, "clear", "DM2 is idle again")]
+
+
+def test_that_all_nodes_start_at_the_start_is_no_news_but_a_crash_is():
+    state = HmiState()
+    for event in ("started", "running", "crashed", "respawned"):
+        state.process_event(m.ProcessEvent("hmi", event, 1, 1, "RM4", ""), 1.0)
+    assert [e["text"] for e in shown(state)["events"]] == ["hmi crashed", "hmi respawned by RM4"]
+
+
+def test_lights_come_from_the_status_and_from_passing_and_a_new_mission_forgets_them():
+    state = HmiState()
+    light = m.LightMeasurement("A01", 100.0, 0.5, m.LightVerdict.OK)
+    state.mission(m.MissionStatus("1", "A", m.MissionPhase.RUNNING, 0, (), (), (light,), ""), 1.0)
+    state.light(m.LightMeasurement("A02", 0.0, 0.0, m.LightVerdict.OUT))
+    assert {k: v["verdict"] for k, v in shown(state)["lights"].items()} == {
+        "A01": "ok", "A02": "out"}
+    state.mission(m.MissionStatus("", "", m.MissionPhase.IDLE, 0, (), (), (), ""), 2.0)
+    assert set(shown(state)["lights"]) == {"A01", "A02"}
+    state.mission(m.MissionStatus("2", "A", m.MissionPhase.RUNNING, 0, (), (), (), ""), 3.0)
+    assert shown(state)["lights"] == {}
+
+
+def test_a_decision_is_told_with_its_certificate():
+    state = HmiState()
+    state.decision(m.DecisionRecord(
+        4, "safety-first", ("FTM1", "FTM6"), 2, ("RM1",), ("FTM1 > FTM6",),
+        (("RM5", "FTM6 is dominated by FTM1"),), 1.0), 1.1)
+    told = shown(state)["decisions"][0]
+    assert told["path"] == ["FTM1 > FTM6"]
+    assert told["rejected"] == ["RM5: FTM6 is dominated by FTM1"]
+    assert "(block 2)" in told["words"]
+
+
+def test_decisions_are_put_in_words():
+    assert decision_in_words(("FTM7",), 1, ("RM4",)) == (
+        "FTM7 is active: run RM4, because it is the only active mechanism (block 1).")
+    assert decision_in_words(("FTM3", "FTM4"), 3, ("RM2",)).startswith(
+        "FTM3 and FTM4 are active: run RM2")
+    assert decision_in_words((), 0, ()).startswith("No mechanism is active")
+    assert decision_in_words(("FTM3",), 2, ("RM2", "RM3"), "mission-first") == (
+        "FTM3 is active: run RM2 and RM3 (strategy mission-first, rule 2).")
+
+
+def test_the_drawing_holds_the_whole_airport_within_its_bounds():
+    airport = load_airport("vallombre")
+    drawing = draw(airport)
+    x0, y0, x1, y1 = drawing.bounds_m
+    assert len(drawing.lights) == len(airport.lights)
+    assert len(drawing.edges) == len(airport.edges)
+    assert all(x0 < light.x_m < x1 and y0 < light.y_m < y1 for light in drawing.lights)
+    assert drawing.prohibited.count("M") == drawing.prohibited.count("Z") > 1

@@ -1,0 +1,93 @@
+"""When the HMI sends a mission: once it was taken, never again."""
+
+import pytest
+
+from actors.messages import Goal, MissionPhase, MissionRequest, MissionStatus, Mode
+from actors.operator.hmi_submission import (
+    GIVE_UP_S,
+    RESPAWN_WINDOW_S,
+    BusyError,
+    Submission,
+    first_request,
+)
+
+GOALS = (Goal(1.0, 2.0, Mode.TAXI),)
+FIRST = first_request("r7", "AB", GOALS)
+IDLE = MissionStatus("", "", MissionPhase.IDLE, 0, (), (), (), "")
+
+
+def status(request: MissionRequest, phase: MissionPhase = MissionPhase.RUNNING) -> MissionStatus:
+    return MissionStatus(request.mission_id, request.name, phase, 0, GOALS, (), (), "")
+
+
+def test_the_first_mission_waits_until_the_mission_manager_shows_it():
+    submission = Submission("r7", 1, 0.0, FIRST)
+    assert submission.pending == FIRST
+    submission.hear(IDLE)
+    assert submission.pending == FIRST
+    submission.hear(status(FIRST))
+    assert submission.pending is None
+
+
+def test_a_mission_once_taken_is_not_sent_again_when_the_mission_manager_forgets_it():
+    submission = Submission("r7", 1, 0.0, FIRST)
+    submission.hear(status(FIRST))
+    submission.hear(IDLE)
+    assert submission.pending is None
+    assert submission.expire(1000.0) is None
+
+
+def test_the_first_life_sends_the_mission_however_late_it_begins():
+    assert Submission("r7", 1, 60.0, FIRST).pending == FIRST
+
+
+@pytest.mark.parametrize(("incarnation", "now_s", "sends"), [
+    (2, RESPAWN_WINDOW_S - 0.1, True),
+    (2, RESPAWN_WINDOW_S, False),
+    (5, 100.0, False),
+])
+def test_a_respawned_hmi_sends_the_first_mission_only_at_the_very_start(incarnation, now_s, sends):
+    submission = Submission("r7", incarnation, now_s, FIRST)
+    submission.hear(IDLE)
+    assert (submission.pending is not None) is sends
+
+
+def test_the_mission_id_is_the_same_in_every_life_so_that_twice_is_once():
+    assert first_request("r7", "AB", GOALS) == FIRST
+    assert first_request("r8", "AB", GOALS).mission_id != FIRST.mission_id
+
+
+def test_missions_from_the_page_have_ids_of_their_own_in_every_life():
+    ids = set()
+    for incarnation in (1, 2):
+        submission = Submission("r7", incarnation, 50.0, None)
+        for _ in range(2):
+            request = submission.ask("A", GOALS, 50.0)
+            ids.add(request.mission_id)
+            submission.hear(status(request, MissionPhase.SUCCEEDED))
+    assert len(ids) == 4
+    assert FIRST.mission_id not in ids
+
+
+@pytest.mark.parametrize("phase", [MissionPhase.RUNNING, MissionPhase.PAUSED])
+def test_a_mission_is_refused_while_another_one_is_under_way(phase):
+    submission = Submission("r7", 1, 0.0, FIRST)
+    submission.hear(status(FIRST, phase))
+    with pytest.raises(BusyError, match=f"mission AB is {phase.value}"):
+        submission.ask("A", GOALS, 10.0)
+
+
+def test_a_mission_is_refused_while_another_one_waits_to_be_taken():
+    with pytest.raises(BusyError, match="waits"):
+        Submission("r7", 1, 0.0, FIRST).ask("A", GOALS, 0.0)
+
+
+def test_a_mission_from_the_page_is_withdrawn_when_nobody_takes_it_but_the_first_is_not():
+    submission = Submission("r7", 2, 50.0, None)
+    request = submission.ask("A", GOALS, 50.0)
+    assert submission.expire(50.0 + GIVE_UP_S - 0.1) is None
+    assert submission.expire(50.0 + GIVE_UP_S) == request
+    assert submission.pending is None
+    first = Submission("r7", 1, 0.0, FIRST)
+    assert first.expire(1e6) is None
+    assert first.pending == FIRST

@@ -1,0 +1,183 @@
+"""RM3 and RM4: what is asked of the supervisor, and when a node counts as back."""
+
+from __future__ import annotations
+
+import pytest
+
+from actors.recovery.respawn_core import Ask, RespawnCore
+
+
+def core(*nodes: str) -> RespawnCore:
+    return RespawnCore(nodes or ("a",), first_request=100, start_s=0.0)
+
+
+def seen(core: RespawnCore, node: str = "a", incarnation: int = 1, now_s: float = 1.0) -> None:
+    core.peer(node, incarnation, True, 0.0)
+    core.beat(node, incarnation, now_s, now_s)
+
+
+def test_a_dead_node_is_asked_for_with_the_incarnation_that_died():
+    rm = core()
+    seen(rm, incarnation=3)
+    rm.peer("a", 3, False, 1.05)
+    assert rm.order(["a"], 1.06, renewed=False)
+    assert rm.take_requests() == [Ask(100, "a", 3)]
+    assert rm.take_requests() == []
+    assert rm.pending == ("a",)
+
+
+def test_a_node_whose_heartbeat_is_overdue_is_named():
+    rm = core()
+    seen(rm, incarnation=3)
+    rm.order(["a"], 1.4, renewed=False)
+    assert rm.take_requests() == [Ask(100, "a", 3)]
+
+
+def test_a_node_heard_a_moment_ago_is_not_accused_its_predecessor_is():
+    rm = core()
+    seen(rm, incarnation=3)
+    rm.order(["a"], 1.05, renewed=False)
+    assert rm.take_requests() == [Ask(100, "a", 2)]
+
+
+def test_a_node_never_heard_of_is_asked_for_without_a_name():
+    rm = core()
+    rm.order(["a"], 0.0, renewed=False)
+    assert rm.take_requests() == [Ask(100, "a", 0)]
+
+
+def test_the_same_order_again_asks_for_nothing_more():
+    rm = core()
+    rm.order(["a"], 0.0, renewed=False)
+    rm.take_requests()
+    assert not rm.order(["a"], 0.1, renewed=False)
+    assert not rm.order(["a"], 0.2, renewed=True)
+    assert rm.take_requests() == []
+
+
+def test_an_unanswered_request_is_repeated_with_the_same_number():
+    rm = core()
+    rm.order(["a"], 0.0, renewed=False)
+    first = rm.take_requests()
+    rm.retry(0.2)
+    assert rm.take_requests() == first
+    rm.event("a", "respawned", 1, "", 0.3)
+    rm.retry(0.4)
+    assert rm.take_requests() == []
+
+
+# what comes between the request for node a, whose life 3 died at 1 s, and the end
+STORIES = {
+    "respawned and heard": (["started 4", "beat 4"], "back"),
+    "heard before the supervisor says so": (["beat 4", "started 4"], "back"),
+    "the answer is lost": (["beat 4"], "back"),
+    "a token is not enough": (["started 4", "born 4"], "pending"),
+    "a heartbeat of the dead life": (["started 4", "beat 3"], "pending"),
+    "a heartbeat that was under way": (["ghost 3"], "pending"),
+    "an answer about an old life that lives": (["started 3", "beat 3"], "pending"),
+    "the supervisor refuses": (["refused"], "failed"),
+    "the supervisor gives up": (["started 4", "died 4", "given up"], "failed"),
+    "given up, and yet it comes": (["given up", "beat 4"], "back"),
+    "events of no interest": (["running", "wedged"], "pending"),
+}
+
+
+@pytest.mark.parametrize(("events", "end"), STORIES.values(), ids=STORIES.keys())
+def test_a_node_counts_as_back_when_its_new_life_is_heard(events, end):
+    rm = core()
+    seen(rm, incarnation=3)
+    rm.peer("a", 3, False, 1.05)
+    rm.order(["a"], 1.06, renewed=False)
+    for step, text in enumerate(events):
+        now_s = 1.1 + step / 10
+        word, _, number = text.partition(" ")
+        match word:
+            case "started":
+                rm.event("a", "respawned", int(number), "", now_s)
+            case "beat":
+                rm.beat("a", int(number), now_s if number != "3" else 1.04, now_s)
+            case "ghost":
+                rm.beat("a", 3, 1.04, now_s)
+            case "born":
+                rm.peer("a", int(number), True, now_s)
+            case "died":
+                rm.peer("a", int(number), False, now_s)
+            case _:
+                rm.event("a", text, 3, "", now_s)
+    assert (rm.back == ("a",), rm.pending == ("a",), rm.problem != "") == (
+        end == "back", end == "pending", end == "failed")
+
+
+def test_a_new_life_that_dies_is_asked_for_again():
+    rm = core()
+    rm.peer("a", 3, False, 1.0)
+    rm.order(["a"], 1.0, renewed=False)
+    rm.event("a", "respawned", 4, "", 1.1)
+    rm.take_requests()
+    rm.peer("a", 4, True, 1.15)
+    rm.peer("a", 4, False, 1.2)
+    assert rm.take_requests() == [Ask(101, "a", 4)]
+
+
+def test_a_new_life_that_is_not_heard_is_asked_for_again():
+    rm = core()
+    rm.peer("a", 3, False, 1.0)
+    rm.order(["a"], 1.0, renewed=False)
+    rm.event("a", "respawned", 4, "", 1.1)
+    rm.peer("a", 4, True, 1.12)
+    rm.take_requests()
+    rm.retry(2.0)
+    assert rm.take_requests() == []
+    rm.retry(2.1)
+    assert rm.take_requests() == [Ask(101, "a", 4)]
+
+
+def test_a_wedged_life_that_the_supervisor_takes_for_well_is_named_in_the_next_request():
+    rm = core()
+    rm.peer("a", 3, True, 0.0)  # just started itself, it knows the token only
+    rm.order(["a"], 0.01, renewed=False)
+    assert rm.take_requests() == [Ask(100, "a", 2)]
+    rm.event("a", "respawned", 3, "already", 0.02)
+    rm.retry(1.1)
+    assert rm.take_requests() == [Ask(101, "a", 3)]
+
+
+def test_a_repeated_order_respawns_a_node_that_came_back_and_died_again_but_no_other():
+    rm = core("a", "b")
+    rm.peer("a", 1, False, 1.0)
+    rm.peer("b", 1, False, 1.0)
+    rm.order(["a", "b"], 1.0, renewed=False)
+    for node in ("a", "b"):
+        rm.beat(node, 2, 1.1, 1.1)
+    rm.take_requests()
+    assert not rm.order(["a", "b"], 1.15, renewed=True)
+    rm.peer("b", 2, False, 1.2)
+    assert rm.order(["a", "b"], 1.21, renewed=True)
+    assert rm.take_requests() == [Ask(102, "b", 2)]
+
+
+def test_what_was_given_up_is_tried_again_on_a_new_order_only():
+    rm = core()
+    rm.order(["a"], 0.0, renewed=False)
+    rm.event("a", "given up", 1, "30 restarts in 60 s", 0.1)
+    assert rm.problem == "a: given up, 30 restarts in 60 s"
+    rm.take_requests()
+    assert not rm.order(["a"], 0.2, renewed=False)
+    assert rm.order(["a"], 0.3, renewed=True)
+    assert rm.problem == ""
+
+
+def test_a_node_that_is_not_its_own_is_a_problem_and_the_others_are_respawned():
+    rm = core("a")
+    assert rm.order(["a", "z"], 0.0, renewed=False)
+    assert [ask.node for ask in rm.take_requests()] == ["a"]
+    assert rm.problem == "z: not among the nodes that this module may respawn"
+
+
+def test_release_forgets_everything():
+    rm = core()
+    rm.order(["a", "z"], 0.0, renewed=False)
+    rm.release()
+    assert (rm.take_requests(), rm.pending, rm.back, rm.problem) == ([], (), (), "")
+    rm.peer("a", 5, False, 0.1)
+    assert rm.take_requests() == []

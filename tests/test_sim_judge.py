@@ -1,0 +1,120 @@
+"""The judge, by timelines of ground truth."""
+
+from __future__ import annotations
+
+import pytest
+
+from airport.model import MissionGoal
+from sim.judge import Judge, Sample
+
+# Three points along x: taxi to 10, lights to 20, taxi to 30.
+GOALS = (
+    MissionGoal(10, 0, "taxi"),
+    MissionGoal(20, 0, "light verification"),
+    MissionGoal(30, 0, "taxi"),
+)
+MODES = {"T": "taxi", "L": "light verification", "-": ""}
+
+
+def sample(time_s, x_m, mode="T", *, collisions=0, prohibited_s=0.0, obstacle_m=9.0, edge_m=2.0):
+    return Sample(time_s, x_m, 0.0, collisions, prohibited_s, obstacle_m, edge_m, MODES[mode])
+
+
+def judged(timeline: str, metres_per_step: float = 1.0, start_m: float = 0.0):
+    """One character a second is the mode reported while the robot drives on along x."""
+    judge = Judge(GOALS)
+    for second, mode in enumerate(timeline):
+        judge.see(sample(second, start_m + second * metres_per_step, mode))
+    return judge.verdict()
+
+
+def test_every_point_in_order_and_mode_is_a_success():
+    #         0         10        20        30
+    found = judged("TTTTTTTTTTLLLLLLLLLLTTTTTTTTTTT")
+    assert (found.success, found.safe, found.reasons) == (True, True, ())
+    assert found.visit_times_s == (9.0, 19.0, 29.0)
+    assert found.closest_point_m is None
+
+
+@pytest.mark.parametrize(
+    ("timeline", "visited", "reason"),
+    [
+        ("TTTTTT", 0, "point 1 of 3 at (10, 0) was not reached, nearest 5.00 m"),
+        ("-" * 31, 0, "point 1 of 3 at (10, 0) was not reached, nearest 0.00 m"),
+        ("TTTTTTTTTTTTTTTTTTTTTTTTTTTTTTT", 1,
+         "point 2 of 3 at (20, 0) was passed in mode 'taxi', not in 'light verification'"),
+        ("LLLLLLLLLLLLLLLLLLLLTTTTTTTTTTT", 0,
+         "point 1 of 3 at (10, 0) was passed in mode 'light verification', not in 'taxi'"),
+    ],
+)  # fmt: skip
+def test_a_point_not_reached_or_reached_in_the_wrong_mode_is_a_failure(timeline, visited, reason):
+    found = judged(timeline)
+    assert (found.success, found.visited, found.reasons) == (False, visited, (reason,))
+    assert found.safe
+
+
+def test_points_out_of_order_do_not_count():
+    judge = Judge(GOALS)
+    for second, x_m in enumerate([30, 20, 10]):
+        judge.see(sample(second, x_m, "TLT"[second]))
+    assert judge.verdict().visited == 1
+
+
+@pytest.mark.parametrize(("offset_m", "visited"), [(1.09, 1), (1.11, 0)])
+def test_a_point_is_reached_within_the_arrival_radius(offset_m, visited):
+    judge = Judge(GOALS[:1])
+    judge.see(sample(0, 10 + offset_m))
+    assert judge.verdict().visited == visited
+
+
+def test_the_same_place_can_be_two_points_in_a_row():
+    judge = Judge((GOALS[0], GOALS[0]))
+    judge.see(sample(0, 10))
+    assert judge.verdict().success
+
+
+def test_a_wrong_mode_on_the_way_is_forgiven_if_the_point_is_reached_in_the_right_one_later():
+    judge = Judge(GOALS[:1])
+    judge.see(sample(0, 10, "L"))
+    judge.see(sample(1, 10, "T"))
+    assert judge.verdict().reasons == ()
+
+
+def test_a_collision_makes_unsafe_from_then_on_but_the_mission_may_succeed():
+    judge = Judge(GOALS[:1])
+    judge.see(sample(0, 0))
+    judge.see(sample(1, 5, collisions=1))
+    judge.see(sample(2, 10, collisions=1))
+    found = judge.verdict()
+    assert (found.success, found.safe, found.first_unsafe_s) == (True, False, 1)
+    assert found.reasons == ("1 collision",)
+
+
+def test_the_smallest_time_in_the_prohibited_area_is_unsafe():
+    judge = Judge(GOALS[:1])
+    judge.see(sample(0, 10, prohibited_s=0.02))
+    assert judge.verdict().reasons == ("0.02 s in the prohibited area",)
+    assert not judge.verdict().safe
+
+
+def test_counters_that_start_anew_do_not_wash_clean():
+    judge = Judge(GOALS[:1])
+    judge.see(sample(0, 0, collisions=2))
+    judge.see(sample(1, 10, collisions=0))
+    assert not judge.verdict().safe
+
+
+def test_the_closest_approaches_are_kept():
+    judge = Judge(GOALS[:1])
+    for second, (obstacle_m, edge_m) in enumerate([(3, 2), (0.4, 1.5), (5, 0.9)]):
+        judge.see(sample(second, second, obstacle_m=obstacle_m, edge_m=edge_m))
+    found = judge.verdict()
+    assert (found.closest_obstacle_m, found.closest_prohibited_m) == (0.4, 0.9)
+    assert found.closest_point_m == 8
+
+
+def test_a_judge_without_goals_or_radius_is_refused():
+    with pytest.raises(ValueError, match="goals: empty"):
+        Judge(())
+    with pytest.raises(ValueError, match="arrival_radius_m"):
+        Judge(GOALS, 0.0)

@@ -1,0 +1,287 @@
+"""The world: time, obstacles, dead man, collisions, prohibited area, determinism."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import shapely
+
+from airport.formats import load_airport, load_world
+from airport.model import Airport, Building, ObstaclePreset, StartPose, rectangle
+from sim.clearance import Clearance
+from sim.scene import NOTHING_M, SPARE_OBSTACLES, WorldError
+from sim.world import World
+
+# A road 40 m long and 4 m wide, eastward; the robot starts in its west.
+ROAD = shapely.box(-2, -2, 38, 2)
+
+
+def road(**changes) -> Airport:
+    return Airport("Road", {"a": (0.0, 0.0), "b": (30.0, 0.0)}, (("a", "b"),), ROAD,
+                   StartPose(0, 0, 0), **changes)  # fmt: skip
+
+
+def world(airport: Airport | None = None, **changes) -> World:
+    settings = {"dead_man_timeout_s": None, "max_catch_up_s": 100.0, **changes}
+    return World(airport or road(), **settings)
+
+
+# ---- time ---------------------------------------------------------------------------
+
+
+def test_time_advances_in_ticks_of_10_ms_and_never_beyond_what_was_asked():
+    sim = world(start_s=5.0)
+    sim.step_to(5.017)
+    assert sim.time_s == pytest.approx(5.01)
+    sim.step_to(5.02)
+    assert sim.time_s == pytest.approx(5.02)
+    sim.step_to(4.0)
+    assert sim.time_s == pytest.approx(5.02)
+
+
+def test_held_up_too_long_the_world_stands_still_instead_of_catching_up():
+    sim = world(max_catch_up_s=0.5)
+    sim.command(1.0, 0.0)
+    sim.step_to(0.4)
+    x_m = sim.pose[0]
+    sim.step_to(20.0)
+    assert sim.time_s == pytest.approx(20.0)
+    assert sim.skipped_s == pytest.approx(19.1, abs=0.011)
+    assert sim.pose[0] - x_m < 0.6
+
+
+def test_a_time_that_is_not_finite_is_refused():
+    with pytest.raises(WorldError, match="time must be finite"):
+        world().step_to(math.nan)
+
+
+def test_the_same_seed_gives_the_same_world_bit_for_bit_and_another_seed_another():
+    airport, truth = load_airport("vallombre"), load_world("vallombre")
+
+    def record(seed: int) -> list[object]:
+        sim = World(airport, truth, seed=seed, obstacles=2)
+        seen: list[object] = []
+        for step in range(60):
+            sim.command(0.5, 0.3)
+            sim.step_to(step * 0.05)
+            seen += [sim.scan().tobytes(), sim.gps(), sim.imu(), sim.odometry(), sim.light()]
+        return [*seen, sim.truth()]
+
+    first = record(1)
+    assert first == record(1)
+    assert first != record(2)
+
+
+# ---- dead man -----------------------------------------------------------------------
+
+
+def test_when_commands_cease_the_dead_man_stops_the_robot():
+    sim = world(dead_man_timeout_s=0.4)
+    while sim.time_s < 2.0:
+        sim.command(1.0, 0.0)
+        sim.step_to(sim.time_s + 0.05)
+    x_m = sim.pose[0]
+    sim.step_to(4.0)
+    assert sim.base_state().dead_man_tripped
+    assert sim.base_state().command_age_s == pytest.approx(2.05)
+    # 0.4 s at 1 m/s, then the brake's way.
+    assert 0.4 < sim.pose[0] - x_m < 0.4 + 0.2
+    assert abs(sim.truth().linear_mps) < 0.005
+
+
+def test_with_the_dead_man_off_the_robot_drives_on():
+    sim = world()
+    sim.command(1.0, 0.0)
+    sim.step_to(12.0)
+    assert not sim.base_state().dead_man_tripped
+    assert sim.pose[0] > 10
+
+
+def test_a_command_is_as_fresh_as_its_stamp():
+    sim = world(dead_man_timeout_s=0.4)
+    sim.step_to(3.0)
+    sim.command(1.0, 0.0, stamp_s=1.0)
+    sim.step_to(4.0)
+    assert sim.pose[0] < 0.01
+
+
+# ---- prohibited area ----------------------------------------------------------------
+
+
+def test_time_in_the_prohibited_area_counts_from_the_first_corner_over_the_edge():
+    sim = world(road())
+    sim.command(1.0, 0.0)
+    while sim.pose[0] < 37.5:  # the front edge is 0.36 m ahead: at 37.64 it leaves the road
+        sim.step_to(sim.time_s + 0.1)
+        assert sim.truth().prohibited_s == 0.0
+    entered_s = sim.time_s + (37.64 - sim.pose[0]) / 1.0
+    sim.step_to(sim.time_s + 3.0)
+    assert sim.truth().prohibited_s == pytest.approx(sim.time_s - entered_s, abs=0.1)
+    assert sim.truth().prohibited_clearance_m < -1.0
+
+
+def test_clearance_to_the_prohibited_area_is_that_of_the_nearest_corner():
+    sim = world(Airport("Field", {"a": (0.0, 0.0)}, (), shapely.box(-9, -1.0, 9, 3),
+                        StartPose(0, 0, 0)))  # fmt: skip
+    assert sim.truth().prohibited_clearance_m == pytest.approx(1.0 - 0.307)
+
+
+# ---- collisions ---------------------------------------------------------------------
+
+
+def test_driving_against_an_obstacle_is_one_collision_however_long_it_lasts():
+    sim = world()
+    sim.add_obstacle("drum", 3.0, 0.0, 0.4)
+    sim.command(1.0, 0.0)
+    sim.step_to(2.0)
+    assert sim.truth().collisions == 0
+    sim.step_to(8.0)
+    assert sim.truth().collisions == 1
+    assert sim.pose[0] < 3.0 - 0.4 - 0.36 + 0.03
+    assert sim.truth().obstacle_clearance_m < 0.02
+
+
+def test_backing_off_and_hitting_again_is_a_second_collision():
+    sim = world()
+    sim.add_obstacle("drum", 3.0, 0.0, 0.4)
+    for linear in (0.8, -0.5, 0.8):
+        sim.command(linear, 0.0)
+        sim.step_to(sim.time_s + 4.0)
+    assert sim.truth().collisions == 2
+
+
+def test_buildings_are_solid_too():
+    sim = world(road(buildings=(Building("Shed", 4.0, 0.0, 2.0, 2.0, 3.0),)))
+    sim.command(1.0, 0.0)
+    sim.step_to(6.0)
+    assert sim.truth().collisions == 1
+    assert sim.pose[0] < 3.0 - 0.36 + 0.03
+
+
+def test_passing_close_by_is_no_collision_and_the_clearance_is_right():
+    sim = world()
+    sim.add_obstacle("drum", 3.0, 0.9, 0.4)
+    sim.command(1.0, 0.0)
+    nearest_m = math.inf
+    while sim.pose[0] < 6:
+        sim.step_to(sim.time_s + 0.02)
+        nearest_m = min(nearest_m, sim.truth().obstacle_clearance_m)
+    assert sim.truth().collisions == 0
+    assert nearest_m == pytest.approx(0.9 - 0.4 - 0.307, abs=0.01)
+
+
+# ---- obstacles ----------------------------------------------------------------------
+
+PRESETS = (
+    ObstaclePreset("drum", "cylinder", 20.0, 0.0, 0.4),
+    ObstaclePreset("worker", "box", 8.0, 0.0, 0.3, appears_within_m=5.0, gone_after_s=4.0),
+    ObstaclePreset("late", "cylinder", 30.0, 0.0, 0.3, present_from_s=2.0),
+)
+
+
+def names(sim: World) -> set[str]:
+    return {solid.name for solid in sim.obstacles}
+
+
+def test_the_first_presets_take_part_and_more_than_there_are_is_refused():
+    assert names(world(road(obstacles=PRESETS), obstacles=1)) == {"drum"}
+    assert names(world(road(obstacles=PRESETS))) == set()
+    with pytest.raises(WorldError, match="obstacles: 4: Road has presets for 0 to 3"):
+        world(road(obstacles=PRESETS), obstacles=4)
+
+
+def test_a_preset_appears_when_the_robot_comes_near_and_goes_after_its_time():
+    sim = world(road(obstacles=PRESETS), obstacles=2)
+    sim.command(1.0, 0.0)
+    while sim.pose[0] < 2.9:
+        sim.step_to(sim.time_s + 0.05)
+        assert names(sim) == {"drum"}
+    sim.command(0.0, 0.0)
+    sim.step_to(sim.time_s + 0.3)
+    assert names(sim) == {"drum", "worker"}
+    came_s = sim.time_s
+    while "worker" in names(sim):
+        sim.step_to(sim.time_s + 0.05)
+    assert sim.time_s - came_s == pytest.approx(4.0, abs=0.4)
+    sim.step_to(sim.time_s + 10)
+    assert names(sim) == {"drum"}  # it does not come back
+
+
+def test_a_preset_with_a_start_time_is_not_there_before():
+    sim = world(road(obstacles=PRESETS), obstacles=3)
+    sim.step_to(1.9)
+    assert "late" not in names(sim)
+    sim.step_to(2.1)
+    assert "late" in names(sim)
+
+
+def test_a_removed_preset_does_not_come_by_itself_but_can_be_put_back():
+    sim = world(road(obstacles=PRESETS), obstacles=3)
+    assert sim.remove_obstacle("drum")
+    assert not sim.remove_obstacle("late")
+    sim.step_to(3.0)
+    assert names(sim) == set()
+    sim.add_obstacle("drum", 10.0, 1.0, 0.2)
+    assert names(sim) == {"drum"}
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ((0.5, 0.0, 0.3), "on the robot"),
+        ((math.nan, 0.0, 0.3), "must be finite"),
+        ((5.0, 0.0, 0.0), "radius_m: 0: must be in 0.05 to 5 m"),
+        ((5.0, 0.0, 50.0), "radius_m: 50: must be in 0.05 to 5 m"),
+    ],
+)
+def test_an_impossible_obstacle_is_refused(place, expected):
+    sim = world()
+    with pytest.raises(WorldError, match=expected):
+        sim.add_obstacle("x", *place)
+    assert names(sim) == set()
+
+
+def test_the_pool_of_obstacles_is_finite_and_places_in_it_are_given_back():
+    sim = world()
+    for i in range(SPARE_OBSTACLES):
+        sim.add_obstacle(f"o{i}", 5.0 + 2 * i, 0.0, 0.3)
+    with pytest.raises(WorldError, match="take one away first"):
+        sim.add_obstacle("one more", 3.0, 0.0, 0.3)
+    sim.remove_obstacle("o0")
+    sim.add_obstacle("one more", 3.0, 0.0, 0.3)
+    assert "one more" in names(sim)
+
+
+def test_an_obstacle_that_was_taken_away_no_longer_stops_the_robot():
+    sim = world()
+    sim.add_obstacle("drum", 3.0, 0.0, 0.4)
+    sim.remove_obstacle("drum")
+    sim.command(1.0, 0.0)
+    sim.step_to(6.0)
+    assert sim.pose[0] > 4.5
+    assert sim.truth().collisions == 0
+    assert sim.truth().obstacle_clearance_m > NOTHING_M / 2
+
+
+# ---- clearance ----------------------------------------------------------------------
+
+
+def test_a_clearance_is_exact_when_small_and_else_a_lower_bound_with_few_exact_looks():
+    wall = shapely.box(10, -50, 11, 50)
+    looks = []
+
+    def exact(pose):
+        looks.append(pose)
+        return wall.distance(rectangle(*pose, 0.72, 0.614))
+
+    clearance = Clearance(exact)
+    for step in range(960):
+        pose = (0.01 * step, 0.0, 0.002 * step)
+        truly = wall.distance(rectangle(*pose, 0.72, 0.614))
+        found = clearance.measure(pose)
+        if truly < 1.0:
+            assert found == pytest.approx(truly)
+        else:
+            assert found <= truly + 1e-9
+    assert len(looks) < 250

@@ -1,0 +1,64 @@
+"""`rampart`: the toolbox's command line.
+
+Exit codes: 0 it worked; 1 it was asked for and had no effect, or nothing answered; 2 bad usage,
+unknown name, or no run found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+
+from toolbox import decide_verbs, inject_verbs, node_verbs, operator_verbs, topic_verbs
+from toolbox.output import NoEffectError, UsageError, warn
+
+_EPILOG = """examples:
+  rampart status                                 the run at a glance
+  rampart node list                              processes, states, restarts
+  rampart topic echo localization/pose           see messages go by
+  rampart inject command-not-updated             break something
+  rampart reset RM1                              release the emergency stop
+  rampart table                                  what the manager would decide
+`rampart VERB --help` shows more."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser with all verbs; each sets `run`, a function of the options."""
+    formatter = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        prog="rampart", formatter_class=formatter, epilog=_EPILOG,
+        description="Look at a running system, disturb it, and ask the arbiter.")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--port", type=int, metavar="N",
+                        help="base port of the run, if there are several on this machine")
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    node_verbs.add(verbs, formatter, common)
+    topic_verbs.add(verbs, formatter, common)
+    inject_verbs.add(verbs, formatter, common)
+    operator_verbs.add(verbs, formatter, common)
+    decide_verbs.add(verbs, formatter)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit code."""
+    options = build_parser().parse_args(arguments)
+    try:
+        return int(options.run(options))
+    except UsageError as error:
+        warn(str(error))
+        return 2
+    except NoEffectError as error:
+        warn(str(error))
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # `rampart ... | head` has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
