@@ -307,7 +307,7 @@ class RunRecorder:
         self._injections[order.injection] = f"{order.mode} {order.topic}"
 
     def _injection_report(self, report: m.InjectionReport, header: Header) -> None:
-        what = self._injections.get(report.injection, f"injection {report.injection}")
+        what = self._injections.get(report.injection, report.injection)
         if self._turn("injection", report.injection, not report.finished, header.stamp, what):
             if report.finished:
                 text = (f"injection over: {what} at {report.node}, "

@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import msgspec
+
 import systems
 from manager.arbiter import (
     Command,
@@ -28,6 +30,12 @@ RMS = ("RM1", "RM2", "RM3", "RM4", "RM5")
 @cache
 def osmosis() -> SystemSpec:
     return parse_specification(OSMOSIS, "systems/osmosis.toml")
+
+
+def edited(**fields) -> SystemSpec:
+    """The shipped system with recoveries changed: `RM3=dict(deadline_s=1.0)`."""
+    return msgspec.structs.replace(osmosis(), recoveries=tuple(
+        msgspec.structs.replace(r, **fields.get(r.name, {})) for r in osmosis().recoveries))
 
 
 class Bench:

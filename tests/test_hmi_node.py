@@ -10,6 +10,7 @@ from contextlib import asynccontextmanager
 import httpx
 import pytest
 import websockets
+from hmi_browser import CHROMIUM, browser
 
 from actors import messages as m
 from actors import topics
@@ -19,7 +20,6 @@ from actors.runtime.actor import Actor, Context, Header, on
 from actors.runtime.clock import Clock
 from actors.runtime.virtual_bus import Hub, VirtualBus
 from airport.formats import load_airport
-from tests.hmi_browser import CHROMIUM, browser
 
 AIRPORT = load_airport("vallombre")
 RATE = 20.0

@@ -9,6 +9,7 @@ from recovery_world import Base, Boss, Node, Pilot, Supervisor, hang
 from virtual_loop import System, run
 
 from actors import messages as m
+from actors import topics
 from actors.messages import PilotMode
 from actors.recovery.controlled_stop import ControlledStop
 from actors.recovery.emergency_stop import EmergencyStop
@@ -122,6 +123,26 @@ def test_an_order_while_a_release_waits_cancels_the_release():
             assert boss.phases == ["idle", "acting", "degraded"]
             assert base.engaged
             assert boss.reports[-1][1].decision == 3
+
+    run(scenario)
+
+
+def test_a_status_from_before_the_order_confirms_nothing():
+    async def scenario() -> None:
+        async with System() as system:
+            boss, base = system.start("boss", Boss), system.start("base", Base)
+            system.start("RM1", EmergencyStop)
+            base.deaf = True
+            await asyncio.sleep(0.55)
+            boss.order("RM1")
+            await system.settle()
+            status = m.BaseStatus(True, False, 0.0, (0.0,) * 4)
+            base.publish(topics.BASE_STATUS, status, stamp=0.5)
+            await system.settle()
+            assert boss.phases == ["idle", "acting"]
+            base.publish(topics.BASE_STATUS, status, stamp=0.55)
+            await system.settle()
+            assert boss.phases == ["idle", "acting", "degraded"]
 
     run(scenario)
 

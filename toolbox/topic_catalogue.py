@@ -106,19 +106,18 @@ def markdown(spec: SystemSpec) -> str:
         "- **command**: each message counts; queued at the reader, bounded, an overflow is "
         "reported.",
         "",
-        "| key | message | QoS | rate | frame | publishers | readers |",
-        "|---|---|---|---|---|---|---|",
+        "| key | message | QoS | mailbox | rate | frame | publishers | readers |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     table = uses(spec)
     for use in table:
         t = use.topic
         lines.append(
             f"| `{t.key}` | [{t.type.__name__}](#{t.type.__name__.lower()}) | {t.qos.value} | "
-            f"{_rate(t)} | {f'`{t.frame}`' if t.frame else ''} | {', '.join(use.publishers)} | "
+            f"{MAILBOX[t.qos]} | {_rate(t)} | {f'`{t.frame}`' if t.frame else ''} | {', '.join(use.publishers)} | "
             f"{', '.join(use.readers)} |")
     lines += ["", "## What each key is for", ""]
-    lines += [f"- `{use.topic.key}`: {use.topic.doc} Waits at its reader: "
-              f"{MAILBOX[use.topic.qos]}." for use in table]
+    lines += [f"- `{use.topic.key}`: {use.topic.doc}" for use in table]
     lines += ["", "## Messages", ""]
     for kind in _messages(use.topic for use in table):
         lines += [f"### {kind.__name__}", "", _summary(kind), ""]

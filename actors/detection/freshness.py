@@ -12,6 +12,10 @@ from actors.runtime.actor import Context, Header, on
 class Freshness(DetectionModule):
     """Active while a topic is stale. A subclass per topic, so that each hears only its own.
 
+    Class attributes:
+        subject: what is stale, for the reason.
+        default_timeout_s: timeout if no parameter says.
+
     Parameters:
         timeout_s: greatest admissible age of the content, s.
         hold_s: how long it must be fresh again before the module is idle, s.
@@ -25,6 +29,9 @@ class Freshness(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
+        if not self.subject:
+            raise ValueError(f"{self.name}: actor Freshness hears no topic; name a subclass, "
+                             "CommandFreshness or LocalizationFreshness")
         timeout_s = number(self.parameters, "timeout_s", self.default_timeout_s)
         self.monitor = FreshnessMonitor(
             self.subject, timeout_s, number(self.parameters, "hold_s", 0.2), self.clock.now(),

@@ -7,8 +7,8 @@ and says on `detection/NAME` what the monitor found: at once when it changes, an
 Two subtleties, both about a module that was not there for a while:
 
 * A module that was itself stopped and goes on, or a machine that hung, finds every deadline
-  passed while the proof to the contrary still waits unread. So a wake-up that comes late is
-  repeated once, a little later, before anybody is accused.
+  passed while the proof to the contrary still waits unread. A module that finds that it has not
+  run for a while reads its mail first, and judges a little later.
 * A respawned module does not know yet whether the fault is there. Had it reported idle from its
   first moment, the manager would let go of a robot whose fault persists. So from its second
   life on it is silent until it knows, and the manager takes silence for activity.
@@ -30,11 +30,14 @@ TRANSITIONS = {
 }
 """The state machine of every detection module (paper, figure 4)."""
 
-LATE_S = 0.1
-"""A wake-up this much late means that the module itself did not run."""
+ABSENCE_S = 0.3
+"""A module that has not run for so long, though it repeats its report each 0.2 s, was stopped."""
 
 EXCUSE_S = 0.1
-"""How long a late module reads its mail before it judges: one period of the slowest input."""
+"""How long it then reads its mail before it judges: one period of the slowest input."""
+
+NEXT_EXCUSE_S = 1.0
+"""Not sooner does another absence count: a module that is always late is not excused for ever."""
 
 DEFAULT_GRACE_S = 5.0
 """How long a starting system may take, if no spec says."""
@@ -90,7 +93,8 @@ class DetectionModule(Actor):
         self._told = False
         self._monitor: Monitor | None = None
         self._wake_s = math.inf
-        self._excused = False
+        self._ran_s = self.clock.now()
+        self._judges_from_s = -math.inf
 
     def grace_s(self, timeout_s: float) -> float:
         """Return how long the first input may take, s."""
@@ -134,6 +138,7 @@ class DetectionModule(Actor):
     @every(0.2)
     def repeat(self) -> None:
         """Say it again, for whoever has joined since."""
+        self._note_absence()
         if self._told or self.first_life:
             self.publish(topics.DETECTION, self._report)
 
@@ -142,6 +147,7 @@ class DetectionModule(Actor):
     def follow(self, monitor: Monitor) -> None:
         """Bring the state in line with the monitor, and see to it that its deadline is kept."""
         self._monitor = monitor
+        self._note_absence()
         if monitor.active:
             self.activate(monitor.reason, monitor.nodes)
         elif self.state is DetectionState.ACTIVE:
@@ -162,15 +168,19 @@ class DetectionModule(Actor):
         if monitor is None:
             return
         self._wake_s = math.inf
+        self._note_absence()
         now_s = self.clock.now()
-        if now_s - monitor.due_s > LATE_S and not self._excused:
-            self._excused = True
-            self._wake_s = now_s + EXCUSE_S
-            self.call_later(EXCUSE_S, self._woken)
-            return
-        self._excused = False
-        monitor.expire(now_s)
-        self.follow(monitor)
+        if now_s < self._judges_from_s:
+            self._sleep_until(self._judges_from_s)
+        else:
+            monitor.expire(now_s)
+            self.follow(monitor)
+
+    def _note_absence(self) -> None:
+        now_s = self.clock.now()
+        if now_s - self._ran_s > ABSENCE_S and now_s > self._judges_from_s + NEXT_EXCUSE_S:
+            self._judges_from_s = now_s + EXCUSE_S
+        self._ran_s = now_s
 
 
 def number(parameters: Any, name: str, default: float) -> float:

@@ -1,0 +1,235 @@
+"""The inspection report: what the recorder makes of messages, and what is written."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+
+import msgspec
+import pytest
+
+from actors import messages as m
+from actors import topics
+from actors.runtime.actor import Header
+from airport.formats import load_airport
+from sim.report import RunRecord, RunRecorder, clock, render, write_report
+
+AIRPORT = load_airport("vallombre")
+MISSION = AIRPORT.mission("AB")
+ACTIVE, IDLE = m.DetectionState.ACTIVE, m.DetectionState.IDLE
+
+
+class Story:
+    """Feeds a recorder; `t` is the stamp of the next messages."""
+
+    def __init__(self, run_id: str = "r1") -> None:
+        self.recorder = RunRecorder(run_id, AIRPORT, MISSION, strategy="safety-first", seed=3)
+        self.sequence = 0
+
+    def tell(self, t_s: float, topic, message, source: str = "x", incarnation: int = 1) -> None:
+        self.sequence += 1
+        self.recorder.feed(topic, message, Header(source, incarnation, self.sequence, t_s))
+
+    def truth(self, t_s: float, x_m: float, y_m: float, **more: float) -> None:
+        fields = {"collisions": 0, "prohibited_s": 0.0, "obstacle_clearance_m": math.inf,
+                  "prohibited_clearance_m": 2.0, "real_time_factor": 1.0} | more
+        self.tell(t_s, topics.TRUTH, m.GroundTruth(
+            m.Pose(x_m, y_m, 0.0), m.Twist(0.0, 0.0), **fields))
+
+    def detect(self, t_s: float, name: str, state: m.DetectionState, reason: str = "") -> None:
+        self.tell(t_s, topics.DETECTION, m.DetectionReport(state, reason, (), t_s), name)
+
+    def end(self, t_s: float = 100.0, *, mission="success", safety="safe", reasons=()) -> RunRecord:
+        return self.recorder.record(mission, safety, reasons, t_s)
+
+
+def bars(run: RunRecord) -> list[tuple[str, str, float, float]]:
+    return [(i.lane, i.name, i.from_s, i.to_s) for i in run.intervals]
+
+
+def test_the_track_and_its_length_are_the_truth_not_what_localization_believes():
+    story = Story()
+    for i in range(101):
+        story.truth(i * 0.1, i * 0.1, 0.0)
+        story.tell(i * 0.1, topics.POSE, m.Pose(i * 0.1, i * 0.05, 0.0))
+    run = story.end()
+    assert run.distance_m == pytest.approx(10.0, abs=0.3)
+    assert all(y == 0 for _, _, y in run.track)
+    assert run.believed[-1][2] == pytest.approx(5.0, abs=0.2)
+
+
+def test_all_lights_of_the_airport_are_listed_measured_or_not():
+    story = Story()
+    light = m.LightMeasurement("A04", 76.0, 0.38, m.LightVerdict.DIM)
+    story.tell(1.0, topics.MISSION_STATUS, m.MissionStatus(
+        "1", "AB", m.MissionPhase.RUNNING, 1, (), (12.5,), (light,), ""))
+    run = story.end()
+    verdicts = {light.name: light.verdict for light in run.lights}
+    assert len(verdicts) == len(AIRPORT.lights)
+    assert verdicts["A04"] == "dim"
+    assert set(verdicts.values()) == {"dim", "not measured"}
+
+
+def test_what_was_measured_and_reached_outlives_a_mission_manager_that_forgets():
+    story = Story()
+    light = m.LightMeasurement("A01", 200.0, 1.0, m.LightVerdict.OK)
+    story.tell(1.0, topics.MISSION_STATUS, m.MissionStatus(
+        "1", "AB", m.MissionPhase.RUNNING, 2, (), (12.5, 40.0), (light,), ""))
+    story.tell(50.0, topics.MISSION_STATUS, m.MissionStatus(
+        "", "", m.MissionPhase.IDLE, 0, (), (), (), ""), incarnation=2)
+    run = story.end()
+    assert [s.reached_s for s in run.steps] == [12.5, 40.0, None, None, None]
+    assert sum(light.verdict == "ok" for light in run.lights) == 1
+
+
+def test_a_crash_is_a_bar_from_the_event_to_the_respawn_and_a_restart():
+    story = Story()
+    crash = m.ProcessEvent("hmi", "crashed", 7, 1, "supervisor", "SIGKILL")
+    story.tell(10.0, topics.PROCESS_EVENT, crash)
+    story.tell(10.5, topics.PROCESS_EVENT, m.ProcessEvent("hmi", "respawned", 8, 2, "RM4", ""))
+    run = story.end()
+    assert bars(run) == [("down", "hmi", 10.0, 10.5)]
+    assert run.restarts == {"hmi": 1}
+    assert [e.text for e in run.events] == ["hmi crashed: SIGKILL", "hmi respawned by RM4"]
+
+
+def test_repeated_states_make_one_bar_and_one_that_never_ends_lasts_to_the_end():
+    story = Story()
+    for t_s in (1.0, 1.2, 1.4):
+        story.detect(t_s, "DM2", ACTIVE, "stale")
+    story.detect(2.0, "DM2", IDLE)
+    story.detect(2.2, "DM2", IDLE)
+    story.detect(90.0, "DM1", ACTIVE, "grass")
+    assert bars(story.end(100.0)) == [
+        ("detection", "DM2", 1.0, 2.0), ("detection", "DM1", 90.0, 100.0)]
+
+
+def test_recoveries_follow_what_the_manager_says():
+    story = Story()
+    for t_s, activated in ((1.0, ("RM3",)), (1.1, ("RM3", "RM2")), (2.0, ("RM2",)), (3.0, ())):
+        story.tell(t_s, topics.MANAGER_STATUS, m.ManagerStatus(
+            (), (), activated, (), "safety-first", 1))
+    assert bars(story.end()) == [("recovery", "RM3", 1.0, 2.0), ("recovery", "RM2", 1.1, 3.0)]
+
+
+def test_an_injection_is_told_with_its_effect_whether_or_not_its_order_was_heard():
+    story = Story()
+    story.tell(4.0, topics.INJECT, m.Injection("i1", "localization/pose", "freeze", 2.0))
+    for injection in ("i1", "command-not-updated-3f"):
+        for t_s, affected, finished in ((5.0, 0, False), (7.0, 40, True)):
+            story.tell(t_s, topics.INJECTION_REPORT, m.InjectionReport(
+                injection, "localization", affected, finished, ""))
+    texts = [e.text for e in story.end().events]
+    assert "fault injected: freeze localization/pose at localization" in texts
+    assert "injection over: freeze localization/pose at localization, 40 messages changed" in texts
+    assert "fault injected: command-not-updated-3f at localization" in texts
+
+
+def test_closest_approaches_are_the_smallest_and_none_when_there_was_nothing():
+    story = Story()
+    story.truth(0.0, 0.0, 0.0)
+    assert story.end().obstacle_clearance_m is None
+    story.truth(1.0, 1.0, 0.0, obstacle_clearance_m=0.4, prohibited_clearance_m=-0.2,
+                collisions=1, prohibited_s=0.5)
+    story.truth(2.0, 2.0, 0.0)
+    run = story.end()
+    assert (run.obstacle_clearance_m, run.prohibited_clearance_m) == (0.4, -0.2)
+    assert (run.collisions, run.prohibited_s) == (1, 0.5)
+
+
+def test_messages_of_other_topics_and_corrupt_poses_do_no_harm():
+    story = Story()
+    story.tell(1.0, topics.LIGHT, m.LightSample(1.0))
+    story.tell(1.0, topics.POSE, m.Pose(math.nan, math.inf, 0.0))
+    assert story.end().believed == ()
+
+
+def full_story() -> Story:
+    story = Story()
+    for i in range(200):
+        story.truth(i * 0.5, -20 + i * 0.2, -18.5, obstacle_clearance_m=0.5)
+        story.tell(i * 0.5, topics.POSE, m.Pose(-20 + i * 0.2, -18.5 + i * 0.05, 0.0))
+    for i, light in enumerate(AIRPORT.lights):
+        verdict = (m.LightVerdict.OK, m.LightVerdict.DIM, m.LightVerdict.OUT)[i % 3]
+        story.tell(9.0, topics.LIGHT_MEASURED, m.LightMeasurement(light.name, 10.0, 0.1, verdict))
+    story.tell(3.0, topics.OBSTACLES, m.ObstacleList((
+        m.ObstacleCommand("crate", True, 1.0, 2.0, 0.4),
+        m.ObstacleCommand("gone", False, 1.0, 2.0, 0.4))))
+    story.detect(20.0, "DM1", ACTIVE, "<script>alert(1)</script> & more")
+    story.tell(20.1, topics.DECISION, m.DecisionRecord(
+        1, "safety-first", ("FTM1", "FTM6"), 2, ("RM1",), ("FTM1 > FTM6",),
+        (("RM5", "FTM6 is dominated by FTM1"),), 20.0))
+    return story
+
+
+def test_the_page_is_self_contained_escaped_and_shows_everything():
+    html = render(full_story().end(mission="fail", safety="unsafe", reasons=("went <astray>",)))
+    assert "<script" not in html
+    assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; more" in html
+    assert "went &lt;astray&gt;" in html
+    assert not re.search(r"""(src|href)=|url\((?!#)|@import|https?://""", html)
+    for text in ("crate", "B11", "FTM1 &gt; FTM6", "RM5 (FTM6 is dominated by FTM1)",
+                 "where localization believed", "not safe"):
+        assert text in html
+    assert "gone" not in html
+
+
+def test_the_tags_of_the_page_are_balanced():
+    html = render(full_story().end())
+    for tag in ("div", "table", "tr", "svg", "g", "ul", "ol", "dl", "main", "p", "i", "span"):
+        opened = re.findall(rf"<{tag}(?:\s[^>]*)?(?<!/)>", html)
+        assert len(opened) == html.count(f"</{tag}>"), tag
+
+
+def test_a_run_in_which_nothing_happened_can_be_reported():
+    html = render(Story().end(0.0, mission="fail", reasons=("no mission was accepted",)))
+    assert "No fault was seen." in html
+    assert "nothing to decide" in html
+    assert "0 of 22" in html
+
+
+def test_the_headline_names_the_lights_that_need_attention():
+    story = Story()
+    for light in AIRPORT.lights[:-1]:
+        verdict = m.LightVerdict.OUT if light.name == "A09" else m.LightVerdict.OK
+        story.tell(9.0, topics.LIGHT_MEASURED, m.LightMeasurement(light.name, 1.0, 1.0, verdict))
+    assert ("1 of 22 lights need attention: A09; 1 was not on the way"
+            in render(story.end()))
+
+
+def test_both_files_are_written_whole_and_the_json_reads_back(tmp_path):
+    run = full_story().end()
+    html, data = write_report(run, tmp_path / "deep" / "er")
+    assert (html.name, data.name) == ("inspection-r1.html", "inspection-r1.json")
+    assert sorted(p.name for p in html.parent.iterdir()) == [html.name, data.name]
+    assert msgspec.json.decode(data.read_bytes(), type=RunRecord) == run
+    assert json.loads(data.read_text())["mission"] == "success"
+
+
+def test_a_run_id_cannot_lead_out_of_the_directory(tmp_path):
+    html, _ = write_report(Story("../../etc/x y").end(), tmp_path)
+    assert html.parent == tmp_path
+
+
+def test_an_interrupted_write_leaves_the_old_report(tmp_path, monkeypatch):
+    html, _ = write_report(Story().end(), tmp_path)
+    before = html.read_text()
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.replace", fail)
+    with pytest.raises(OSError, match="No space"):
+        write_report(full_story().end(), tmp_path)
+    assert html.read_text() == before
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize(("seconds", "text"), [
+    (0.0, "0:00.0"), (61.26, "1:01.3"), (59.96, "1:00.0"), (3600.0, "60:00.0"),
+    (None, "\N{EN DASH}"),
+    (math.nan, "\N{EN DASH}"),
+])
+def test_times_are_written_as_minutes_and_seconds(seconds, text):
+    assert clock(seconds) == text

@@ -1,0 +1,269 @@
+"""The verbs of `rampart` against living actors over real Zenoh."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+from contextlib import AsyncExitStack
+
+import pytest
+
+from actors import messages as m
+from actors import topics
+from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.clock import Clock
+from actors.runtime.zenoh_bus import ZenohBus, endpoint
+from actors.supervision.run_info import RunInfo
+from toolbox import systems
+from toolbox.main import main
+
+RATE = 5.0
+
+
+class Everything(Actor):
+    """Publishes what verbs look at; one node that plays them all."""
+
+    outputs = (topics.POSE, topics.ROUTE, topics.MISSION_STATUS, topics.PILOT_STATUS,
+               topics.MANAGER_STATUS, topics.NODES, topics.OBSTACLES, topics.DETECTION)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.latched: tuple[str, ...] = ("RM1",)
+        self.obstinate = False
+        self.obstacles: dict[str, m.ObstacleCommand] = {}
+        self.resets = 0
+        self.orders: list[m.Injection] = []
+        self.time_s = 0.0
+
+    @every(0.1)
+    def states(self) -> None:
+        self.time_s += 0.1
+        self.publish(topics.POSE, m.Pose(1.0, self.time_s, 0.0))
+        self.publish(topics.MISSION_STATUS, m.MissionStatus(
+            "1", "AB", m.MissionPhase.RUNNING, 0, (m.Goal(0.0, 0.0, m.Mode.TAXI),), (), (), ""))
+        self.publish(topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.STOP, True, "RM2", 0))
+        self.publish(topics.MANAGER_STATUS, m.ManagerStatus(
+            ("FTM1",), (), self.latched, self.latched, "safety-first", 1))
+        self.publish(topics.NODES, m.NodeTable((
+            m.NodeInfo("hmi", "non-control", 42, m.NodeState.CRASHED, 3, 2),
+            m.NodeInfo("DM1", "detection", 43, m.NodeState.RUNNING, 1, 0))))
+        self.list_obstacles()
+
+    def list_obstacles(self) -> None:
+        self.publish(topics.OBSTACLES, m.ObstacleList(tuple(self.obstacles.values())))
+
+    @on(topics.RESET)
+    def reset(self, message: m.Reset, _header: Header) -> None:
+        self.resets += 1
+        if not self.obstinate:
+            self.latched = ()
+
+    @on(topics.OBSTACLE)
+    def obstacle(self, message: m.ObstacleCommand, header: Header) -> None:
+        if message.radius_m > 5:
+            self.report_diagnostic("obstacle", "too big", header.source)
+        elif message.present:
+            self.obstacles[message.name] = message
+        else:
+            del self.obstacles[message.name]
+
+    def _on_injection(self, order: m.Injection, _header: Header) -> None:
+        self.orders.append(order)
+        super()._on_injection(order, _header)
+
+
+class Bystander(Actor):
+    """Another node, so that commands have more than one receiver."""
+
+
+class Run:
+    """Calls the toolbox in a thread, as the shell would in a process."""
+
+    def __init__(self, node: Everything, bus: ZenohBus) -> None:
+        self.node = node
+        self.bus = bus
+
+    async def call(self, capsys, *arguments: str) -> tuple[int, str, str]:
+        code = await asyncio.to_thread(main, list(arguments))
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+
+def free_ports(count: int) -> list[int]:
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [s.getsockname()[1] for s in sockets]
+    for s in sockets:
+        s.close()
+    return ports
+
+
+@pytest.fixture
+async def run(monkeypatch):
+    loop = asyncio.get_running_loop()
+    clock = Clock(loop.time(), RATE, loop.time)
+    ports = dict(zip(("simulator", "DM1"), free_ports(2), strict=True))
+    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), ports, "r1", 0,
+                   "test run")
+    monkeypatch.setattr("toolbox.session.find_run", lambda _port: info)
+    async with AsyncExitStack() as stack:
+        nodes = []
+        for name, cls in (("simulator", Everything), ("DM1", Bystander)):
+            bus = ZenohBus(name, 1, endpoint(ports[name]),
+                           [endpoint(p) for n, p in ports.items() if n != name])
+            node = cls(Context(name, 1, clock, bus))
+            task = asyncio.create_task(node.run())
+            stack.push_async_callback(asyncio.wait_for, task, 5)
+            stack.callback(node.stop)
+            nodes.append((node, bus))
+        await asyncio.sleep(0.1)
+        yield Run(*nodes[0])
+
+
+async def test_status_shows_the_run_at_a_glance(run, capsys):
+    code, out, _ = await run.call(capsys, "status")
+    assert code == 0
+    assert "test run" in out
+    assert "mission   AB running, step 1 of 1, 0 lights measured" in out
+    assert "pilot     stop, stopped: RM2" in out
+    assert "manager   safety-first, active FTM1; activated RM1; latched RM1" in out
+    assert "nodes     1 of 2 running, 2 restarts; hmi crashed" in out
+
+
+async def test_status_as_json_holds_the_same(run, capsys):
+    code, out, _ = await run.call(capsys, "status", "--json")
+    status = json.loads(out)
+    assert code == 0
+    assert (status["mission"]["phase"], status["pilot"]["mode"]) == ("running", "stop")
+    assert status["manager"]["latched"] == ["RM1"]
+    assert status["time_s"] > 0
+
+
+async def test_the_node_list_has_the_promised_shape(run, capsys):
+    code, out, _ = await run.call(capsys, "node", "list", "--json")
+    assert code == 0
+    assert json.loads(out)[0] == {"name": "hmi", "kind": "non-control", "pid": 42,
+                                  "state": "crashed", "incarnation": 3, "restarts": 2}
+
+
+async def test_echo_prints_one_line_per_message(run, capsys):
+    code, out, _ = await run.call(capsys, "topic", "echo", "localization/pose", "-n", "3")
+    assert code == 0
+    lines = out.splitlines()
+    assert len(lines) == 3
+    assert all("simulator#1 localization/pose {\"x_m\":1.0," in line for line in lines)
+
+
+async def test_echo_shows_garbage_as_such_with_the_reason(run, capsys):
+    async def spoil() -> None:
+        while True:
+            run.bus.publish(topics.ROUTE, topics.ROUTE.at(), b"\xc1garbage")
+            await asyncio.sleep(0.02)
+
+    spoiler = asyncio.create_task(spoil())
+    _, out, _ = await run.call(capsys, "topic", "echo", "plan/route", "-n", "1")
+    assert out.startswith("garbage plan/route 8 bytes, not a Route: ")
+    _, out, _ = await run.call(capsys, "topic", "echo", "plan/route", "-n", "1", "--json")
+    spoiler.cancel()
+    assert json.loads(out)["garbage"] == b"\xc1garbage".hex()
+
+
+async def test_a_silent_topic_is_said_to_be_silent(run, capsys):
+    code, out, err = await run.call(capsys, "topic", "echo", "plan/route", "--duration", "0.2")
+    assert (code, out) == (1, "")
+    assert err == "rampart: nothing came on plan/route within 0.2 s\n"
+    code, _, _ = await run.call(capsys, "topic", "hz", "plan/route", "--duration", "0.2", "--json")
+    assert code == 1
+
+
+async def test_hz_measures_in_simulated_time(run, capsys):
+    code, out, _ = await run.call(
+        capsys, "topic", "hz", "localization/pose", "--duration", "1", "--json")
+    measured = json.loads(out)[0]
+    assert code == 0
+    assert measured["nominal_hz"] == 20
+    assert 5 < measured["rate_hz"] < 15
+    assert measured["window"] > 20
+
+
+async def test_a_member_of_a_family_that_is_no_node_is_unknown(run, capsys):
+    code, _, err = await run.call(capsys, "topic", "echo", "detection/DM9")
+    assert code == 2
+    assert err == "rampart: unknown node 'DM9'; known: simulator, DM1\n"
+
+
+async def test_an_injection_acts_and_tells_how_many_messages_it_affected(run, capsys):
+    code, out, _ = await run.call(
+        capsys, "inject", "localization-not-updated", "--duration", "2", "--json")
+    told = json.loads(out)
+    assert code == 0
+    assert told["effective"] is True
+    (injection,) = told["injections"]
+    assert injection["nodes"] == ["simulator"]
+    assert injection["finished"] is True
+    assert 10 < injection["affected"] < 30
+    assert len(run.node.orders) == 1, "copies of an order must not reach the actor"
+
+
+async def test_an_injection_at_once_returns_while_the_fault_lasts(run, capsys):
+    code, out, _ = await run.call(
+        capsys, "inject", "localization-not-updated", "--duration", "60", "--at-once")
+    assert code == 0
+    assert "in force at simulator for 60 s" in out
+    _, out, _ = await run.call(
+        capsys, "topic", "echo", "localization/pose", "-n", "3", "--json")
+    assert len({json.loads(line)["message"]["y_m"] for line in out.splitlines()}) == 1
+
+
+async def test_an_injection_that_no_node_publishes_says_so_and_fails(run, capsys):
+    code, _, err = await run.call(capsys, "inject", "command-not-updated", "--duration", "1")
+    assert code == 1
+    assert err == "rampart: no effect: no node publishes control/command in this run\n"
+
+
+async def test_an_injection_that_affected_nothing_says_so_and_fails(run, capsys):
+    code, out, err = await run.call(capsys, "inject", "wrong-graph", "--duration", "1")
+    assert code == 1
+    assert "in force at simulator" in out
+    assert err == ("rampart: no effect: simulator published nothing on plan/route within 1 s\n")
+
+
+async def test_an_injection_into_a_node_that_is_none_is_refused(run, capsys):
+    code, _, err = await run.call(
+        capsys, "inject", "--topic", "detection/DM9", "--mode", "drop", "--duration", "1")
+    assert code == 2
+    assert "unknown node 'DM9'" in err
+
+
+async def test_reset_releases_a_latched_recovery_once(run, capsys):
+    assert (await run.call(capsys, "reset", "RM1"))[:2] == (0, "RM1 released\n")
+    assert run.node.resets == 1
+    code, _, err = await run.call(capsys, "reset", "RM1")
+    assert code == 1
+    assert err == "rampart: no effect: RM1 is not latched; latched: none\n"
+    code, _, err = await run.call(capsys, "reset", "RM9")
+    assert code == 2
+    assert "unknown recovery 'RM9'; known: RM1, RM2" in err
+
+
+async def test_a_reset_while_the_cause_is_there_says_that_nothing_was_released(run, capsys):
+    run.node.obstinate = True
+    code, _, err = await run.call(capsys, "reset", "RM1")
+    assert code == 1
+    assert err == "rampart: RM1 was not released; active: FTM1\n"
+
+
+async def test_obstacles_come_move_and_go(run, capsys):
+    assert (await run.call(capsys, "obstacle", "add", "crate", "-1", "2.5"))[0] == 0
+    assert (await run.call(capsys, "obstacle", "add", "crate", "3", "2.5"))[0] == 0
+    _, out, _ = await run.call(capsys, "obstacle", "list", "--json")
+    assert json.loads(out) == [{"name": "crate", "x_m": 3.0, "y_m": 2.5, "radius_m": 0.4}]
+    code, _, err = await run.call(capsys, "obstacle", "remove", "box")
+    assert (code, err) == (2, "rampart: unknown obstacle 'box'; known: crate\n")
+    assert (await run.call(capsys, "obstacle", "remove", "crate"))[0] == 0
+    assert run.node.obstacles == {}
+
+
+async def test_an_obstacle_that_the_world_refuses_is_reported_with_its_reason(run, capsys):
+    code, _, err = await run.call(capsys, "obstacle", "add", "moon", "1", "2", "--radius", "9")
+    assert (code, err) == (1, "rampart: no effect: too big\n")

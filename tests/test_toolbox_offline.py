@@ -1,0 +1,211 @@
+"""The verbs of `rampart` that need no running system, and how it refuses nonsense."""
+
+from __future__ import annotations
+
+import json
+
+import msgspec
+import pytest
+
+from actors import messages as m
+from actors import topics
+from actors.runtime.injection import FaultGate
+from sim.faults import CATALOGUE, find_fault
+from toolbox import systems
+from toolbox.inject_verbs import choose
+from toolbox.main import build_parser, main
+from toolbox.output import UsageError
+from toolbox.topic_catalogue import resolve
+from toolbox.topic_verbs import in_line, rate_of
+
+
+def told(capsys) -> str:
+    return capsys.readouterr().out
+
+
+def test_the_table_holds_every_non_empty_set_once_in_the_promised_shape(capsys):
+    assert main(["table", "--json"]) == 0
+    rows = json.loads(told(capsys))
+    assert len(rows) == 2**7 - 1
+    assert len({tuple(row["active"]) for row in rows}) == 127
+    assert all(set(row) == {"active", "block", "rm"} for row in rows)
+    assert {"active": ["FTM7"], "block": 1, "rm": ["RM4"]} in rows
+
+
+@pytest.mark.parametrize(("active", "block", "rm"), [
+    (["FTM7"], 1, ["RM4"]), (["FTM1", "FTM6"], 2, ["RM1"]), (["FTM3", "FTM4"], 3, ["RM2"]),
+    (["FTM2", "FTM6", "FTM5"], 4, ["RM1"]),
+])
+def test_a_decision_is_the_papers_with_path_and_rejected(capsys, active, block, rm):
+    assert main(["decide", *active, "--json"]) == 0
+    decision = json.loads(told(capsys))
+    assert sorted(decision["active"]) == sorted(active)
+    assert (decision["block"], decision["rm"]) == (block, rm)
+    assert decision["path"]
+    assert all(set(r) == {"name", "reason"} for r in decision["rejected"])
+
+
+def test_a_decision_is_told_in_words(capsys):
+    main(["decide", "FTM3", "FTM4"])
+    assert told(capsys).startswith("FTM3 and FTM4 are active: run RM2, because")
+
+
+def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
+    text = systems.DEFAULT.read_text().replace('"FTM7"', '"FTM70"')
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    assert main(["table", "--system", str(file), "--json"]) == 0
+    assert {"active": ["FTM70"], "block": 1, "rm": ["RM4"]} in json.loads(told(capsys))
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["decide", "FTM9"], ["'FTM9'", "known: FTM1"]),
+    (["decide", "FTM1", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
+    (["table", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
+    (["table", "--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
+    (["inject", "gremlins"], ["'gremlins'", "known: command-not-updated"]),
+    (["inject"], ["--list"]),
+    (["inject", "wrong-graph", "--topic", "plan/route"], ["either"]),
+    (["inject", "wrong-graph", "--mode", "drop"], ["--mode"]),
+    (["inject", "wrong-graph", "--duration", "-1"], ["--duration -1"]),
+    (["inject", "wrong-graph", "--duration", "nan"], ["--duration nan"]),
+    (["inject", "--topic", "no/such", "--mode", "drop"], ["'no/such'", "localization/pose"]),
+    (["inject", "--topic", "detection/*", "--mode", "drop"], ["detection/DM1"]),
+    (["inject", "--topic", "localization/pose", "--mode", "melt"], ["melt", "freeze"]),
+    (["inject", "--topic", "localization/pose", "--mode", "delay"], ["--delay"]),
+    (["inject", "--topic", "localization/pose", "--mode", "drop", "--set", "x_m=1"], ["corrupt"]),
+    (["inject", "--topic", "localization/pose", "--mode", "corrupt"], ["--set"]),
+    (["inject", "--topic", "localization/pose", "--mode", "corrupt", "--set", "z_m=1"],
+     ["'z_m'", "x_m, y_m, yaw_rad"]),
+    (["inject", "--topic", "localization/pose", "--mode", "corrupt", "--set", "x_m=east"],
+     ["x_m=east", "float"]),
+    (["inject", "--topic", "localization/pose", "--mode", "corrupt", "--set", "x_m"],
+     ["FIELD=VALUE"]),
+    (["inject", "--topic", "plan/route", "--mode", "corrupt", "--ramp", "step=1"], ["float"]),
+    (["inject", "--topic", "plan/route", "--mode", "corrupt", "--keep-ends", "step"], ["list"]),
+    (["topic", "info", "no/such"], ["'no/such'", "localization/pose"]),
+    (["topic", "echo", "localization/pose/x"], ["'localization/pose/x'"]),
+    (["topic", "echo", "localization/pose", "--duration", "0"], ["--duration 0"]),
+])
+def test_nonsense_is_refused_in_one_line_that_names_it(capsys, monkeypatch, arguments, words):
+    monkeypatch.setattr("toolbox.session.find_run", lambda _port: pytest.fail("looked for a run"))
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    for word in words:
+        assert word in captured.err
+
+
+@pytest.mark.parametrize("arguments", [
+    ["status"], ["node", "list"], ["topic", "hz", "plan/route"], ["inject", "wrong-graph"],
+    ["topic", "echo", "plan/route"], ["reset", "RM1"], ["obstacle", "list"],
+    ["obstacle", "add", "crate", "1", "2"], ["obstacle", "remove", "crate"],
+])
+def test_without_a_run_each_verb_says_so_and_exits_2(capsys, monkeypatch, arguments):
+    monkeypatch.setattr("actors.supervision.run_info.find_runs", list)
+    assert main(arguments) == 2
+    assert capsys.readouterr().err == (
+        "rampart: no run found; start one with `python launch.py`\n")
+
+
+def test_the_catalogue_is_listed_with_who_should_see_each_fault(capsys):
+    assert main(["inject", "--list", "--json"]) == 0
+    listed = {f["name"]: f["detected_by"] for f in json.loads(told(capsys))}
+    assert listed == {
+        "command-not-updated": ["DM2"], "command-out-of-bounds": ["DM3"],
+        "localization-not-updated": ["DM6"], "prohibited-area": ["DM1"], "wrong-graph": ["DM1"]}
+
+
+SAMPLES = {
+    "control/command": m.Twist(0.5, 0.1),
+    "localization/pose": m.Pose(1.0, 2.0, 0.3),
+    "plan/route": m.Route("1", 0, m.Mode.TAXI, True, ((0.0, 0.0), (1.0, 1.0), (2.0, 0.0)), ""),
+}
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_every_fault_of_the_catalogue_changes_a_real_message(name):
+    gate = FaultGate()
+    for order in find_fault(name).orders("i"):
+        topic, key = resolve(order.topic)
+        first, later = SAMPLES[order.topic], SAMPLES[order.topic]
+        if order.topic != "plan/route":
+            later = type(first)(*(value + 1 for value in msgspec.structs.astuple(first)))
+        gate.remember(key, gate.apply(key, first, 0.0, 0.0))
+        assert gate.order(order, 1.0) == ""
+        out = gate.apply(key, later, 3.0, 3.0)
+        assert type(out.body) is topic.type
+        assert out.body != later
+        assert gate.expire(order.injection) == 1
+
+
+def test_a_fault_of_ones_own_is_put_together_from_options():
+    options = build_parser().parse_args([
+        "inject", "--topic", "rampart/plan/route", "--mode", "corrupt", "--set", "reason=why not",
+        "--set", "step=3", "--keep-ends", "waypoints"])
+    (order,) = choose(options).orders("i1", 4.0)
+    assert order == m.Injection("i1", "plan/route", "corrupt", 4.0,
+                                set_fields={"reason": "why not", "step": 3},
+                                keep_ends=("waypoints",))
+
+
+def test_a_nested_field_can_be_ramped():
+    options = build_parser().parse_args([
+        "inject", "--topic", "summit_xl/odom", "--mode", "corrupt", "--ramp", "pose.x_m=0.5"])
+    (order,) = choose(options).orders("i1")
+    assert order.ramp_fields == {"pose.x_m": 0.5}
+
+
+@pytest.mark.parametrize(("key", "topic", "full"), [
+    ("plan/route", topics.ROUTE, "rampart/plan/route"),
+    ("/rampart/plan/route", topics.ROUTE, "rampart/plan/route"),
+    ("detection/DM1", topics.DETECTION, "rampart/detection/DM1"),
+    ("detection/*", topics.DETECTION, "rampart/detection/*"),
+    ("recovery/RM2/state", topics.RECOVERY, "rampart/recovery/RM2/state"),
+    ("recovery/{name}/command", topics.RECOVERY_COMMAND, "rampart/recovery/*/command"),
+])
+def test_a_key_is_found_however_it_is_written(key, topic, full):
+    assert resolve(key) == (topic, full)
+
+
+@pytest.mark.parametrize("key", ["", "detection", "detection/", "detection/a/b", "rampart", "x/y"])
+def test_a_key_of_no_topic_is_refused(key):
+    with pytest.raises(UsageError, match="unknown topic"):
+        resolve(key)
+
+
+def test_rates_are_measured_like_ros2_does():
+    rate = rate_of([0.0, 0.1, 0.2, 0.4])
+    assert rate["rate_hz"] == pytest.approx(7.5)
+    assert (rate["min_s"], rate["max_s"]) == (pytest.approx(0.1), pytest.approx(0.2))
+    assert rate["window"] == 4
+    assert rate_of([1.0])["rate_hz"] is None
+
+
+def test_long_bytes_are_counted_not_printed():
+    scan = m.LaserScan(0.0, 0.1, 5.0, bytes(1440))
+    assert in_line(scan).endswith('"ranges_f32":"<1440 bytes>"}')
+
+
+def test_topic_info_names_publishers_and_readers(capsys):
+    assert main(["topic", "info", "localization/pose", "--json"]) == 0
+    info = json.loads(told(capsys))
+    assert info["publishers"] == ["localization"]
+    assert {"hmi", "DM6", "osmosis_control"} <= set(info["readers"])
+
+
+def verbs(parser, path=()):
+    for action in parser._actions:
+        if hasattr(action, "choices") and isinstance(action.choices, dict):
+            for name, sub in action.choices.items():
+                yield (*path, name), sub
+                yield from verbs(sub, (*path, name))
+
+
+@pytest.mark.parametrize(("path", "parser"), list(verbs(build_parser())),
+                         ids=lambda v: " ".join(v) if isinstance(v, tuple) else "")
+def test_the_help_of_each_verb_teaches_with_examples(path, parser):
+    text = parser.format_help()
+    assert f"rampart {path[0]}" in text.partition("examples:")[2]
+    assert parser.description
