@@ -92,7 +92,10 @@ def test_decisions_are_put_in_words():
         "FTM7 is active: run RM4, because it is the only active mechanism (block 1).")
     assert decision_in_words(("FTM3", "FTM4"), 3, ("RM2",)).startswith(
         "FTM3 and FTM4 are active: run RM2")
-    assert decision_in_words((), 0, ()).startswith("No mechanism is active")
+    assert decision_in_words((), 0, ()) == (
+        "No mechanism is active: there is nothing to recover from.")
+    assert decision_in_words((), 0, ("RM1",)) == (
+        "No mechanism is active any more; RM1 stays in force until reset.")
     assert decision_in_words(("FTM3",), 2, ("RM2", "RM3"), "mission-first") == (
         "FTM3 is active: run RM2 and RM3 (strategy mission-first, rule 2).")
 

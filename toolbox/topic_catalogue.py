@@ -112,10 +112,11 @@ def markdown(spec: SystemSpec) -> str:
     table = uses(spec)
     for use in table:
         t = use.topic
-        lines.append(
-            f"| `{t.key}` | [{t.type.__name__}](#{t.type.__name__.lower()}) | {t.qos.value} | "
-            f"{MAILBOX[t.qos]} | {_rate(t)} | {f'`{t.frame}`' if t.frame else ''} | {', '.join(use.publishers)} | "
-            f"{', '.join(use.readers)} |")
+        cells = (
+            f"`{t.key}`", f"[{t.type.__name__}](#{t.type.__name__.lower()})", t.qos.value,
+            MAILBOX[t.qos], _rate(t), f"`{t.frame}`" if t.frame else "",
+            ", ".join(use.publishers), ", ".join(use.readers))
+        lines.append(f"| {' | '.join(cells)} |")
     lines += ["", "## What each key is for", ""]
     lines += [f"- `{use.topic.key}`: {use.topic.doc}" for use in table]
     lines += ["", "## Messages", ""]

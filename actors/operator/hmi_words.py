@@ -17,8 +17,11 @@ def decision_in_words(
     active: Sequence[str], rule: int, recoveries: Sequence[str], strategy: str = "safety-first"
 ) -> str:
     """Return one sentence: what is active, what is done about it, and by which rule."""
+    if not active and recoveries:
+        return (f"No mechanism is active any more; {listing(recoveries)} "
+                f"{'stays' if len(recoveries) == 1 else 'stay'} in force until reset.")
     if not active:
-        return "No mechanism is active: recoveries that are not latched are released."
+        return "No mechanism is active: there is nothing to recover from."
     verb = "is" if len(active) == 1 else "are"
     taken = f"run {listing(recoveries)}" if recoveries else "no recovery"
     sentence = f"{listing(active)} {verb} active: {taken}"

@@ -192,6 +192,7 @@ function nodes(heard) {
   $("nodes-count").textContent = heard ? `${up} of ${rows.length} running${heard.stale ? " · supervisor silent" : ""}` : "supervisor not heard";
   $("nodes").replaceChildren(...rows.map((n) => {
     const row = element("tr");
+    row.title = `${n.kind}, incarnation ${n.incarnation}`;
     const stateCell = element("td");
     stateCell.append(element("span", `dot ${STATES[n.state] || ""}`), n.state);
     row.append(element("td", "", n.name), element("td", "quiet", n.kind), stateCell,
