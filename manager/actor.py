@@ -114,7 +114,8 @@ class FtmManager(Actor):
 
     def _step(self, event: Input) -> None:
         now_s = self.clock.now()
-        missed_s = now_s - self._ran_s - ABSENCE_S
+        # Before simulated time 0 the system is starting: nobody's silence means anything yet.
+        missed_s = now_s - self._ran_s - (ABSENCE_S if now_s > 0 else 0.0)
         self._ran_s = now_s
         state = self.arbiter_state
         if missed_s > 0:

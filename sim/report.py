@@ -17,6 +17,7 @@ from typing import Any
 import jinja2
 import msgspec
 
+from sim.clearance import EXACT_BELOW_M
 from sim.report_record import Interval, LightResult, RunRecord, RunRecorder
 
 __all__ = ["RunRecord", "RunRecorder", "render", "write_report"]
@@ -72,7 +73,7 @@ def render(run: RunRecord) -> str:
     """Return the HTML page."""
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters.update(clock=clock, metres=metres)
+    environment.filters.update(clock=clock, clearance=clearance)
     template = environment.from_string(
         Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
     x0, y0, x1, y1 = _bounds(run)
@@ -117,9 +118,11 @@ def clock(seconds: float | None) -> str:
     return f"{int(minutes)}:{rest:04.1f}"
 
 
-def metres(value: float | None) -> str:
-    """Return a distance for people."""
-    return "–" if value is None else f"{value:.2f} m"  # noqa: RUF001
+def clearance(value: float | None) -> str:
+    """Return a clearance for people; above `EXACT_BELOW_M` the simulator knows only a bound."""
+    if value is None:
+        return "–"  # noqa: RUF001
+    return f"{EXACT_BELOW_M:g} m or more" if value >= EXACT_BELOW_M else f"{value:.2f} m"
 
 
 def _bounds(run: RunRecord) -> tuple[float, float, float, float]:

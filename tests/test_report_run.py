@@ -13,7 +13,7 @@ from actors import messages as m
 from actors import topics
 from actors.runtime.actor import Header
 from airport.formats import load_airport
-from sim.report import RunRecord, RunRecorder, clock, render, write_report
+from sim.report import RunRecord, RunRecorder, clearance, clock, render, write_report
 
 AIRPORT = load_airport("vallombre")
 MISSION = AIRPORT.mission("AB")
@@ -136,6 +136,14 @@ def test_closest_approaches_are_the_smallest_and_none_when_there_was_nothing():
     run = story.end()
     assert (run.obstacle_clearance_m, run.prohibited_clearance_m) == (0.4, -0.2)
     assert (run.collisions, run.prohibited_s) == (1, 0.5)
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (None, "\N{EN DASH}"), (-0.2, "-0.20 m"), (0.994, "0.99 m"), (1.0, "1 m or more"),
+    (3.2, "1 m or more"),
+])
+def test_a_clearance_beyond_the_exact_range_is_given_as_a_bound(value, text):
+    assert clearance(value) == text
 
 
 def test_messages_of_other_topics_and_corrupt_poses_do_no_harm():

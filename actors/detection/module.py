@@ -94,7 +94,7 @@ class DetectionModule(Actor):
         self._monitor: Monitor | None = None
         self._wake_s = math.inf
         self._ran_s = self.clock.now()
-        self._judges_from_s = -math.inf
+        self._judges_from_s = 0.0  # before that the system is starting, see `Launcher.start`
 
     def grace_s(self, timeout_s: float) -> float:
         """Return how long the first input may take, s."""

@@ -84,21 +84,20 @@ def every(period_s: float) -> Callable[[F], F]:
 class Timer:
     """A pending `call_later`; `cancel` is harmless after it has run."""
 
-    __slots__ = ("_call", "_handle")
+    __slots__ = ("_call", "_release")
 
     def __init__(self, call: Callable[[], None]) -> None:
         self._call: Callable[[], None] | None = call
-        self._handle: asyncio.TimerHandle | None = None
+        self._release: Callable[[], None] = lambda: None
 
-    def arm(self, handle: asyncio.TimerHandle) -> None:
-        """Keep the loop's handle."""
-        self._handle = handle
+    def arm(self, release: Callable[[], None]) -> None:
+        """Keep what takes the timer from the loop."""
+        self._release = release
 
     def cancel(self) -> None:
         """Make sure the call does not happen (any more)."""
         self._call = None
-        if self._handle is not None:
-            self._handle.cancel()
+        self._release()
 
     def fire(self) -> None:
         """Make the call, unless it was cancelled while it waited in the mailbox."""
@@ -229,7 +228,13 @@ class Actor:
         self._timer_count += 1
         slot = f"later {self._timer_count}"
         due = self.clock.source_time(self.clock.now() + delay_s)
-        timer.arm(self._at(due, lambda: self._mailbox.put_latest(slot, timer.fire)))
+        handle = self._at(due, lambda: self._mailbox.put_latest(slot, timer.fire))
+
+        def release() -> None:
+            handle.cancel()
+            self._timers.discard(handle)
+
+        timer.arm(release)
         return timer
 
     def report_diagnostic(self, context: str, reason: str, offender: str) -> None:

@@ -31,6 +31,10 @@ from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableE
 
 LOAD_TIMEOUT_S = 60.0
 GUARD_PERIOD_S = 0.25
+STARTUP_S = 1.0
+"""Simulated time 0 lies so many wall seconds after the start of the first actor: until then all
+processes open their sessions at once, and silence is no fault."""
+
 STOP_TIMEOUT_S = 1.2
 SUPERVISOR_PATIENCE_S = 1.5
 """A supervisor that has not published its table (every 0.5 s at rate 1) for so long is hung."""
@@ -119,14 +123,14 @@ class Launcher:
         check_ports(self.plan.base_port, len(self.ports))
 
     async def start(self) -> None:
-        """Set simulated time 0 to now and start the second spawner and the supervisor.
+        """Set simulated time 0 and start the second spawner and the supervisor.
 
         Raises:
             LaunchError: the spawner does not answer.
         """
         loop = asyncio.get_running_loop()
         loop.add_signal_handler(signal.SIGCHLD, self._reap)
-        self.plan = msgspec.structs.replace(self.plan, origin_s=time.monotonic())
+        self.plan = msgspec.structs.replace(self.plan, origin_s=time.monotonic() + STARTUP_S)
         try:
             self._spawners.set_origin(self.plan.origin_s)
             self._spawners.fork((f"spawner_{NAMES[1]}",), 1)
