@@ -36,6 +36,7 @@ from sim.report_record import RunRecord, RunRecorder
 from sim.run_end import RunEnd
 
 ROOT = Path(__file__).resolve().parent
+LAST_PORT = 32_000
 EXIT_SUCCESS, EXIT_FAILED, EXIT_USAGE, EXIT_UNSAFE = 0, 1, 2, 3
 
 EPILOG = """\
@@ -112,6 +113,9 @@ class Run:
         mission_name = _existing_path(options.mission or self.spec.mission)
         self.airport: Airport = load_airport(airport_name)
         self.mission: Mission = load_mission(mission_name, self.airport)
+        if options.obstacles > len(self.airport.obstacles):
+            raise UsageError(f"--obstacles {options.obstacles}: {self.airport.name} has places for "
+                             f"{len(self.airport.obstacles)}")
         self.directory = Path(options.report or ROOT / "reports" / (
             time.strftime("%Y%m%d-%H%M%S-") + self.mission.name))
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -221,8 +225,9 @@ def _check(options: argparse.Namespace) -> None:
     if not options.patience > 0:
         raise UsageError(f"--patience {options.patience:g}: must be above 0")
     for name, port in (("--port", options.port), ("--hmi-port", options.hmi_port)):
-        if not 1024 <= port <= 65_000:
-            raise UsageError(f"{name} {port}: must be between 1024 and 65000")
+        if not 1024 <= port <= LAST_PORT:
+            raise UsageError(f"{name} {port}: must be between 1024 and {LAST_PORT}, below the "
+                             "ports that the kernel gives to outgoing connections")
     if options.strategy and options.strategy not in STRATEGIES:
         raise UsageError(f"--strategy {options.strategy}: unknown strategy; known: "
                          f"{', '.join(STRATEGIES)}")

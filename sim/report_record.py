@@ -10,11 +10,11 @@ import msgspec
 
 from actors import messages as m
 from actors import topics
-from actors.operator.hmi_map import AirportDrawing, draw
-from actors.operator.hmi_words import decision_in_words
 from actors.runtime.actor import Header
 from actors.runtime.topic import Topic
+from airport.drawing import AirportDrawing, draw
 from airport.model import Airport, Mission
+from manager.words import decision_in_words
 
 TRACK_STEP_M = 0.2
 """A track point is kept when the robot has moved this far."""

@@ -35,8 +35,8 @@ def write_stub_system(directory: Path) -> Path:
 
 
 def free_base_port(count: int = 40) -> int:
-    """Return the first of `count` consecutive free ports."""
-    for base in range(20_000 + os.getpid() % 1000 * 20, 60_000, count):
+    """Return the first of `count` consecutive free ports below the ephemeral ones."""
+    for base in range(10_000 + os.getpid() % 400 * count, 32_000, count):
         try:
             for port in range(base, base + count):
                 with socket.socket() as probe:

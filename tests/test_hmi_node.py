@@ -135,7 +135,7 @@ async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world)
 
 
 async def test_an_hmi_respawned_in_mid_run_starts_nothing(world):
-    await asyncio.sleep(5.0 / RATE)
+    await asyncio.sleep(9.0 / RATE)
     async with world.hmi(incarnation=2, mission=AIRPORT.mission("AB")):
         await asyncio.sleep(2.0 / RATE)
     assert world.others.requests == []

@@ -6,10 +6,10 @@ import math
 import msgspec
 
 from actors import messages as m
-from actors.operator.hmi_map import draw
 from actors.operator.hmi_state import STALE_S, TRACK_POINTS, HmiState
-from actors.operator.hmi_words import decision_in_words
+from airport.drawing import draw
 from airport.formats import load_airport
+from manager.words import decision_in_words
 
 
 def shown(state: HmiState, now_s: float = 0.0) -> dict:

@@ -33,7 +33,7 @@ TOP = {"actors", "airport", "manager", "sim", "toolbox", "launch", "systems"}
 
 def room_of(module: str) -> str | None:
     """Return the room of a dotted module name; longest match wins."""
-    if module.split(".")[0] not in TOP:
+    if module.split(".", maxsplit=1)[0] not in TOP:
         return None
     if module == "systems" or module.startswith("systems."):
         return "systems"

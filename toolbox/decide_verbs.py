@@ -6,11 +6,11 @@ import argparse
 from itertools import combinations
 from typing import Any
 
-from actors.operator.hmi_words import decision_in_words
 from manager.decision import Decision
 from manager.order import UnknownElementError
 from manager.schema import SystemSpec
 from manager.strategies import UnknownStrategyError, decide
+from manager.words import decision_in_words
 from toolbox import systems
 from toolbox.output import UsageError, print_json, print_table, say
 

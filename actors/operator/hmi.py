@@ -13,11 +13,17 @@ from typing import Any
 
 from actors import messages as m
 from actors import topics
-from actors.operator.hmi_map import draw
 from actors.operator.hmi_server import MissionWish, PageServer, PortError, RefusedError, Wish
 from actors.operator.hmi_state import HmiState
-from actors.operator.hmi_submission import REPEAT_S, BusyError, Submission, first_request
+from actors.operator.hmi_submission import (
+    REPEAT_S,
+    BusyError,
+    Submission,
+    first_request,
+    system_is_up,
+)
 from actors.runtime.actor import Actor, Context, Header, every, on
+from airport.drawing import draw
 from airport.model import Airport, Mission
 
 __all__ = ["Hmi"]
@@ -42,6 +48,7 @@ class Hmi(Actor):
         first = first_request(run_id, mission.name, _goals(mission)) if mission else None
         self._submission = Submission(run_id, context.incarnation, self.clock.now(), first)
         self._state = HmiState()
+        self._table: m.NodeTable | None = None
         self._port: int = self.parameters.get("port", shared.get("hmi_port")) or 0
         self._server: PageServer | None = None
         self._starting: asyncio.Task[None] | None = None
@@ -88,7 +95,7 @@ class Hmi(Actor):
         if withdrawn is not None:
             self._state.log(now, "note", f"mission {withdrawn.name} was not taken: "
                                          "the Mission Manager does not answer")
-        if self._submission.pending is not None:
+        if self._submission.pending is not None and system_is_up(self._table, now):
             self.publish(topics.MISSION_REQUEST, self._submission.pending)
 
     def _fulfil(self, wish: Wish) -> str:
@@ -153,6 +160,7 @@ class Hmi(Actor):
 
     @on(topics.NODES)
     def _nodes(self, message: m.NodeTable, _header: Header) -> None:
+        self._table = message
         self._state.keep("nodes", message, self.clock.now())
 
     @on(topics.OBSTACLES)

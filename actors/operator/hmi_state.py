@@ -11,7 +11,7 @@ from collections import deque
 from typing import Any
 
 from actors import messages as m
-from actors.operator.hmi_words import decision_in_words
+from manager.words import decision_in_words
 
 TRACK_STEP_M = 0.25
 """A track point is kept when the robot has moved this far."""

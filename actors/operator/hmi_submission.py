@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from actors import messages as m
 
-RESPAWN_WINDOW_S = 3.0
+RESPAWN_WINDOW_S = 8.0
 """A respawned HMI still sends the first mission this early in the run (simulated time): its
 predecessor may have died before it was heard."""
 
@@ -22,11 +22,23 @@ REPEAT_S = 0.5
 GIVE_UP_S = 10.0
 """A mission asked for on the page is withdrawn when it was not taken for so long."""
 
+START_ANYWAY_S = 5.0
+"""A node that does not come up does not hold the mission back longer (simulated time): what is
+missing is the fault tolerance's business, not the HMI's."""
+
 _BUSY = (m.MissionPhase.RUNNING, m.MissionPhase.PAUSED)
 
 
 class BusyError(ValueError):
     """A mission cannot be started now; the text says why."""
+
+
+def system_is_up(table: m.NodeTable | None, now_s: float) -> bool:
+    """Whether a mission may be sent: simulated time has begun, and all known nodes run."""
+    if now_s < 0 or table is None:
+        return now_s >= 0
+    return now_s > START_ANYWAY_S or all(
+        row.state is m.NodeState.RUNNING for row in table.nodes)
 
 
 class Submission:

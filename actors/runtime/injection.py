@@ -71,8 +71,8 @@ class FaultGate:
             if f"{ROOT}/{active.order.topic}" != key:
                 continue
             order = active.order
-            active.affected += 1
             if order.mode == "drop":
+                active.affected += 1
                 return None
             if order.mode == "delay":
                 out.delay_s += order.delay_s
@@ -81,6 +81,7 @@ class FaultGate:
                 out = Outgoing(active.frozen.body, active.frozen.stamp, out.delay_s)
             else:
                 out.body = corrupt(out.body, order, now_s - active.since_s)
+            active.affected += 1
         return out
 
     def remember(self, key: str, out: Outgoing) -> None:
