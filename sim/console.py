@@ -42,6 +42,7 @@ class Console:
         self._mission: MissionStatus | None = None
         self._pilot = ""
         self._last_live_s = 0.0
+        self._unsafe = (0, False)
 
     def banner(self, airport: str, mission: Mission, plan: RunPlan, strategy: str) -> None:
         """Say what is about to run and how to disturb it."""
@@ -58,7 +59,7 @@ class Console:
         if isinstance(message, MissionStatus):
             self._take_mission(message, at)
         elif isinstance(message, ProcessEvent):
-            if message.event not in _QUIET_EVENTS:
+            if message.event not in _QUIET_EVENTS and message.detail != "already":
                 detail = f" ({message.detail})" if message.detail else ""
                 self.line(at, f"{message.node} {message.event}, incarnation "
                           f"{message.incarnation}{detail}")
@@ -121,6 +122,11 @@ class Console:
             self.line(header.stamp, f"{header.source}: {what}")
 
     def _show_live(self, truth: GroundTruth, at: float) -> None:
+        unsafe = (truth.collisions, truth.prohibited_s > 0)
+        if unsafe != self._unsafe:
+            self._unsafe = unsafe
+            self.line(at, "UNSAFE: " + ("in the prohibited area" if unsafe[1] else "")
+                      + (f" {unsafe[0]} collisions" if unsafe[0] else ""))
         if not self._live or at - self._last_live_s < 0.25:
             return
         self._last_live_s = at

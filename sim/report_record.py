@@ -176,6 +176,7 @@ class RunRecorder:
         self._open: dict[tuple[str, str], tuple[float, str]] = {}
         self._decisions: dict[tuple[int, int], DecisionLine] = {}
         self._restarts: dict[str, int] = {}
+        self._lives: dict[str, set[int]] = {}
         self._collisions = 0
         self._prohibited_s = 0.0
         self._obstacle_clearance_m = math.inf
@@ -253,11 +254,11 @@ class RunRecorder:
     def _pose(self, pose: m.Pose, header: Header) -> None:
         _append(self._believed, header.stamp, pose)
 
-    def _mission_status(self, status: m.MissionStatus, _header: Header) -> None:
+    def _mission_status(self, status: m.MissionStatus, header: Header) -> None:
         for light in status.lights:
             self._lights[light.light] = light
-        if len(status.step_times_s) > len(self._reached):  # a respawned Mission Manager forgets
-            self._reached = status.step_times_s
+        newly = len(status.step_times_s) - len(self._reached)  # negative: it forgot, we do not
+        self._reached += (header.stamp,) * newly
 
     def _light(self, light: m.LightMeasurement, _header: Header) -> None:
         self._lights[light.light] = light
@@ -300,8 +301,10 @@ class RunRecorder:
             self._turn("down", event.node, False, header.stamp)
             by = f" by {event.by}" if event.by else ""
             self._note(header.stamp, "clear", f"{event.node} {event.event}{by}")
-        if event.event == "respawned":
-            self._restarts[event.node] = self._restarts.get(event.node, 0) + 1
+        if event.event == "respawned":  # may be told twice, to whoever asks twice
+            lives = self._lives.setdefault(event.node, set())
+            lives.add(event.incarnation)
+            self._restarts[event.node] = len(lives)
 
     def _injection(self, order: m.Injection, _header: Header) -> None:
         self._injections[order.injection] = f"{order.mode} {order.topic}"

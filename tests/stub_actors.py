@@ -19,6 +19,10 @@ from actors.supervision.run_plan import RunPlan
 ROOT = Path(__file__).resolve().parents[1]
 
 
+_BASES = iter(range(10_000 + os.getpid() % 250 * 40, 32_000, 40))
+"""Each base is given out once per process, so that two runs of one test differ."""
+
+
 class Idler(Actor):
     """Beats its heart and does nothing else."""
 
@@ -35,8 +39,8 @@ def write_stub_system(directory: Path) -> Path:
 
 
 def free_base_port(count: int = 40) -> int:
-    """Return the first of `count` consecutive free ports below the ephemeral ones."""
-    for base in range(10_000 + os.getpid() % 400 * count, 32_000, count):
+    """Return the first of consecutive free ports, below the ephemeral ones."""
+    for base in _BASES:
         try:
             for port in range(base, base + count):
                 with socket.socket() as probe:

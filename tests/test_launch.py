@@ -100,27 +100,35 @@ def test_with_ftm_a_fault_leaves_the_robot_safe(tmp_path, fault):
     assert recoveries <= {r for d in result["decisions"] for r in d["recoveries"]}
 
 
+def stopped_when_unsafe(run: RealRun):
+    """Wait until the judge has seen enough, and end the run then."""
+    run.wait_until(lambda: "UNSAFE" in run.story or run.process.poll() is not None, 100,
+                   "the run did not end")
+    run.process.terminate()
+    return run.result()
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_without_ftm_the_same_fault_is_unsafe(tmp_path, fault):
-    with RealRun(tmp_path, "--mission", "A", "--rate", "3", "--patience", "15",
+    with RealRun(tmp_path, "--mission", "A", "--rate", "3", "--patience", "35",
                  "--no-ftm") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(3 if fault == "wrong-graph" else 9)
         injected = run.tool("inject", fault, "--duration", "60", "--at-once")
         assert injected.returncode == 0, injected.stderr
-        code, result = run.result()
+        code, result = stopped_when_unsafe(run)
     assert (code, result["safety"]) == (3, "unsafe"), run.story
     assert result["decisions"] == []
 
 
 @pytest.mark.parametrize("node", ["localization", "osmosis_control"])
 def test_without_ftm_a_killed_node_stays_dead_and_the_run_is_unsafe(tmp_path, node):
-    with RealRun(tmp_path, "--mission", "A", "--rate", "3", "--patience", "15",
+    with RealRun(tmp_path, "--mission", "A", "--rate", "3", "--patience", "35",
                  "--no-ftm") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(9)
         run.kill(node)
-        code, result = run.result()
+        code, result = stopped_when_unsafe(run)
     assert (code, result["safety"]) == (3, "unsafe"), run.story
     assert result["restarts"] == {}
 
@@ -129,7 +137,7 @@ def test_an_emergency_stop_stays_until_it_is_reset_and_then_the_mission_goes_on(
     with RealRun(tmp_path, "--mission", "A", "--rate", "2") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(8)
-        assert run.tool("inject", "prohibited-area", "--duration", "6", "--at-once"
+        assert run.tool("inject", "prohibited-area", "--duration", "20", "--at-once"
                         ).returncode == 0
         run.wait_for("RM1")
         run.wait_for("DM1: clear")
@@ -165,7 +173,7 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
         assert done.returncode == 0, done.stderr
         run.wait_for("goal 2/3", 60)
         assert "payload rejected" in run.story
-        assert "decision" not in run.story
+        assert "decision 1:" not in run.story
         assert "crashed" not in run.story
 
 

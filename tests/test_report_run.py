@@ -74,8 +74,10 @@ def test_all_lights_of_the_airport_are_listed_measured_or_not():
 def test_what_was_measured_and_reached_outlives_a_mission_manager_that_forgets():
     story = Story()
     light = m.LightMeasurement("A01", 200.0, 1.0, m.LightVerdict.OK)
-    story.tell(1.0, topics.MISSION_STATUS, m.MissionStatus(
-        "1", "AB", m.MissionPhase.RUNNING, 2, (), (12.5, 40.0), (light,), ""))
+    story.tell(12.5, topics.MISSION_STATUS, m.MissionStatus(
+        "1", "AB", m.MissionPhase.RUNNING, 1, (), (12.0,), (light,), ""))
+    story.tell(40.0, topics.MISSION_STATUS, m.MissionStatus(
+        "1", "AB", m.MissionPhase.RUNNING, 2, (), (12.0, 27.5), (light,), ""))
     story.tell(50.0, topics.MISSION_STATUS, m.MissionStatus(
         "", "", m.MissionPhase.IDLE, 0, (), (), (), ""), incarnation=2)
     run = story.end()

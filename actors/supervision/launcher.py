@@ -67,7 +67,7 @@ class Launcher:
     """One run's processes. Use: `load`, then `start` on a running event loop, then `end`."""
 
     def __init__(self, plan: RunPlan, title: str) -> None:
-        self.plan = plan
+        self.plan = msgspec.structs.replace(plan, launcher_pid=os.getpid())
         self.ports: dict[str, int] = {}
         self.supervisor_incarnation = 0
         self.known_incarnations: dict[str, int] = {}
@@ -84,7 +84,19 @@ class Launcher:
     # -- start ----------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Start the first spawner, which then loads in the background."""
+        """Claim the base port and start the first spawner, which then loads in the background.
+
+        Raises:
+            LaunchError: another run has the base port.
+        """
+        self._info = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self._info.bind(run_info.address(self.plan.base_port))
+        except OSError:
+            self._info.close()
+            self._info = None
+            raise LaunchError(f"--port {self.plan.base_port}: in use by another run; "
+                              "choose another --port") from None
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         self._lifeline = os.pipe()
         self._start_first_spawner()
@@ -159,7 +171,8 @@ class Launcher:
         # The pidfd wakes the guard the moment the supervisor dies; the period serves the rest.
         while True:
             await self._supervisor_gone(GUARD_PERIOD_S)
-            names = {n for p in find_processes(self.plan.base_port) for n in p.names}
+            names = {n for p in find_processes(self.plan.base_port)
+                     if p.launcher == self.plan.launcher_pid for n in p.names}
             for name in NAMES:
                 full = f"spawner_{name}"
                 if full not in names or not self._spawners.ping(name):
@@ -223,8 +236,8 @@ class Launcher:
     # -- tools ----------------------------------------------------------------------------------
 
     def _answer_tools(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._info = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._info.bind(run_info.address(self.plan.base_port))
+        if self._info is None:
+            return
         self._info.listen(8)
         self._info.setblocking(False)
         loop.add_reader(self._info, self._answer_one)
@@ -273,6 +286,6 @@ class Launcher:
             if self._first.stdout is not None:
                 self._first.stdout.close()
         deadline = time.monotonic() + 1.0
-        while kill_leftovers(self.plan.base_port) and time.monotonic() < deadline:
+        while kill_leftovers(self.plan.launcher_pid) and time.monotonic() < deadline:
             time.sleep(0.01)
         self._reap()

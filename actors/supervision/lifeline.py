@@ -30,11 +30,11 @@ def exit_with_launcher(read_end: int, last_act: Callable[[], object] | None = No
     threading.Thread(target=wait, name="lifeline", daemon=True).start()
 
 
-def kill_leftovers(port: int, spare: frozenset[int] = frozenset()) -> list[int]:
-    """SIGKILL all processes of a run except this one and `spare`; return their pids."""
+def kill_leftovers(launcher: int) -> list[int]:
+    """SIGKILL all processes of a launcher's run except this one; return their pids."""
     killed = []
-    for process in find_processes(port):
-        if process.pid == os.getpid() or process.pid in spare:
+    for process in find_processes():
+        if process.launcher != launcher or process.pid == os.getpid():
             continue
         with contextlib.suppress(ProcessLookupError):
             os.kill(process.pid, signal.SIGKILL)

@@ -45,9 +45,10 @@ def node_main(
     lifeline: int,
 ) -> int:
     """Run the actors of one process to their end and return the exit code."""
-    set_title(layout.plan.base_port, names, incarnation)
-    port = layout.plan.base_port
-    exit_with_launcher(lifeline, (lambda: kill_leftovers(port)) if SUPERVISOR in names else None)
+    launcher = layout.plan.launcher_pid
+    set_title(layout.plan.base_port, launcher, names, incarnation)
+    exit_with_launcher(
+        lifeline, (lambda: kill_leftovers(launcher)) if SUPERVISOR in names else None)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is the launcher's to handle
     signal.signal(signal.SIGUSR2, _wedge)
     try:

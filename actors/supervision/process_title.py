@@ -2,7 +2,8 @@
 
 The title is the registry: a restarted supervisor, `kill-node` and the clean-up after a killed
 launcher find a run's processes in /proc, with no file that could be stale and no bus that could
-be down. Format: `rampart[PORT] NAME #INCARNATION`; several actors in one process are `A+B`.
+be down. Format: `rampart[PORT/LAUNCHER] NAME #INCARNATION`, where LAUNCHER is
+the launcher's pid, which tells two runs on one port apart; several actors in one process are `A+B`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import setproctitle
 
-_TITLE = re.compile(r"^rampart\[(\d+)\] ([\w+.-]+) #(\d+)")
+_TITLE = re.compile(r"^rampart\[(\d+)/(\d+)\] ([\w+.-]+) #(\d+)")
 _STATE_STOPPED = ("T", "t")
 
 
@@ -24,13 +25,14 @@ class RunProcess:
 
     pid: int
     port: int
+    launcher: int
     names: tuple[str, ...]
     incarnation: int
 
 
-def set_title(port: int, names: tuple[str, ...], incarnation: int) -> None:
+def set_title(port: int, launcher: int, names: tuple[str, ...], incarnation: int) -> None:
     """Name the calling process."""
-    setproctitle.setproctitle(f"rampart[{port}] {'+'.join(names)} #{incarnation}")
+    setproctitle.setproctitle(f"rampart[{port}/{launcher}] {'+'.join(names)} #{incarnation}")
     setproctitle.setthreadtitle("+".join(names)[:15])
 
 
@@ -39,7 +41,7 @@ def parse_title(pid: int, title: str) -> RunProcess | None:
     match = _TITLE.match(title)
     if match is None:
         return None
-    return RunProcess(pid, int(match[1]), tuple(match[2].split("+")), int(match[3]))
+    return RunProcess(pid, int(match[1]), int(match[2]), tuple(match[3].split("+")), int(match[4]))
 
 
 def find_processes(port: int | None = None) -> list[RunProcess]:

@@ -41,6 +41,7 @@ class RunPlan(msgspec.Struct, frozen=True):
         obstacles: how many of the airport's obstacles stand there.
         ftm: False runs the paper's unprotected baseline.
         hmi_port: port of the operator's page; 0 for none.
+        launcher_pid: process id of the launcher; set by it.
         error_log: file that collects tracebacks of failed nodes; "" for none.
         origin_s: reading of the monotonic clock at simulated time 0; set when all is loaded.
     """
@@ -56,6 +57,7 @@ class RunPlan(msgspec.Struct, frozen=True):
     obstacles: int
     ftm: bool
     hmi_port: int
+    launcher_pid: int = 0
     error_log: str = ""
     origin_s: float = 0.0
 

@@ -96,9 +96,9 @@ class Spawner:
         Raises:
             OSError: another run has the address.
         """
-        port = self._layout.plan.base_port
-        set_title(port, (f"spawner_{self.name}",), 1)
-        self._listen(address(port, self.name))
+        plan = self._layout.plan
+        set_title(plan.base_port, plan.launcher_pid, (f"spawner_{self.name}",), 1)
+        self._listen(address(plan.base_port, self.name))
 
     def serve(self) -> NoReturn:
         """Serve until the launcher ends."""
@@ -198,7 +198,7 @@ class Spawner:
     def _launcher_gone(self, lifeline: int) -> None:
         if os.read(lifeline, 1):
             return
-        kill_leftovers(self._layout.plan.base_port)
+        kill_leftovers(self._layout.plan.launcher_pid)
         os._exit(0)
 
 

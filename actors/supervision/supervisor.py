@@ -88,7 +88,8 @@ class Supervisor(Actor):
 
     def on_start(self) -> None:
         """Adopt what lives, start what does not, in the order of the spec."""
-        living = {p.names: p for p in find_processes(self._plan.base_port)}
+        living = {p.names: p for p in find_processes(self._plan.base_port)
+                  if p.launcher == self._plan.launcher_pid}
         for process in self._processes.values():
             found = living.get(tuple(n.name for n in process.unit.nodes))
             if found is not None:
@@ -184,9 +185,8 @@ class Supervisor(Actor):
         if self._owns(process):
             self._respawn(process, self.name)
 
-    def _exited(self, name: str, pidfd: int) -> None:
-        process = self._processes[name]
-        if process.pidfd != pidfd:
+    def _exited(self, process: _Process, pid: int) -> None:
+        if process.pid != pid:  # it was replaced while the news waited in the mailbox
             return
         self._unwatch(process)
         if process.respawning:
@@ -267,12 +267,11 @@ class Supervisor(Actor):
             self._event(process, "crashed", self.name, "it ended before it could be watched")
             self._lost(process, NodeState.CRASHED)
             return
-        name, pidfd = process.unit.name, process.pidfd
-        self._loop.add_reader(pidfd, self._pidfd_readable, name, pidfd)
+        self._loop.add_reader(process.pidfd, self._pidfd_readable, process, process.pidfd, pid)
 
-    def _pidfd_readable(self, name: str, pidfd: int) -> None:
+    def _pidfd_readable(self, process: _Process, pidfd: int, pid: int) -> None:
         self._loop.remove_reader(pidfd)
-        self._mailbox.put_latest(f"exit {name} {pidfd}", lambda: self._exited(name, pidfd))
+        self._mailbox.put_latest(f"exit {pid}", lambda: self._exited(process, pid))
 
     def _unwatch(self, process: _Process, *, close: bool = True) -> None:
         if process.pidfd < 0:
