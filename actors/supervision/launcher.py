@@ -31,9 +31,10 @@ from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableE
 
 LOAD_TIMEOUT_S = 60.0
 GUARD_PERIOD_S = 0.25
-STARTUP_S = 1.0
-"""Simulated time 0 lies so many wall seconds after the start of the first actor: until then all
-processes open their sessions at once, and silence is no fault."""
+STARTUP_S = (1.0, 5.0)
+"""Simulated time 0 lies between so many wall seconds after the start of the first actor: until
+then all processes open their sessions at once, and silence is no fault. How many depends on how
+long the machine took to load the first process."""
 
 STOP_TIMEOUT_S = 1.2
 SUPERVISOR_PATIENCE_S = 1.5
@@ -76,6 +77,7 @@ class Launcher:
         self._spawners = SpawnerClient(plan.base_port)
         self._lifeline: tuple[int, int] = (-1, -1)
         self._first: subprocess.Popen[bytes] | None = None
+        self._begun_s = self._load_s = 0.0
         self._supervisor_pid = 0
         self._supervisor_heard_s = 0.0
         self._info: socket.socket | None = None
@@ -99,6 +101,7 @@ class Launcher:
                               "choose another --port") from None
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         self._lifeline = os.pipe()
+        self._begun_s = time.monotonic()
         self._start_first_spawner()
 
     def _start_first_spawner(self) -> None:
@@ -126,6 +129,7 @@ class Launcher:
                 asyncio.to_thread(self._first.stdout.readline), LOAD_TIMEOUT_S)
         except TimeoutError:
             raise LaunchError(f"the spawner did not load within {LOAD_TIMEOUT_S:.0f} s") from None
+        self._load_s = time.monotonic() - self._begun_s
         text = line.decode().strip()
         if text.startswith("error: "):
             raise LaunchError(text.removeprefix("error: "))
@@ -142,7 +146,8 @@ class Launcher:
         """
         loop = asyncio.get_running_loop()
         loop.add_signal_handler(signal.SIGCHLD, self._reap)
-        self.plan = msgspec.structs.replace(self.plan, origin_s=time.monotonic() + STARTUP_S)
+        startup_s = min(max(STARTUP_S[0], 2 * self._load_s), STARTUP_S[1])
+        self.plan = msgspec.structs.replace(self.plan, origin_s=time.monotonic() + startup_s)
         try:
             self._spawners.set_origin(self.plan.origin_s)
             self._spawners.fork((f"spawner_{NAMES[1]}",), 1)
