@@ -16,6 +16,7 @@ import signal
 import statistics
 import sys
 import time
+from collections import deque
 from typing import Any
 
 from actors import topics
@@ -51,6 +52,7 @@ class Stopwatch(Actor):
         self._launcher: Launcher = context.shared["launcher"]
         self.newest: dict[str, int] = {}
         self.first: dict[tuple[str, int, str], float] = {}
+        self.story: deque[str] = deque(maxlen=40)
         self.detected_s: float | None = None
         self.decided_s: float | None = None
 
@@ -63,14 +65,23 @@ class Stopwatch(Actor):
     def detection(self, report: DetectionReport, header: Header) -> None:
         """Note the first active report."""
         self._note(header, topics.DETECTION)
+        if report.state is DetectionState.ACTIVE:
+            self.story.append(f"{header.stamp:.2f} {header.source} {report}")
         if report.state is DetectionState.ACTIVE and self.detected_s is None:
             self.detected_s = time.monotonic()
 
     @on(topics.DECISION)
     def decision(self, record: DecisionRecord, _header: Header) -> None:
         """Note the first decision with a recovery."""
+        self.story.append(str(record))
         if record.recoveries and self.decided_s is None:
             self.decided_s = time.monotonic()
+
+    @on(topics.PROCESS_EVENT)
+    @on(topics.DIAGNOSTIC)
+    def event(self, message: Any, header: Header) -> None:
+        """Keep the story, for when a node does not come back."""
+        self.story.append(f"{header.stamp:.2f} {header.source} {message}")
 
     @on(topics.MISSION_STATUS)
     def mission(self, _message: Any, header: Header) -> None:
@@ -156,8 +167,10 @@ async def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
 async def _kill(
     watch: Stopwatch, port: int, node: str
 ) -> tuple[float | None, float | None, float | None]:
-    victim = max((p for p in find_processes(port) if node in p.names),
-                 key=lambda p: p.incarnation)
+    found = [p for p in find_processes(port) if node in p.names]
+    if not found:
+        raise SystemExit("\n".join([*watch.story, f"{node} did not come back"]))
+    victim = max(found, key=lambda p: p.incarnation)
     old = victim.incarnation
     watch.detected_s = watch.decided_s = None
     start = time.monotonic()

@@ -82,6 +82,8 @@ class Arbiter:
         self.order = order
         self.strategy = strategy
         self.rules = rules
+        self._no_hold = msgspec.structs.replace(rules, release_hold_s=0.0, release_hold_max_s=0.0)
+        self._repairs = self._repaired_by(mechanisms)
         self._detection = {name: i for i, name in enumerate(mechanisms.detections)}
         self._recovery = {name: i for i, name in enumerate(mechanisms.recoveries)}
         self._decisions: dict[tuple[str, ...], Decision] = {}
@@ -89,6 +91,28 @@ class Arbiter:
             recovery: frozenset(mechanisms.detect[ftm] for ftm in mechanisms.names
                                 if mechanisms.recover[ftm] == recovery)
             for recovery in mechanisms.recoveries}
+
+    @staticmethod
+    def _repaired_by(mechanisms: Mechanisms) -> dict[str, tuple[str, ...]]:
+        """Return the recoveries of each detection module whose mechanisms only repair."""
+        recoveries: dict[str, tuple[str, ...]] = {}
+        for ftm in mechanisms.names:
+            detection = mechanisms.detect[ftm]
+            recoveries[detection] = (*recoveries.get(detection, ()), mechanisms.recover[ftm])
+        return {detection: names for detection, names in recoveries.items()
+                if all(mechanisms.contracts[name].kind.repairs for name in names)}
+
+    def _rules_of(self, state: State, detection: str) -> DetectionRules:
+        # The hold keeps a forward recovery (a stop) from being taken up and let go with every
+        # flap. A repair that has been done has ended by itself. Held, its mechanism would still
+        # count when another becomes active, and two unrelated crashes a second apart would end
+        # in an emergency stop (block 4).
+        repairs = self._repairs.get(detection, ())
+        if repairs and all(
+                track.phase is Phase.DONE and track.acknowledged
+                for track in (state.recoveries[self._recovery[name]] for name in repairs)):
+            return self._no_hold
+        return self.rules
 
     def initial(self, now: float, number: int = 0) -> State:
         """Return the state in which an arbiter starts.
@@ -121,7 +145,8 @@ class Arbiter:
         match event:
             case DetectionHeard() if event.detection in self._detection:
                 state = self._with_detection(state, detection_track.hear(
-                    state.detections[self._detection[event.detection]], self.rules, now,
+                    state.detections[self._detection[event.detection]],
+                    self.rules, now,
                     active=event.active, reason=event.reason, nodes=event.nodes,
                     since_s=event.since_s))
             case DetectionRestarted() if event.detection in self._detection:
@@ -181,7 +206,7 @@ class Arbiter:
             name, True, f"reset by {event.by}" if event.by else "reset")
 
     def _pass_time(self, state: State, now: float) -> State:
-        detections = tuple(detection_track.pass_time(track, self.rules, now)
+        detections = tuple(detection_track.pass_time(track, self._rules_of(state, track.name), now)
                            for track in state.detections)
         believed = {track.name: track for track in detections}
         active = self.mechanisms.detected_by(t.name for t in detections if t.active)

@@ -20,9 +20,7 @@ def test_a_crash_is_answered_by_a_respawn_and_control_handed_back():
     assert "DM4 says so" in out[0].reason
     bench.report("RM3", ACTING)
     bench.report("RM3", DONE)
-    bench.idle("DM4")
-    assert commands(bench.wait(0.45)) == []
-    assert commands(bench.wait(0.1)) == [("RM3", False)]  # after the hold of half a second
+    assert commands(bench.idle("DM4")) == [("RM3", False)]  # a repair that is done needs no hold
     assert bench.orders == ""
     assert [d.decision.rule for d in bench.decisions] == [1, 0]
 
@@ -268,7 +266,29 @@ def test_the_same_node_crashing_again_is_respawned_again():
     bench.idle("DM4")
     bench.wait(0.2)
     assert commands(bench.active("DM4", "osmosis_control")) == [("RM3", True)]
-    assert bench.state.desired["RM3"].decision == 2
+    assert bench.state.desired["RM3"].decision == 3  # 2 released it
+
+
+def test_a_repair_that_is_not_done_is_held_like_a_stop():
+    bench = Bench()
+    bench.active("DM4", "osmosis_control")
+    bench.report("RM3", ACTING)
+    bench.idle("DM4")
+    assert commands(bench.report("RM3", DEGRADED)) == []
+    assert commands(bench.wait(0.45)) == []
+    assert commands(bench.wait(0.1)) == [("RM3", False)]
+
+
+def test_two_crashes_a_second_apart_are_two_repairs_and_no_emergency():
+    bench = Bench()
+    for _ in range(10):
+        for dm, rm in (("DM4", "RM3"), ("DM7", "RM4")):
+            assert commands(bench.active(dm, "node")) == [(rm, True)]
+            bench.report(rm, ACTING)
+            bench.report(rm, DONE)
+            bench.idle(dm)
+            bench.wait(0.5)
+    assert {r for d in bench.decisions for r in d.decision.recoveries} == {"RM3", "RM4"}
 
 
 def test_a_crash_long_after_the_order_is_a_new_cause_and_no_failure_of_the_old():

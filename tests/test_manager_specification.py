@@ -263,7 +263,7 @@ REFUSED = {
     "a robot that is too fast": (
         [("top_speed_mps = 1.0", "top_speed_mps = 2.5")],
         ["$.robot.corridor_clearance_m = 1.5: too little to brake in", "1.562 m"]),
-    "intrusion without a margin": ([("parameters = { margin_m = 0.6 }", "")],
+    "intrusion without a margin": ([("margin_m = 0.6, ", "")],
                                    ["$.mechanism[0].against = 'intrusion': DM1 needs"]),
     "a root that races its parent": ([('against = "intrusion"', 'against = "parent"')],
                                      ["$.mechanism[0].against = 'parent': FTM1 is the root"]),
