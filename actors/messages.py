@@ -9,7 +9,14 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from actors.runtime.messages import Diagnostic, Heartbeat, Injection, InjectionReport, Message  # noqa: F401
+from actors.runtime.messages import (  # noqa: F401
+    Diagnostic,
+    Heartbeat,
+    Hello,
+    Injection,
+    InjectionReport,
+    Message,
+)
 
 # ---- robot: what a Summit XL driver publishes and takes --------------------------------------
 

@@ -12,6 +12,7 @@ import argparse
 import asyncio
 import json
 import os
+import random
 import signal
 import statistics
 import sys
@@ -178,7 +179,8 @@ async def _kill(
     key = (node, old + 1, OUTPUT[node].key)
     while key not in watch.first and time.monotonic() - start < 5:  # noqa: ASYNC110 polled
         await asyncio.sleep(0.001)
-    await asyncio.sleep(1.2)  # let detection modules go idle again
+    # Let detection modules go idle again, and lose step with the 20 Hz of sensors and commands.
+    await asyncio.sleep(1.2 + random.uniform(0.0, 0.05))
 
     def since(at: float | None) -> float | None:
         return None if at is None else at - start

@@ -18,8 +18,8 @@ takes `release_hold_max_s` per portion. Therefore
 * the bucket is no larger than `release_hold_max_s`, so that long after the last flap the recovery
   is released for certain: no starvation either.
 
-A single fault finds the bucket empty and is held for `release_hold_s`. With both times 0 there is no
-hold: so it is once a repair has been done (see `Arbiter`).
+A single fault finds the bucket empty and is held for `release_hold_s`. With both times 0 there is
+no hold: so it is once a repair has been done (see `Arbiter`).
 """
 
 from __future__ import annotations

@@ -11,9 +11,8 @@ from typing import Any
 
 from actors import topics
 from actors.messages import GroundTruth, MissionPhase, MissionStatus
-from actors.runtime.actor import Actor, Context, Header, on
+from actors.runtime.actor import BASE_INPUTS, Actor, Context, Header, on
 from actors.runtime.topic import Topic
-from actors.runtime.topics import INJECT
 from sim.judge import Judge, Sample
 
 Sink = Callable[[Topic[Any], Any, Header], None]
@@ -25,7 +24,8 @@ class Observer(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self._sinks: list[Sink] = list(context.shared.get("sinks", ()))
-        self._topic_of = {topic.type: topic for topic in self.inputs() if topic is not INJECT}
+        self._topic_of = {topic.type: topic for topic in self.inputs()
+                          if topic not in BASE_INPUTS}
 
     @on(topics.MISSION_STATUS)
     @on(topics.CONTROL_STATUS)

@@ -222,3 +222,22 @@ async def test_an_injected_fault_changes_what_is_published(make_bus, mode, expec
             talker.publish(topics.POSE, m.Pose(7.0, 0.0, 0.0), stamp=4.0)
             await eventually(lambda: listener.heard[-1][0].x_m == 7.0)
             assert [(b.x_m, h.stamp) for b, h in listener.heard[1:-1]] == expected
+
+
+async def test_a_newcomer_hears_the_states_of_its_partners_at_once(make_bus):
+    class Stateful(Actor):
+        outputs = (topics.GOAL,)
+
+    class Newcomer(Listener):
+        @on(topics.GOAL)
+        def goal(self, message: m.GoalOrder, header: Header) -> None:
+            self.heard.append((message, header))
+
+    order = m.GoalOrder("m1", 0, m.Goal(1.0, 2.0, m.Mode.TAXI), True)
+    async with running(Stateful, "talker", make_bus) as stateful:
+        stateful.publish(topics.GOAL, order, stamp=0.125)  # once, and never repeated by itself
+        await asyncio.sleep(0.05)
+        async with running(Newcomer, "listener", make_bus) as newcomer:
+            await eventually(lambda: bool(newcomer.heard))
+            assert newcomer.heard[0][0] == order
+            assert newcomer.heard[0][1].stamp == 0.125

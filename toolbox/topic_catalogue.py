@@ -11,9 +11,8 @@ import msgspec
 
 from actors import topics
 from actors.messages import Message
-from actors.runtime.actor import BASE_OUTPUTS, Actor
+from actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from actors.runtime.topic import ROOT, Qos, Topic
-from actors.runtime.topics import INJECT
 from actors.runtime.wiring import topics_of
 from actors.supervision.run_plan import (
     OBSERVER,
@@ -135,7 +134,7 @@ def _publishers(topic: Topic[Any], wired: list[Any]) -> tuple[str, ...]:
 
 
 def _readers(topic: Topic[Any], wired: list[Any]) -> tuple[str, ...]:
-    if topic is INJECT:
+    if topic in BASE_INPUTS:
         return ("every node",)
     return tuple(name for name, inputs, _ in wired if topic in inputs)
 

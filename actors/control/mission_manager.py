@@ -38,6 +38,11 @@ class MissionManager(Actor):
         """Keep a light's measurement."""
         self._become(mission_state.measured(self.state, message))
 
+    def on_start(self) -> None:
+        """Say at once how things stand."""
+        self.repeat_status()
+        self.repeat_goal()
+
     @every(0.2)
     def repeat_goal(self) -> None:
         """Repeat the goal for whoever joined late."""

@@ -51,6 +51,7 @@ class OsmosisControl(Actor):
         self._follower: PathFollower | LightRow | None = None
         self._status = ControlStatus("", 0, ControlPhase.IDLE, 0, 0.0)
         self._ticked_s = context.clock.now()
+        self._begun = False
 
     @on(topics.POSE)
     def pose(self, message: Pose, header: Header) -> None:
@@ -58,6 +59,7 @@ class OsmosisControl(Actor):
         if all(map(math.isfinite, (message.x_m, message.y_m, message.yaw_rad))):
             self._pose = message
             self._inspection.pose(header.stamp, message.x_m, message.y_m, message.yaw_rad)
+            self._begin()
 
     @on(topics.SCAN)
     def scan(self, message: LaserScan, _header: Header) -> None:
@@ -68,6 +70,7 @@ class OsmosisControl(Actor):
             message.angle_increment_rad,
             message.range_max_m,
         )
+        self._begin()
 
     @on(topics.LIGHT)
     def light(self, message: LightSample, header: Header) -> None:
@@ -91,6 +94,14 @@ class OsmosisControl(Actor):
         if message.active and message.waypoints:
             kind = PathFollower if message.mode is Mode.TAXI else LightRow
             self._follower = kind(message.waypoints, self._hull, self._motion)
+            self._begin()
+
+    def _begin(self) -> None:
+        """Command at once when all inputs are there, so that a respawn costs no extra period."""
+        if self._begun or self._follower is None or self._pose is None or self._points is None:
+            return
+        self._begun = True
+        self.control()
 
     @every(_PERIOD_S)
     def control(self) -> None:

@@ -26,16 +26,22 @@ from actors.runtime.clock import Clock
 from actors.runtime.envelope import ArrivalGuard, Header, RejectedError, encode
 from actors.runtime.injection import FaultGate, Outgoing
 from actors.runtime.mailbox import Mailbox
-from actors.runtime.messages import Diagnostic, Heartbeat, Injection, InjectionReport
+from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection, InjectionReport
 from actors.runtime.topic import Qos, Topic
-from actors.runtime.topics import DIAGNOSTIC, HEARTBEAT, INJECT, INJECTION_REPORT
+from actors.runtime.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
 
 __all__ = ["Actor", "Context", "Header", "every", "on"]
 
 F = TypeVar("F", bound=Callable[..., None])
 
-BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, DIAGNOSTIC, INJECTION_REPORT)
+BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, HELLO, DIAGNOSTIC, INJECTION_REPORT)
 """What every actor publishes besides its own outputs."""
+
+BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT, HELLO)
+"""What every actor hears besides its own inputs: injections from tools, hellos from partners."""
+
+_REPEATED_SOON_HZ = 10.0
+"""A state that is repeated this often anyway is not repeated for a newcomer."""
 
 _DIAGNOSTIC_PERIOD_S = 1.0
 
@@ -116,7 +122,7 @@ class Actor:
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = ()
     heartbeat_period_s: float = 0.1
-    _handlers: ClassVar[tuple[tuple[Topic[Any], str], ...]] = ((INJECT, "_on_injection"),)
+    _handlers: ClassVar[tuple[tuple[Topic[Any], str], ...]] = ()
     _periodic: ClassVar[tuple[tuple[float, str], ...]] = ()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -129,7 +135,8 @@ class Actor:
                     handlers[(topic.key, name)] = (topic, name)
                 if hasattr(member, "_rampart_period_s"):
                     periodic[name] = member._rampart_period_s
-        cls._handlers = ((INJECT, "_on_injection"), *handlers.values())
+        cls._handlers = (
+            (INJECT, "_on_injection"), (HELLO, "_on_hello"), *handlers.values())
         cls._periodic = tuple((period, name) for name, period in periodic.items())
 
     def __init__(self, context: Context) -> None:
@@ -148,6 +155,7 @@ class Actor:
         self._stopping = False
         self._timers: set[asyncio.TimerHandle] = set()
         self._diagnostics: dict[str, tuple[float, int]] = {}
+        self._states: dict[str, tuple[Topic[Any], Outgoing]] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
 
     # -- what a subclass may override -----------------------------------------------------------
@@ -173,7 +181,7 @@ class Actor:
 
     @classmethod
     def inputs(cls) -> tuple[Topic[Any], ...]:
-        """Topics it has handlers for."""
+        """Topics it has handlers for, those of every actor included."""
         return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
 
     def on_start(self) -> None:
@@ -286,6 +294,7 @@ class Actor:
         for node in self.watches(self.name, self.parameters):
             self._bus.watch(node, self._peer_changed)
         self.on_start()
+        self.publish(HELLO, Hello())
         self._beat()
         self._start_timer(self.heartbeat_period_s, "_beat")
         for period_s, method in self._periodic:
@@ -345,6 +354,8 @@ class Actor:
         self._sequence += 1
         header = Header(self.name, self.context.incarnation, self._sequence, out.stamp)
         self._faults.remember(key, out)
+        if topic.qos is Qos.STATE and topic.rate_hz < _REPEATED_SOON_HZ:
+            self._states[key] = (topic, out)
         self._bus.publish(topic, key, encode(header, out.body))
 
     # -- timers ---------------------------------------------------------------------------------
@@ -380,6 +391,12 @@ class Actor:
         self.publish(HEARTBEAT, Heartbeat(
             os.getpid(), self._progress, self.heartbeat_period_s, self._rejected,
             self._mailbox.overflowed))
+
+    # -- newcomers ------------------------------------------------------------------------------
+
+    def _on_hello(self, _hello: Hello, _header: Header) -> None:
+        for key, (topic, out) in list(self._states.items()):
+            self._send(topic, key, out)
 
     # -- fault injection ------------------------------------------------------------------------
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from actors.runtime.messages import Diagnostic, Heartbeat, Injection, InjectionReport
+from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection, InjectionReport
 from actors.runtime.topic import Qos, Topic
 
 HEARTBEAT = Topic("heartbeat/{name}", Heartbeat, Qos.STATE, 10, "",
                   "Proof that the event loop of node {name} turns.")
+HELLO = Topic("hello/{name}", Hello, Qos.COMMAND, 0, "",
+              "Node {name} has started; its partners repeat their states for it.")
 DIAGNOSTIC = Topic("diagnostic/{name}", Diagnostic, Qos.COMMAND, 0, "",
                    "Error report of node {name}.")
 INJECT = Topic("inject/order", Injection, Qos.COMMAND, 0, "", "A fault to inject on a topic.")

@@ -11,9 +11,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from actors.runtime.actor import BASE_OUTPUTS, Actor
+from actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from actors.runtime.topic import Topic
-from actors.runtime.topics import INJECT
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +37,7 @@ def heard(member: Member) -> dict[str, tuple[str, ...] | None]:
     return {
         t.key: member.actor.names(t, member.name, member.parameters) if t.is_family else None
         for t in member.actor.inputs()
-        if t is not INJECT  # injections come from tools, which dial for themselves
+        if t not in BASE_INPUTS  # tools dial for themselves; hellos use the links there are
     }
 
 
@@ -70,6 +69,6 @@ def partners(members: Iterable[Member]) -> dict[str, tuple[str, ...]]:
 def topics_of(actor: type[Actor]) -> tuple[tuple[Topic[Any], ...], tuple[Topic[Any], ...]]:
     """Return (inputs, outputs) of an actor class without what every actor has."""
     return (
-        tuple(t for t in actor.inputs() if t is not INJECT),
+        tuple(t for t in actor.inputs() if t not in BASE_INPUTS),
         tuple(actor.outputs),
     )
