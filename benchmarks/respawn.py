@@ -31,7 +31,6 @@ from actors.supervision.process_title import find_processes
 from actors.supervision.run_plan import OBSERVER, RunPlan
 
 OUTPUT: dict[str, Topic[Any]] = {
-    "mission_manager": topics.MISSION_STATUS,
     "graph_planner": topics.ROUTE,
     "osmosis_control": topics.COMMAND,
     "localization": topics.POSE,
@@ -41,6 +40,7 @@ OUTPUT: dict[str, Topic[Any]] = {
     "ftm_manager": topics.MANAGER_STATUS,
     "DM2": topics.DETECTION,
     "RM2": topics.RECOVERY,
+    "mission_manager": topics.MISSION_STATUS,  # last: without checkpoints it loses the mission
 }
 """Nodes to kill and the topic whose first message shows that the replacement works."""
 

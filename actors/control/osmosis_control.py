@@ -94,11 +94,12 @@ class OsmosisControl(Actor):
         if message.active and message.waypoints:
             kind = PathFollower if message.mode is Mode.TAXI else LightRow
             self._follower = kind(message.waypoints, self._hull, self._motion)
-            self._begin()
+        self._begin()
 
     def _begin(self) -> None:
         """Command at once when all inputs are there, so that a respawn costs no extra period."""
-        if self._begun or self._follower is None or self._pose is None or self._points is None:
+        blind = self._pose is None or self._points is None
+        if self._begun or self._route is None or (self._follower is not None and blind):
             return
         self._begun = True
         self.control()

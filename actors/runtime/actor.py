@@ -394,7 +394,9 @@ class Actor:
 
     # -- newcomers ------------------------------------------------------------------------------
 
-    def _on_hello(self, _hello: Hello, _header: Header) -> None:
+    def _on_hello(self, _hello: Hello, header: Header) -> None:
+        if header.source == self.name:
+            return
         for key, (topic, out) in list(self._states.items()):
             self._send(topic, key, out)
 

@@ -277,6 +277,7 @@ class Launcher:
         if self._info is not None:
             asyncio.get_running_loop().remove_reader(self._info)
             self._info.close()
+        asyncio.get_running_loop().remove_signal_handler(signal.SIGCHLD)
 
     def abort(self) -> None:
         """End all processes of the run at once. Harmless when there are none."""
