@@ -17,7 +17,8 @@ from typing import Any
 
 import msgspec
 
-from actors.messages import ControlStatus, GroundTruth, MissionStatus, NodeTable
+from actors import topics
+from actors.messages import ControlStatus, GroundTruth, MissionStatus, NodeTable, ProcessEvent
 from actors.runtime.actor import Context, Header
 from actors.runtime.clock import Clock
 from actors.runtime.topic import Topic
@@ -127,6 +128,7 @@ class Run:
         self.end = RunEnd(options.patience)
         self.console = Console(sys.stderr)
         self._interrupted = ""
+        self._guards_restarted = 0
 
     async def run(self) -> int:
         """Run the mission and return the exit code.
@@ -157,8 +159,16 @@ class Run:
         recorder = RunRecorder(
             plan.run_id, self.airport, self.mission, seed=plan.seed, rate=plan.rate,
             strategy=self.spec.strategy if plan.ftm else "")
-        self.launcher.on_restart = lambda name, _: self.console.line(
-            clock.now(), f"{name} brought back")
+
+        def brought_back(name: str) -> None:
+            self._guards_restarted += 1
+            self.console.line(clock.now(), f"{name} brought back")
+            recorder.feed(
+                topics.PROCESS_EVENT,
+                ProcessEvent(name, "respawned", 0, self._guards_restarted, "launch.py", ""),
+                Header("launch.py", 1, self._guards_restarted, clock.now()))
+
+        self.launcher.on_restart = brought_back
 
         def to_launcher(_topic: Topic[Any], message: Any, _header: Header) -> None:
             if isinstance(message, NodeTable):

@@ -293,6 +293,8 @@ class RunRecorder:
         self._turn("stop", "Safety Pilot", status.stopped, header.stamp, status.reason)
 
     def _process_event(self, event: m.ProcessEvent, header: Header) -> None:
+        if event.detail == "already":  # the answer to a request that came twice
+            return
         detail = f": {event.detail}" if event.detail else ""
         if event.event in _CRASHES:
             self._turn("down", event.node, True, header.stamp, event.event)
@@ -301,7 +303,7 @@ class RunRecorder:
             self._turn("down", event.node, False, header.stamp)
             by = f" by {event.by}" if event.by else ""
             self._note(header.stamp, "clear", f"{event.node} {event.event}{by}")
-        if event.event == "respawned":  # may be told twice, to whoever asks twice
+        if event.event == "respawned":
             lives = self._lives.setdefault(event.node, set())
             lives.add(event.incarnation)
             self._restarts[event.node] = len(lives)

@@ -72,7 +72,7 @@ class Launcher:
         self.ports: dict[str, int] = {}
         self.supervisor_incarnation = 0
         self.known_incarnations: dict[str, int] = {}
-        self.on_restart: Callable[[str, int], None] = lambda _name, _incarnation: None
+        self.on_restart: Callable[[str], None] = lambda _name: None
         self._title = title
         self._spawners = SpawnerClient(plan.base_port)
         self._lifeline: tuple[int, int] = (-1, -1)
@@ -216,10 +216,10 @@ class Launcher:
         try:
             if name == SUPERVISOR:
                 self._start_supervisor()
-                self.on_restart(name, self.supervisor_incarnation)
+                self.on_restart(name)
             else:
                 self._spawners.fork((name,), 1)
-                self.on_restart(name, 0)
+                self.on_restart(name)
         except SpawnerUnavailableError:
             self._restart_first_spawner()
 
@@ -231,7 +231,7 @@ class Launcher:
             if self._first.stdout is not None:
                 self._first.stdout.close()
         self._start_first_spawner()
-        self.on_restart(f"spawner_{NAMES[0]}", 0)
+        self.on_restart(f"spawner_{NAMES[0]}")
 
     def _reap(self) -> None:
         with contextlib.suppress(ChildProcessError):
