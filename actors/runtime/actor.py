@@ -27,6 +27,7 @@ from actors.runtime.envelope import ArrivalGuard, Header, RejectedError, encode
 from actors.runtime.injection import FaultGate, Outgoing
 from actors.runtime.mailbox import Mailbox
 from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection, InjectionReport
+from actors.runtime.timer import Timer
 from actors.runtime.topic import Qos, Topic
 from actors.runtime.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
 
@@ -85,31 +86,6 @@ def every(period_s: float) -> Callable[[F], F]:
         return function
 
     return mark
-
-
-class Timer:
-    """A pending `call_later`; `cancel` is harmless after it has run."""
-
-    __slots__ = ("_call", "_release")
-
-    def __init__(self, call: Callable[[], None]) -> None:
-        self._call: Callable[[], None] | None = call
-        self._release: Callable[[], None] = lambda: None
-
-    def arm(self, release: Callable[[], None]) -> None:
-        """Keep what takes the timer from the loop."""
-        self._release = release
-
-    def cancel(self) -> None:
-        """Make sure the call does not happen (any more)."""
-        self._call = None
-        self._release()
-
-    def fire(self) -> None:
-        """Make the call, unless it was cancelled while it waited in the mailbox."""
-        call, self._call = self._call, None
-        if call is not None:
-            call()
 
 
 class Actor:

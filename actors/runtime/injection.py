@@ -53,11 +53,6 @@ class FaultGate:
         active = self._active.pop(injection, None)
         return active.affected if active else 0
 
-    def affected(self, injection: str) -> int:
-        """Return how many messages an injection has changed so far."""
-        active = self._active.get(injection)
-        return active.affected if active else 0
-
     def apply(self, key: str, body: Any, stamp: float, now_s: float) -> Outgoing | None:
         """Return the message as the faults in force leave it, or None if it is dropped.
 

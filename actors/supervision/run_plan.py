@@ -164,10 +164,6 @@ class Layout:
         """Return the endpoints that a node connects to when it starts."""
         return [endpoint(self.port_of[p]) for p in self._partners[node]]
 
-    def partners_of(self, node: str) -> tuple[str, ...]:
-        """Return the nodes that share a topic or a watch with a node."""
-        return self._partners[node]
-
 
 def load_shared(plan: RunPlan, spec: SystemSpec) -> Mapping[str, Any]:
     """Load what actors share read-only; done once, before the fork.

@@ -94,7 +94,7 @@ class Supervisor(Actor):
             found = living.get(tuple(n.name for n in process.unit.nodes))
             if found is not None:
                 self._adopt(process, found.pid, found.incarnation)
-            elif self.context.incarnation == 1 or self._may_start(process):
+            elif self.context.incarnation == 1 or self._owns(process):
                 self._spawn(process, by=self.name)
         self._publish_table()
 
@@ -199,10 +199,6 @@ class Supervisor(Actor):
         return (self._spec.layers.supervisor_respawn
                 and process.unit.respawn == self.name
                 and process.unit.kind != Kind.WORLD.value)
-
-    def _may_start(self, process: _Process) -> bool:
-        """Whether a restarted supervisor starts what it does not find alive."""
-        return self._owns(process)
 
     # -- acting ---------------------------------------------------------------------------------
 

@@ -1,0 +1,56 @@
+"""When a run is over, as timelines."""
+
+from __future__ import annotations
+
+from actors.messages import ControlPhase, ControlStatus, Goal, MissionPhase, MissionStatus, Mode
+from sim.run_end import ACCEPT_WITHIN_S, LOST_AFTER_S, SETTLE_S, WORLD_SILENT_S, RunEnd
+
+GOALS = (Goal(1.0, 2.0, Mode.TAXI), Goal(3.0, 4.0, Mode.TAXI))
+
+
+def mission(phase: MissionPhase, step: int = 0, mission_id: str = "m1") -> MissionStatus:
+    return MissionStatus(mission_id, "A", phase, step, GOALS, (), (), "")
+
+
+def going(distance_m: float) -> ControlStatus:
+    return ControlStatus("m1", 0, ControlPhase.FOLLOWING, 0, distance_m)
+
+
+def test_a_mission_that_succeeded_ends_the_run_once_the_robot_has_settled():
+    end = RunEnd(60.0)
+    end.mission(mission(MissionPhase.RUNNING), 1.0)
+    end.mission(mission(MissionPhase.SUCCEEDED, 2), 9.0)
+    assert end.ended(9.0 + SETTLE_S - 0.1) is None
+    assert end.ended(9.0 + SETTLE_S) == "mission succeeded"
+
+
+def test_a_mission_manager_that_forgot_its_mission_ends_the_run_and_a_flicker_does_not():
+    end = RunEnd(60.0)
+    end.mission(mission(MissionPhase.RUNNING), 1.0)
+    end.mission(mission(MissionPhase.IDLE, mission_id=""), 5.0)
+    end.mission(mission(MissionPhase.RUNNING), 6.0)
+    assert end.ended(5.0 + LOST_AFTER_S + 0.1) is None
+    end.mission(mission(MissionPhase.IDLE, mission_id=""), 10.0)
+    assert "mission lost" in (end.ended(10.0 + LOST_AFTER_S + 0.1) or "")
+
+
+def test_patience_counts_from_the_last_progress_and_driving_in_circles_is_none():
+    end = RunEnd(10.0)
+    end.mission(mission(MissionPhase.RUNNING), 0.0)
+    end.control(going(20.0), 1.0)
+    end.control(going(19.0), 5.0)
+    for t_s in range(6, 15):
+        end.control(going(19.0 + t_s % 2), float(t_s))
+    assert end.ended(14.9) is None
+    assert end.ended(15.1) == "no progress for 10 s"
+    end.mission(mission(MissionPhase.RUNNING, step=1), 15.1)
+    assert end.ended(25.0) is None
+
+
+def test_a_mission_nobody_takes_and_a_world_that_is_gone_end_the_run():
+    assert RunEnd(100.0).ended(ACCEPT_WITHIN_S) is None
+    assert "no mission was accepted" in (RunEnd(100.0).ended(ACCEPT_WITHIN_S + 0.1) or "")
+    end = RunEnd(100.0)
+    end.truth(2.0)
+    assert end.ended(2.0 + WORLD_SILENT_S) is None
+    assert "the world is gone" in (end.ended(2.1 + WORLD_SILENT_S) or "")
