@@ -306,6 +306,15 @@ class DecisionRecord(Message, frozen=True):
     detected_s: float
 
 
+class DetectionView(Message, frozen=True):
+    """What the manager believes about a detection module (it holds a flapping one active)."""
+
+    name: str
+    active: bool
+    reason: str
+    nodes: tuple[str, ...]
+
+
 class ManagerStatus(Message, frozen=True):
     """The manager's view, and by its regularity the proof that it lives."""
 
@@ -315,6 +324,7 @@ class ManagerStatus(Message, frozen=True):
     latched: tuple[str, ...]
     strategy: str
     decision: int
+    detections: tuple[DetectionView, ...] = ()
 
 
 class Reset(Message, frozen=True):

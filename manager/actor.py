@@ -146,7 +146,9 @@ class FtmManager(Actor):
     def _status(self) -> m.ManagerStatus:
         state = self.arbiter_state
         return m.ManagerStatus(state.active, state.silent, state.activated, state.latched,
-                               self._strategy, state.number)
+                               self._strategy, state.number, tuple(
+                                   m.DetectionView(t.name, t.active, t.reason, t.nodes)
+                                   for t in state.detections))
 
     def _show(self) -> None:
         self._shown = self._status()

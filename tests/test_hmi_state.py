@@ -48,10 +48,10 @@ def test_a_corrupt_pose_neither_breaks_the_track_nor_the_json():
 
 def test_a_detection_is_logged_when_it_begins_and_when_it_ends():
     state = HmiState()
-    active, idle = m.DetectionState.ACTIVE, m.DetectionState.IDLE
+    active, idle = True, False
     for at_s, which in enumerate([idle, idle, active, active, idle, idle]):
-        report = m.DetectionReport(which, "stale" if which is active else "", (), 0.0)
-        state.detection("DM2", report, float(at_s))
+        view = m.DetectionView("DM2", which, "stale" if which else "", ())
+        state.manager(m.ManagerStatus((), (), (), (), "safety-first", 0, (view,)), float(at_s))
     assert [(e["t"], e["kind"], e["text"]) for e in shown(state)["events"]] == [
         (2.0, "fault", "DM2 detects: stale"), (4.0, "clear", "DM2 is idle again")]
 

@@ -16,7 +16,7 @@ import pytest
 from stub_actors import ROOT, launched, stub_plan, write_stub_system
 
 from actors import topics
-from actors.messages import NodeTable, ProcessEvent, RespawnRequest
+from actors.messages import Diagnostic, NodeTable, ProcessEvent, RespawnRequest
 from actors.runtime.actor import Actor, Context, Header, on
 from actors.runtime.clock import Clock
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
@@ -38,11 +38,16 @@ class Witness(Actor):
         super().__init__(context)
         self.launcher: Launcher = context.shared["launcher"]
         self.events: list[ProcessEvent] = []
+        self.errors: list[Diagnostic] = []
         self.table = NodeTable(())
 
     @on(topics.PROCESS_EVENT)
     def event(self, message: ProcessEvent, header: Header) -> None:
         self.events.append(message)
+
+    @on(topics.ERROR_REPORT)
+    def error(self, message: Diagnostic, header: Header) -> None:
+        self.errors.append(message)
 
     @on(topics.NODES)
     def nodes(self, message: NodeTable, header: Header) -> None:
@@ -120,6 +125,14 @@ async def test_a_request_for_an_unknown_node_is_refused(tmp_path):
     async with running(tmp_path) as (_, witness):
         witness.publish(topics.RESPAWN, RespawnRequest(1, "nobody", 1, "RM3"))
         await eventually(lambda: witness.saw("nobody", "refused"))
+
+
+async def test_error_reports_of_all_nodes_and_its_own_are_passed_on_by_the_supervisor(tmp_path):
+    async with running(tmp_path) as (_, witness):
+        witness.context.bus.publish(topics.INJECT, topics.INJECT.at(), b"garbage")
+        names = {r.name for r in witness.table.nodes}
+        await eventually(lambda: names <= {e.node for e in witness.errors})
+        assert {e.offender for e in witness.errors} == {topics.INJECT.at()}
 
 
 async def test_the_supervisor_comes_back_and_adopts_the_living(tmp_path):

@@ -156,7 +156,7 @@ class Hmi(Actor):
 
     @on(topics.MANAGER_STATUS)
     def _manager(self, message: m.ManagerStatus, _header: Header) -> None:
-        self._state.keep("manager", message, self.clock.now())
+        self._state.manager(message, self.clock.now())
 
     @on(topics.NODES)
     def _nodes(self, message: m.NodeTable, _header: Header) -> None:
@@ -167,10 +167,6 @@ class Hmi(Actor):
     def _obstacles(self, message: m.ObstacleList, _header: Header) -> None:
         self._state.keep("obstacles", message, self.clock.now())
 
-    @on(topics.DETECTION)
-    def _detection(self, message: m.DetectionReport, header: Header) -> None:
-        self._state.detection(header.source, message, self.clock.now())
-
     @on(topics.DECISION)
     def _decision(self, message: m.DecisionRecord, header: Header) -> None:
         self._state.decision(message, header.stamp)
@@ -179,7 +175,7 @@ class Hmi(Actor):
     def _process_event(self, message: m.ProcessEvent, header: Header) -> None:
         self._state.process_event(message, header.stamp)
 
-    @on(topics.DIAGNOSTIC)
+    @on(topics.ERROR_REPORT)
     def _diagnostic(self, message: m.Diagnostic, header: Header) -> None:
         self._state.diagnostic(message, header.stamp)
 

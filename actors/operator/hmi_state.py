@@ -31,7 +31,7 @@ class HmiState:
     def __init__(self) -> None:
         self.track: deque[tuple[float, float]] = deque(maxlen=TRACK_POINTS)
         self._latest: dict[str, tuple[Any, float]] = {}
-        self._detections: dict[str, tuple[m.DetectionReport, float]] = {}
+        self._detections: dict[str, m.DetectionView] = {}
         self._lights: dict[str, m.LightMeasurement] = {}
         self._log: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
         self._decisions: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
@@ -65,14 +65,15 @@ class HmiState:
         """Keep the measurement of a light."""
         self._lights[measured.light] = measured
 
-    def detection(self, name: str, report: m.DetectionReport, now_s: float) -> None:
-        """Keep a detection module's state, and log that it changed."""
-        before = self._detections.get(name)
-        self._detections[name] = (report, now_s)
-        active = report.state is m.DetectionState.ACTIVE
-        if active != (before is not None and before[0].state is m.DetectionState.ACTIVE):
-            text = f"{name} detects: {report.reason}" if active else f"{name} is idle again"
-            self.log(now_s, "fault" if active else "clear", text)
+    def manager(self, status: m.ManagerStatus, now_s: float) -> None:
+        """Keep the manager's view, and log which detections have come and gone."""
+        before = self._detections
+        self._detections = {view.name: view for view in status.detections}
+        self._latest["manager"] = (status, now_s)
+        for name, view in self._detections.items():
+            if view.active != (name in before and before[name].active):
+                text = f"{name} detects: {view.reason}" if view.active else f"{name} is idle again"
+                self.log(now_s, "fault" if view.active else "clear", text)
 
     def decision(self, record: m.DecisionRecord, now_s: float) -> None:
         """Add a decision of the manager to the decision log."""
@@ -117,6 +118,7 @@ class HmiState:
 
     def snapshot(self, now_s: float) -> dict[str, Any]:
         """Return everything the page shows, ready for JSON; times in simulated seconds."""
+        manager = self._aged("manager", now_s)
         return {
             "type": "state",
             "time_s": round(now_s, 2),
@@ -125,12 +127,12 @@ class HmiState:
             "route": self._route(),
             "control": self._aged("control", now_s),
             "pilot": self._aged("pilot", now_s),
-            "manager": self._aged("manager", now_s),
+            "manager": manager,
             "nodes": self._aged("nodes", now_s),
             "detections": [
-                {"name": name, "active": report.state is m.DetectionState.ACTIVE,
-                 "reason": report.reason, "nodes": report.nodes, "stale": now_s - at > STALE_S}
-                for name, (report, at) in sorted(self._detections.items())
+                {"name": name, "active": view.active, "reason": view.reason, "nodes": view.nodes,
+                 "stale": manager is None or manager["stale"]}
+                for name, view in sorted(self._detections.items())
             ],
             "lights": {
                 name: {"verdict": light.verdict, "ratio": round(light.ratio, 3),

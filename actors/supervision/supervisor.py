@@ -25,7 +25,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from actors import topics
-from actors.messages import Heartbeat, NodeInfo, NodeState, NodeTable, ProcessEvent, RespawnRequest
+from actors.messages import (
+    Diagnostic,
+    Heartbeat,
+    NodeInfo,
+    NodeState,
+    NodeTable,
+    ProcessEvent,
+    RespawnRequest,
+)
 from actors.runtime.actor import Actor, Context, Header, every, on
 from actors.runtime.topic import Topic
 from actors.supervision.process_title import find_processes, is_stopped, process_state
@@ -62,7 +70,7 @@ class _Process:
 class Supervisor(Actor):
     """Keeps the processes of the run alive. Parameters: `nodes`, the names it watches."""
 
-    outputs = (topics.NODES, topics.PROCESS_EVENT)
+    outputs = (topics.NODES, topics.PROCESS_EVENT, topics.ERROR_REPORT)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -135,6 +143,11 @@ class Supervisor(Actor):
             process.state = NodeState.RUNNING
             self._event(process, "resumed" if resumed else "running", self.name)
             self._publish_table()
+
+    @on(topics.DIAGNOSTIC)
+    def diagnostic(self, message: Diagnostic, _header: Header) -> None:
+        """Pass a node's error report on to whoever shows it."""
+        self.publish(topics.ERROR_REPORT, message)
 
     @on(topics.RESPAWN)
     def respawn(self, request: RespawnRequest, _header: Header) -> None:
