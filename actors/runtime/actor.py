@@ -14,6 +14,7 @@ process and its liveliness token live on.
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -224,7 +225,7 @@ class Actor:
     def report_diagnostic(self, context: str, reason: str, offender: str) -> None:
         """Publish an error report, at most one a second per context and offender."""
         slot = f"{context} {offender}"
-        last, count = self._diagnostics.get(slot, (-_DIAGNOSTIC_PERIOD_S, 0))
+        last, count = self._diagnostics.get(slot, (-math.inf, 0))
         now = self.clock.now()
         if now - last < _DIAGNOSTIC_PERIOD_S:
             self._diagnostics[slot] = (last, count + 1)
