@@ -306,6 +306,17 @@ class DecisionRecord(Message, frozen=True):
     detected_s: float
 
 
+class ShadowRecord(Message, frozen=True):
+    """A decision that the strategy in shadow would have taken instead of decision `decision`."""
+
+    decision: int
+    strategy: str
+    active: tuple[str, ...]
+    rule: int
+    recoveries: tuple[str, ...]
+    taken: tuple[str, ...]
+
+
 class DetectionView(Message, frozen=True):
     """What the manager believes about a detection module (it holds a flapping one active)."""
 

@@ -53,6 +53,8 @@ RECOVERY = Topic("recovery/{name}/state", m.RecoveryReport, Qos.STATE, 5, "",
                  "State of recovery module {name}.")
 DECISION = Topic("manager/decision", m.DecisionRecord, Qos.COMMAND, 0, "",
                  "Each decision of the FTM Manager with its certificate.")
+SHADOW = Topic("manager/shadow", m.ShadowRecord, Qos.COMMAND, 0, "",
+               "What the strategy in shadow would have decided, where it differs.")
 MANAGER_STATUS = Topic("manager/status", m.ManagerStatus, Qos.STATE, 10, "",
                        "The FTM Manager's view; its silence stops the robot.")
 RESET = Topic("manager/reset", m.Reset, Qos.COMMAND, 0, "", "Release a latched recovery.")

@@ -27,6 +27,7 @@ from manager.arbiter import (
     RecoveryHeard,
     ResetAnswered,
     ResetAsked,
+    ShadowDiffered,
     State,
     Tick,
     build_arbiter,
@@ -48,7 +49,8 @@ class FtmManager(Actor):
         strategy: name of a strategy; that of the system spec if left out.
     """
 
-    outputs = (topics.RECOVERY_COMMAND, topics.DECISION, topics.MANAGER_STATUS)
+    outputs = (topics.RECOVERY_COMMAND, topics.DECISION, topics.SHADOW,
+               topics.MANAGER_STATUS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -127,6 +129,10 @@ class FtmManager(Actor):
                     self._command(output)
                 case DecisionMade():
                     self._publish_decision(output)
+                case ShadowDiffered():
+                    self.publish(topics.SHADOW, m.ShadowRecord(
+                        output.number, output.strategy, output.decision.active,
+                        output.decision.rule, output.decision.recoveries, output.taken))
                 case ResetAnswered(granted=False):
                     self.report_diagnostic("reset refused", output.reason, output.recovery)
         if self._status() != self._shown:
@@ -138,7 +144,7 @@ class FtmManager(Actor):
             name=command.recovery)
 
     def _publish_decision(self, made: DecisionMade) -> None:
-        decision = made.decision
+        decision = self._arbiter.explain(made)  # the commands are on their way already
         self.publish(topics.DECISION, m.DecisionRecord(
             made.number, self._strategy, decision.active, decision.rule, decision.recoveries,
             decision.path, decision.rejected, made.detected_s))

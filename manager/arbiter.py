@@ -4,7 +4,11 @@ A pure state machine, `step(state, input, now) -> (state, outputs)`: it reads no
 nothing, and its state is immutable, so a timeline can be tested as one and all its reachable
 states can be explored. The strategy decides *which* recovery; the arbiter sees to *how*:
 
-* Exactly one recovery runs. Before one is activated, every other is released.
+* Exactly one recovery runs under a strategy that is exclusive, as the paper's is; before one is
+  activated, every other is released. Under others those run together that the strategy chose.
+* No two hold the same resource. One that claims what a released one claimed waits for that one's
+  word that it has let go, or for its deadline, whichever comes first: a release is a message, and
+  a message takes time. Nothing claims what the last resort claims, so that never waits.
 * None is cut off. One that is not interruptible and is acting, or may be because the order is
   still on its way, is not released but *drains*: it stays under orders until it reports that it
   is done, degraded or idle. What comes next waits for it, with one exception: a safer recovery
@@ -12,10 +16,10 @@ states can be explored. The strategy decides *which* recovery; the arbiter sees 
 * A recovery whose cause has cleared is released, and hands control back. A latched one stays
   until it is reset; only a safer one takes its place meanwhile. A reset is refused while the
   cause persists.
-* A recovery that fails, or is not done by its deadline, is followed by the one it escalates to,
-  else by that of the mechanism above. A repair also fails if it is done but its cause persists.
-  One that is late but still acting is let be as long as it is in nobody's way: late is better
-  than never.
+* A recovery that fails, is not done by its deadline, or needs a node that is reported failed is
+  followed by the one it escalates to, else by that of the mechanism above. A repair also fails if
+  it is done but its cause persists. One that is late but still acting is let be as long as it is
+  in nobody's way: late is better than never.
 * An arbiter that starts while recoveries are activated, because the one before it was killed,
   adopts them, and releases none before it has heard every module (or has waited long enough).
 
@@ -42,54 +46,56 @@ from manager.arbiter_state import (
     RecoveryHeard,
     ResetAnswered,
     ResetAsked,
+    ShadowDiffered,
     State,
     Tick,
 )
+from manager.arrangement import Arrangement, arrange
+from manager.budget import patience_s
 from manager.decision import NOTHING_ACTIVE, Decision, Strategy
 from manager.detection_track import DetectionRules, DetectionTrack
 from manager.escalation import escalate
-from manager.mechanisms import Mechanisms
-from manager.order import PartialOrder, Tree
+from manager.mechanisms import Contract, Mechanisms
 from manager.recovery_track import Command, Phase, RecoveryTrack
 from manager.schema import SystemSpec
-from manager.strategies import find_strategy
+from manager.strategies import Decider, find_strategy
 
 __all__ = [
     "Arbiter", "Command", "DecisionMade", "DetectionHeard", "DetectionRestarted", "Input",
-    "Output", "Phase", "RecoveryHeard", "ResetAnswered", "ResetAsked", "State", "Tick",
-    "build_arbiter",
+    "Output", "Phase", "RecoveryHeard", "ResetAnswered", "ResetAsked", "ShadowDiffered", "State",
+    "Tick", "build_arbiter",
 ]
-
-MEMORY = 4096
-"""Answers of the strategy to remember; seven mechanisms have 128 active sets."""
 
 
 class Arbiter:
     """The rules; all that changes is in `State`.
 
     Args:
-        mechanisms: Registry of mechanisms and recovery contracts.
-        tree: The FTMTree.
-        order: The RM order.
+        arrangement: Mechanisms with their contracts, FTMTree, RM order.
         strategy: The policy.
         rules: For belief in detection modules.
+        shadow: A policy that is asked as well, and whose differing decisions are told.
     """
 
-    def __init__(self, mechanisms: Mechanisms, tree: Tree, order: PartialOrder,
-                 strategy: Strategy, rules: DetectionRules) -> None:
-        self.mechanisms = mechanisms
-        self.tree = tree
-        self.order = order
-        self.strategy = strategy
+    def __init__(self, arrangement: Arrangement, strategy: Strategy, rules: DetectionRules,
+                 shadow: Strategy | None = None) -> None:
+        self.arrangement = arrangement
+        self.mechanisms = mechanisms = arrangement.mechanisms
+        self.order = arrangement.order
+        self.decider = Decider(strategy, arrangement)
+        self.shadow = Decider(shadow, arrangement) if shadow else None
         self.rules = rules
+        self._patient = strategy.patient or (shadow is not None and shadow.patient)
         self._no_hold = msgspec.structs.replace(rules, release_hold_s=0.0, release_hold_max_s=0.0)
         self._repairs = self._repaired_by(mechanisms)
         self._detection = {name: i for i, name in enumerate(mechanisms.detections)}
         self._recovery = {name: i for i, name in enumerate(mechanisms.recoveries)}
-        self._decisions: dict[tuple[str, ...], Decision] = {}
+        self._needy = {name for name, c in mechanisms.contracts.items() if c.needs}
         self._detections_for = {
-            recovery: frozenset(mechanisms.detect[ftm] for ftm in mechanisms.names
-                                if mechanisms.recover[ftm] == recovery)
+            recovery: frozenset(
+                detection for ftm in mechanisms.names
+                if any(recovery in way for way in mechanisms.alternatives(ftm))
+                for detection in mechanisms.detect[ftm])
             for recovery in mechanisms.recoveries}
 
     @staticmethod
@@ -97,10 +103,16 @@ class Arbiter:
         """Return the recoveries of each detection module whose mechanisms only repair."""
         recoveries: dict[str, tuple[str, ...]] = {}
         for ftm in mechanisms.names:
-            detection = mechanisms.detect[ftm]
-            recoveries[detection] = (*recoveries.get(detection, ()), mechanisms.recover[ftm])
+            for detection in mechanisms.detect[ftm]:
+                recoveries[detection] = (*recoveries.get(detection, ()), *mechanisms.recover[ftm])
         return {detection: names for detection, names in recoveries.items()
                 if all(mechanisms.contracts[name].kind.repairs for name in names)}
+
+    def explain(self, made: DecisionMade) -> Decision:
+        """Return a decision with its certificate, what the arbiter itself rejected included."""
+        reasons = self.decider.explain(made.chosen)
+        return msgspec.structs.replace(
+            made.decision, path=reasons.path, rejected=reasons.rejected + made.decision.rejected)
 
     def _rules_of(self, state: State, detection: str) -> DetectionRules:
         # The hold keeps a forward recovery (a stop) from being taken up and let go with every
@@ -159,10 +171,12 @@ class Arbiter:
                 answers = (answer,)
         state = self._pass_time(state, now)
         state, outputs = self._settle(state, now)
-        if isinstance(event, RecoveryHeard) and not event.activated:
-            command = state.desired.get(event.recovery)
-            if command is not None and command.activate and command not in outputs:
-                outputs = (command, *outputs)  # it was respawned, or has not got the order yet
+        if isinstance(event, RecoveryHeard) and not event.activated \
+                and event.recovery in self._recovery:
+            track = self._track(state, event.recovery)
+            if (track.wanted or track.letting_go) and track.command not in outputs:
+                # It was respawned, or has not got the order yet.
+                outputs = (track.command, *outputs)
         return state, outputs + answers
 
     def _with_detection(self, state: State, track: DetectionTrack) -> State:
@@ -197,7 +211,7 @@ class Arbiter:
         if index < 0 or not state.recoveries[index].latched:
             problem = "it is not latched" if index >= 0 else "there is no such recovery module"
             return state, ResetAnswered(name, False, problem)
-        chosen, _ = self._choose(state)
+        chosen = self._choose(state)[1]
         if name in chosen.recoveries:
             return state, ResetAnswered(
                 name, False, f"the cause persists: {', '.join(chosen.active)} active")
@@ -209,76 +223,112 @@ class Arbiter:
         detections = tuple(detection_track.pass_time(track, self._rules_of(state, track.name), now)
                            for track in state.detections)
         believed = {track.name: track for track in detections}
-        active = self.mechanisms.detected_by(t.name for t in detections if t.active)
+        active = self._active(detections)
         recoveries = tuple(self._judge(track, believed, active, now) for track in state.recoveries)
         oriented = state.oriented or now - state.started_s >= self.rules.startup_grace_s or (
             all(t.ever_heard for t in detections) and all(t.heard for t in recoveries))
         if oriented and not state.oriented:
             recoveries = tuple(msgspec.structs.replace(t, adopted=False) for t in recoveries)
-        return msgspec.structs.replace(
+        state = msgspec.structs.replace(
             state, detections=detections, recoveries=recoveries, oriented=oriented)
+        return self._with_late(state, active, now) if self._patient else state
+
+    def _active(self, detections: tuple[DetectionTrack, ...]) -> tuple[str, ...]:
+        return self.mechanisms.detected_by(
+            (t.name for t in detections if t.active), (t.name for t in detections if t.silent))
+
+    def _with_late(self, state: State, active: tuple[str, ...], now: float) -> State:
+        """Note since when mechanisms are active, and which of them are late."""
+        before = dict(state.since)
+        since = tuple((name, before.get(name, now)) for name in active)
+        late = frozenset(
+            name for name, since_s in since
+            if name in state.late or (
+                now - since_s > self.mechanisms.by_name[name].patience_s
+                and not all(self._in_force(state, recovery)
+                            for recovery in self.mechanisms.recover[name])))
+        return msgspec.structs.replace(state, since=since, late=late)
+
+    def _in_force(self, state: State, recovery: str) -> bool:
+        """Tell whether a forward recovery is in force; a repair ends the error or it does not."""
+        track = self._track(state, recovery)
+        return (track.wanted and track.acknowledged and not track.failure
+                and track.phase in {Phase.DONE, Phase.DEGRADED}
+                and not self.mechanisms.contracts[recovery].kind.repairs)
 
     def _judge(self, track: RecoveryTrack, believed: dict[str, DetectionTrack],
                active: tuple[str, ...], now: float) -> RecoveryTrack:
         """Find a recovery to have failed, or forgive it."""
         if track.failure:
-            if not set(track.failed_for) & set(active):
-                return msgspec.structs.replace(track, failure="", failed_for=())
-            return track
+            forgiven = not set(track.failed_for) & set(active)
+            return msgspec.structs.replace(track, failure="", failed_for=()) if forgiven else track
         contract = self.mechanisms.contracts[track.name]
-        if not track.wanted or now - track.ordered_s <= contract.deadline_s:
+        if now - track.ordered_s <= contract.deadline_s:
             return track
-        if not active and not track.draining:
+        if track.letting_go:  # one that does not answer for so long is dead, and holds nothing
+            return msgspec.structs.replace(track, letting_go=False)
+        if not track.wanted or not (active or track.draining):
             return track  # latched or adopted: there is nothing to escalate for
-        failure = ""
+        failure = self._failure(track, believed, contract)
+        if not failure:
+            return track
+        return msgspec.structs.replace(track, failure=failure, failed_for=active)
+
+    @staticmethod
+    def _failure(track: RecoveryTrack, believed: dict[str, DetectionTrack], contract: Contract
+                 ) -> str:
+        """Say why a recovery has failed whose deadline is over; "" if it has not."""
         if track.unfinished:
-            failure = f"not done within {contract.deadline_s:g} s"
-        elif contract.kind.repairs and not track.draining:
+            return f"not done within {contract.deadline_s:g} s"
+        if contract.kind.repairs and not track.draining:
             # What it was not told of yet, it cannot have repaired.
             lasting = sorted(
                 name for name, rises in track.cause
                 if believed[name].asserted and believed[name].rises == rises
                 and set(believed[name].nodes) <= set(track.command.nodes))
             if lasting:
-                failure = (f"done, but {', '.join(lasting)} still active after "
-                           f"{contract.deadline_s:g} s")
-        if not failure:
-            return track
-        return msgspec.structs.replace(track, failure=failure, failed_for=active)
+                return (f"done, but {', '.join(lasting)} still active after "
+                        f"{contract.deadline_s:g} s")
+        return ""
 
-    def _choose(self, state: State) -> tuple[Decision, Decision]:
-        """Return the decision after escalation, and that after latching on top of it."""
-        active = self.mechanisms.detected_by(t.name for t in state.detections if t.active)
-        decision = self._decide(active)
+    def _choose(self, state: State) -> tuple[Decision, Decision, Decision]:
+        """Return the strategy's decision, that after escalation, and that after latching too."""
+        chosen = decision = self.decider.choose(self._active(state.detections), state.late)
         failures = {t.name: t.failure for t in state.recoveries if t.failure}
+        if self._needy and chosen.active:
+            failures = {**self._unmet(state), **failures}
         if failures:
-            decision = escalate(decision, failures, self.mechanisms, self.tree)
+            decision = escalate(decision, failures, self.arrangement)
         kept = [t for t in state.recoveries if t.latched or t.adopted]
         if not kept:
-            return decision, decision
+            return chosen, decision, decision
         # Several are kept only if one drains under another; the safest is the one in force.
         safest = min(kept, key=lambda t: self.order.number[t.name])
         winners = tuple(name for name in decision.recoveries
                         if name == safest.name or self.order.is_above(name, safest.name))
-        losers = tuple(name for name in decision.recoveries if name not in winners)
+        base = winners or (safest.name,)
+        beneath = () if self.decider.strategy.exclusive else tuple(
+            name for name in decision.recoveries
+            if name not in base and self.mechanisms.contracts[name].kind.repairs
+            and self.arrangement.can_join(name, self.order.mask(base)))
+        losers = tuple(
+            name for name in decision.recoveries if name not in base and name not in beneath)
         why = "is latched until reset" if safest.latched else "was found activated, and not all " \
             "modules have been heard yet"
-        return decision, msgspec.structs.replace(
-            decision, recoveries=winners or (safest.name,),
+        return chosen, decision, msgspec.structs.replace(
+            decision, recoveries=base + beneath,
             rejected=decision.rejected + tuple((name, f"{safest.name} {why}") for name in losers))
 
-    def _decide(self, active: tuple[str, ...]) -> Decision:
-        """Ask the strategy, which is pure: the answer to a question asked before is known."""
-        if active not in self._decisions:
-            if len(self._decisions) >= MEMORY:
-                self._decisions.clear()
-            self._decisions[active] = self.strategy(
-                active, self.mechanisms, self.tree, self.order)
-        return self._decisions[active]
+    def _unmet(self, state: State) -> dict[str, str]:
+        """Return why recoveries are of no use now: a node that they need is reported failed."""
+        failed = {node: t.name for t in state.detections if t.active for node in t.nodes}
+        return {name: f"needs {node}, which {failed[node]} reports failed"
+                for name in sorted(self._needy)
+                for node in sorted(self.mechanisms.contracts[name].needs & failed.keys())[:1]}
 
     def _settle(self, state: State, now: float) -> tuple[State, tuple[Output, ...]]:
         """Decide, then command: release what is not chosen, activate what is."""
-        _, decision = self._choose(state)
+        strategys, _, decision = self._choose(state)
         chosen = decision.recoveries
         fresh = decision != state.decision or any(
             self._has_new_cause(state, self._track(state, name)) for name in chosen)
@@ -287,7 +337,7 @@ class Arbiter:
         outputs: list[Output] = []
         for before in state.recoveries:
             if before.wanted and before.name not in chosen:
-                after = self._release(before, chosen, state.number)
+                after = self._release(before, chosen, state.number, now)
                 state = self._with_recovery(state, after)
                 if after.command != before.command:
                     outputs.append(after.command)
@@ -299,8 +349,17 @@ class Arbiter:
                 outputs.append(after.command)
         if fresh:
             detected_s = max((t.since_s for t in state.detections if t.active), default=now)
-            outputs.append(DecisionMade(state.number, decision, detected_s))
+            outputs.append(DecisionMade(state.number, decision, detected_s, strategys))
+            outputs.extend(self._ask_shadow(state, strategys))
         return state, tuple(outputs)
+
+    def _ask_shadow(self, state: State, chosen: Decision) -> tuple[ShadowDiffered, ...]:
+        if self.shadow is None:
+            return ()
+        other = self.shadow.choose(chosen.active, state.late)
+        if set(other.recoveries) == set(chosen.recoveries):
+            return ()
+        return (ShadowDiffered(state.number, self.shadow.strategy.name, other, chosen.recoveries),)
 
     def _track(self, state: State, recovery: str) -> RecoveryTrack:
         return state.recoveries[self._recovery[recovery]]
@@ -326,7 +385,7 @@ class Arbiter:
                    or not set(cause.nodes) <= set(track.command.nodes)
                    for cause in self._causes(state, track.name))
 
-    def _release(self, track: RecoveryTrack, chosen: tuple[str, ...], number: int
+    def _release(self, track: RecoveryTrack, chosen: tuple[str, ...], number: int, now: float
                  ) -> RecoveryTrack:
         """Release a recovery, or let it drain."""
         if track.unfinished and not self.mechanisms.contracts[track.name].interruptible:
@@ -336,7 +395,8 @@ class Arbiter:
         reason = f"superseded by {', '.join(chosen)}" if chosen else "the cause is gone"
         return msgspec.structs.replace(
             track, command=Command(track.name, False, number, reason=reason), cause=frozenset(),
-            acknowledged=False, draining=False, adopted=False)
+            ordered_s=now, acknowledged=False, draining=False, adopted=False,
+            letting_go=not track.failure)  # nobody waits for the word of one that failed
 
     def _activate(self, state: State, track: RecoveryTrack, now: float) -> RecoveryTrack:
         """Activate a recovery, order it again if need be, or let it wait for another to drain."""
@@ -356,15 +416,19 @@ class Arbiter:
         return msgspec.structs.replace(
             track, command=Command(track.name, True, state.number, nodes, reason),
             ordered_s=ordered_s, cause=frozenset((cause.name, cause.rises) for cause in causes),
-            acknowledged=False, draining=False, adopted=False,
+            acknowledged=False, draining=False, letting_go=False, adopted=False,
             latched=track.latched or self.mechanisms.contracts[track.name].latched)
 
     def _blocks(self, other: RecoveryTrack, name: str, chosen: tuple[str, ...]) -> bool:
-        """Tell whether a recovery has to wait for another to drain."""
-        if other.name in chosen or not other.unfinished or other.failure:
+        """Tell whether a recovery has to wait for another to drain, or to let go."""
+        if other.name == name:
             return False
-        return self.mechanisms.overlap(name, other.name) \
-            or not self.order.is_above(name, other.name)
+        busy = other.unfinished and not other.failure
+        if self.mechanisms.overlap(name, other.name):
+            return busy or other.letting_go
+        if other.name in chosen or not busy or not self.decider.strategy.exclusive:
+            return False
+        return not self.order.is_above(name, other.name)
 
 
 def build_arbiter(spec: SystemSpec, strategy: str = "") -> Arbiter:
@@ -378,8 +442,10 @@ def build_arbiter(spec: SystemSpec, strategy: str = "") -> Arbiter:
         UnknownStrategyError: No such strategy.
     """
     timing = spec.timing
+    arrangement = arrange(
+        spec.build_mechanisms(patience_s(spec)), spec.build_ftm_tree(), spec.build_order())
     return Arbiter(
-        spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order(),
-        find_strategy(strategy or spec.strategy),
+        arrangement, find_strategy(strategy or spec.strategy),
         DetectionRules(timing.detection_silence_timeout_s, timing.startup_grace_s,
-                       timing.release_hold_s, timing.release_hold_max_s))
+                       timing.release_hold_s, timing.release_hold_max_s),
+        find_strategy(spec.shadow) if spec.shadow else None)

@@ -50,18 +50,36 @@ Input = DetectionHeard | DetectionRestarted | RecoveryHeard | ResetAsked | Tick
 
 
 class DecisionMade(msgspec.Struct, frozen=True, tag=True):
-    """Output: a decision with its certificate, as it is carried out.
+    """Output: a decision, as it is carried out. `Arbiter.explain` adds the certificate.
 
     Attributes:
         number: Counts up; commands refer to it.
         decision: The strategy's, but `recoveries` are those that the arbiter takes after
             escalation and latching, and `rejected` says so.
         detected_s: When the youngest of its causes was detected.
+        chosen: The strategy's, before escalation and latching.
     """
 
     number: int
     decision: Decision
     detected_s: float
+    chosen: Decision
+
+
+class ShadowDiffered(msgspec.Struct, frozen=True, tag=True):
+    """Output: the strategy that runs in shadow would have run other recoveries.
+
+    Attributes:
+        number: Of the decision that was taken instead.
+        strategy: Name of the shadow strategy.
+        decision: What it would have decided.
+        taken: Recoveries that the active strategy chose.
+    """
+
+    number: int
+    strategy: str
+    decision: Decision
+    taken: tuple[str, ...]
 
 
 class ResetAnswered(msgspec.Struct, frozen=True, tag=True):
@@ -72,7 +90,7 @@ class ResetAnswered(msgspec.Struct, frozen=True, tag=True):
     reason: str
 
 
-Output = Command | DecisionMade | ResetAnswered
+Output = Command | DecisionMade | ShadowDiffered | ResetAnswered
 
 
 class State(msgspec.Struct, frozen=True):
@@ -85,6 +103,8 @@ class State(msgspec.Struct, frozen=True):
         decision: The last decision, as carried out.
         started_s: When the arbiter started.
         oriented: It has heard everybody, or has waited long enough; adoption is over.
+        since: Active mechanisms, each with the time since when it is active.
+        late: Those whose recovery has not ended the error within its patience.
     """
 
     detections: tuple[DetectionTrack, ...]
@@ -93,6 +113,8 @@ class State(msgspec.Struct, frozen=True):
     decision: Decision
     started_s: float
     oriented: bool = False
+    since: tuple[tuple[str, float], ...] = ()
+    late: frozenset[str] = frozenset()
 
     @property
     def desired(self) -> dict[str, Command]:

@@ -178,22 +178,35 @@ def find_false_alarms(spec: SystemSpec) -> Iterator[tuple[str, float, str]]:
 def _of_mechanism(spec: SystemSpec, mechanism: MechanismSpec) -> Budget:
     timing, robot = spec.timing, spec.robot
     detections = {detection.name: detection for detection in spec.detections}
-    detection = detections[mechanism.detect]
-    recovery = next(r for r in spec.recoveries if r.name == mechanism.recover)
+    repairs = any(r.kind.repairs for r in spec.recoveries if r.name in mechanism.recoveries)
     if mechanism.against is Hazard.DRIFT:
         left_s, hazard = time_to_drift_s(robot), "the robot drifts out of the corridor"
     elif mechanism.against is Hazard.RUNAWAY:
         left_s, hazard = time_to_runaway_s(robot), "the robot runs away out of the corridor"
     elif mechanism.against is Hazard.INTRUSION:
-        left_s = time_to_intrusion_s(robot, detection.parameters["margin_m"])
+        left_s = time_to_intrusion_s(robot, min(
+            detections[name].parameters["margin_m"] for name in mechanism.detections))
         hazard = "the robot enters the prohibited area"
     else:
         above = spec.build_ftm_tree().parents[mechanism.name]
         parent = next(m for m in spec.mechanisms if m.name == above)
-        left_s = detections[parent.detect].latency_s
+        left_s = min(detections[name].latency_s for name in parent.detections)
         hazard = f"{parent.detect} of {parent.name} detects the consequence"
-    return Budget(mechanism.name, hazard, left_s, detection.latency_s, timing.arbitration_s,
-                  timing.actuation_s, timing.respawn_s if recovery.kind.repairs else 0.0)
+    # Which input of a gate opens it is not known: count on the slowest.
+    detection_s = max(detections[name].latency_s for name in mechanism.detections)
+    return Budget(mechanism.name, hazard, left_s, detection_s, timing.arbitration_s,
+                  timing.actuation_s, timing.respawn_s if repairs else 0.0)
+
+
+def patience_s(spec: SystemSpec) -> dict[str, float]:
+    """Return how long the recovery of each mechanism may take, in seconds from its detection.
+
+    What is left of the time before the hazard when detection has taken its longest, and when the
+    next recovery still has to be decided on and to take effect.
+    """
+    return {mechanism.name: max(0.0, budget.margin_s + budget.respawn_s)
+            for mechanism in spec.mechanisms
+            for budget in [_of_mechanism(spec, mechanism)]}
 
 
 def _of_guards(spec: SystemSpec) -> Iterator[Budget]:

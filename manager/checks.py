@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from itertools import permutations, product
 from typing import Any, NamedTuple
 
 from manager.budget import braking_distance_m, check, find_false_alarms
 from manager.fault_tree import FaultTreeError
+from manager.gates import GateError, detection_gate, recovery_gate
 from manager.order import CycleError, PartialOrder, find_cycle
 from manager.schema import Hazard, Kind, SystemSpec
 from manager.strategies import STRATEGIES
@@ -101,10 +103,17 @@ def _mechanisms(spec: SystemSpec) -> Iterator[Finding]:
     events = [event.name for event in spec.events]
     for index, mechanism in enumerate(spec.mechanisms):
         path = f"$.mechanism[{index}]"
-        if mechanism.detect not in detections:
-            yield _unknown(f"{path}.detect", mechanism.detect, "detection module", detections)
-        if mechanism.recover not in recoveries:
-            yield _unknown(f"{path}.recover", mechanism.recover, "recovery module", recoveries)
+        for field, text, read, what, known in (
+                ("detect", mechanism.detect, detection_gate, "detection module", detections),
+                ("recover", mechanism.recover, recovery_gate, "recovery module", recoveries)):
+            try:
+                names = read(text).names
+            except GateError as error:
+                yield Finding(f"{path}.{field}", str(error), (text,))
+                return
+            for name in names:
+                if name not in known:
+                    yield _unknown(f"{path}.{field}", name, what, known)
         if mechanism.event not in events:
             yield _unknown(f"{path}.event", mechanism.event, "event", events)
     if not spec.mechanisms and (spec.detections or spec.recoveries):
@@ -124,8 +133,8 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
 
 
 def _reachability(spec: SystemSpec) -> Iterator[Finding]:
-    detecting = {mechanism.detect for mechanism in spec.mechanisms}
-    recovering = {mechanism.recover for mechanism in spec.mechanisms} | {
+    detecting = {name for mechanism in spec.mechanisms for name in mechanism.detections}
+    recovering = {name for mechanism in spec.mechanisms for name in mechanism.recoveries} | {
         recovery.escalate_to for recovery in spec.recoveries}
     for index, detection in enumerate(spec.detections):
         if detection.name not in detecting:
@@ -135,8 +144,9 @@ def _reachability(spec: SystemSpec) -> Iterator[Finding]:
         if recovery.name not in recovering:
             yield Finding(f"$.recovery[{index}].name", "unreachable: no mechanism and no escalation"
                                                        " leads to this recovery", (recovery.name,))
-    watched = {(node, mechanism.recover) for mechanism in spec.mechanisms
-               for detection in spec.detections if detection.name == mechanism.detect
+    watched = {(node, recovery) for mechanism in spec.mechanisms
+               for recovery in mechanism.recoveries
+               for detection in spec.detections if detection.name in mechanism.detections
                for node in detection.watch}
     for index, node in enumerate(spec.nodes):
         if node.respawn != SUPERVISOR and (node.name, node.respawn) not in watched:
@@ -175,12 +185,22 @@ def _fault_tree(spec: SystemSpec) -> Iterator[Finding]:
             yield Finding("$.mechanism", str(error))
 
 
+def _policy(spec: SystemSpec) -> Iterator[Finding]:
+    for field in ("strategy", "shadow"):
+        name = getattr(spec, field)
+        if name not in STRATEGIES and (name or field == "strategy"):
+            yield _unknown(f"$.{field}", name, "strategy", sorted(STRATEGIES))
+    if not spec.criteria:
+        yield Finding("$.order", "expected the name of an order, or a list of such", ([],))
+    for name in spec.criteria:
+        if name not in spec.orders:
+            yield _unknown("$.order", name, "order", list(spec.orders))
+        if spec.criteria.count(name) > 1:
+            yield Finding("$.order", f"{name!r} is listed twice", (list(spec.criteria),))
+
+
 def _orders(spec: SystemSpec) -> Iterator[Finding]:
     recoveries = [recovery.name for recovery in spec.recoveries]
-    if spec.strategy not in STRATEGIES:
-        yield _unknown("$.strategy", spec.strategy, "strategy", sorted(STRATEGIES))
-    if spec.order not in spec.orders:
-        yield _unknown("$.order", spec.order, "order", list(spec.orders))
     for name, relation in spec.orders.items():
         for upper, lowers in relation.items():
             path = f"$.orders.{name}.{upper}"
@@ -199,39 +219,64 @@ def _orders(spec: SystemSpec) -> Iterator[Finding]:
                           (list(relation[error.cycle[0]]),))
 
 
+def _criteria(spec: SystemSpec) -> Iterator[Finding]:
+    try:
+        spec.build_order()
+    except CycleError as error:
+        yield Finding("$.order", f"the criteria contradict each other, {error}; leave one out or "
+                                 "let them agree", (list(spec.criteria),))
+
+
+def _compounds(spec: SystemSpec) -> Iterator[Finding]:
+    """Recoveries that one mechanism runs together must be able to run together."""
+    contracts = spec.build_mechanisms().contracts
+    for index, mechanism in enumerate(spec.mechanisms):
+        for way in recovery_gate(mechanism.recover).alternatives():
+            for one, other in permutations(way, 2):
+                shared = contracts[one].claims & contracts[other].claims
+                harmed = contracts[one].disables & contracts[other].needs
+                if shared or harmed:
+                    yield Finding(f"$.mechanism[{index}].recover", (
+                        f"{one} and {other} both claim {', '.join(sorted(shared))}" if shared else
+                        f"{one} disables {', '.join(sorted(harmed))}, which {other} needs"
+                        ) + "; they cannot run together", (mechanism.recover,))
+
+
 def _order_against_tree(spec: SystemSpec) -> Iterator[Finding]:
     if not spec.mechanisms:
         return
-    order, tree = spec.build_order(), spec.build_ftm_tree()
-    recover = {mechanism.name: mechanism.recover for mechanism in spec.mechanisms}
+    order, tree = spec.build_safety_order(), spec.build_ftm_tree()
+    safer = spec.criteria[0]
+    recover = {mechanism.name: mechanism.recoveries for mechanism in spec.mechanisms}
     for upper in tree.names:
         for lower in tree.members(tree.below[tree.number[upper]]):
-            if order.is_above(recover[lower], recover[upper]):
-                yield Finding(
-                    f"$.orders.{spec.order}.{recover[lower]}",
-                    f"contradicts the FTMTree: {recover[lower]} of {lower} is above "
-                    f"{recover[upper]} of {upper}, but {upper} is above {lower}",
-                    (list(spec.orders[spec.order].get(recover[lower], ())),))
+            for above, below in product(recover[lower], recover[upper]):
+                if order.is_above(above, below):
+                    yield Finding(
+                        f"$.orders.{safer}.{above}",
+                        f"contradicts the FTMTree: {above} of {lower} is above {below} of {upper}, "
+                        f"but {upper} is above {lower}",
+                        (list(spec.orders[safer].get(above, ())),))
     for index, recovery in enumerate(spec.recoveries):
         if recovery.escalate_to and order.is_above(recovery.name, recovery.escalate_to):
             yield Finding(f"$.recovery[{index}].escalate_to",
-                          f"{recovery.name} is above it in the order {spec.order!r}; escalation "
+                          f"{recovery.name} is above it in the order {safer!r}; escalation "
                           "must not lead to less", (recovery.escalate_to,))
-    yield from _undelayed(spec, order, recover[tree.root])
+    for last_resort in recover[tree.root]:
+        yield from _undelayed(spec, order, last_resort)
 
 
 def _undelayed(spec: SystemSpec, order: PartialOrder, last_resort: str) -> Iterator[Finding]:
-    """The recovery of the FTMTree's root is the last resort: nothing may make it wait."""
-    contracts = spec.build_mechanisms()
+    """A recovery of the FTMTree's root is a last resort: nothing may make it wait."""
+    contracts = spec.build_mechanisms().contracts
     names = [recovery.name for recovery in spec.recoveries]
     for name in order.names:
-        if name != last_resort and contracts.overlap(name, last_resort) \
-                and not contracts.contracts[name].interruptible:
-            shared = contracts.contracts[name].claims & contracts.contracts[last_resort].claims
+        shared = contracts[name].claims & contracts[last_resort].claims
+        if name != last_resort and shared:
             yield Finding(f"$.recovery[{names.index(name)}].claims",
                           f"{last_resort}, the last resort, would have to wait for {name}, which "
-                          f"is not interruptible and claims {', '.join(sorted(shared))} as well",
-                          (sorted(contracts.contracts[name].claims),))
+                          f"claims {', '.join(sorted(shared))} as well",
+                          (sorted(contracts[name].claims),))
 
 
 def _timing(spec: SystemSpec) -> Iterator[Finding]:
@@ -260,7 +305,8 @@ def _budget(spec: SystemSpec) -> Iterator[Finding]:
             yield Finding(f"$.mechanism[{index}].against", f"{root} is the root of the FTMTree and "
                           "has no parent to be faster than", (mechanism.against.value,))
         if mechanism.against is Hazard.INTRUSION and \
-                "margin_m" not in detections[mechanism.detect].parameters:
+                any("margin_m" not in detections[name].parameters
+                    for name in mechanism.detections):
             yield Finding(f"$.mechanism[{index}].against", f"{mechanism.detect} needs "
                           "parameters.margin_m, the distance at which it warns",
                           (mechanism.against.value,))
@@ -277,4 +323,4 @@ def _budget(spec: SystemSpec) -> Iterator[Finding]:
 
 VALIDATORS: tuple[Callable[[SystemSpec], Iterator[Finding]], ...] = (
     _timing, _names, _nodes, _detections, _recoveries, _mechanisms, _reachability, _fault_tree,
-    _orders, _order_against_tree, _budget)
+    _policy, _orders, _criteria, _compounds, _order_against_tree, _budget)

@@ -1,18 +1,21 @@
 """A decision and its certificate.
 
-A decision says which recovery is to run. Its certificate says why, so that a reader, or a proof
-checker, need not trust the program: which block of the strategy applied, the chains of dominance
+A decision says which recoveries are to run. Its certificate says why, so that a reader, or a proof
+checker, need not trust the program: which rule of the strategy applied, the chains of dominance
 that make it apply, and every alternative that was turned down, with the reason.
+
+Deciding and giving reasons are two steps, because a robot should brake first and explain after.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from typing import Protocol
 
 import msgspec
 
-from manager.mechanisms import Mechanisms
-from manager.order import PartialOrder, Tree
+from manager.arrangement import Arrangement
+from manager.order import PartialOrder
 
 
 class Decision(msgspec.Struct, frozen=True):
@@ -22,7 +25,7 @@ class Decision(msgspec.Struct, frozen=True):
         active: The active mechanisms, in declared sequence.
         rule: Which rule of the strategy applied; for safety-first block 1 to 4 of the paper's
             figure 7. 0: nothing is active, so there is nothing to do.
-        recoveries: To run; at most one under safety-first.
+        recoveries: To run; at most one under safety-first, where mechanisms are not compound.
         mechanisms: For whose sake: those whose recovery was taken. Escalation starts from them.
         path: The dominance that justifies it: one chain for each dominated element, written
             `"FTM1 > FTM6 > FTM7"`, greatest first.
@@ -39,8 +42,31 @@ class Decision(msgspec.Struct, frozen=True):
 
 NOTHING_ACTIVE = Decision(active=())
 
-Strategy = Callable[[Iterable[str], Mechanisms, Tree, PartialOrder], Decision]
-"""A policy: a pure function (active mechanisms, mechanisms, FTMTree, RM order) -> Decision."""
+Late = frozenset[str]
+
+
+class Strategy(Protocol):
+    """A policy, pure. It can be replaced without touching any detection or recovery module."""
+
+    name: str
+    patient: bool
+    """Whether it asks how long recoveries have taken (`late`)."""
+    exclusive: bool
+    """Whether one recovery runs at a time, as the paper has it, even where two could."""
+    rules: dict[int, str]
+    """What each rule says, as the end of a sentence that begins with "because"."""
+
+    def choose(self, active: tuple[str, ...], arrangement: Arrangement, late: Late) -> Decision:
+        """Decide, without a certificate.
+
+        Args:
+            active: Active mechanisms, in declared sequence, at least one.
+            arrangement: Mechanisms, tree, order.
+            late: Those of them whose recovery has not ended the error within its patience.
+        """
+
+    def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:
+        """Return a decision of `choose` with `path` and `rejected`."""
 
 
 def chains(order: PartialOrder, upper: str, lowers: Iterable[str]) -> tuple[str, ...]:

@@ -1,52 +1,54 @@
 """What follows a recovery that fails.
 
-The recovery that its contract names; else that of the mechanism above, which is the next barrier
+An alternative that its mechanism names; else the recovery that its contract names; else that of
+the mechanism above, which is the next barrier
 on the way to the top event. At the root there is nothing above: a last resort that fails stays in
 force, for releasing it could only make things worse.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from itertools import pairwise
 
 import msgspec
 
+from manager.arrangement import Arrangement
 from manager.decision import Decision
-from manager.mechanisms import Mechanisms
-from manager.order import Tree
 
 
-def escalate(decision: Decision, failures: Mapping[str, str], mechanisms: Mechanisms,
-             tree: Tree) -> Decision:
+def escalate(decision: Decision, failures: Mapping[str, str], arrangement: Arrangement) -> Decision:
     """Replace failed recoveries in a decision.
 
     Args:
         decision: As the strategy took it.
         failures: Why a recovery counts as failed, by its name.
-        mechanisms: Registry, with the contracts.
-        tree: The FTMTree.
+        arrangement: Mechanisms with their contracts, and the FTMTree.
 
     Returns:
         The decision with other recoveries; each failed one is among the rejected, with the reason
         and what it escalated to.
     """
+    recover = arrangement.mechanisms.recover
     recoveries: dict[str, None] = {}
     rejected: list[tuple[str, str]] = []
     for recovery in decision.recoveries:
-        sakes = [name for name in decision.mechanisms if mechanisms.recover[name] == recovery]
-        tried = _line_of_succession(recovery, sakes or decision.mechanisms, failures, mechanisms,
-                                    tree)
+        sakes = [name for name in decision.mechanisms if recovery in recover[name]]
+        tried = succession(recovery, sakes or decision.mechanisms, failures, arrangement)
         recoveries[tried[-1]] = None
         rejected.extend((failed, f"failed: {failures[failed]}; escalated to {following}")
                         for failed, following in pairwise(tried))
+    taken = _compatible(tuple(recoveries), arrangement)
+    rejected.extend((name, "conflicts with the recovery that was escalated to")
+                    for name in recoveries if name not in taken)
     return msgspec.structs.replace(
-        decision, recoveries=tuple(recoveries), rejected=decision.rejected + tuple(rejected))
+        decision, recoveries=taken, rejected=decision.rejected + tuple(rejected))
 
 
-def _line_of_succession(recovery: str, sakes: Iterable[str], failures: Mapping[str, str],
-                        mechanisms: Mechanisms, tree: Tree) -> list[str]:
+def succession(recovery: str, sakes: Iterable[str], failures: Container[str],
+               arrangement: Arrangement) -> list[str]:
     """Return a recovery and its successors up to the first that has not failed."""
+    tree, mechanisms = arrangement.tree, arrangement.mechanisms
     tried = [recovery]
     wanting = tuple(sakes)
     # Above a mechanism that wants the recovery is its parent; above several of them, none of which
@@ -55,12 +57,32 @@ def _line_of_succession(recovery: str, sakes: Iterable[str], failures: Mapping[s
     above = list(reversed(tree.chain(tree.root, closest)))
     if closest in wanting:
         above.pop(0)
+    alternatives = [name for mechanism in wanting
+                    for way in mechanisms.alternatives(mechanism)
+                    if not any(one in failures for one in way)
+                    for name in way]
     while tried[-1] in failures:
         named = mechanisms.contracts[tried[-1]].escalate_to
-        candidates = [named] if named else []
-        candidates += [mechanisms.recover[mechanism] for mechanism in above]
+        candidates = [*alternatives, *([named] if named else [])]
+        candidates += [name for mechanism in above for name in mechanisms.recover[mechanism]]
         following = next((name for name in candidates if name not in tried), None)
         if following is None:
             break
         tried.append(following)
     return tried
+
+
+def _compatible(recoveries: tuple[str, ...], arrangement: Arrangement) -> tuple[str, ...]:
+    """Return the recoveries that can run together, those higher in the order first.
+
+    What was escalated to may claim what another recovery of the decision claims.
+    """
+    order = arrangement.order
+    if len(recoveries) < 2:
+        return recoveries
+    taken, mask = set(), 0
+    for name in sorted(recoveries, key=order.number.__getitem__):
+        if arrangement.can_join(name, mask):
+            taken.add(name)
+            mask |= order.bit[name]
+    return tuple(name for name in recoveries if name in taken)

@@ -1,17 +1,21 @@
 """The fault-tolerance mechanisms: FTMx(DMy, RMz), and what a recovery promises.
 
-A mechanism joins one detection module to one recovery module. It is *active* when its detection
-module is, and *activated* when its recovery module is (paper, section III-B). Two mechanisms may
-share a recovery: FTM2 and FTM3 both stop the robot with RM2.
+A mechanism joins a detection module to a recovery module, or gates over several of them. It is
+*active* when its detection module is (or its gate holds), and *activated* when its recovery
+module is (paper, section III-B). Two mechanisms may share a recovery: FTM2 and FTM3 both stop the
+robot with RM2.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Collection, Iterable, Sequence
 from enum import StrEnum
+from itertools import chain
 
 import msgspec
 
+from manager.gates import detection_gate, recovery_gate
 from manager.order import UnknownElementError
 
 
@@ -43,6 +47,9 @@ class Contract(msgspec.Struct, frozen=True):
         latched: Stays in force until an operator resets it, even when the cause is gone.
         deadline_s: From command to done (and, for a repair, to the cause being gone).
         escalate_to: Recovery to take when this one fails; "" for that of the mechanism above.
+        needs: Preconditions: nodes or resources without which it is of no use. While a node
+            among them is reported failed, the recovery counts as failed too.
+        disables: Nodes or resources that nobody can use while it is in force.
     """
 
     name: str
@@ -52,14 +59,20 @@ class Contract(msgspec.Struct, frozen=True):
     latched: bool = False
     deadline_s: float = 2.0
     escalate_to: str = ""
+    needs: frozenset[str] = frozenset()
+    disables: frozenset[str] = frozenset()
 
 
 class Mechanism(msgspec.Struct, frozen=True):
-    """FTMx(DMy, RMz)."""
+    """FTMx(DMy, RMz); `detect` and `recover` are gates in text (`manager.gates`).
+
+    `patience_s` is how long its recovery may take before the error has gone too far.
+    """
 
     name: str
     detect: str
     recover: str
+    patience_s: float = math.inf
 
 
 class Mechanisms:
@@ -69,8 +82,13 @@ class Mechanisms:
         mechanisms: In the sequence in which they are shown.
         contracts: Of all recoveries, those included that are only escalated to.
 
+    Attributes:
+        recover: The recoveries that each mechanism runs, where all can be had.
+        detect: The detection modules that each mechanism listens to.
+
     Raises:
         ValueError: Two of one name, or a recovery without a contract.
+        GateError: A gate that cannot be read.
     """
 
     def __init__(self, mechanisms: Sequence[Mechanism], contracts: Sequence[Contract]) -> None:
@@ -78,14 +96,19 @@ class Mechanisms:
         self.contracts = {contract.name: contract for contract in contracts}
         if len(self.by_name) != len(mechanisms) or len(self.contracts) != len(contracts):
             raise ValueError("two mechanisms or two recoveries have the same name")
-        self.recover = {mechanism.name: mechanism.recover for mechanism in mechanisms}
-        self.detect = {mechanism.name: mechanism.detect for mechanism in mechanisms}
-        for mechanism in mechanisms:
-            if mechanism.recover not in self.contracts:
-                raise ValueError(f"{mechanism.name} names unknown recovery {mechanism.recover!r}")
+        self._alternatives = {m.name: tuple(recovery_gate(m.recover).alternatives())
+                              for m in mechanisms}
+        self._gates = {m.name: detection_gate(m.detect) for m in mechanisms}
+        self.recover = {name: ways[0] for name, ways in self._alternatives.items()}
+        self.detect = {name: gate.names for name, gate in self._gates.items()}
+        for name, ways in self._alternatives.items():
+            for recovery in chain.from_iterable(ways):
+                if recovery not in self.contracts:
+                    raise ValueError(f"{name} names unknown recovery {recovery!r}")
         self.names = tuple(self.by_name)
-        self.detections = tuple(dict.fromkeys(self.detect.values()))
+        self.detections = tuple(dict.fromkeys(chain.from_iterable(self.detect.values())))
         self.recoveries = tuple(self.contracts)
+        self._number = {name: index for index, name in enumerate(self.names)}
 
     def sort(self, names: Iterable[str]) -> tuple[str, ...]:
         """Return mechanism names once each, in the declared sequence.
@@ -93,18 +116,43 @@ class Mechanisms:
         Raises:
             UnknownElementError: One of them is no mechanism.
         """
-        wanted = set(names)
-        unknown = wanted - self.by_name.keys()
-        if unknown:
-            raise UnknownElementError(
-                f"unknown mechanism {min(unknown)!r}; known: {', '.join(self.names)}")
-        return tuple(name for name in self.names if name in wanted)
+        try:
+            return tuple(sorted(set(names), key=self._number.__getitem__))
+        except KeyError as error:
+            raise UnknownElementError(f"unknown mechanism {error.args[0]!r}; "
+                                      f"known: {', '.join(self.names)}") from None
 
-    def detected_by(self, active_detections: Iterable[str]) -> tuple[str, ...]:
-        """Return the mechanisms that are active when these detection modules are."""
-        active = set(active_detections)
-        return tuple(name for name in self.names if self.detect[name] in active)
+    def detected_by(self, active_detections: Iterable[str], silent: Iterable[str] = ()
+                    ) -> tuple[str, ...]:
+        """Return the mechanisms that are active when these detection modules are.
+
+        Args:
+            active_detections: Active modules, silent ones included.
+            silent: Those of them that are active only because they are silent.
+        """
+        active, mute = set(active_detections), set(silent)
+        if not active:
+            return ()
+        return tuple(name for name, gate in self._gates.items() if gate.holds(active, mute))
+
+    def alternatives(self, mechanism: str) -> tuple[tuple[str, ...], ...]:
+        """Return the sets of recoveries that would do for a mechanism, preferred ones first."""
+        return self._alternatives[mechanism]
+
+    def available(self, mechanism: str, failed: Collection[str]) -> tuple[str, ...]:
+        """Return the recoveries to run for a mechanism.
+
+        That is its first alternative without a failed one, else the first of all.
+        """
+        ways = self._alternatives[mechanism]
+        if not failed:
+            return ways[0]
+        return next((way for way in ways if not any(name in failed for name in way)), ways[0])
 
     def overlap(self, one: str, other: str) -> bool:
         """Tell whether two recoveries claim a common resource."""
         return not self.contracts[one].claims.isdisjoint(self.contracts[other].claims)
+
+    def harms(self, one: str, other: str) -> frozenset[str]:
+        """Return what the recovery `one` disables although `other` needs it."""
+        return self.contracts[one].disables & self.contracts[other].needs

@@ -93,9 +93,11 @@ class PartialOrder:
             for lower in relation[self.names[bit]]:
                 below[bit] |= self.bit[lower] | below[self.number[lower]]
         self.below = tuple(below)
-        self.up_set = tuple(
-            sum(1 << upper for upper in range(bit + 1) if upper == bit or below[upper] >> bit & 1)
-            for bit in range(len(self.names)))
+        up_set = [1 << bit for bit in range(len(self.names))]
+        for bit, name in enumerate(self.names):  # an upper one is complete before its lowers
+            for lower in relation[name]:
+                up_set[self.number[lower]] |= up_set[bit]
+        self.up_set = tuple(up_set)
 
     def mask(self, names: Iterable[str]) -> int:
         """Return the set of `names` as a bitmask; an unknown one raises UnknownElementError."""
@@ -154,6 +156,27 @@ class PartialOrder:
         return tuple(chain)
 
 
+def refine(criteria: Sequence[PartialOrder]) -> PartialOrder:
+    """Return the order in which each criterion decides what those before it leave open.
+
+    Args:
+        criteria: Orders over the same elements, the most important first; at least one.
+
+    Raises:
+        CycleError: The criteria contradict each other: of three elements the first criterion puts
+            a above b, the second b above c and c above a.
+    """
+    first = criteria[0]
+    above = {name: list(first.members(first.below[first.number[name]])) for name in first.names}
+    for order in criteria[1:]:
+        settled = PartialOrder(first.names, above)
+        for upper in order.names:
+            above[upper] += [lower for lower in order.members(order.below[order.number[upper]])
+                             if not settled.is_above(upper, lower)
+                             and not settled.is_above(lower, upper)]
+    return first if len(criteria) == 1 else PartialOrder(first.names, above)
+
+
 class Tree(PartialOrder):
     """A tree in which a parent is above its children.
 
@@ -186,12 +209,14 @@ class Tree(PartialOrder):
 
     def lowest_common_in(self, mask: int) -> int:
         """Return the number of the closest element above or equal to all of a non-empty set."""
-        common = (1 << len(self.names)) - 1
-        while mask:
-            lowest = mask & -mask
-            common &= self.up_set[lowest.bit_length() - 1]
-            mask ^= lowest
-        return common.bit_length() - 1
+        bit = (mask & -mask).bit_length() - 1
+        common = self.up_set[bit]
+        # Climb from the first member; whatever it is not above yet takes it further up, never
+        # down, so this ends after no more steps than the tree is deep.
+        while rest := mask & ~(self.below[bit] | 1 << bit):
+            common &= self.up_set[rest.bit_length() - 1]
+            bit = common.bit_length() - 1
+        return bit
 
     def lowest_common_dominant(self, names: Iterable[str]) -> str:
         """Return the closest element above or equal to all `names` (`low_com_dom` of the paper).

@@ -41,7 +41,7 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
 
     Attributes:
         command: What it was last told; to be repeated until it is obeyed.
-        ordered_s: Since when its deadline runs.
+        ordered_s: Since when its deadline runs; once it is released, since when it is.
         cause: Detection modules for which it acts, each with the count of its rises: a cause not
             among these is a new one.
         heard: It was heard since the arbiter started.
@@ -49,6 +49,7 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
         phase: What it last reported.
         acknowledged: It has reported to act on `command`. Until then it may be about to.
         draining: It is superseded, and left to finish.
+        letting_go: It was released and has not confirmed it; it may hold what it claims.
         adopted: It was found activated by an arbiter that had just started.
         latched: It stays until reset.
         failure: Why it counts as failed; "" if it does not.
@@ -63,6 +64,7 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
     phase: Phase = Phase.IDLE
     acknowledged: bool = False
     draining: bool = False
+    letting_go: bool = False
     adopted: bool = False
     latched: bool = False
     failure: str = ""
@@ -94,6 +96,8 @@ def report(track: RecoveryTrack, now: float, *, activated: bool, phase: Phase, d
     replace = msgspec.structs.replace
     after = replace(track, heard=True, activated=activated, phase=phase)
     if not track.wanted:
+        if track.letting_go and not activated and decision == track.command.decision:
+            after = replace(after, letting_go=False)
         return after
     if activated:
         # A report on an earlier decision says nothing about this one.

@@ -9,14 +9,17 @@ is checked by type alone: unknown fields, wrong types, names that are no names, 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from enum import StrEnum
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import msgspec
 
 from manager.fault_tree import Event, FaultTree
+from manager.gates import detection_gate, recovery_gate
 from manager.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
-from manager.order import PartialOrder, Tree
+from manager.order import PartialOrder, Tree, refine
 
 OptionalName = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z][A-Za-z0-9_]*)?$")]
 Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -216,6 +219,8 @@ class RecoverySpec(Table, frozen=True):
     actor: ClassPath
     kind: RecoveryKind
     claims: frozenset[Name] = frozenset()
+    needs: frozenset[Name] = frozenset()
+    disables: frozenset[Name] = frozenset()
     interruptible: bool = False
     latched: bool = False
     deadline_s: Positive = 2.0
@@ -238,13 +243,31 @@ class Hazard(StrEnum):
 
 
 class MechanismSpec(Table, frozen=True):
-    """FTMx(DMy, RMz), on an event of the fault tree, in time before a hazard."""
+    """FTMx(DMy, RMz), on an event of the fault tree, in time before a hazard.
+
+    Attributes:
+        name: Of the mechanism, e.g. "FTM1".
+        detect: A detection module, or a gate over several; `manager.gates` has the language.
+        recover: A recovery module, or a gate over several.
+        event: Of the fault tree, on which it is a barrier.
+        against: What it races.
+    """
 
     name: Name
-    detect: Name
-    recover: Name
+    detect: str
+    recover: str
     event: Name
     against: Hazard = Hazard.DRIFT
+
+    @property
+    def detections(self) -> tuple[str, ...]:
+        """Names of the detection modules that it listens to."""
+        return detection_gate(self.detect).names
+
+    @property
+    def recoveries(self) -> tuple[str, ...]:
+        """Names of the recovery modules that it may run."""
+        return recovery_gate(self.recover).names
 
 
 class AtLeast(Table, frozen=True):
@@ -272,7 +295,15 @@ class EventSpec(Table, frozen=True):
 
 
 class SystemSpec(Table, frozen=True):
-    """A whole system. In the file the arrays of tables are called by the singular."""
+    """A whole system. In the file the arrays of tables are called by the singular.
+
+    Attributes:
+        strategy: By which the arbiter decides; `manager.strategies` has them.
+        shadow: A strategy that is asked as well, and whose differing decisions are recorded;
+            "" for none.
+        order: Name of an order of the recoveries, or several: what the first leaves open the
+            next decides. The first is the one that says what is safer.
+    """
 
     name: Name
     title: str
@@ -280,7 +311,8 @@ class SystemSpec(Table, frozen=True):
     mission: str
     robot: Robot
     strategy: str = "safety-first"
-    order: Name = "safer"
+    shadow: str = ""
+    order: Name | tuple[Name, ...] = "safer"
     timing: Timing = Timing()
     layers: Layers = Layers()
     nodes: tuple[NodeSpec, ...] = msgspec.field(name="node", default=())
@@ -314,12 +346,18 @@ class SystemSpec(Table, frozen=True):
             placement.setdefault(node.process, []).append(node)
         return {process: tuple(nodes) for process, nodes in placement.items()}
 
-    def build_mechanisms(self) -> Mechanisms:
-        """Build the registry of mechanisms and recovery contracts."""
+    def build_mechanisms(self, patience_s: Mapping[str, float] = MappingProxyType({})
+                         ) -> Mechanisms:
+        """Build the registry of mechanisms and recovery contracts.
+
+        Args:
+            patience_s: How long each mechanism's recovery may take (`manager.budget.patience_s`).
+        """
         return Mechanisms(
-            [Mechanism(m.name, m.detect, m.recover) for m in self.mechanisms],
+            [Mechanism(m.name, m.detect, m.recover, patience_s.get(m.name, math.inf))
+             for m in self.mechanisms],
             [Contract(r.name, r.kind, r.claims, r.interruptible, r.latched, r.deadline_s,
-                      r.escalate_to) for r in self.recoveries])
+                      r.escalate_to, r.needs, r.disables) for r in self.recoveries])
 
     def build_fault_tree(self) -> FaultTree:
         """Build the fault tree."""
@@ -329,6 +367,20 @@ class SystemSpec(Table, frozen=True):
         """Derive the FTMTree from the fault tree and the placement of the mechanisms."""
         return self.build_fault_tree().derive_ftm_tree({m.name: m.event for m in self.mechanisms})
 
-    def build_order(self, name: str = "") -> PartialOrder:
-        """Build the RM order of that name; "" for the one that the spec selects."""
-        return PartialOrder([r.name for r in self.recoveries], self.orders[name or self.order])
+    @property
+    def criteria(self) -> tuple[str, ...]:
+        """Names of the selected orders; the first says what is safer."""
+        return (self.order,) if isinstance(self.order, str) else self.order
+
+    def build_order(self, *criteria: str) -> PartialOrder:
+        """Build the RM order of these criteria; of those that the spec selects if none is given.
+
+        Raises:
+            CycleError: One of them has a cycle, or together they have one.
+        """
+        names = [r.name for r in self.recoveries]
+        return refine([PartialOrder(names, self.orders[c]) for c in criteria or self.criteria])
+
+    def build_safety_order(self) -> PartialOrder:
+        """Build the order that says which recovery is safer: the first criterion alone."""
+        return self.build_order(self.criteria[0])

@@ -96,7 +96,8 @@ class Bench:
 
     @property
     def decisions(self) -> list[DecisionMade]:
-        return [output for output in self.log if isinstance(output, DecisionMade)]
+        return [msgspec.structs.replace(output, decision=self.arbiter.explain(output))
+                for output in self.log if isinstance(output, DecisionMade)]
 
 
 def commands(outputs: list) -> list[tuple[str, bool]]:

@@ -85,7 +85,57 @@ def test_what_claims_the_same_waits_until_the_other_has_finished():
     assert bench.orders == "(RM2)"
     assert commands(bench.active("DM6")) == []
     assert bench.orders == "(RM2)"
-    assert commands(bench.report("RM2", DONE)) == [("RM2", False), ("RM5", True)]
+    assert commands(bench.report("RM2", DONE)) == [("RM2", False)]
+    assert commands(bench.report("RM2", Phase.IDLE)) == [("RM5", True)]
+
+
+def test_who_lets_go_keeps_its_claim_until_it_says_so():
+    """A release is a message: until it has arrived, RM2 still holds the robot."""
+    bench = Bench()
+    bench.active("DM2")
+    ordered = bench.state.desired["RM2"].decision
+    bench.report("RM2", DONE)
+    bench.idle("DM2")
+    bench.wait(0.6)
+    assert bench.orders == ""
+    bench.active("DM6")
+    assert bench.orders == ""
+    bench.report("RM2", DONE, ordered)  # sent before the release arrived
+    bench.report("RM2", Phase.IDLE, ordered)  # its word from before the order: proves nothing
+    assert bench.orders == ""
+    bench.report("RM2", Phase.IDLE)
+    assert bench.orders == "RM5"
+
+
+def test_who_is_asked_to_let_go_and_was_respawned_is_told_again_at_once():
+    bench = Bench()
+    bench.active("DM2")
+    bench.report("RM2", DONE)
+    bench.idle("DM2")
+    bench.wait(0.6)
+    assert commands(bench.report("RM2", Phase.IDLE, 0)) == [("RM2", False)]
+
+
+def test_nobody_waits_longer_than_the_deadline_for_one_that_never_lets_go():
+    bench = Bench()
+    bench.active("DM2")
+    bench.report("RM2", DONE)
+    bench.idle("DM2")
+    bench.wait(0.6)
+    bench.active("DM6")
+    bench.wait(1.8)
+    assert bench.orders == ""
+    bench.wait(0.3)
+    assert bench.orders == "RM5"
+
+
+def test_an_emergency_stop_waits_for_nobody_to_let_go():
+    bench = Bench()
+    bench.active("DM2")
+    bench.report("RM2", DONE)
+    bench.idle("DM2")
+    bench.wait(0.6)
+    assert commands(bench.active("DM1")) == [("RM1", True)]
 
 
 def test_a_less_safe_recovery_waits_even_if_it_claims_something_else():
@@ -101,12 +151,13 @@ def test_a_less_safe_recovery_waits_even_if_it_claims_something_else():
 
 
 def test_a_safer_recovery_waits_for_one_that_claims_the_same():
-    bench = Bench(edited(RM2={"claims": frozenset({"actuation", "processes"})}))
+    bench = Bench(edited(RM2={"claims": frozenset({"actuation", "control_nodes"})}))
     bench.active("DM4", "osmosis_control")
     bench.report("RM3", ACTING)
     assert commands(bench.active("DM2")) == []
     assert bench.orders == "(RM3)"
-    assert commands(bench.report("RM3", DONE)) == [("RM3", False), ("RM2", True)]
+    assert commands(bench.report("RM3", DONE)) == [("RM3", False)]
+    assert commands(bench.report("RM3", Phase.IDLE)) == [("RM2", True)]
 
 
 def test_an_interruptible_recovery_is_released_at_once():

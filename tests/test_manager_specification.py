@@ -241,8 +241,8 @@ REFUSED = {
         [('escalate_to = "RM1"            # a robot', 'escalate_to = "RM4" # a robot')],
         ["$.recovery[1].escalate_to = 'RM4': RM2 is above it"]),
     "a last resort that has to wait": (
-        [('claims = ["brakes"]', 'claims = ["brakes", "processes"]')],
-        ["RM1, the last resort, would have to wait for RM3", "claims processes"]),
+        [('claims = ["brakes"]', 'claims = ["brakes", "control_nodes"]')],
+        ["RM1, the last resort, would have to wait for RM3", "claims control_nodes"]),
     # time
     "bounds that are too slow": ([('within_s = "control_period_s"', "within_s = 0.5")],
                                  ["$.timing: the time budget does not fit: FTM3 needs 0.650 s",

@@ -6,6 +6,7 @@ import pytest
 from manager_bench import osmosis
 
 from manager.order import UnknownElementError
+from manager.safety_first import SafetyFirst
 from manager.strategies import (
     STRATEGIES,
     UnknownStrategyError,
@@ -148,11 +149,13 @@ def test_an_unknown_strategy_is_named_with_those_that_are_known():
 
 
 def test_a_strategy_can_be_added_but_not_replaced_by_accident():
-    name = "test-only"
+    class Mine(SafetyFirst):
+        name = "test-only"
+
     try:
-        register(name)(STRATEGIES["safety-first"])
-        assert decide(["FTM7"], MECHANISMS, TREE, ORDER, name).recoveries == ("RM4",)
+        register(Mine())
+        assert decide(["FTM7"], MECHANISMS, TREE, ORDER, Mine.name).recoveries == ("RM4",)
         with pytest.raises(ValueError, match="registered twice"):
-            register(name)(STRATEGIES["safety-first"])
+            register(Mine())
     finally:
-        STRATEGIES.pop(name, None)
+        STRATEGIES.pop(Mine.name, None)

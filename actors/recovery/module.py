@@ -169,7 +169,9 @@ class RecoveryModule(Actor):
             self._release = None
             self._obey_order(message)
         elif not self.activated:
+            self.decision = message.decision  # confirms that it holds nothing
             self.stay_idle()
+            self._tell_change()
         elif self.phase is RecoveryPhase.ACTING:
             self._release = message
         else:

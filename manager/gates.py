@@ -1,0 +1,236 @@
+"""Logical gates over names: what a mechanism detects by, and what it recovers with.
+
+A mechanism joins detection modules to recovery modules by two gates (paper, section V, "logical
+gates"): `detect = "DM1 and DM3"`, `recover = "RM2 and RM4"`. The language is
+
+    DM1                      DM1 and DM3               DM1 or (DM2 and not DM3)
+    2 of (DM1, DM2, DM3)     RM2 and RM4               RM4 or RM3
+
+`and` binds tighter than `or`, `not` tighter than both. On the recovery side `and` means both
+together, and `or` means the first that can be had: the next one is taken when it has failed or
+when what it needs is not there. `not` and `k of` make no sense there.
+
+*Silence is no alibi.* A detection module that is silent counts as active, so `DM1` holds; it must
+not count as an assurance that all is well either, so `not DM1` holds too.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterator
+from itertools import chain, combinations
+
+import msgspec
+
+MAX_NAMES = 16
+"""A gate over more modules than these is a fault tree; it belongs there."""
+
+MAX_DEPTH = 50
+
+
+class GateError(ValueError):
+    """A gate that cannot be read, or that makes no sense. The message is one line."""
+
+
+class Gate(msgspec.Struct, frozen=True):
+    """A gate: a name, its negation, or at least `required` of some inputs.
+
+    Attributes:
+        name: Of a module; "" for a gate over inputs.
+        negated: The name must not be active.
+        required: How many inputs must hold.
+        inputs: Of the gate.
+    """
+
+    name: str = ""
+    negated: bool = False
+    required: int = 0
+    inputs: tuple[Gate, ...] = ()
+
+    @property
+    def is_name(self) -> bool:
+        """Whether it is no more than a name."""
+        return bool(self.name) and not self.negated
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in the gate, each once, as written."""
+        if self.name:
+            return (self.name,)
+        return tuple(dict.fromkeys(chain.from_iterable(i.names for i in self.inputs)))
+
+    def holds(self, active: Collection[str], silent: Collection[str] = ()) -> bool:
+        """Tell whether the gate holds when these modules are active (`silent` ones included)."""
+        if self.name:
+            if self.negated:
+                return self.name not in active or self.name in silent
+            return self.name in active
+        return sum(gate.holds(active, silent) for gate in self.inputs) >= self.required
+
+    def alternatives(self) -> Iterator[tuple[str, ...]]:
+        """Yield the sets of names that satisfy a gate without negation, preferred ones first."""
+        if self.name:
+            yield (self.name,)
+            return
+        for chosen in combinations(self.inputs, self.required):
+            yield from _product([tuple(gate.alternatives()) for gate in chosen])
+
+    def __str__(self) -> str:
+        if self.name:
+            return f"not {self.name}" if self.negated else self.name
+        inner = [str(i) if i.name or 1 < i.required < len(i.inputs) else f"({i})"
+                 for i in self.inputs]
+        if self.required == 1:
+            return " or ".join(inner)
+        if self.required == len(self.inputs):
+            return " and ".join(inner)
+        return f"{self.required} of ({', '.join(map(str, self.inputs))})"
+
+
+def detection_gate(text: str) -> Gate:
+    """Read the gate on the detection side of a mechanism.
+
+    Raises:
+        GateError: It cannot be read, can never be active, or is active when nothing is wrong.
+    """
+    gate = _Parser(text).read()
+    names = gate.names
+    if len(names) > MAX_NAMES:
+        raise GateError(f"a gate over {len(names)} modules; at most {MAX_NAMES} are right, more "
+                        "belong into the fault tree")
+    if gate.holds(()):
+        raise GateError("it is active while all its detection modules are idle")
+    if not any(gate.holds(active) for size in range(1, len(names) + 1)
+               for active in combinations(names, size)):
+        raise GateError("it can never be active")
+    return gate
+
+
+def recovery_gate(text: str) -> Gate:
+    """Read the gate on the recovery side of a mechanism.
+
+    Raises:
+        GateError: It cannot be read, or has more in it than names, `and` and `or`.
+    """
+    gate = _Parser(text).read()
+    names = gate.names
+    if len(names) > MAX_NAMES:
+        raise GateError(f"{len(names)} recovery modules; at most {MAX_NAMES} are right")
+
+    def check(part: Gate) -> None:
+        if part.negated:
+            raise GateError(f"'not {part.name}' cannot be run; names, 'and' and 'or' are right")
+        if not part.name and 1 < part.required < len(part.inputs):
+            raise GateError(f"'{part.required} of' does not say which; names, 'and' and 'or' "
+                            "are right")
+        for inner in part.inputs:
+            check(inner)
+
+    check(gate)
+    return gate
+
+
+def _product(parts: list[tuple[tuple[str, ...], ...]]) -> Iterator[tuple[str, ...]]:
+    """Yield the unions of one choice from each part, earlier choices first."""
+    if not parts:
+        yield ()
+        return
+    for head in parts[0]:
+        for tail in _product(parts[1:]):
+            yield tuple(dict.fromkeys((*head, *tail)))
+
+
+_TOKEN = re.compile(r"\s*([A-Za-z][A-Za-z0-9_]*|\d+|[(),])")
+_WORDS = frozenset({"and", "or", "not", "of"})
+
+
+class _Parser:
+    """Recursive descent; the depth is bounded, so is the recursion."""
+
+    def __init__(self, text: str) -> None:
+        self._tokens: list[str] = []
+        at = 0
+        text = text.rstrip()
+        while at < len(text):
+            match = _TOKEN.match(text, at)
+            if match is None:
+                raise GateError(f"unexpected {text[at:].strip()[:1]!r}; a gate is made of names, "
+                                "'and', 'or', 'not', 'k of (...)' and parentheses")
+            self._tokens.append(match[1])
+            at = match.end()
+        self._at = 0
+        self._depth = 0
+
+    def read(self) -> Gate:
+        gate = self._joined("or", lambda: self._joined("and", self._single))
+        if self._peek():
+            raise GateError(f"unexpected {self._peek()!r} after a complete gate; join two parts "
+                            "with 'and' or 'or'")
+        return gate
+
+    def _peek(self) -> str:
+        return self._tokens[self._at] if self._at < len(self._tokens) else ""
+
+    def _take(self, wanted: str = "") -> str:
+        token = self._peek()
+        if wanted and token != wanted:
+            raise GateError(f"expected {wanted!r}, got {token or 'the end'!r}")
+        self._at += 1
+        return token
+
+    def _or(self) -> Gate:
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise GateError(f"nested more than {MAX_DEPTH} deep")
+        gate = self._joined("or", lambda: self._joined("and", self._single))
+        self._depth -= 1
+        return gate
+
+    def _joined(self, word: str, part: Callable[[], Gate]) -> Gate:
+        inputs = [part()]
+        while self._peek() == word:
+            self._take()
+            inputs.append(part())
+        if len(inputs) == 1:
+            return inputs[0]
+        return Gate(required=1 if word == "or" else len(inputs), inputs=tuple(inputs))
+
+    def _single(self) -> Gate:
+        token = self._take()
+        if token == "not":  # noqa: S105 a word of the language
+            self._depth += 1
+            if self._depth > MAX_DEPTH:
+                raise GateError(f"nested more than {MAX_DEPTH} deep")
+            gate = _negate(self._single())
+            self._depth -= 1
+            return gate
+        if token == "(":  # noqa: S105
+            gate = self._or()
+            self._take(")")
+            return gate
+        if token.isdigit():
+            return self._at_least(int(token))
+        if not token or token in _WORDS or not token[0].isalpha():
+            raise GateError(f"expected a name, got {token or 'the end'!r}")
+        return Gate(name=token)
+
+    def _at_least(self, required: int) -> Gate:
+        self._take("of")
+        self._take("(")
+        inputs = [self._or()]
+        while self._peek() == ",":
+            self._take()
+            inputs.append(self._or())
+        self._take(")")
+        if not 1 <= required <= len(inputs):
+            raise GateError(f"{required} of {len(inputs)} inputs; between 1 and {len(inputs)} "
+                            "is right")
+        return Gate(required=required, inputs=tuple(inputs))
+
+
+def _negate(gate: Gate) -> Gate:
+    """Push a negation down to the names (De Morgan; not k-of-n is (n-k+1)-of-n of negations)."""
+    if gate.name:
+        return Gate(name=gate.name, negated=not gate.negated)
+    return Gate(required=len(gate.inputs) - gate.required + 1,
+                inputs=tuple(_negate(i) for i in gate.inputs))
