@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from toolbox import decide_verbs, inject_verbs, node_verbs, operator_verbs, topic_verbs
+from toolbox import decide_verbs, inject_verbs, node_verbs, operator_verbs, topic_verbs, verify_verb
 from toolbox.output import NoEffectError, UsageError, warn
 
 _EPILOG = """examples:
@@ -39,6 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
     inject_verbs.add(verbs, formatter, common)
     operator_verbs.add(verbs, formatter, common)
     decide_verbs.add(verbs, formatter)
+    verify_verb.add(verbs, formatter)
     return parser
 
 
