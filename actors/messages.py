@@ -306,6 +306,37 @@ class DecisionRecord(Message, frozen=True):
     detected_s: float
 
 
+class AdaptationRequest(Message, frozen=True):
+    """Asks the manager to change a mechanism while running (`manager.adaptation.Change`).
+
+    `values` is a JSON object. The answer carries the same `request`.
+    """
+
+    request: str
+    action: str
+    name: str
+    values: str
+    by: str
+
+
+class AdaptationAnswer(Message, frozen=True):
+    """Whether a change was made, and why not; `version` counts the changes made in this run."""
+
+    request: str
+    accepted: bool
+    reason: str
+    version: int
+
+
+class AdaptedSystem(Message, frozen=True):
+    """The system as it was changed; `document` is its whole spec as a JSON object."""
+
+    version: int
+    change: str
+    by: str
+    document: str
+
+
 class ShadowRecord(Message, frozen=True):
     """A decision that the strategy in shadow would have taken instead of decision `decision`."""
 

@@ -55,6 +55,12 @@ DECISION = Topic("manager/decision", m.DecisionRecord, Qos.COMMAND, 0, "",
                  "Each decision of the FTM Manager with its certificate.")
 SHADOW = Topic("manager/shadow", m.ShadowRecord, Qos.COMMAND, 0, "",
                "What the strategy in shadow would have decided, where it differs.")
+ADAPT = Topic("manager/adapt", m.AdaptationRequest, Qos.COMMAND, 0, "",
+              "Change a module, a mechanism or the strategy while running.")
+ADAPTATION = Topic("manager/adaptation", m.AdaptationAnswer, Qos.COMMAND, 0, "",
+                   "Whether a change was made, and why not.")
+ADAPTED_SYSTEM = Topic("manager/system", m.AdaptedSystem, Qos.STATE, 1, "",
+                       "The changed system, whole; silent while nothing was changed.")
 MANAGER_STATUS = Topic("manager/status", m.ManagerStatus, Qos.STATE, 10, "",
                        "The FTM Manager's view; its silence stops the robot.")
 RESET = Topic("manager/reset", m.Reset, Qos.COMMAND, 0, "", "Release a latched recovery.")

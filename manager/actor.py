@@ -20,6 +20,8 @@ from actors import messages as m
 from actors import topics
 from actors.runtime.actor import Actor, Context, Header, every, on
 from actors.runtime.topic import Topic
+from actors.runtime.wiring import load_class
+from manager.adaptation import Action, Change, Document, adapt, describe
 from manager.arbiter import (
     DecisionMade,
     DetectionHeard,
@@ -50,13 +52,15 @@ class FtmManager(Actor):
     """
 
     outputs = (topics.RECOVERY_COMMAND, topics.DECISION, topics.SHADOW,
-               topics.MANAGER_STATUS)
+               topics.MANAGER_STATUS, topics.ADAPTATION, topics.ADAPTED_SYSTEM)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system: SystemSpec = context.shared["system"]
-        self._strategy = str(self.parameters.get("strategy", "")) or system.strategy
-        self._arbiter = build_arbiter(system, self._strategy)
+        self._system: SystemSpec = context.shared["system"]
+        self._document: Document = context.shared.get("document", {})
+        self._adapted: m.AdaptedSystem | None = context.shared.get("adapted")
+        self._strategy = str(self.parameters.get("strategy", "")) or self._system.strategy
+        self._arbiter = build_arbiter(self._system, self._strategy)
         now_s = self.clock.now()
         self.arbiter_state = self._arbiter.initial(
             now_s, (context.incarnation - 1) * DECISIONS_PER_LIFE)
@@ -97,6 +101,24 @@ class FtmManager(Actor):
         """Hear the operator release a latched recovery."""
         self._step(ResetAsked(message.recovery, message.by))
 
+    @on(topics.ADAPT)
+    def adapt(self, message: m.AdaptationRequest, _header: Header) -> None:
+        """Change the system, if the changed one is sound and no recovery is under way."""
+        try:
+            change = Change(Action(message.action), message.name,
+                            msgspec.json.decode(message.values, type=dict[str, Any]))
+            reason = self._change(change, message.by)
+        except (ValueError, msgspec.MsgspecError) as error:
+            reason = " ".join(str(error).split())
+        self.publish(topics.ADAPTATION, m.AdaptationAnswer(
+            message.request, not reason, reason, self._version))
+
+    @every(1.0)
+    def repeat_system(self) -> None:
+        """Repeat the changed system for whoever joined late."""
+        if self._adapted is not None:
+            self.publish(topics.ADAPTED_SYSTEM, self._adapted)
+
     @every(0.1)
     def tick(self) -> None:
         """Let time pass, and show that the manager lives."""
@@ -111,6 +133,32 @@ class FtmManager(Actor):
             # One that has just started does not know yet what is in force: it releases nothing.
             if command.activate or state.oriented:
                 self._command(command)
+
+    # -- adaptation -----------------------------------------------------------------------------
+
+    @property
+    def _version(self) -> int:
+        return self._adapted.version if self._adapted else 0
+
+    def _change(self, change: Change, by: str) -> str:
+        """Make a change at once and whole; return why not, or ""."""
+        busy = self.arbiter_state.busy
+        if busy:
+            return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"
+        if not self._document:
+            return "this manager was started without a system file"
+        document, system = adapt(self._document, change, f"{self._system.name}.toml")
+        for actor in (*(d.actor for d in system.detections), *(r.actor for r in system.recoveries)):
+            load_class(actor)
+        arbiter = build_arbiter(system)
+        self.arbiter_state = arbiter.take_over(self.arbiter_state, self.clock.now())
+        self._arbiter, self._document, self._system = arbiter, document, system
+        self._strategy = system.strategy
+        self._adapted = m.AdaptedSystem(
+            self._version + 1, describe(change), by, msgspec.json.encode(document).decode())
+        self.publish(topics.ADAPTED_SYSTEM, self._adapted)
+        self._step(Tick())
+        return ""
 
     # -- what it does ---------------------------------------------------------------------------
 

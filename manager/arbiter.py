@@ -140,6 +140,19 @@ class Arbiter:
                   for name in self.mechanisms.recoveries),
             number, NOTHING_ACTIVE, now)
 
+    def take_over(self, state: State, now: float) -> State:
+        """Return the state of another arbiter, one of the same system before a change, as mine.
+
+        What is known of modules that there still are is kept; new ones are waited for.
+        """
+        detections = {track.name: track for track in state.detections}
+        recoveries = {track.name: track for track in state.recoveries}
+        mine = self.initial(now, state.number)
+        return msgspec.structs.replace(
+            mine, started_s=state.started_s, oriented=state.oriented,
+            detections=tuple(detections.get(t.name, t) for t in mine.detections),
+            recoveries=tuple(recoveries.get(t.name, t) for t in mine.recoveries))
+
     def step(self, state: State, event: Input, now: float) -> tuple[State, tuple[Output, ...]]:
         """Take one input.
 

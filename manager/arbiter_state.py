@@ -137,6 +137,12 @@ class State(msgspec.Struct, frozen=True):
         return tuple(track.name for track in self.recoveries if track.wanted)
 
     @property
+    def busy(self) -> tuple[str, ...]:
+        """Names of the recovery modules that are in the middle of something."""
+        return tuple(track.name for track in self.recoveries
+                     if track.wanted or track.letting_go or track.latched)
+
+    @property
     def draining(self) -> tuple[str, ...]:
         """Names of the recovery modules that are superseded and finishing their action."""
         return tuple(track.name for track in self.recoveries if track.draining)

@@ -38,6 +38,22 @@ def find_nonsense(spec: SystemSpec) -> Finding | None:
     return None
 
 
+def find_nonsense_of_rest(spec: SystemSpec) -> Finding | None:
+    """Return the first thing wrong with what is left of a sound spec when some is disabled."""
+    if not spec.mechanisms:
+        return Finding("$.mechanism", "no mechanism is left enabled; at least one must be")
+    off = {recovery.name for recovery in spec.recoveries if not recovery.enabled}
+    for index, recovery in enumerate(spec.recoveries):
+        if recovery.enabled and recovery.escalate_to in off:
+            return Finding(f"$.recovery[{index}].escalate_to",
+                           f"{recovery.name} escalates to it, and it is disabled",
+                           (recovery.escalate_to,))
+    for validator in (_fault_tree, _criteria, _order_against_tree, _budget):
+        for finding in validator(spec):
+            return finding
+    return None
+
+
 def _unknown(path: str, value: str, what: str, known: Sequence[str]) -> Finding:
     return Finding(path, f"unknown {what}; known: {', '.join(known) or 'none'}", (value,))
 

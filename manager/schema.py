@@ -190,6 +190,7 @@ class DetectionSpec(Table, frozen=True):
         title: For people.
         actor: Its class, `module:Class`.
         process: OS process it lives in; "" for one of its own name.
+        enabled: False leaves out every mechanism that listens to it.
     """
 
     name: Name
@@ -198,6 +199,7 @@ class DetectionSpec(Table, frozen=True):
     within_s: Positive | Name = DERIVED
     process: OptionalName = ""
     parameters: dict[str, Any] = {}
+    enabled: bool = True
 
     @property
     def watch(self) -> tuple[str, ...]:
@@ -227,6 +229,7 @@ class RecoverySpec(Table, frozen=True):
     escalate_to: OptionalName = ""
     process: OptionalName = ""
     parameters: dict[str, Any] = {}
+    enabled: bool = True
 
 
 class Hazard(StrEnum):
@@ -251,6 +254,7 @@ class MechanismSpec(Table, frozen=True):
         recover: A recovery module, or a gate over several.
         event: Of the fault tree, on which it is a barrier.
         against: What it races.
+        enabled: False leaves it out. One with a disabled module is left out as well.
     """
 
     name: Name
@@ -258,6 +262,7 @@ class MechanismSpec(Table, frozen=True):
     recover: str
     event: Name
     against: Hazard = Hazard.DRIFT
+    enabled: bool = True
 
     @property
     def detections(self) -> tuple[str, ...]:
@@ -321,6 +326,17 @@ class SystemSpec(Table, frozen=True):
     mechanisms: tuple[MechanismSpec, ...] = msgspec.field(name="mechanism", default=())
     events: tuple[EventSpec, ...] = msgspec.field(name="event", default=())
     orders: dict[str, dict[str, tuple[str, ...]]] = {}
+
+    def without_disabled(self) -> SystemSpec:
+        """Return the spec without the mechanisms that are disabled; itself if none is.
+
+        Modules that are disabled stay: their processes run, but nobody acts on what they say.
+        """
+        off = {d.name for d in self.detections if not d.enabled}
+        off |= {r.name for r in self.recoveries if not r.enabled}
+        left = tuple(m for m in self.mechanisms
+                     if m.enabled and not off.intersection((*m.detections, *m.recoveries)))
+        return self if left == self.mechanisms else msgspec.structs.replace(self, mechanisms=left)
 
     def actors(self) -> tuple[NodeSpec, ...]:
         """Return everything that runs as an actor, detection and recovery modules as nodes too.

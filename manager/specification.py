@@ -23,7 +23,7 @@ from typing import Any
 import msgspec
 
 from manager.budget import derive_timeouts
-from manager.checks import find_nonsense
+from manager.checks import find_nonsense, find_nonsense_of_rest
 from manager.mechanisms import RecoveryKind
 from manager.schema import (
     AtLeast,
@@ -45,7 +45,7 @@ from manager.schema import (
 __all__ = [
     "AtLeast", "DetectionSpec", "EventSpec", "Hazard", "Kind", "Layers", "MechanismSpec",
     "NodeSpec", "RecoverySpec", "Robot", "SpecificationError", "SystemSpec", "Timing",
-    "parse_specification",
+    "check_document", "parse_specification", "read_document",
 ]
 
 TABLES: dict[str, type[Table]] = {
@@ -73,10 +73,34 @@ def parse_specification(text: str, file: str) -> SystemSpec:
         SpecificationError: The text is no TOML, a field is missing, unknown or of the wrong type,
             or the spec makes no sense.
     """
+    return check_document(read_document(text, file), file)
+
+
+def read_document(text: str, file: str) -> dict[str, Any]:
+    """Read TOML, unchecked.
+
+    Raises:
+        SpecificationError: The text is no TOML.
+    """
     try:
-        document = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SpecificationError(file, "$", f"not valid TOML: {error}") from None
+    except RecursionError:
+        raise SpecificationError(file, "$", "nested too deeply; a spec needs three levels"
+                                 ) from None
+
+
+def check_document(document: dict[str, Any], file: str) -> SystemSpec:
+    """Make a spec of a document, and check it.
+
+    Mechanisms that are disabled, or of which a module is, are checked like all others and then
+    left out; what remains has to make sense as well.
+
+    Raises:
+        SpecificationError: A field is missing, unknown or of the wrong type, or the spec makes no
+            sense.
+    """
     for path, value in _find_unwritable(document, "$"):
         raise SpecificationError(file, path, "expected a finite number", value)
     _check_orders(document.get("orders", {}), file)
@@ -87,9 +111,12 @@ def parse_specification(text: str, file: str) -> SystemSpec:
     spec = msgspec.structs.replace(spec, timing=derive_timeouts(spec.robot, spec.timing))
     spec = _resolve_timing_names(spec, file)
     finding = find_nonsense(spec)
+    enabled = spec.without_disabled()
+    if finding is None and enabled is not spec:
+        finding = find_nonsense_of_rest(enabled)
     if finding is not None:
         raise SpecificationError(file, finding.path, finding.problem, *finding.value)
-    return spec
+    return enabled
 
 
 def _find_unwritable(value: object, path: str) -> Iterator[tuple[str, float]]:

@@ -7,6 +7,7 @@ process of the system.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -72,3 +73,19 @@ def topics_of(actor: type[Actor]) -> tuple[tuple[Topic[Any], ...], tuple[Topic[A
         tuple(t for t in actor.inputs() if t not in BASE_INPUTS),
         tuple(actor.outputs),
     )
+
+
+def load_class(path: str) -> type[Actor]:
+    """Return the actor class named `module:Class`.
+
+    Raises:
+        ValueError: there is no such class, or it is no actor.
+    """
+    module, _, name = path.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError as error:
+        raise ValueError(f"actor = {path!r}: {error}") from None
+    if not (isinstance(found, type) and issubclass(found, Actor)):
+        raise ValueError(f"actor = {path!r}: no such actor class")
+    return found

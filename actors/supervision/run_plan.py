@@ -6,17 +6,23 @@ data (JSON), so that any process can be given it.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from actors.runtime.actor import Actor
-from actors.runtime.wiring import Member, partners
+from actors.messages import AdaptedSystem
+from actors.runtime.wiring import Member, load_class, partners
 from actors.runtime.zenoh_bus import endpoint
-from manager.specification import Kind, Layers, NodeSpec, SystemSpec, parse_specification
+from manager.specification import (
+    Kind,
+    Layers,
+    NodeSpec,
+    SystemSpec,
+    check_document,
+    read_document,
+)
 
 SUPERVISOR = "supervisor"
 OBSERVER = "observer"
@@ -36,6 +42,7 @@ class RunPlan(msgspec.Struct, frozen=True):
         seed: for everything random.
         system_file: path of the system spec.
         strategy: name that replaces the spec's strategy; "" for the spec's.
+        shadow: name of a strategy to run in shadow; "" for the spec's.
         airport: name or path.
         mission: name or path.
         obstacles: how many of the airport's obstacles stand there.
@@ -58,6 +65,7 @@ class RunPlan(msgspec.Struct, frozen=True):
     ftm: bool
     hmi_port: int
     launcher_pid: int = 0
+    shadow: str = ""
     error_log: str = ""
     origin_s: float = 0.0
 
@@ -86,31 +94,29 @@ def load_system(plan: RunPlan) -> SystemSpec:
         SpecificationError: the spec is unsound.
         OSError: it cannot be read.
     """
-    spec = parse_specification(
+    return tailor(plan, check_document(load_document(plan), plan.system_file))
+
+
+def load_document(plan: RunPlan) -> dict[str, Any]:
+    """Read the plan's system spec as TOML, with the plan's choice of strategies.
+
+    Raises:
+        SpecificationError: it is no TOML.
+        OSError: it cannot be read.
+    """
+    document = read_document(
         Path(plan.system_file).read_text(encoding="utf-8"), plan.system_file)
-    if plan.strategy:
-        spec = msgspec.structs.replace(spec, strategy=plan.strategy)
+    chosen = {"strategy": plan.strategy, "shadow": plan.shadow}
+    return {**document, **{key: name for key, name in chosen.items() if name}}
+
+
+def tailor(plan: RunPlan, spec: SystemSpec) -> SystemSpec:
+    """Return a spec with the baseline's layers off where the plan says so."""
     if not plan.ftm:
         spec = msgspec.structs.replace(spec, layers=Layers(
             dead_man=False, safety_pilot_checks=False, manager_watch=False,
             supervisor_respawn=False, ftm=False))
     return spec
-
-
-def load_class(path: str) -> type[Actor]:
-    """Return the actor class named `module:Class`.
-
-    Raises:
-        ValueError: there is no such class, or it is no actor.
-    """
-    module, _, name = path.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), name, None)
-    except ImportError as error:
-        raise ValueError(f"actor = {path!r}: {error}") from None
-    if not (isinstance(found, type) and issubclass(found, Actor)):
-        raise ValueError(f"actor = {path!r}: no such actor class")
-    return found
 
 
 def actor_parameters(plan: RunPlan, spec: SystemSpec, node: NodeSpec) -> dict[str, Any]:
@@ -165,6 +171,20 @@ class Layout:
         return [endpoint(self.port_of[p]) for p in self._partners[node]]
 
 
+def adapted_system(
+    layout: Layout, shared: Mapping[str, Any], adapted: AdaptedSystem
+) -> tuple[Layout, dict[str, Any]]:
+    """Return layout and shared objects of the system as it was changed while running.
+
+    Raises:
+        ValueError: the changed system is unsound; the manager does not let that happen.
+    """
+    document = msgspec.json.decode(adapted.document)
+    spec = tailor(layout.plan, check_document(document, layout.plan.system_file))
+    return Layout(layout.plan, spec), {
+        **shared, "system": spec, "document": document, "adapted": adapted}
+
+
 def load_shared(plan: RunPlan, spec: SystemSpec) -> Mapping[str, Any]:
     """Load what actors share read-only; done once, before the fork.
 
@@ -176,6 +196,7 @@ def load_shared(plan: RunPlan, spec: SystemSpec) -> Mapping[str, Any]:
     airport = load_airport(plan.airport)
     return {
         "system": spec,
+        "document": load_document(plan),
         "airport": airport,
         "world": load_world(plan.airport),
         "mission": load_mission(plan.mission, airport),

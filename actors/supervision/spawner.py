@@ -24,13 +24,21 @@ from typing import Any, NoReturn
 
 import msgspec
 
+from actors.messages import AdaptedSystem
 from actors.supervision.lifeline import kill_leftovers
 from actors.supervision.node_process import node_main
 from actors.supervision.process_title import set_title
-from actors.supervision.run_plan import Layout, RunPlan, load_shared, load_system
+from actors.supervision.run_plan import (
+    Layout,
+    RunPlan,
+    adapted_system,
+    load_shared,
+    load_system,
+)
 
 NAMES = ("a", "b")
-MAX_DATAGRAM = 4096
+MAX_DATAGRAM = 160_000
+"""A changed system spec has to fit; unix sockets take 200 kB by default."""
 
 
 class ForkRequest(msgspec.Struct, frozen=True, tag="fork"):
@@ -49,6 +57,12 @@ class Ping(msgspec.Struct, frozen=True, tag="ping"):
     """Ask whether the spawner turns."""
 
 
+class Adapt(msgspec.Struct, frozen=True, tag="adapt"):
+    """Fork from now on by a changed system: an encoded `AdaptedSystem`."""
+
+    adapted: str
+
+
 class SetOrigin(msgspec.Struct, frozen=True, tag="origin"):
     """Set simulated time 0; sent once by the launcher before the first fork."""
 
@@ -63,7 +77,7 @@ class Reply(msgspec.Struct, frozen=True):
     error: str = ""
 
 
-Request = ForkRequest | Ping | SetOrigin
+Request = ForkRequest | Ping | SetOrigin | Adapt
 
 
 def address(port: int, name: str) -> str:
@@ -134,7 +148,7 @@ class Spawner:
             return
         try:
             reply = self._obey(msgspec.json.decode(data, type=Request))
-        except (msgspec.MsgspecError, KeyError, OSError) as error:
+        except (msgspec.MsgspecError, KeyError, ValueError, OSError) as error:
             reply = Reply(os.getpid(), error=f"{type(error).__name__}: {error}")
         with contextlib.suppress(OSError):
             connection.send(msgspec.json.encode(reply))
@@ -145,6 +159,10 @@ class Spawner:
                 self._layout.plan, origin_s=request.origin_s)
             return Reply(os.getpid())
         if isinstance(request, Ping):
+            return Reply(os.getpid())
+        if isinstance(request, Adapt):
+            adapted = msgspec.json.decode(request.adapted, type=AdaptedSystem)
+            self._layout, self._shared = adapted_system(self._layout, self._shared, adapted)
             return Reply(os.getpid())
         for name in request.names:
             if name not in self._layout.members and name not in {f"spawner_{n}" for n in NAMES}:

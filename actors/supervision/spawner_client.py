@@ -14,9 +14,11 @@ import struct
 
 import msgspec
 
+from actors.messages import AdaptedSystem
 from actors.supervision.spawner import (
     MAX_DATAGRAM,
     NAMES,
+    Adapt,
     ForkRequest,
     Ping,
     Reply,
@@ -66,6 +68,12 @@ class SpawnerClient:
         """Tell the first spawner when simulated time starts."""
         if self.ask(NAMES[0], SetOrigin(origin_s)) is None:
             raise SpawnerUnavailableError("spawner_a: no answer")
+
+    def adapt(self, adapted: AdaptedSystem) -> None:
+        """Have both spawners fork by a changed system from now on."""
+        request = Adapt(msgspec.json.encode(adapted).decode())
+        for name in NAMES:
+            self.ask(name, request)  # one that is dead is forked anew by the other, changed
 
     def ask(self, name: str, request: Request) -> Reply | None:
         """Send a request and return the reply, or None if the spawner is dead or was hung."""

@@ -26,6 +26,7 @@ from typing import Any
 
 from actors import topics
 from actors.messages import (
+    AdaptedSystem,
     Diagnostic,
     Heartbeat,
     NodeInfo,
@@ -38,8 +39,9 @@ from actors.runtime.actor import Actor, Context, Header, every, on
 from actors.runtime.topic import Topic
 from actors.supervision.process_title import find_processes, is_stopped, process_state
 from actors.supervision.restart_policy import RestartPolicy
-from actors.supervision.run_plan import Layout, RunPlan, Unit
+from actors.supervision.run_plan import Layout, RunPlan, Unit, adapted_system
 from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+from manager.adaptation import changed_actors
 from manager.specification import Kind, SystemSpec
 
 STOP_GRACE_S = 0.5
@@ -82,6 +84,8 @@ class Supervisor(Actor):
         for node, incarnation in context.shared.get("known_incarnations", {}).items():
             if node in self._layout.unit_of:
                 self._processes[self._layout.unit_of[node]].incarnation = incarnation
+        adapted: AdaptedSystem | None = context.shared.get("adapted")
+        self._version = (0, adapted.version if adapted else 0)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
         self._loop = asyncio.get_running_loop()
 
@@ -148,6 +152,28 @@ class Supervisor(Actor):
     def diagnostic(self, message: Diagnostic, _header: Header) -> None:
         """Pass a node's error report on to whoever shows it."""
         self.publish(topics.ERROR_REPORT, message)
+
+    @on(topics.ADAPTED_SYSTEM)
+    def adapted(self, message: AdaptedSystem, header: Header) -> None:
+        """Fork by the changed system from now on, and start the changed modules anew."""
+        # A manager that died before it was heard counts from an older version.
+        version = (header.incarnation, message.version)
+        if version <= self._version:
+            return
+        self._version = version
+        try:
+            layout, _ = adapted_system(self._layout, {}, message)
+        except ValueError as error:
+            self.report_diagnostic("adaptation", " ".join(str(error).split()), message.change)
+            return
+        self._spawner.adapt(message)
+        changed = changed_actors(self._spec, layout.spec)
+        self._layout, self._spec = layout, layout.spec
+        for unit in {self._layout.unit_of[name] for name in changed}:
+            process = self._processes[unit]
+            process.unit = self._layout.units[unit]
+            self._event(process, "adapted", self.name, message.change)
+            self._respawn(process, self.name)
 
     @on(topics.RESPAWN)
     def respawn(self, request: RespawnRequest, _header: Header) -> None:
