@@ -17,6 +17,7 @@ from actors.messages import (
     MissionStatus,
     PilotStatus,
     ProcessEvent,
+    ShadowRecord,
 )
 from actors.runtime.actor import Header
 from actors.runtime.topic import Topic
@@ -70,6 +71,9 @@ class Console:
             block = f", block {message.rule}" if message.rule else ""
             self.line(at, f"decision {message.decision}: {what}{block}"
                       + (f" for {', '.join(message.active)}" if message.active else ""))
+        elif isinstance(message, ShadowRecord):
+            self.line(at, f"  in shadow {message.strategy} would run "
+                          f"{' and '.join(message.recoveries) or 'nothing'}")
         elif isinstance(message, Diagnostic):
             self.line(at, f"{message.node}: {message.context}: {message.reason} "
                       f"[{message.offender}]")

@@ -35,6 +35,7 @@ class Observer(Actor):
     @on(topics.DETECTION)
     @on(topics.RECOVERY)
     @on(topics.DECISION)
+    @on(topics.SHADOW)
     @on(topics.MANAGER_STATUS)
     @on(topics.NODES)
     @on(topics.PROCESS_EVENT)

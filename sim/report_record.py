@@ -69,7 +69,8 @@ class EventLine(msgspec.Struct, frozen=True):
 class DecisionLine(msgspec.Struct, frozen=True):
     """A decision of the FTM Manager with its certificate, and in words.
 
-    `detected_s` is when the first detection behind it was made.
+    `detected_s` is when the first detection behind it was made; `shadow` is what the strategy in
+    shadow would have run instead, where it differs.
     """
 
     t_s: float
@@ -82,6 +83,7 @@ class DecisionLine(msgspec.Struct, frozen=True):
     path: tuple[str, ...]
     rejected: tuple[tuple[str, str], ...]
     detected_s: float
+    shadow: str = ""
 
 
 class ObstacleSeen(msgspec.Struct, frozen=True):
@@ -191,6 +193,7 @@ class RunRecorder:
             topics.DETECTION.key: self._detection,
             topics.MANAGER_STATUS.key: self._manager,
             topics.DECISION.key: self._decision,
+            topics.SHADOW.key: self._shadow,
             topics.PILOT_STATUS.key: self._pilot,
             topics.PROCESS_EVENT.key: self._process_event,
             topics.INJECT.key: self._injection,
@@ -288,6 +291,13 @@ class RunRecorder:
             record.recoveries,
             decision_in_words(record.active, record.rule, record.recoveries, record.strategy),
             record.path, record.rejected, record.detected_s)
+
+    def _shadow(self, record: m.ShadowRecord, header: Header) -> None:
+        key = header.incarnation, record.decision
+        if key in self._decisions:  # it is told right after the decision, on the same way
+            self._decisions[key] = msgspec.structs.replace(
+                self._decisions[key],
+                shadow=f"{record.strategy}: {' and '.join(record.recoveries) or 'nothing'}")
 
     def _pilot(self, status: m.PilotStatus, header: Header) -> None:
         self._turn("stop", "Safety Pilot", status.stopped, header.stamp, status.reason)
