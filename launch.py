@@ -68,6 +68,9 @@ def parser() -> argparse.ArgumentParser:
                    help="system spec (default: systems/osmosis.toml)")
     p.add_argument("--strategy", metavar="NAME", default="",
                    help=f"one of {', '.join(STRATEGIES)} (default: the system's)")
+    p.add_argument("--shadow", metavar="NAME", default="",
+                   help="a second strategy that decides without effect; where it differs, it says "
+                   "so (default: the system's)")
     p.add_argument("--obstacles", metavar="N", type=int, default=0,
                    help="how many of the airport's obstacles stand on the way (default: 0)")
     p.add_argument("--no-ftm", action="store_true",
@@ -108,7 +111,7 @@ class Run:
             run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
             seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
             airport="", mission="", obstacles=options.obstacles, ftm=not options.no_ftm,
-            hmi_port=0 if options.no_hmi else options.hmi_port)
+            hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow)
         self.spec: SystemSpec = load_system(plan)
         airport_name = _existing_path(options.airport or self.spec.airport)
         mission_name = _existing_path(options.mission or self.spec.mission)
@@ -238,9 +241,9 @@ def _check(options: argparse.Namespace) -> None:
         if not 1024 <= port <= LAST_PORT:
             raise UsageError(f"{name} {port}: must be between 1024 and {LAST_PORT}, below the "
                              "ports that the kernel gives to outgoing connections")
-    if options.strategy and options.strategy not in STRATEGIES:
-        raise UsageError(f"--strategy {options.strategy}: unknown strategy; known: "
-                         f"{', '.join(STRATEGIES)}")
+    for option, name in (("--strategy", options.strategy), ("--shadow", options.shadow)):
+        if name and name not in STRATEGIES:
+            raise UsageError(f"{option} {name}: unknown strategy; known: {', '.join(STRATEGIES)}")
 
 
 def _existing_path(name: str) -> str:

@@ -68,7 +68,8 @@ class Console:
             self._take_detection(message, header)
         elif isinstance(message, DecisionRecord):
             what = " and ".join(message.recoveries) or "nothing to recover"
-            block = f", block {message.rule}" if message.rule else ""
+            word = "block" if message.strategy == "safety-first" else "rule"  # figure 7's word
+            block = f", {word} {message.rule}" if message.rule else ""
             self.line(at, f"decision {message.decision}: {what}{block}"
                       + (f" for {', '.join(message.active)}" if message.active else ""))
         elif isinstance(message, ShadowRecord):

@@ -256,3 +256,37 @@ def test_two_runs_side_by_side_do_not_know_of_each_other(tmp_path):
             os.kill(two.process.pid, signal.SIGKILL)
             two.wait_until(lambda: find_processes(two.port) == [], 2, "processes were left")
         assert len(find_processes(one.port)) == 24
+
+
+def test_the_paper_s_strategy_leaves_a_dead_node_dead_where_repair_under_guard_respawns_it(
+        tmp_path):
+    """The trap that `rampart verify` finds, on real processes: FTM2 and FTM4 active together."""
+    stories = {}
+    for strategy, shadow in (("safety-first", "guarded-repair"),
+                             ("guarded-repair", "safety-first")):
+        directory = tmp_path / strategy
+        directory.mkdir()
+        with RealRun(directory, "--mission", "A", "--rate", "2", "--strategy", strategy,
+                     "--shadow", shadow) as run:
+            run.wait_for("goal 1/3")
+            freeze = subprocess.Popen(
+                [sys.executable, "-m", "toolbox.main", "inject", "command-not-updated", "--port",
+                 str(run.port)], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            try:
+                run.wait_for("for FTM2")
+                run.kill("osmosis_control")
+                run.wait_for("for FTM2, FTM4")
+                if strategy == "guarded-repair":
+                    run.wait_for("nothing to recover")
+                    run.wait_for("goal 2/3", 60)
+                else:
+                    time.sleep(3)
+            finally:
+                freeze.terminate()
+                freeze.wait()
+            stories[strategy] = run.story
+    assert "RM2, block 2 for FTM2, FTM4" in stories["safety-first"]
+    assert "in shadow guarded-repair would run RM2 and RM3" in stories["safety-first"]
+    assert "osmosis_control respawned" not in stories["safety-first"]
+    assert "RM2 and RM3, rule 2 for FTM2, FTM4" in stories["guarded-repair"]
+    assert "in shadow safety-first would run RM2" in stories["guarded-repair"]
