@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 
 import msgspec
@@ -50,6 +52,45 @@ def test_a_decision_is_told_in_words(capsys):
     assert told(capsys).startswith("FTM3 and FTM4 are active: run RM2, because")
 
 
+def test_the_table_as_csv_is_the_table_as_json(capsys):
+    main(["table", "--json"])
+    rows = json.loads(told(capsys))
+    assert main(["table", "--format", "csv"]) == 0
+    table = list(csv.DictReader(io.StringIO(told(capsys))))
+    assert [{"active": r["active"].split(), "block": int(r["block"]), "rm": r["rm"].split()}
+            for r in table] == rows
+
+
+def compared(capsys, *more):
+    assert main(["table", "--strategy", "safety-first", "--strategy", "mission-first", *more]) == 0
+    return told(capsys)
+
+
+def test_strategies_are_compared_each_in_a_column_of_its_own(capsys):
+    table = compared(capsys).splitlines()
+    assert table[0].split() == ["active", "safety-first", "mission-first"]
+    assert len(table) == 1 + 127 + 1
+    rows = {row["active"]: row
+            for row in csv.DictReader(io.StringIO(compared(capsys, "--format", "csv")))}
+    for row in json.loads(compared(capsys, "--json")):
+        for strategy, decision in row["decisions"].items():
+            assert rows[" ".join(row["active"])][strategy] == " ".join(decision["rm"])
+            assert main(["decide", *row["active"], "--strategy", strategy, "--json"]) == 0
+            told_alone = json.loads(told(capsys))
+            assert (told_alone["block"], told_alone["rm"]) == (decision["block"], decision["rm"])
+
+
+def test_only_the_sets_in_which_strategies_differ_can_be_shown(capsys):
+    def differ(row):
+        return len({frozenset(d["rm"]) for d in row["decisions"].values()}) > 1
+
+    everything = json.loads(compared(capsys, "--json"))
+    some = json.loads(compared(capsys, "--differing", "--json"))
+    assert some == [row for row in everything if differ(row)]
+    assert 0 < len(some) < 127
+    assert compared(capsys, "--differing").endswith(f"\n{len(some)} of 127 sets differ\n")
+
+
 def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     text = systems.DEFAULT.read_text().replace('"FTM7"', '"FTM70"')
     file = tmp_path / "mine.toml"
@@ -62,6 +103,8 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     (["decide", "FTM9"], ["'FTM9'", "known: FTM1"]),
     (["decide", "FTM1", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
     (["table", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
+    (["table", "--differing"], ["--differing", "--strategy"]),
+    (["table", "--strategy", "safety-first", "--strategy", "bravely"], ["'bravely'"]),
     (["table", "--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
     (["inject", "gremlins"], ["'gremlins'", "known: command-not-updated"]),
     (["inject"], ["--list"]),

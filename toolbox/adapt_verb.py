@@ -22,6 +22,18 @@ _WAIT_S = 2.0
 """Real seconds for the manager to answer; it answers at once, or is being respawned."""
 
 
+_EXAMPLES = {
+    Action.ENABLE: "  rampart adapt enable FTM7",
+    Action.DISABLE: "  rampart adapt disable FTM7\n  rampart adapt disable DM7   and what uses it",
+    Action.RETUNE: "  rampart adapt retune RM3 deadline_s=2.5\n"
+                   "  rampart adapt retune DM1 margin_m=0.7\n"
+                   "  rampart adapt retune FTM3 detect='DM3 or DM2'",
+    Action.REPLACE: "  rampart adapt replace FTM7 ftm7.toml",
+    Action.SET: "  rampart adapt set strategy guarded-repair\n"
+                "  rampart adapt set order safer autonomy",
+}
+
+
 def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
     """Add the verb to the parser."""
     parser = verbs.add_parser(
@@ -60,7 +72,8 @@ def _action(actions: Any, formatter: Any, common: argparse.ArgumentParser, actio
             text: str) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = actions.add_parser(
         action.value, parents=[common], formatter_class=formatter, help=text,
-        description=text[0].upper() + text[1:] + ".")
+        description=text[0].upper() + text[1:] + ".",
+        epilog=f"examples:\n{_EXAMPLES[action]}")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=lambda options: asyncio.run(change(options)))
     return parser

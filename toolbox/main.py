@@ -11,7 +11,16 @@ import os
 import sys
 from collections.abc import Sequence
 
-from toolbox import decide_verbs, inject_verbs, node_verbs, operator_verbs, topic_verbs, verify_verb
+from toolbox import (
+    adapt_verb,
+    decide_verbs,
+    inject_verbs,
+    node_verbs,
+    operator_verbs,
+    topic_verbs,
+    tree_verbs,
+    verify_verb,
+)
 from toolbox.output import NoEffectError, UsageError, warn
 
 _EPILOG = """examples:
@@ -20,7 +29,10 @@ _EPILOG = """examples:
   rampart topic echo localization/pose           see messages go by
   rampart inject command-not-updated             break something
   rampart reset RM1                              release the emergency stop
+  rampart adapt set strategy guarded-repair      change mechanisms while it runs
   rampart table                                  what the manager would decide
+  rampart tree                                   see fault tree, FTMTree and orders
+  rampart verify                                 prove it, or show where it fails
 `rampart VERB --help` shows more."""
 
 
@@ -38,7 +50,9 @@ def build_parser() -> argparse.ArgumentParser:
     topic_verbs.add(verbs, formatter, common)
     inject_verbs.add(verbs, formatter, common)
     operator_verbs.add(verbs, formatter, common)
+    adapt_verb.add(verbs, formatter, common)
     decide_verbs.add(verbs, formatter)
+    tree_verbs.add(verbs, formatter)
     verify_verb.add(verbs, formatter)
     return parser
 
