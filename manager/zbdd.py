@@ -1,0 +1,138 @@
+"""Families of sets as zero-suppressed decision diagrams, as far as minimal cut sets need them.
+
+A node stands for a family of sets of variables: those with the node's variable, continued by
+`high`, and those without, continued by `low` (Minato 1993). 0 is the empty family, 1 the family of
+the empty set alone. Variables are numbered from the top.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+EMPTY, UNIT = 0, 1
+
+
+class TooManyNodesError(ValueError):
+    """A diagram that grows beyond its limit."""
+
+
+class Families:
+    """A store of families; equal families have equal numbers.
+
+    Args:
+        limit: Nodes that may be made.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.variable = [1 << 60, 1 << 60]
+        self.high = [EMPTY, UNIT]
+        self.low = [EMPTY, UNIT]
+        self._limit = limit
+        self._nodes: dict[tuple[int, int, int], int] = {}
+        self._without: dict[tuple[int, int], int] = {}
+
+    def node(self, variable: int, high: int, low: int) -> int:
+        """Return the family {s + variable: s in high} + low.
+
+        Raises:
+            TooManyNodesError: The limit is reached.
+        """
+        if high == EMPTY:
+            return low
+        key = (variable, high, low)
+        found = self._nodes.get(key)
+        if found is None:
+            found = len(self.variable)
+            if found > self._limit:
+                raise TooManyNodesError(f"more than {self._limit} nodes")
+            self._nodes[key] = found
+            self.variable.append(variable)
+            self.high.append(high)
+            self.low.append(low)
+        return found
+
+    def without(self, u: int, v: int) -> int:
+        """Return the sets of `u` that include no set of `v` (Rauzy 1993)."""
+        if EMPTY in (u, v):
+            return u
+        if v in (UNIT, u):
+            return EMPTY
+        if u == UNIT:
+            return u
+        key = (u, v)
+        found = self._without.get(key)
+        if found is not None:
+            return found
+        x, y = self.variable[u], self.variable[v]
+        if x == y:
+            high = self.without(self.without(self.high[u], self.high[v]), self.low[v])
+            result = self.node(x, high, self.without(self.low[u], self.low[v]))
+        elif x < y:
+            result = self.node(x, self.without(self.high[u], v), self.without(self.low[u], v))
+        else:
+            result = self.without(u, self.low[v])
+        self._without[key] = result
+        return result
+
+    def upwards(self, family: int) -> Iterator[int]:
+        """Yield the nodes of a family, those below before those above."""
+        done = {EMPTY, UNIT}
+        stack = [family]
+        while stack:
+            node = stack[-1]
+            if node in done:
+                stack.pop()
+                continue
+            open_ = [n for n in (self.high[node], self.low[node]) if n not in done]
+            if open_:
+                stack.extend(open_)
+            else:
+                done.add(node)
+                stack.pop()
+                yield node
+
+    def sizes(self, family: int, weight: Callable[[int], Sequence[int]]) -> list[int]:
+        """Return how many sets of each size a family has.
+
+        Args:
+            family: The family.
+            weight: For a variable, how many sets of each size it stands for: (0, 1) if it stands
+                for itself.
+        """
+        found: dict[int, list[int]] = {EMPTY: [], UNIT: [1]}
+        for node in self.upwards(family):
+            found[node] = _add(_times(weight(self.variable[node]), found[self.high[node]]),
+                               found[self.low[node]])
+        return found[family]
+
+
+@contextmanager
+def deep_recursion(levels: int) -> Iterator[None]:
+    """Allow recursion as deep as a diagram has levels; these frames lie on the heap."""
+    before = sys.getrecursionlimit()
+    sys.setrecursionlimit(max(before, 1000 + 6 * levels))
+    try:
+        yield
+    finally:
+        sys.setrecursionlimit(before)
+
+
+def _times(a: Sequence[int], b: Sequence[int]) -> list[int]:
+    if not a or not b:
+        return []
+    if list(a) == [0, 1]:
+        return [0, *b]
+    product = [0] * (len(a) + len(b) - 1)
+    for i, x in enumerate(a):
+        if x:
+            for j, y in enumerate(b):
+                product[i + j] += x * y
+    return product
+
+
+def _add(a: list[int], b: list[int]) -> list[int]:
+    if len(a) < len(b):
+        a, b = b, a
+    return [x + (b[i] if i < len(b) else 0) for i, x in enumerate(a)]
