@@ -24,9 +24,9 @@ from oxidd.bdd import BDDFunction, BDDManager
 from oxidd.util import DDMemoryError
 
 from manager.formula import Connective, Formula
-from manager.zbdd import EMPTY, UNIT, Families, TooManyNodesError, deep_recursion
+from manager.zbdd import EMPTY, UNIT, Diagram, Families, TooManyNodesError, deep_recursion
 
-BOUNDS = (30_000, 300_000, 3_000_000, 20_000_000)
+BOUNDS = (30_000, 300_000, 1_000_000, 5_000_000, 20_000_000)
 """Nodes of a decision diagram: each bound is tried with every variable order before the next."""
 
 Progress = Callable[[str], None]
@@ -137,22 +137,25 @@ class CutSets:
     def _solve(self, top: str, bounds: Sequence[int], progress: Progress) -> _Module:
         inside = _Inside(self._gates, self._modules, self.formula, top)
         for bound in bounds:
-            for words, order in inside.orders():
+            progress(f"{top}: up to {bound} nodes")
+            # To build a diagram is cheap, to find its minimal solutions is not: try all orders.
+            built = sorted(
+                ((diagram, order) for order in inside.orders()
+                 if (diagram := inside.diagram(order, bound)) is not None),
+                key=lambda found: len(found[0].level))
+            for diagram, order in built:
+                families = Families(bound)
                 try:
-                    return self._attempt(inside, order, bound)
-                except (DDMemoryError, TooManyNodesError):
-                    progress(f"{top}: more than {bound} nodes, {words}")
+                    with deep_recursion(len(order)):
+                        family = diagram.minimal_solutions(
+                            len(diagram.level) - 1, families, monotone=self.formula.is_monotone)
+                except TooManyNodesError:
+                    continue
+                weights = [self._weight(name) for name in order]
+                return _Module(order, families, family,
+                               tuple(families.sizes(family, weights.__getitem__)))
         raise TooLargeError(f"gate {top!r} with {len(inside.leaves)} inputs and modules: more than "
                             f"{bounds[-1]} nodes with every variable order tried")
-
-    def _attempt(self, inside: _Inside, order: tuple[str, ...], bound: int) -> _Module:
-        manager = BDDManager(bound, max(1024, bound // 4), 1)
-        function = inside.build(manager, order)
-        families = Families(bound)
-        with deep_recursion(len(order)):
-            family = _minimal_solutions(function, families)
-        sizes = families.sizes(family, lambda v: self._weight(order[v]))
-        return _Module(order, families, family, tuple(sizes))
 
 
 class _Inside:
@@ -163,9 +166,12 @@ class _Inside:
         self._gates = gates
         self._house = formula.house
         self._top = top
-        self._is_leaf = lambda name: name != top and (name in modules or name not in gates)
+        self._modules = modules
         self._sequence = self._upwards()
         self.leaves = tuple(n for n in self._met(lambda inputs: inputs) if n not in self._house)
+
+    def _is_leaf(self, name: str) -> bool:
+        return name != self._top and (name in self._modules or name not in self._gates)
 
     def _upwards(self) -> list[str]:
         sequence: list[str] = []
@@ -183,8 +189,8 @@ class _Inside:
                 stack.extend((entry, False) for entry in self._gates[name].inputs)
         return sequence
 
-    def orders(self) -> Iterator[tuple[str, tuple[str, ...]]]:
-        """Yield variable orders to try, each with a word for it."""
+    def orders(self) -> Iterator[tuple[str, ...]]:
+        """Yield variable orders to try."""
         below: dict[str, int] = {}
         users: dict[str, int] = {}
         for name in self._sequence:
@@ -192,20 +198,15 @@ class _Inside:
             below[name] = 1 + sum(below.get(entry, 1) for entry in inputs)
             for entry in inputs:
                 users[entry] = users.get(entry, 0) + 1
-        ways: list[tuple[str, Callable[[tuple[str, ...]], Sequence[str]]]] = [
-            ("leftmost first", lambda inputs: inputs),
-            ("shared first", lambda inputs: sorted(
-                inputs, key=lambda n: (-users.get(n, 0), below.get(n, 1)))),
-            ("smaller first", lambda inputs: sorted(inputs, key=lambda n: below.get(n, 1))),
-            ("larger first", lambda inputs: sorted(inputs, key=lambda n: -below.get(n, 1))),
-            ("rightmost first", lambda inputs: inputs[::-1]),
-        ]
-        seen = set()
-        for words, way in ways:
-            order = tuple(n for n in self._met(way) if n not in self._house)
-            if order not in seen:
-                seen.add(order)
-                yield words, order
+        ways: tuple[Callable[[tuple[str, ...]], Sequence[str]], ...] = (
+            lambda inputs: inputs,
+            lambda inputs: sorted(inputs, key=lambda n: (-users.get(n, 0), below.get(n, 1))),
+            lambda inputs: sorted(inputs, key=lambda n: below.get(n, 1)),
+            lambda inputs: sorted(inputs, key=lambda n: -below.get(n, 1)),
+            lambda inputs: inputs[::-1],
+        )
+        yield from dict.fromkeys(
+            tuple(n for n in self._met(way) if n not in self._house) for way in ways)
 
     def _met(self, way: Callable[[tuple[str, ...]], Sequence[str]]) -> list[str]:
         """Return the leaves in the sequence in which a depth-first search meets them."""
@@ -221,12 +222,15 @@ class _Inside:
                 stack.extend(reversed(way(self._gates[name].inputs)))
         return list(met)
 
-    def build(self, manager: BDDManager, order: tuple[str, ...]) -> BDDFunction:
-        """Return the module's function.
+    def diagram(self, order: tuple[str, ...], bound: int) -> Diagram | None:
+        """Return the module's decision diagram, or None if it grows beyond a bound."""
+        manager = BDDManager(bound, max(1024, bound // 4), 1)
+        try:
+            return _as_numbers(self._build(manager, order))
+        except DDMemoryError:
+            return None
 
-        Raises:
-            DDMemoryError: It needs more nodes than the manager has.
-        """
+    def _build(self, manager: BDDManager, order: tuple[str, ...]) -> BDDFunction:
         manager.add_vars(len(order))
         value = {name: manager.var(i) for i, name in enumerate(order)}
         for name, state in self._house.items():
@@ -271,24 +275,28 @@ def _at_least(manager: BDDManager, inputs: list[BDDFunction], required: int) -> 
     return rest[required]
 
 
-def _minimal_solutions(function: BDDFunction, families: Families) -> int:
+def _as_numbers(function: BDDFunction) -> Diagram:
+    """Copy a diagram into plain numbers; the top has the last one."""
+    diagram = Diagram()
     known: dict[BDDFunction, int] = {}
-
-    def solve(f: BDDFunction) -> int:
-        found = known.get(f)
-        if found is not None:
-            return found
-        level = f.node_level()
-        if level is None:
-            return UNIT if f.valid() else EMPTY
+    stack = [function]
+    while stack:
+        f = stack[-1]
+        if f in known:
+            stack.pop()
+            continue
         cofactors = f.cofactors()
-        assert cofactors is not None  # noqa: S101 an inner node has both
-        low = solve(cofactors[1])
-        result = families.node(level, families.without(solve(cofactors[0]), low), low)
-        known[f] = result
-        return result
-
-    return solve(function)
+        if cofactors is None:
+            known[f] = UNIT if f.valid() else EMPTY
+            continue
+        missing = [c for c in cofactors if c not in known]
+        if missing:
+            stack.extend(missing)
+        else:
+            known[f] = diagram.add(f.node_level() or 0, known[cofactors[0]], known[cofactors[1]])
+    if known[function] in {EMPTY, UNIT}:
+        diagram.add(0, known[function], known[function])  # a constant, as the last number
+    return diagram
 
 
 # -- modules -------------------------------------------------------------------------------------

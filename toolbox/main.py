@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 from toolbox import (
     adapt_verb,
+    cut_set_verbs,
     decide_verbs,
     inject_verbs,
     node_verbs,
@@ -51,6 +52,7 @@ def build_parser() -> argparse.ArgumentParser:
     inject_verbs.add(verbs, formatter, common)
     operator_verbs.add(verbs, formatter, common)
     adapt_verb.add(verbs, formatter, common)
+    cut_set_verbs.add(verbs, formatter, common)
     decide_verbs.add(verbs, formatter)
     tree_verbs.add(verbs, formatter)
     verify_verb.add(verbs, formatter)
