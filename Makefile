@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test lint bench-respawn setup clean requirements
+.PHONY: run test lint bench bench-respawn setup clean requirements
 
 run: setup
 	$(BIN)/python launch.py
@@ -15,6 +15,10 @@ test: setup
 lint: setup
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
+
+# Times loading, deciding and verifying; two minutes. The figures are in docs/measurements.md.
+bench: setup
+	$(BIN)/python -m pytest benchmarks -q -s
 
 # Kills each node 20 times during a mission and measures detection and recovery; five minutes.
 bench-respawn: setup

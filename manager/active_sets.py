@@ -16,7 +16,6 @@ from manager.arrangement import Arrangement
 from manager.decision import Decision, Strategy
 from manager.escalation import succession
 from manager.order import PartialOrder
-from manager.strategies import Decider
 from manager.words import listing
 
 MAX_MECHANISMS = 14
@@ -77,7 +76,6 @@ class ActiveSets:
         self.arrangement = arrangement
         self.safety = safety
         self.strategy = strategy
-        self.decider = Decider(strategy, arrangement)
         names = arrangement.mechanisms.names
         self.cases = [
             Case(active, frozenset(late), strategy.choose(active, arrangement, frozenset(late)))
@@ -87,6 +85,7 @@ class ActiveSets:
         self._by_set = {(case.active, case.late): case for case in self.cases}
         tree, recover = arrangement.tree, arrangement.mechanisms.recover
         self.last_resort = frozenset(recover[tree.root])
+        self._milder: dict[tuple[tuple[str, ...], tuple[str, ...]], tuple[str, str] | None] = {}
 
     def check(self) -> Iterator[Property]:
         """Check every property in turn."""
@@ -162,14 +161,27 @@ class ActiveSets:
             if extra in case.active:
                 continue
             more = self._by_set[mechanisms.sort((*case.active, extra)), case.late]
-            # Compared is what is safest of each: repairs that run beneath make nothing less safe.
-            safest = self.safety.maximal(more.decision.recoveries)
-            for had in self.safety.maximal(case.decision.recoveries):
-                lower = [r for r in safest if self.safety.is_above(had, r)]
-                if lower and not self._covered(had, safest):
-                    return (case.describe(), more.describe(),
-                            f"with {extra} active as well, {lower[0]} runs instead of {had}, which "
-                            "is safer")
+            pair = case.decision.recoveries, more.decision.recoveries
+            if pair not in self._milder:
+                self._milder[pair] = self._find_milder(*pair)
+            milder = self._milder[pair]
+            if milder:
+                return (case.describe(), more.describe(),
+                        f"with {extra} active as well, {milder[1]} runs instead of {milder[0]}, "
+                        "which is safer")
+        return None
+
+    def _find_milder(self, before: tuple[str, ...], after: tuple[str, ...]
+                     ) -> tuple[str, str] | None:
+        """Return a recovery that ran before, and a less safe one that runs instead of it.
+
+        Compared is what is safest of each: repairs that run beneath make nothing less safe.
+        """
+        safest = self.safety.maximal(after)
+        for had in self.safety.maximal(before):
+            lower = [r for r in safest if self.safety.is_above(had, r)]
+            if lower and not self._covered(had, safest):
+                return had, lower[0]
         return None
 
     def _harm(self, case: Case) -> Trace | None:
@@ -199,7 +211,7 @@ class ActiveSets:
                 tree.is_above(n, b) for b in broken))
             if not broken:
                 return None
-            decision = self.decider.choose(lasting, case.late & set(lasting))
+            decision = self._by_set[lasting, case.late.intersection(lasting)].decision
             if set(decision.recoveries) & self.last_resort:
                 return None  # it stops for good, which is counted elsewhere
             if lasting != active:

@@ -182,8 +182,12 @@ class Arbiter:
             case ResetAsked():
                 state, answer = self._reset(state, event)
                 answers = (answer,)
+        late_before = state.late
         state = self._pass_time(state, now)
         state, outputs = self._settle(state, now)
+        if state.late != late_before and not any(isinstance(o, DecisionMade) for o in outputs):
+            # Nothing new was decided, but a patient shadow may have climbed.
+            outputs += self._ask_shadow(state, self._choose(state)[0])
         if isinstance(event, RecoveryHeard) and not event.activated \
                 and event.recovery in self._recovery:
             track = self._track(state, event.recovery)

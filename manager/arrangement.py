@@ -25,6 +25,7 @@ class Arrangement:
     Attributes:
         repairs: Recoveries that bring something back, as a bitmask of `order`.
         compound: Whether a mechanism runs more than one recovery.
+        asks: Recoveries of each mechanism, as a bitmask of `order`.
     """
 
     def __init__(self, mechanisms: Mechanisms, tree: Tree, order: PartialOrder) -> None:
@@ -39,6 +40,7 @@ class Arrangement:
         self._bits = {
             name: tree.bit[name] | order.mask(way) << self._width
             for name, way in mechanisms.recover.items()}
+        self.asks = {name: order.mask(way) for name, way in mechanisms.recover.items()}
         self._conflicts = {
             name: order.mask(
                 other for other in order.names if other != name and (

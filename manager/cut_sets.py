@@ -72,9 +72,13 @@ class CutSets:
         self.formula = formula
         self._gates, modules = _prepare(formula)
         self._modules: dict[str, _Module] = {}
+        self._constants = dict(formula.house)
+        self._sizes_below: dict[int, dict[int, int]] = {}
         for number, name in enumerate(modules, 1):
             progress(f"module {number} of {len(modules)}: {name}")
-            self._modules[name] = self._solve(name, bounds, progress)
+            module = self._modules[name] = self._solve(name, bounds, progress)
+            if module.family in {EMPTY, UNIT}:  # by house events below it
+                self._constants[name] = module.family == UNIT
         self.sizes = self._weight(formula.top)
 
     @property
@@ -124,6 +128,8 @@ class CutSets:
             return
         if node == EMPTY or size < 0:
             return
+        if not self._possible(module, node) >> size & 1:
+            return
         families = module.families
         name = module.names[families.variable[node]]
         weight = self._weight(name)
@@ -134,8 +140,23 @@ class CutSets:
                         yield own | rest
         yield from self._paths(module, families.low[node], size)
 
+    def _possible(self, module: _Module, node: int) -> int:
+        """Return the sizes of the sets below a node as a bitmask, so that no way is a dead end."""
+        known = self._sizes_below.setdefault(id(module), {EMPTY: 0, UNIT: 1})
+        if node not in known:
+            families = module.families
+            weights = [sum(1 << size for size, count in enumerate(self._weight(name)) if count)
+                       for name in module.names]
+            for one in families.upwards(module.family):
+                own, high = weights[families.variable[one]], known[families.high[one]]
+                known[one] = known[families.low[one]]
+                for size in range(own.bit_length()):
+                    if own >> size & 1:
+                        known[one] |= high << size
+        return known[node]
+
     def _solve(self, top: str, bounds: Sequence[int], progress: Progress) -> _Module:
-        inside = _Inside(self._gates, self._modules, self.formula, top)
+        inside = _Inside(self._gates, self._modules, self._constants, top)
         for bound in bounds:
             progress(f"{top}: up to {bound} nodes")
             # To build a diagram is cheap, to find its minimal solutions is not: try all orders.
@@ -162,9 +183,9 @@ class _Inside:
     """The part of a formula between a module's gate and its events and modules."""
 
     def __init__(self, gates: dict[str, Connective], modules: dict[str, _Module],
-                 formula: Formula, top: str) -> None:
+                 constants: dict[str, bool], top: str) -> None:
         self._gates = gates
-        self._house = formula.house
+        self._house = constants
         self._top = top
         self._modules = modules
         self._sequence = self._upwards()

@@ -51,11 +51,12 @@ def succession(recovery: str, sakes: Iterable[str], failures: Container[str],
     tree, mechanisms = arrangement.tree, arrangement.mechanisms
     tried = [recovery]
     wanting = tuple(sakes)
-    # Above a mechanism that wants the recovery is its parent; above several of them, none of which
-    # is above the others, is their lowest common dominant itself.
+    # Above a mechanism that wants its own recovery is its parent; above several of them, none of
+    # which is above the others, is their lowest common dominant itself. So it is above a guard
+    # that is taken for the dominant's sake but is not the dominant's own.
     closest = tree.lowest_common_dominant(wanting)
     above = list(reversed(tree.chain(tree.root, closest)))
-    if closest in wanting:
+    if closest in wanting and recovery in mechanisms.recover[closest]:
         above.pop(0)
     alternatives = [name for mechanism in wanting
                     for way in mechanisms.alternatives(mechanism)

@@ -16,6 +16,7 @@ not count as an assurance that all is well either, so `not DM1` holds too.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Collection, Iterator
 from itertools import chain, combinations
@@ -26,6 +27,9 @@ MAX_NAMES = 16
 """A gate over more modules than these is a fault tree; it belongs there."""
 
 MAX_DEPTH = 50
+
+MAX_WAYS = 64
+"""Alternatives of a recovery gate: `(A or B) and (C or D)` has four. Each is tried in turn."""
 
 
 class GateError(ValueError):
@@ -127,7 +131,18 @@ def recovery_gate(text: str) -> Gate:
             check(inner)
 
     check(gate)
+    ways = _count_ways(gate)
+    if ways > MAX_WAYS:
+        raise GateError(f"{ways} alternatives; at most {MAX_WAYS} are right")
     return gate
+
+
+def _count_ways(gate: Gate) -> int:
+    """Return how many alternatives there are, without making them: there may be millions."""
+    if gate.name:
+        return 1
+    counts = [_count_ways(i) for i in gate.inputs]
+    return sum(counts) if gate.required == 1 else math.prod(counts)
 
 
 def _product(parts: list[tuple[tuple[str, ...], ...]]) -> Iterator[tuple[str, ...]]:

@@ -16,6 +16,8 @@ causes go away and the guard can be released.
 
 from __future__ import annotations
 
+from itertools import chain
+
 import msgspec
 
 from manager.arrangement import Arrangement
@@ -54,36 +56,39 @@ class GuardedRepair:
         ftms, rms = arrangement.masks(active)
         if len(active) == 1:
             return Decision(active, 1, mechanisms.recover[active[0]], active)
-        rule, guards, sakes = self._guard(active, ftms, rms, arrangement)
+        rule, guards, sakes = self._guard(ftms, rms, arrangement)
         taken = list(guards)
         mask = order.mask(guards)
-        repairs = {order.names[i] for i in _numbers(rms & arrangement.repairs & ~mask)}
+        asks, waiting = arrangement.asks, rms & arrangement.repairs & ~mask
         for name in active:
-            for recovery in mechanisms.recover[name]:
-                if recovery in repairs and recovery not in taken \
-                        and arrangement.can_join(recovery, mask):
-                    taken.append(recovery)
-                    mask |= order.bit[recovery]
-        return Decision(active, rule, tuple(taken), mechanisms.sort((
-            *sakes, *(n for n in active if set(mechanisms.recover[n]) & set(taken)))))
+            if asks[name] & waiting:
+                for recovery in mechanisms.recover[name]:
+                    if order.bit[recovery] & waiting and arrangement.can_join(recovery, mask):
+                        taken.append(recovery)
+                        mask |= order.bit[recovery]
+                waiting &= ~asks[name]
+        served = tuple(name for name in active if asks[name] & mask)
+        if not set(sakes) <= set(served):
+            served = mechanisms.sort((*sakes, *served))
+        return Decision(active, rule, tuple(taken), served)
 
-    def _guard(self, active: tuple[str, ...], ftms: int, rms: int, arrangement: Arrangement
+    def _guard(self, ftms: int, rms: int, arrangement: Arrangement
                ) -> tuple[int, tuple[str, ...], tuple[str, ...]]:
-        """Return rule, guard, and the mechanisms for whose sake it is taken."""
+        """Return rule, guard, and the mechanism for whose sake it is, if it need not ask for it."""
         order, recover = arrangement.order, arrangement.mechanisms.recover
         greatest = order.greatest_in(rms)
         if greatest >= 0:
             guard = order.names[greatest]
-            return 2, (guard,), tuple(n for n in active if guard in recover[n])
+            return 2, (guard,), ()  # for the sake of those that ask for it, and they are active
         dominant = arrangement.tree.names[arrangement.tree.lowest_common_in(ftms)]
         above = (1 << len(order.names)) - 1
         for number in _numbers(rms):
             above &= order.up_set[number]
-        least = [order.names[i] for i in _numbers(above) if not order.below[i] & above]
+        least = {order.names[i] for i in _numbers(above) if not order.below[i] & above}
         if not least:
             return 4, recover[dominant], (dominant,)
-        guard = next((name for name in recover[dominant] if name in least), least[0])
-        return 3, (guard,), (dominant,)
+        preferred = chain(recover[dominant], arrangement.mechanisms.recoveries)
+        return 3, (next(name for name in preferred if name in least),), (dominant,)
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:
         """Give what the guard dominates, and why the others were rejected."""
@@ -91,7 +96,7 @@ class GuardedRepair:
             return msgspec.structs.replace(decision, path=decision.active)
         order, taken = arrangement.order, decision.recoveries
         candidates = arrangement.demanded(decision.active)
-        path = tuple(chain for one in taken for chain in chains(
+        path = tuple(line for one in taken for line in chains(
             order, one, (c for c in candidates if order.is_above(one, c))))
         mask = order.mask(taken)
         return msgspec.structs.replace(decision, path=path or taken, rejected=tuple(

@@ -44,28 +44,31 @@ class MissionFirst:
         tree, order, mechanisms = arrangement.tree, arrangement.order, arrangement.mechanisms
         if tree.root in active:
             return Decision(active, 3, mechanisms.recover[tree.root], (tree.root,))
-        in_time = [name for name in active if name not in late]
+        in_time = tree.mask(name for name in active if name not in late)
         asking: dict[str, None] = {}
         for name in active:
-            if any(tree.is_above(name, other) for other in in_time):
+            if tree.below[tree.number[name]] & in_time:
                 continue  # the cause is being dealt with
             while name in late and tree.parents[name]:
                 name = str(tree.parents[name])  # noqa: PLW2901 climbing
             asking[name] = None
-        highest = [name for name in asking if not any(tree.is_above(o, name) for o in asking)]
+        mask = tree.mask(asking)
+        highest = [name for name in asking
+                   if not tree.up_set[tree.number[name]] & mask & ~tree.bit[name]]
         ranked = sorted(highest, key=lambda n: -tree.up_set[tree.number[n]].bit_count())
         demanded = arrangement.demanded(ranked)
-        ranked_recoveries = sorted(demanded, key=lambda r: sum(
-            order.is_above(other, r) for other in demanded))
+        mask = order.mask(demanded)
+        ranked_recoveries = sorted(
+            demanded, key=lambda r: (order.up_set[order.number[r]] & mask).bit_count())
         taken: list[str] = []
         mask = 0
         for recovery in ranked_recoveries:
             if arrangement.can_join(recovery, mask):
                 taken.append(recovery)
                 mask |= order.bit[recovery]
-        sakes = mechanisms.sort(n for n in highest if set(mechanisms.recover[n]) & set(taken))
-        climbed = any(name not in active for name in highest) or any(
-            name in late for name in active)
+        sakes = mechanisms.sort(
+            n for n in highest if arrangement.asks[n] & mask)
+        climbed = bool(late) and not late.isdisjoint(active)
         return Decision(active, 2 if climbed else 1, tuple(taken), sakes)
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:

@@ -34,14 +34,16 @@ class Simultaneous:
         recover = arrangement.mechanisms.recover
         sakes, rule = active, 1 if len(active) == 1 else 2
         while True:
+            if len(sakes) == 1:  # all its parts, even if one dominates another
+                return Decision(active, rule, recover[sakes[0]], sakes)
             maximal = order.maximal(arrangement.demanded(sakes))
             mask = order.mask(maximal)
-            clash = {name for name in maximal if not arrangement.can_join(name, mask)}
-            if not clash or len(sakes) == 1:
-                mechanisms = tuple(n for n in sakes if set(recover[n]) & set(maximal))
+            clash = order.mask(n for n in maximal if not arrangement.can_join(n, mask))
+            if not clash:
+                mechanisms = tuple(n for n in sakes if arrangement.asks[n] & mask)
                 return Decision(active, rule, maximal, mechanisms)
             rule = 3
-            involved = tuple(name for name in sakes if clash & set(recover[name]))
+            involved = tuple(name for name in sakes if arrangement.asks[name] & clash)
             upper = tree.lowest_common_dominant(involved)
             sakes = arrangement.mechanisms.sort(
                 (upper, *(n for n in sakes if n != upper and not tree.is_above(upper, n))))

@@ -1,0 +1,183 @@
+"""Minimal cut sets against brute force, and against counts that are known."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import comb
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from manager.cut_sets import CutSets, TooLargeError
+from manager.formula import Connective, Formula, FormulaError
+
+
+def formula(gates: dict[str, Connective], house: dict[str, bool] | None = None, top: str = ""
+            ) -> Formula:
+    """A formula; names that are no gates and no house events are basic events."""
+    used = {entry for gate in gates.values() for entry in gate.inputs}
+    return Formula(gates, frozenset(used - gates.keys() - (house or {}).keys()), house or {}, top)
+
+
+def any_of(*inputs: str) -> Connective:
+    return Connective(inputs, 1, len(inputs))
+
+
+def all_of(*inputs: str) -> Connective:
+    return Connective(inputs, len(inputs), len(inputs))
+
+
+def at_least(k: int, *inputs: str) -> Connective:
+    return Connective(inputs, k, len(inputs))
+
+
+def brute_force(tree: Formula) -> set[frozenset[str]]:
+    """All sets for which the top occurs and for no part of which it does."""
+    found: list[frozenset[str]] = []
+    for size in range(len(tree.basic) + 1):
+        for chosen in map(frozenset, combinations(tree.basic, size)):
+            if tree.holds(chosen) and not any(smaller < chosen for smaller in found):
+                found.append(chosen)
+    return set(found)
+
+
+@st.composite
+def trees(draw, *, coherent: bool) -> Formula:
+    """Random gates over few events: shared, nested, k-of-n, house events; negations if wanted."""
+    names = [f"e{i}" for i in range(draw(st.integers(2, 6)))]
+    house = draw(st.dictionaries(st.sampled_from(["h0", "h1"]), st.booleans()))
+    usable = [*names, *house]
+    gates: dict[str, Connective] = {}
+    for i in range(draw(st.integers(1, 8))):
+        inputs = draw(st.lists(st.sampled_from(usable), min_size=1, max_size=4, unique=True))
+        low = draw(st.integers(0 if not coherent else 1, len(inputs)))
+        high = len(inputs) if coherent else draw(st.integers(low, len(inputs)))
+        gates[f"g{i}"] = Connective(tuple(inputs), low, high,
+                                    negated=not coherent and draw(st.booleans()))
+        usable.append(f"g{i}")
+    return Formula(gates, frozenset(names), house, f"g{len(gates) - 1}")
+
+
+@settings(max_examples=200, deadline=None)
+@given(trees(coherent=True))
+def test_coherent_trees_have_the_cut_sets_that_brute_force_finds(tree):
+    found = CutSets(tree)
+    listed = [frozenset(s) for s in found.sets()]
+    assert set(listed) == brute_force(tree)
+    assert len(listed) == len(set(listed)) == found.count
+    assert [len(s) for s in listed] == sorted(len(s) for s in listed)
+    for size, count in enumerate(found.sizes):
+        assert count == sum(len(s) == size for s in listed)
+
+
+@settings(max_examples=200, deadline=None)
+@given(trees(coherent=False))
+def test_trees_with_negations_have_the_minimal_sets_that_brute_force_finds(tree):
+    found = CutSets(tree)
+    assert {frozenset(s) for s in found.sets()} == brute_force(tree)
+    assert found.count == len(brute_force(tree))
+
+
+@pytest.mark.parametrize(("n", "k"), [(1, 1), (5, 3), (20, 10), (40, 20), (60, 2)])
+def test_k_of_n_has_as_many_cut_sets_as_there_are_choices(n, k):
+    found = CutSets(formula({"top": at_least(k, *(f"e{i}" for i in range(n)))}))
+    assert found.count == comb(n, k)
+    assert found.sizes == tuple([0] * k + [comb(n, k)])
+
+
+def test_independent_parts_multiply():
+    """200 pairs in series: 2^200 cut sets of 200 events, counted in no time."""
+    gates = {f"pair{i}": any_of(f"a{i}", f"b{i}") for i in range(200)}
+    found = CutSets(formula({**gates, "top": all_of(*gates)}))
+    assert found.count == 2 ** 200
+    assert next(iter(found.sets(limit=1)))[0].startswith("a")
+
+
+def test_shared_events_are_no_separate_causes():
+    tree = formula({"top": all_of("left", "right"), "left": any_of("a", "shared"),
+                    "right": any_of("b", "shared")})
+    assert {frozenset(s) for s in CutSets(tree).sets()} == {
+        frozenset({"shared"}), frozenset({"a", "b"})}
+
+
+def ladder(n: int) -> Formula:
+    """Each rung shares an event with the next: no module inside, a Fibonacci-like count."""
+    rungs = {f"r{i}": any_of(f"e{i}", f"e{i + 1}") for i in range(n)}
+    return formula({**rungs, "top": all_of(*rungs)})
+
+
+def covers(n: int) -> int:
+    """Minimal vertex covers of a path with n edges, by brute force over bitmasks."""
+    edges = [(i, i + 1) for i in range(n)]
+    full = [s for s in range(1 << (n + 1)) if all(s >> a & 1 or s >> b & 1 for a, b in edges)]
+    return sum(not any(s & ~(1 << v) in set(full) for v in range(n + 1) if s >> v & 1)
+               for s in full)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 9])
+def test_a_ladder_without_modules_has_the_count_of_minimal_vertex_covers(n):
+    assert CutSets(ladder(n)).count == covers(n)
+
+
+def test_hundreds_of_shared_events_and_millions_of_sets_are_counted_not_listed():
+    found = CutSets(ladder(400))
+    assert found.count > 10 ** 20
+    assert sum(found.sizes) == found.count
+    assert len(list(found.sets(limit=5))) == 5
+
+
+def test_house_events_are_constants():
+    gates = {"top": any_of("g", "b"), "g": all_of("a", "h")}
+    assert {frozenset(s) for s in CutSets(formula(gates, {"h": True})).sets()} == {
+        frozenset("a"), frozenset("b")}
+    assert {frozenset(s) for s in CutSets(formula(gates, {"h": False})).sets()} == {frozenset("b")}
+
+
+@pytest.mark.parametrize(("state", "count"), [(True, 1), (False, 0)])
+def test_a_top_that_is_constant_has_the_empty_set_or_none(state, count):
+    found = CutSets(formula({"top": any_of("h")}, {"h": state}))
+    assert found.count == count
+    assert list(found.sets()) == [()] * count
+
+
+def test_thousands_of_gates_in_a_chain_are_no_problem():
+    gates = {f"g{i}": any_of(f"g{i + 1}", f"e{i}") if i % 2 else all_of(f"g{i + 1}", f"e{i}")
+             for i in range(5000)}
+    gates["g5000"] = any_of("last")
+    assert CutSets(formula(gates)).count == 2501
+
+
+def test_max_order_and_limit_cut_the_list_and_not_the_count():
+    tree = formula({"top": any_of("a", "pairs"), "pairs": at_least(2, "b", "c", "d")})
+    found = CutSets(tree)
+    assert list(found.sets(max_order=1)) == [("a",)]
+    assert list(found.sets(limit=2)) == [("a",), ("b", "c")]
+    assert found.count == 4
+
+
+def test_a_tree_beyond_every_bound_is_refused_in_one_line():
+    """Rows and columns of a grid: no order of the variables keeps that small."""
+    n = 6
+    gates = {f"row{i}": all_of(*(f"x{i}_{j}" for j in range(n))) for i in range(n)}
+    gates |= {f"col{j}": any_of(*(f"x{i}_{j}" for i in range(n))) for j in range(n)}
+    tree = formula({**gates, "rows": any_of(*(f"row{i}" for i in range(n))),
+                    "cols": all_of(*(f"col{j}" for j in range(n))), "top": all_of("rows", "cols")})
+    with pytest.raises(TooLargeError, match=r"gate '.*' with 36 inputs and modules: more than 50"):
+        CutSets(tree, bounds=(20, 50))
+
+
+@pytest.mark.parametrize(("gates", "words"), [
+    ({}, "no gates; a top is needed"),
+    ({"a": any_of("b"), "b": any_of("a")}, "cycle a > b > a"),
+    ({"top": any_of("a"), "a": any_of("b"), "b": any_of("a")}, "cycle a > b > a"),
+    ({"x": any_of("e"), "y": any_of("e")}, "2 gates are no input of another: x, y; say which"),
+])
+def test_a_formula_without_a_single_top_or_with_a_cycle_is_refused(gates, words):
+    with pytest.raises(FormulaError, match=words):
+        formula(gates)
+
+
+def test_an_unknown_input_is_refused():
+    with pytest.raises(FormulaError, match="gate 'top' has the unknown input 'x'"):
+        Formula({"top": any_of("x")}, frozenset(), {})

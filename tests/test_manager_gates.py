@@ -1,0 +1,280 @@
+"""Gates: truth tables, precedence, negation, silence, and every refusal word for word."""
+
+from itertools import combinations, product
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from manager.gates import (
+    MAX_DEPTH,
+    MAX_NAMES,
+    Gate,
+    GateError,
+    detection_gate,
+    recovery_gate,
+)
+
+NAMES = ("A", "B", "C", "D")
+NOT_A_GATE = "; a gate is made of names, 'and', 'or', 'not', 'k of (...)' and parentheses"
+
+
+def rows(text: str, names: str) -> str:
+    """The truth table as a timeline: one character a row, the last name changing fastest."""
+    gate = detection_gate(text)
+    return "".join(
+        "-1"[gate.holds({name for name, on in zip(names, row, strict=True) if on})]
+        for row in product((False, True), repeat=len(names)))
+
+
+# ---- truth tables -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("text", "names", "table"), [
+    ("A", "A", "-1"),
+    ("(A)", "A", "-1"),
+    ("A and B", "AB", "---1"),
+    ("A or B", "AB", "-111"),
+    ("A and not B", "AB", "--1-"),
+    ("A and B and C", "ABC", "-------1"),
+    ("A or B or C", "ABC", "-1111111"),
+    ("1 of (A, B, C)", "ABC", "-1111111"),
+    ("2 of (A, B, C)", "ABC", "---1-111"),
+    ("3 of (A, B, C)", "ABC", "-------1"),
+    ("2 of (A, B and C, A or C)", "ABC", "---11111"),
+])
+def test_a_gate_has_its_truth_table(text, names, table):
+    assert rows(text, names) == table
+
+
+@pytest.mark.parametrize(("text", "same"), [
+    ("A or B and C", "A or (B and C)"),
+    ("A and B or C", "(A and B) or C"),
+    ("A and B or C and D", "(A and B) or (C and D)"),
+    ("A and not B or C", "(A and (not B)) or C"),
+    ("A and not not B", "A and B"),
+    ("A   and\tB\n", "A and B"),
+])
+def test_not_binds_tighter_than_and_which_binds_tighter_than_or(text, same):
+    assert rows(text, "ABCD") == rows(same, "ABCD")
+
+
+def test_parentheses_go_before_precedence():
+    assert rows("(A or B) and C", "ABC") == "---1-1-1"
+    assert rows("A or B and C", "ABC") == "---11111"
+
+
+@pytest.mark.parametrize(("text", "same"), [
+    ("D and not (A and B)", "D and (not A or not B)"),
+    ("D and not (A or B)", "D and (not A and not B)"),
+    ("D and not 2 of (A, B, C)", "D and 2 of (not A, not B, not C)"),
+    ("D and not (A and (B or not C))", "D and (not A or (not B and C))"),
+])
+def test_a_negation_goes_down_to_the_names_by_de_morgan(text, same):
+    assert detection_gate(text) == detection_gate(same)
+    assert rows(text, "ABCD") == rows(same, "ABCD")
+
+
+def test_names_come_once_each_as_written():
+    assert detection_gate("C and A or C and not B").names == ("C", "A", "B")
+
+
+def test_only_a_plain_name_is_one():
+    assert detection_gate("A").is_name
+    assert not detection_gate("A or B").is_name
+    assert not Gate(name="A", negated=True).is_name
+
+
+# ---- silence ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("active", "silent", "holds"), [
+    ({"A"}, set(), True),
+    ({"A", "B"}, set(), False),
+    ({"A", "B"}, {"B"}, True),   # B is silent: that is no assurance that all is well
+    ({"A", "B"}, {"A"}, False),  # A counts as active, and B says that it is
+    ({"B"}, {"B"}, False),
+    ({"A", "B"}, {"A", "B"}, True),
+])
+def test_silence_is_no_alibi(active, silent, holds):
+    assert detection_gate("A and not B").holds(active, silent) is holds
+
+
+# ---- any gate ---------------------------------------------------------------------------------
+
+
+LEAVES = st.builds(Gate, name=st.sampled_from(NAMES), negated=st.booleans())
+
+
+def _over(inputs: st.SearchStrategy[Gate]) -> st.SearchStrategy[Gate]:
+    return st.lists(inputs, min_size=2, max_size=4).flatmap(lambda of: st.builds(
+        Gate, required=st.integers(1, len(of)), inputs=st.just(tuple(of))))
+
+
+GATES = st.recursive(LEAVES, _over, max_leaves=10)
+PLAIN = st.recursive(
+    st.builds(Gate, name=st.sampled_from(NAMES)),
+    lambda of: st.lists(of, min_size=2, max_size=3).flatmap(lambda i: st.builds(
+        Gate, required=st.sampled_from((1, len(i))), inputs=st.just(tuple(i)))), max_leaves=6)
+
+
+def by_words(gate: Gate, active: set[str], silent: set[str]) -> bool:
+    """The docstring, read aloud: a silent name is good for `A` and for `not A`."""
+    if gate.name:
+        if gate.name in silent:
+            return True
+        return (gate.name in active) != gate.negated
+    return len([1 for i in gate.inputs if by_words(i, active, silent)]) >= gate.required
+
+
+@settings(max_examples=200, deadline=None)
+@given(GATES, st.sets(st.sampled_from(NAMES)), st.sets(st.sampled_from(NAMES)))
+def test_any_gate_holds_as_its_words_say(gate, active, mute):
+    silent = mute & active  # a silent module counts as active
+    assert gate.holds(active, silent) == by_words(gate, active, silent)
+
+
+@settings(max_examples=200, deadline=None)
+@given(GATES)
+def test_what_is_written_is_read_again_as_the_same(gate):
+    text = str(gate)
+    try:
+        again = detection_gate(text)
+    except GateError as error:  # always or never active: readable, but refused for its meaning
+        assert "active" in str(error)  # noqa: PT017
+        return
+    for size in range(len(NAMES) + 1):
+        for active in combinations(NAMES, size):
+            assert again.holds(active) == gate.holds(active)
+    assert str(again) == text
+
+
+@settings(max_examples=200, deadline=None)
+@given(GATES)
+def test_a_gate_is_refused_exactly_if_it_is_active_on_nothing_or_never(gate):
+    table = [gate.holds(active) for size in range(5) for active in combinations(NAMES, size)]
+    refused = table[0] or not any(table)
+    if refused:
+        with pytest.raises(GateError, match="active"):
+            detection_gate(str(gate))
+    else:
+        detection_gate(str(gate))
+
+
+@settings(max_examples=200, deadline=None)
+@given(PLAIN)
+def test_each_alternative_satisfies_its_gate_and_what_satisfies_it_contains_one(gate):
+    ways = list(gate.alternatives())
+    assert all(gate.holds(way) for way in ways)
+    assert all(len(set(way)) == len(way) for way in ways)
+    for size in range(len(NAMES) + 1):
+        for chosen in combinations(NAMES, size):
+            assert gate.holds(chosen) == any(set(way) <= set(chosen) for way in ways)
+
+
+@pytest.mark.parametrize(("text", "ways"), [
+    ("RM1", [("RM1",)]),
+    ("RM2 and RM4", [("RM2", "RM4")]),
+    ("RM4 or RM3", [("RM4",), ("RM3",)]),
+    ("RM4 or RM3 and RM2", [("RM4",), ("RM3", "RM2")]),
+    ("(RM4 or RM3) and RM2", [("RM4", "RM2"), ("RM3", "RM2")]),
+    ("(A or B) and (C or D)", [("A", "C"), ("A", "D"), ("B", "C"), ("B", "D")]),
+    ("RM2 and (RM2 or RM3)", [("RM2",), ("RM2", "RM3")]),
+    ("1 of (A, B)", [("A",), ("B",)]),
+    ("2 of (A, B)", [("A", "B")]),
+])
+def test_alternatives_come_in_the_sequence_of_preference(text, ways):
+    assert list(recovery_gate(text).alternatives()) == ways
+
+
+# ---- refusals ---------------------------------------------------------------------------------
+
+
+def many(count: int) -> str:
+    return " or ".join(f"X{i}" for i in range(count))
+
+
+REFUSED = [
+    ("", "expected a name, got 'the end'"),
+    ("   ", "expected a name, got 'the end'"),
+    ("A and", "expected a name, got 'the end'"),
+    ("and A", "expected a name, got 'and'"),
+    ("A or or B", "expected a name, got 'or'"),
+    ("not", "expected a name, got 'the end'"),
+    ("of", "expected a name, got 'of'"),
+    ("()", "expected a name, got ')'"),
+    ("(A", "expected ')', got 'the end'"),
+    ("A B", "unexpected 'B' after a complete gate; join two parts with 'and' or 'or'"),
+    ("A)", "unexpected ')' after a complete gate; join two parts with 'and' or 'or'"),
+    ("A, B", "unexpected ',' after a complete gate; join two parts with 'and' or 'or'"),
+    ("A & B", "unexpected '&'" + NOT_A_GATE),
+    ("A and \u00e9", "unexpected '\u00e9'" + NOT_A_GATE),
+    ("A -", "unexpected '-'" + NOT_A_GATE),
+    ("_A", "unexpected '_'" + NOT_A_GATE),
+    ("2", "expected 'of', got 'the end'"),
+    ("2 (A, B)", "expected 'of', got '('"),
+    ("2 of A", "expected '(', got 'A'"),
+    ("2 of (A, B", "expected ')', got 'the end'"),
+    ("2 of (A,)", "expected a name, got ')'"),
+    ("2 of ()", "expected a name, got ')'"),
+    ("0 of (A, B)", "0 of 2 inputs; between 1 and 2 is right"),
+    ("3 of (A, B)", "3 of 2 inputs; between 1 and 2 is right"),
+    ("(" * (MAX_DEPTH + 1) + "A" + ")" * (MAX_DEPTH + 1), f"nested more than {MAX_DEPTH} deep"),
+    ("not " * (MAX_DEPTH + 1) + "A", f"nested more than {MAX_DEPTH} deep"),
+    ("1 of (" * (MAX_DEPTH + 1) + "A" + ")" * (MAX_DEPTH + 1),
+     f"nested more than {MAX_DEPTH} deep"),
+    ("(" * 100_000, f"nested more than {MAX_DEPTH} deep"),
+]
+
+
+@pytest.mark.parametrize("read", [detection_gate, recovery_gate])
+@pytest.mark.parametrize(("text", "line"), REFUSED, ids=lambda t: str(t)[:20])
+def test_what_cannot_be_read_is_refused_in_one_line(read, text, line):
+    with pytest.raises(GateError) as caught:
+        read(text)
+    assert str(caught.value) == line
+    assert isinstance(caught.value, ValueError)
+
+
+@pytest.mark.parametrize(("text", "line"), [
+    ("not A", "it is active while all its detection modules are idle"),
+    ("A or not B", "it is active while all its detection modules are idle"),
+    ("A or not A", "it is active while all its detection modules are idle"),
+    ("A and not A", "it can never be active"),
+    ("A and B and not (A or C)", "it can never be active"),
+    (many(MAX_NAMES + 1), f"a gate over {MAX_NAMES + 1} modules; at most {MAX_NAMES} are right, "
+                          "more belong into the fault tree"),
+])
+def test_a_detection_gate_must_be_able_to_change(text, line):
+    with pytest.raises(GateError) as caught:
+        detection_gate(text)
+    assert str(caught.value) == line
+
+
+@pytest.mark.parametrize(("text", "line"), [
+    ("not RM1", "'not RM1' cannot be run; names, 'and' and 'or' are right"),
+    ("RM2 and not RM1", "'not RM1' cannot be run; names, 'and' and 'or' are right"),
+    ("RM2 or (RM3 and not RM1)", "'not RM1' cannot be run; names, 'and' and 'or' are right"),
+    ("2 of (RM1, RM2, RM3)", "'2 of' does not say which; names, 'and' and 'or' are right"),
+    ("RM4 or 2 of (RM1, RM2, RM3)",
+     "'2 of' does not say which; names, 'and' and 'or' are right"),
+    (many(MAX_NAMES + 1), f"{MAX_NAMES + 1} recovery modules; at most {MAX_NAMES} are right"),
+])
+def test_a_recovery_gate_must_say_what_to_run(text, line):
+    with pytest.raises(GateError) as caught:
+        recovery_gate(text)
+    assert str(caught.value) == line
+
+
+@pytest.mark.parametrize(("pairs", "ways"), [(7, "128"), (60, str(2**60))])
+def test_a_recovery_gate_with_too_many_alternatives_is_refused_without_making_them(pairs, ways):
+    with pytest.raises(GateError) as caught:
+        recovery_gate(" and ".join(["(RM1 or RM2)"] * pairs))
+    assert str(caught.value) == f"{ways} alternatives; at most 64 are right"
+
+
+def test_the_largest_gates_are_read():
+    assert len(list(recovery_gate(" and ".join(["(RM1 or RM2)"] * 6)).alternatives())) == 64
+    assert len(detection_gate(many(MAX_NAMES)).names) == MAX_NAMES
+    assert len(recovery_gate(many(MAX_NAMES)).names) == MAX_NAMES
+    detection_gate("(" * MAX_DEPTH + "A" + ")" * MAX_DEPTH)
