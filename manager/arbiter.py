@@ -255,9 +255,17 @@ class Arbiter:
             (t.name for t in detections if t.active), (t.name for t in detections if t.silent))
 
     def _with_late(self, state: State, active: tuple[str, ...], now: float) -> State:
-        """Note since when mechanisms are active, and which of them are late."""
+        """Note since when mechanisms have had their turn, and which of them are late.
+
+        One that has to wait for a deeper one does not lose its patience meanwhile, or it would be
+        late, and the next above in force, the moment the deeper one has succeeded.
+        """
         before = dict(state.since)
-        since = tuple((name, before.get(name, now)) for name in active)
+        tree = self.arrangement.tree
+        in_time = [name for name in active if name not in state.late]
+        since = tuple(
+            (name, now if any(tree.is_above(name, deeper) for deeper in in_time)
+             else before.get(name, now)) for name in active)
         late = frozenset(
             name for name, since_s in since
             if name in state.late or (

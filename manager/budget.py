@@ -149,8 +149,9 @@ def derive_timeouts(robot: Robot, timing: Timing) -> Timing:
 
 def check(spec: SystemSpec) -> list[Budget]:
     """Draw up the budget of every mechanism and guard that is switched on, mechanisms first."""
-    return [*(_of_mechanism(spec, mechanism) for mechanism in spec.mechanisms if spec.layers.ftm),
-            *_of_guards(spec)]
+    modules = _Modules(spec)
+    return [*(_of_mechanism(spec, mechanism, modules) for mechanism in spec.mechanisms
+              if spec.layers.ftm), *_of_guards(spec)]
 
 
 def find_false_alarms(spec: SystemSpec) -> Iterator[tuple[str, float, str]]:
@@ -175,10 +176,20 @@ def find_false_alarms(spec: SystemSpec) -> Iterator[tuple[str, float, str]]:
                    f"of {period_field} = {period:.3f} s, is right")
 
 
-def _of_mechanism(spec: SystemSpec, mechanism: MechanismSpec) -> Budget:
+class _Modules:
+    """A spec's modules by name, and the FTMTree: looked up once for all mechanisms."""
+
+    def __init__(self, spec: SystemSpec) -> None:
+        self.detections = {detection.name: detection for detection in spec.detections}
+        self.recoveries = {recovery.name: recovery for recovery in spec.recoveries}
+        self.mechanisms = {mechanism.name: mechanism for mechanism in spec.mechanisms}
+        self.parents = spec.build_ftm_tree().parents if spec.mechanisms else {}
+
+
+def _of_mechanism(spec: SystemSpec, mechanism: MechanismSpec, modules: _Modules) -> Budget:
     timing, robot = spec.timing, spec.robot
-    detections = {detection.name: detection for detection in spec.detections}
-    repairs = any(r.kind.repairs for r in spec.recoveries if r.name in mechanism.recoveries)
+    detections = modules.detections
+    repairs = any(modules.recoveries[name].kind.repairs for name in mechanism.recoveries)
     if mechanism.against is Hazard.DRIFT:
         left_s, hazard = time_to_drift_s(robot), "the robot drifts out of the corridor"
     elif mechanism.against is Hazard.RUNAWAY:
@@ -188,8 +199,7 @@ def _of_mechanism(spec: SystemSpec, mechanism: MechanismSpec) -> Budget:
             detections[name].parameters["margin_m"] for name in mechanism.detections))
         hazard = "the robot enters the prohibited area"
     else:
-        above = spec.build_ftm_tree().parents[mechanism.name]
-        parent = next(m for m in spec.mechanisms if m.name == above)
+        parent = modules.mechanisms[str(modules.parents[mechanism.name])]
         left_s = min(detections[name].latency_s for name in parent.detections)
         hazard = f"{parent.detect} of {parent.name} detects the consequence"
     # Which input of a gate opens it is not known: count on the slowest.
@@ -204,9 +214,10 @@ def patience_s(spec: SystemSpec) -> dict[str, float]:
     What is left of the time before the hazard when detection has taken its longest, and when the
     next recovery still has to be decided on and to take effect.
     """
+    modules = _Modules(spec)
     return {mechanism.name: max(0.0, budget.margin_s + budget.respawn_s)
             for mechanism in spec.mechanisms
-            for budget in [_of_mechanism(spec, mechanism)]}
+            for budget in [_of_mechanism(spec, mechanism, modules)]}
 
 
 def _of_guards(spec: SystemSpec) -> Iterator[Budget]:

@@ -160,10 +160,10 @@ def _reachability(spec: SystemSpec) -> Iterator[Finding]:
         if recovery.name not in recovering:
             yield Finding(f"$.recovery[{index}].name", "unreachable: no mechanism and no escalation"
                                                        " leads to this recovery", (recovery.name,))
+    watch = {detection.name: detection.watch for detection in spec.detections}
     watched = {(node, recovery) for mechanism in spec.mechanisms
-               for recovery in mechanism.recoveries
-               for detection in spec.detections if detection.name in mechanism.detections
-               for node in detection.watch}
+               for detection in mechanism.detections for node in watch[detection]
+               for recovery in mechanism.recoveries}
     for index, node in enumerate(spec.nodes):
         if node.respawn != SUPERVISOR and (node.name, node.respawn) not in watched:
             yield Finding(f"$.node[{index}].respawn", f"node {node.name!r} is unreachable for "

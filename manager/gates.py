@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Collection, Iterator
+from functools import lru_cache
 from itertools import chain, combinations
 
 import msgspec
@@ -91,6 +92,7 @@ class Gate(msgspec.Struct, frozen=True):
         return f"{self.required} of ({', '.join(map(str, self.inputs))})"
 
 
+@lru_cache(maxsize=4096)
 def detection_gate(text: str) -> Gate:
     """Read the gate on the detection side of a mechanism.
 
@@ -110,6 +112,7 @@ def detection_gate(text: str) -> Gate:
     return gate
 
 
+@lru_cache(maxsize=4096)
 def recovery_gate(text: str) -> Gate:
     """Read the gate on the recovery side of a mechanism.
 

@@ -382,3 +382,21 @@ def test_a_patient_shadow_is_told_who_is_late():
     (differed,) = differences(bench.wait(5.0))
     assert (differed.taken, differed.decision.recoveries) == (("RM3",), ("RM2",))
     assert bench.orders == "RM3"
+
+
+def test_who_waited_for_a_deeper_one_has_its_whole_patience_when_its_turn_comes():
+    """A respawn that succeeds must not end in the stop of the barrier two steps up."""
+    bench = Bench(msgspec.structs.replace(osmosis(), strategy="mission-first"))
+    bench.active("DM4", "osmosis_control")
+    bench.active("DM2")
+    bench.report("RM3", Phase.ACTING)
+    bench.wait(0.3)
+    bench.report("RM3", Phase.DONE)
+    bench.idle("DM4")
+    assert bench.orders == "RM2"
+    bench.report("RM2", Phase.DEGRADED)
+    bench.wait(0.3)
+    assert bench.orders == "RM2"
+    bench.idle("DM2")
+    bench.wait(1.0)
+    assert bench.orders == ""
