@@ -9,7 +9,6 @@ import contextlib
 import json
 import signal
 import sys
-import time
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,6 +34,7 @@ from sim.observer import JudgeSink, Observer
 from sim.report import write_report
 from sim.report_record import RunRecord, RunRecorder
 from sim.run_end import RunEnd
+from sim.watched_run import WatchedRun, new_directory
 
 ROOT = Path(__file__).resolve().parent
 LAST_PORT = 32_000
@@ -46,6 +46,7 @@ examples:
   python launch.py --mission A --obstacles 2        two obstacles on the way
   python launch.py --rate 4 --no-hmi --json         four times real time, result as JSON
   python launch.py --no-ftm                         the paper's baseline, without fault tolerance
+  python launch.py --system cell                    the manipulator cell, with stand-in nodes
   python launch.py --airport my/airport.graph --mission my/MISSION_A.miss
 while it runs, from another shell:
   kill-node osmosis_control                         kill a node and watch it come back
@@ -65,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--airport", metavar="NAME|FILE", help="shipped airport, a .toml, or a .graph "
                    "with its image beside it (default: the system's)")
     p.add_argument("--system", metavar="FILE", default=str(ROOT / "systems" / "osmosis.toml"),
-                   help="system spec (default: systems/osmosis.toml)")
+                   help="system spec, or name of a shipped one: osmosis, cell (default: osmosis)")
     p.add_argument("--strategy", metavar="NAME", default="",
                    help=f"one of {', '.join(STRATEGIES)} (default: the system's)")
     p.add_argument("--shadow", metavar="NAME", default="",
@@ -87,6 +88,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--patience", metavar="S", type=float, default=60.0,
                    help="simulated seconds without progress after which the mission counts as "
                    "failed (default: 60)")
+    p.add_argument("--duration", metavar="S", type=float,
+                   help="simulated seconds after which a system without a mission ends (default: "
+                   "when it is interrupted)")
     p.add_argument("--report", metavar="DIR", help="where the report goes (default: "
                    "reports/TIME-MISSION)")
     p.add_argument("--json", action="store_true",
@@ -101,18 +105,12 @@ class UsageError(Exception):
 class Run:
     """One run from the parsed options to the exit code."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
+    def __init__(self, options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> None:
         self._options = options
-        _check(options)
-        system_file = Path(options.system)
-        if not system_file.is_file():
-            raise UsageError(f"--system {options.system}: no such file")
-        plan = RunPlan(
-            run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
-            seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
-            airport="", mission="", obstacles=options.obstacles, ftm=not options.no_ftm,
-            hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow)
-        self.spec: SystemSpec = load_system(plan)
+        self.spec = spec
+        if options.duration is not None:
+            raise UsageError(f"--duration {options.duration:g}: a mission ends by itself; "
+                             "--patience S ends one that makes no progress")
         airport_name = _existing_path(options.airport or self.spec.airport)
         mission_name = _existing_path(options.mission or self.spec.mission)
         self.airport: Airport = load_airport(airport_name)
@@ -120,8 +118,8 @@ class Run:
         if options.obstacles > len(self.airport.obstacles):
             raise UsageError(f"--obstacles {options.obstacles}: {self.airport.name} has places for "
                              f"{len(self.airport.obstacles)}")
-        self.directory = Path(options.report or ROOT / "reports" / (
-            time.strftime("%Y%m%d-%H%M%S-") + self.mission.name))
+        self.directory = Path(options.report) if options.report else new_directory(
+            ROOT / "reports", self.mission.name)
         self.directory.mkdir(parents=True, exist_ok=True)
         self.launcher = Launcher(
             msgspec.structs.replace(plan, airport=airport_name, mission=mission_name,
@@ -230,11 +228,55 @@ def _summary(record: RunRecord, html: Path, data: Path) -> dict[str, Any]:
     }
 
 
+def _plan(options: argparse.Namespace) -> tuple[RunPlan, SystemSpec]:
+    """Return the plan that the options ask for, and the system they name."""
+    system_file = Path(options.system)
+    shipped = ROOT / "systems" / f"{options.system}.toml"
+    if not system_file.is_file() and shipped.is_file():
+        system_file = shipped
+    if not system_file.is_file():
+        raise UsageError(f"--system {options.system}: no such file")
+    plan = RunPlan(
+        run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
+        seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
+        airport="", mission="", obstacles=options.obstacles, ftm=not options.no_ftm,
+        hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow)
+    return plan, load_system(plan)
+
+
+async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> int:
+    """Run a system that drives nowhere, until its time is over or somebody ends it."""
+    for option in ("mission", "airport", "obstacles"):
+        if getattr(options, option):
+            raise UsageError(f"--{option} {getattr(options, option)}: {spec.name} has no [robot] "
+                             "and drives nowhere")
+    directory = Path(options.report) if options.report else new_directory(
+        ROOT / "reports", spec.name)
+    directory.mkdir(parents=True, exist_ok=True)
+    run = WatchedRun(plan, spec, options.duration, directory, sys.stderr)
+
+    def interrupt(name: str) -> None:
+        if run.interrupted:  # the second time it is meant
+            run.launcher.abort()
+            raise SystemExit(EXIT_FAILED)
+        run.interrupted = f"interrupted by {name}"
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(
+            number, interrupt, signal.Signals(number).name)
+    await run.run()
+    if options.json:
+        print(json.dumps(run.summary()), flush=True)
+    return EXIT_SUCCESS
+
+
 def _check(options: argparse.Namespace) -> None:
     if not 0.1 <= options.rate <= 20:
         raise UsageError(f"--rate {options.rate:g}: must be between 0.1 and 20")
     if options.obstacles < 0:
         raise UsageError(f"--obstacles {options.obstacles}: must not be negative")
+    if options.duration is not None and not 0 < options.duration < 1e9:
+        raise UsageError(f"--duration {options.duration:g}: must be above 0")
     if not options.patience > 0:
         raise UsageError(f"--patience {options.patience:g}: must be above 0")
     for name, port in (("--port", options.port), ("--hmi-port", options.hmi_port)):
@@ -255,7 +297,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line, run, and return the exit code."""
     options = parser().parse_args(arguments)
     try:
-        return asyncio.run(Run(options).run())
+        _check(options)
+        plan, spec = _plan(options)
+        if spec.mobile is None:
+            return asyncio.run(_watch(options, plan, spec))
+        return asyncio.run(Run(options, plan, spec).run())
     except (UsageError, LaunchError, ValueError, OSError) as error:
         print("launch.py: " + " ".join(str(error).split()), file=sys.stderr)
         return EXIT_USAGE

@@ -337,6 +337,14 @@ class AdaptedSystem(Message, frozen=True):
     document: str
 
 
+class StubTrigger(Message, frozen=True):
+    """Makes the stand-in for detection module `name` active or idle."""
+
+    name: str
+    active: bool
+    reason: str
+
+
 class ShadowRecord(Message, frozen=True):
     """A decision that the strategy in shadow would have taken instead of decision `decision`."""
 

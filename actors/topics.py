@@ -74,6 +74,10 @@ ERROR_REPORT = Topic("supervisor/error", m.Diagnostic, Qos.COMMAND, 0, "",
 PROCESS_EVENT = Topic("supervisor/event", m.ProcessEvent, Qos.COMMAND, 0, "",
                       "What happened to processes.")
 
+# Stand-ins for modules that are not written yet.
+STUB_TRIGGER = Topic("stub/trigger", m.StubTrigger, Qos.COMMAND, 0, "",
+                     "Make the stand-in of a detection module active or idle.")
+
 # World: ground truth is for the judge, never for the controller.
 TRUTH = Topic("world/truth", m.GroundTruth, Qos.STATE, 20, "map", "Ground truth.")
 OBSTACLE = Topic("world/obstacle", m.ObstacleCommand, Qos.COMMAND, 0, "map",

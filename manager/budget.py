@@ -35,7 +35,7 @@ from collections.abc import Iterator
 
 import msgspec
 
-from manager.schema import Hazard, MechanismSpec, Robot, SystemSpec, Timing
+from manager.schema import Hazard, MechanismSpec, Robot, SystemSpec, Timing, Within
 
 SHARE = 0.9
 """Of the time that is left, a derived timeout takes this much."""
@@ -115,11 +115,11 @@ def time_to_obstacle_s(robot: Robot) -> float:
     return (robot.stop_distance_m - braking_distance_m(robot, v)) / v
 
 
-def derive_timeouts(robot: Robot, timing: Timing) -> Timing:
+def derive_timeouts(robot: Robot | None, timing: Timing) -> Timing:
     """Fill in the timeouts that a spec leaves out.
 
     Args:
-        robot: Speeds and distances.
+        robot: Speeds and distances; None leaves timing as it is.
         timing: With NaN where a value is to be derived; values that are given are kept, and
             those derived follow from them.
 
@@ -127,6 +127,8 @@ def derive_timeouts(robot: Robot, timing: Timing) -> Timing:
         Timing without NaN. A robot that leaves no time gets values that are too short, zero or
         even negative; `check` and `find_false_alarms` then refuse it.
     """
+    if robot is None:
+        return timing
     drift = time_to_drift_s(robot)
     noticed_s = SHARE * (drift - timing.arbitration_s - timing.actuation_s)
     derived = {
@@ -187,15 +189,17 @@ class _Modules:
 
 
 def _of_mechanism(spec: SystemSpec, mechanism: MechanismSpec, modules: _Modules) -> Budget:
-    timing, robot = spec.timing, spec.robot
+    timing = spec.timing
     detections = modules.detections
     repairs = any(modules.recoveries[name].kind.repairs for name in mechanism.recoveries)
-    if mechanism.against is Hazard.DRIFT:
-        left_s, hazard = time_to_drift_s(robot), "the robot drifts out of the corridor"
+    if isinstance(mechanism.against, Within):
+        left_s, hazard = mechanism.against.within_s, mechanism.against.hazard
+    elif mechanism.against is Hazard.DRIFT:
+        left_s, hazard = time_to_drift_s(spec.robot), "the robot drifts out of the corridor"
     elif mechanism.against is Hazard.RUNAWAY:
-        left_s, hazard = time_to_runaway_s(robot), "the robot runs away out of the corridor"
+        left_s, hazard = time_to_runaway_s(spec.robot), "the robot runs away out of the corridor"
     elif mechanism.against is Hazard.INTRUSION:
-        left_s = time_to_intrusion_s(robot, min(
+        left_s = time_to_intrusion_s(spec.robot, min(
             detections[name].parameters["margin_m"] for name in mechanism.detections))
         hazard = "the robot enters the prohibited area"
     else:
@@ -221,7 +225,10 @@ def patience_s(spec: SystemSpec) -> dict[str, float]:
 
 
 def _of_guards(spec: SystemSpec) -> Iterator[Budget]:
-    timing, robot = spec.timing, spec.robot
+    timing = spec.timing
+    if spec.mobile is None:
+        return
+    robot = spec.mobile
     drift_s, obstacle_s = time_to_drift_s(robot), time_to_obstacle_s(robot)
     collision = "the robot hits an obstacle"
     # The Safety Pilot decides in its own cycle: one to see, one to command.

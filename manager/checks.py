@@ -6,16 +6,19 @@ sequence and the first finding is the one reported, so a validator may rely on t
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from itertools import permutations, product
 from typing import Any, NamedTuple
 
+import msgspec
+
 from manager.budget import braking_distance_m, check, find_false_alarms
 from manager.fault_tree import FaultTreeError
 from manager.gates import GateError, detection_gate, recovery_gate
 from manager.order import CycleError, PartialOrder, find_cycle
-from manager.schema import Hazard, Kind, SystemSpec
+from manager.schema import Hazard, Kind, Robot, SystemSpec
 from manager.strategies import STRATEGIES
 
 SUPERVISOR = "supervisor"
@@ -296,7 +299,26 @@ def _undelayed(spec: SystemSpec, order: PartialOrder, last_resort: str) -> Itera
 
 
 def _timing(spec: SystemSpec) -> Iterator[Finding]:
-    robot, timing = spec.robot, spec.timing
+    timing = spec.timing
+    if spec.mobile is not None:
+        yield from _room(spec.mobile)
+    else:
+        for field, value in msgspec.structs.asdict(timing).items():
+            if math.isnan(value):
+                yield Finding(f"$.timing.{field}", "missing; it is derived from [robot], and this "
+                                                   "system has none")
+        if spec.airport or spec.mission:
+            yield Finding("$.airport" if spec.airport else "$.mission",
+                          "without [robot] there is nobody to drive there; leave it out",
+                          (spec.airport or spec.mission,))
+    if timing.release_hold_max_s < timing.release_hold_s:
+        yield Finding("$.timing.release_hold_max_s", "must be no less than release_hold_s = "
+                      f"{timing.release_hold_s}", (timing.release_hold_max_s,))
+    for path, value, problem in find_false_alarms(spec):
+        yield Finding(path, problem, (value,))
+
+
+def _room(robot: Robot) -> Iterator[Finding]:
     braking_m = braking_distance_m(robot, robot.top_speed_mps)
     for field in ("corridor_clearance_m", "stop_distance_m"):
         room_m = getattr(robot, field)
@@ -306,17 +328,16 @@ def _timing(spec: SystemSpec) -> Iterator[Finding]:
     if robot.sensing_range_m <= robot.stop_distance_m:
         yield Finding("$.robot.sensing_range_m", "obstacles must be seen before they are nearer "
                       f"than stop_distance_m = {robot.stop_distance_m}", (robot.sensing_range_m,))
-    if timing.release_hold_max_s < timing.release_hold_s:
-        yield Finding("$.timing.release_hold_max_s", "must be no less than release_hold_s = "
-                      f"{timing.release_hold_s}", (timing.release_hold_max_s,))
-    for path, value, problem in find_false_alarms(spec):
-        yield Finding(path, problem, (value,))
 
 
 def _budget(spec: SystemSpec) -> Iterator[Finding]:
     root = spec.build_ftm_tree().root if spec.mechanisms else ""
+    of_robots = {Hazard.DRIFT, Hazard.RUNAWAY, Hazard.INTRUSION}
     detections = {detection.name: detection for detection in spec.detections}
     for index, mechanism in enumerate(spec.mechanisms):
+        if spec.mobile is None and mechanism.against in of_robots:
+            yield Finding(f"$.mechanism[{index}].against", "needs a [robot]; 'parent' or "
+                          "{ within_s = ..., hazard = '...' } is right", (mechanism.against.value,))
         if mechanism.against is Hazard.PARENT and mechanism.name == root:
             yield Finding(f"$.mechanism[{index}].against", f"{root} is the root of the FTMTree and "
                           "has no parent to be faster than", (mechanism.against.value,))
@@ -328,7 +349,7 @@ def _budget(spec: SystemSpec) -> Iterator[Finding]:
                           (mechanism.against.value,))
     for index, detection in enumerate(spec.detections):
         margin_m = detection.parameters.get("margin_m", 0.0)
-        if margin_m >= spec.robot.corridor_clearance_m:
+        if spec.mobile is not None and margin_m >= spec.robot.corridor_clearance_m:
             yield Finding(f"$.detection[{index}].parameters.margin_m", "would raise false alarms; "
                           "it must be below corridor_clearance_m = "
                           f"{spec.robot.corridor_clearance_m:g}", (margin_m,))

@@ -245,6 +245,13 @@ class Hazard(StrEnum):
     """Nothing yet, but the mechanism above is about to detect the consequence."""
 
 
+class Within(Table, frozen=True):
+    """A hazard in the user's own words, and the time that is left before it, in seconds."""
+
+    within_s: Positive
+    hazard: str
+
+
 class MechanismSpec(Table, frozen=True):
     """FTMx(DMy, RMz), on an event of the fault tree, in time before a hazard.
 
@@ -261,7 +268,7 @@ class MechanismSpec(Table, frozen=True):
     detect: str
     recover: str
     event: Name
-    against: Hazard = Hazard.DRIFT
+    against: Hazard | Within = Hazard.DRIFT
     enabled: bool = True
 
     @property
@@ -303,6 +310,9 @@ class SystemSpec(Table, frozen=True):
     """A whole system. In the file the arrays of tables are called by the singular.
 
     Attributes:
+        airport: Where a mobile robot drives; "" if the system is none.
+        mission: What it does there.
+        mobile: Speeds and distances of a mobile robot, `[robot]` in the file.
         strategy: By which the arbiter decides; `manager.strategies` has them.
         shadow: A strategy that is asked as well, and whose differing decisions are recorded;
             "" for none.
@@ -312,9 +322,9 @@ class SystemSpec(Table, frozen=True):
 
     name: Name
     title: str
-    airport: str
-    mission: str
-    robot: Robot
+    airport: str = ""
+    mission: str = ""
+    mobile: Robot | None = msgspec.field(name="robot", default=None)
     strategy: str = "safety-first"
     shadow: str = ""
     order: Name | tuple[Name, ...] = "safer"
@@ -382,6 +392,17 @@ class SystemSpec(Table, frozen=True):
     def build_ftm_tree(self) -> Tree:
         """Derive the FTMTree from the fault tree and the placement of the mechanisms."""
         return self.build_fault_tree().derive_ftm_tree({m.name: m.event for m in self.mechanisms})
+
+    @property
+    def robot(self) -> Robot:
+        """The mobile robot.
+
+        Raises:
+            ValueError: The system is none.
+        """
+        if self.mobile is None:
+            raise ValueError(f"system {self.name!r} has no [robot]")
+        return self.mobile
 
     @property
     def criteria(self) -> tuple[str, ...]:

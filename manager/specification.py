@@ -108,7 +108,7 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
         spec = msgspec.convert(document, SystemSpec)
     except msgspec.ValidationError as error:
         raise _explain(error, document, file) from None
-    spec = msgspec.structs.replace(spec, timing=derive_timeouts(spec.robot, spec.timing))
+    spec = msgspec.structs.replace(spec, timing=derive_timeouts(spec.mobile, spec.timing))
     spec = _resolve_timing_names(spec, file)
     finding = find_nonsense(spec)
     enabled = spec.without_disabled()

@@ -113,7 +113,7 @@ def test_derived_timeouts_always_fit_whatever_the_robot(speed, brake, clearance,
     """If there is time at all; otherwise they are so short that they are refused."""
     robot = changed(ROBOT, top_speed_mps=speed, braking_mps2=brake, stop_distance_m=stop,
                     corridor_clearance_m=clearance)
-    spec = changed(SPEC, robot=robot, timing=derive_timeouts(robot, Timing()))
+    spec = changed(SPEC, mobile=robot, timing=derive_timeouts(robot, Timing()))
     detections = tuple(
         changed(d, parameters=d.parameters | {"timeout_s": getattr(spec.timing, {
             "DM2": "command_timeout_s", "DM6": "localization_timeout_s"}.get(

@@ -284,8 +284,9 @@ def test_refused(case):
         assert fragment in message
 
 
-def test_a_spec_without_a_robot_is_refused():
-    assert "required field" in refusal('name = "x"\ntitle = "x"\n')
+def test_without_a_robot_timeouts_have_to_be_stated():
+    assert "$.timing.heartbeat_timeout_s: missing; it is derived from [robot]" in refusal(
+        'name = "x"\ntitle = "x"\n')
 
 
 def test_recoveries_without_any_mechanism_are_refused():

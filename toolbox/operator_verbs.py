@@ -18,6 +18,8 @@ from toolbox.session import Session, connect
 
 T = TypeVar("T")
 
+STUB_DETECTION = "actors.stub.detection:StubDetection"
+
 _RESET_WAIT_S = 3.0
 """Simulated seconds within which the manager releases a recovery whose cause is gone."""
 
@@ -35,6 +37,17 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
         epilog="examples:\n  rampart reset RM1")
     parser.add_argument("recovery", metavar="RM", help="e.g. RM1")
     parser.set_defaults(run=lambda options: asyncio.run(reset(options)))
+
+    parser = verbs.add_parser(
+        "trigger", parents=[common], formatter_class=formatter,
+        help="make the stand-in of a detection module detect",
+        description="Make a detection module that is a stand-in (actors.stub) active, for some\n"
+                    "simulated seconds. What real modules detect is injected: rampart inject.",
+        epilog="examples:\n  rampart trigger D_CURTAIN\n  rampart trigger D_VISION --for 5")
+    parser.add_argument("module", metavar="NAME", help="detection module, e.g. D_CURTAIN")
+    parser.add_argument("--for", dest="duration", type=float, default=2.0, metavar="S",
+                        help="simulated seconds (default 2)")
+    parser.set_defaults(run=lambda options: asyncio.run(trigger(options)))
 
     parser = verbs.add_parser(
         "obstacle", formatter_class=formatter, help="put obstacles in the robot's way",
@@ -86,6 +99,35 @@ async def reset(options: argparse.Namespace) -> int:
         active = ", ".join(latched.value.active) if latched.value else ""
         raise NoEffectError(f"{options.recovery} was not released; active: {active or 'none'}")
     say(f"{options.recovery} released")
+    return 0
+
+
+async def trigger(options: argparse.Namespace) -> int:
+    """Make a stand-in detect for a while."""
+    if not 0 < options.duration < 1e6:
+        raise UsageError(f"--for {options.duration:g}: must be above 0")
+    async with connect(options.port) as session:
+        spec = systems.load(session.run.system_file)
+        stubs = [d.name for d in spec.detections if d.actor == STUB_DETECTION]
+        if options.module not in stubs:
+            raise unknown("stand-in detection module", options.module, stubs)
+        heard = _Latest[m.DetectionReport]()
+        session.listen(topics.DETECTION, topics.DETECTION.at(options.module), heard.keep)
+
+        async def bring(state: m.DetectionState) -> bool:
+            active = state is m.DetectionState.ACTIVE
+            return await session.command(
+                topics.STUB_TRIGGER, m.StubTrigger(options.module, active, "triggered by hand"),
+                lambda: heard.value is not None and heard.value.state is state,
+                session.real_s(1.0))
+
+        if not await bring(m.DetectionState.ACTIVE):
+            raise NoEffectError(f"no effect: {options.module} does not answer")
+        say(f"{options.module} detects")
+        await asyncio.sleep(options.duration / session.clock.rate)
+        if not await bring(m.DetectionState.IDLE):
+            raise NoEffectError(f"{options.module} did not become idle again")
+    say(f"{options.module} is idle again")
     return 0
 
 

@@ -43,8 +43,8 @@ class RunPlan(msgspec.Struct, frozen=True):
         system_file: path of the system spec.
         strategy: name that replaces the spec's strategy; "" for the spec's.
         shadow: name of a strategy to run in shadow; "" for the spec's.
-        airport: name or path.
-        mission: name or path.
+        airport: name or path; "" if the system drives nowhere.
+        mission: name or path; "" likewise.
         obstacles: how many of the airport's obstacles stand there.
         ftm: False runs the paper's unprotected baseline.
         hmi_port: port of the operator's page; 0 for none.
@@ -193,13 +193,13 @@ def load_shared(plan: RunPlan, spec: SystemSpec) -> Mapping[str, Any]:
     """
     from airport.formats import load_airport, load_mission, load_world  # noqa: PLC0415 heavy
 
-    airport = load_airport(plan.airport)
+    airport = load_airport(plan.airport) if plan.airport else None
     return {
         "system": spec,
         "document": load_document(plan),
         "airport": airport,
-        "world": load_world(plan.airport),
-        "mission": load_mission(plan.mission, airport),
+        "world": load_world(plan.airport) if airport else None,
+        "mission": load_mission(plan.mission, airport) if airport else None,
         "run_id": plan.run_id,
         "seed": plan.seed,
         "obstacles": plan.obstacles,

@@ -1,0 +1,113 @@
+"""A run of a system that drives nowhere: no world, no mission, no judge, but an end.
+
+For systems that are being specified, and for those whose world is not simulated here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from pathlib import Path
+from typing import Any, TextIO
+
+import msgspec
+
+from actors import topics
+from actors.messages import DecisionRecord, NodeTable, ProcessEvent
+from actors.runtime.actor import Context, Header
+from actors.runtime.clock import Clock
+from actors.runtime.topic import Topic
+from actors.runtime.zenoh_bus import ZenohBus, endpoint
+from actors.supervision.launcher import Launcher
+from actors.supervision.run_plan import OBSERVER, RunPlan
+from manager.schema import SystemSpec
+from sim.console import Console
+from sim.observer import Observer
+
+
+class WatchedRun:
+    """One run. Use: `run`, and `summary` afterwards.
+
+    Args:
+        plan: What to run.
+        spec: The system.
+        duration_s: Simulated seconds after which it ends; None for when it is interrupted.
+        directory: For tracebacks of failed nodes.
+        stream: For the story.
+    """
+
+    def __init__(self, plan: RunPlan, spec: SystemSpec, duration_s: float | None, directory: Path,
+                 stream: TextIO) -> None:
+        self.launcher = Launcher(msgspec.structs.replace(
+            plan, error_log=str(directory.resolve() / "errors.log")), spec.title)
+        self.interrupted = ""
+        self._spec = spec
+        self._duration_s = duration_s
+        self._console = Console(stream)
+        self._decisions: list[DecisionRecord] = []
+        self._restarts: dict[str, int] = {}
+        self._lasted_s = 0.0
+
+    async def run(self) -> None:
+        """Start everything, and watch until the end.
+
+        Raises:
+            LaunchError: The system cannot be started.
+        """
+        self.launcher.begin()
+        try:
+            await self.launcher.load()
+            await self.launcher.start()
+            await self._watch()
+        finally:
+            await self.launcher.end()
+
+    def summary(self) -> dict[str, Any]:
+        """Return the result for scripts: there is no mission, and nobody to judge safety."""
+        return {
+            "mission": None, "safety": None, "duration_s": round(self._lasted_s, 2), "lights": [],
+            "decisions": [msgspec.to_builtins(d) for d in self._decisions],
+            "restarts": self._restarts}
+
+    async def _watch(self) -> None:
+        plan = self.launcher.plan
+        clock = Clock(plan.origin_s, plan.rate)
+        self.launcher.on_restart = lambda name: self._console.line(
+            clock.now(), f"{name} brought back")
+        ports = dict(self.launcher.ports)
+        bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()))
+        observer = Observer(Context(
+            OBSERVER, 1, clock, bus, {}, {"sinks": [self._take, self._console.take]}))
+        task = asyncio.create_task(observer.run())
+        self._console.line(clock.now(), f"{self._spec.title} ({self._spec.name}), "
+                           f"{self._spec.strategy}, rate {plan.rate:g}; ctrl-C ends it")
+        try:
+            while not (self.interrupted or task.done()  # noqa: ASYNC110 three kinds of end
+                       or self._is_over(clock.now())):
+                await asyncio.sleep(0.05)
+            if task.done():
+                await task
+        finally:
+            self._lasted_s = clock.now()
+            observer.stop()
+            await asyncio.gather(task, return_exceptions=True)
+            self._console.close()
+
+    def _is_over(self, now_s: float) -> bool:
+        return self._duration_s is not None and now_s >= self._duration_s
+
+    def _take(self, topic: Topic[Any], message: Any, _header: Header) -> None:
+        if isinstance(message, NodeTable):
+            self.launcher.supervisor_heard(message)
+        elif topic is topics.DECISION:
+            self._decisions.append(message)
+        elif isinstance(message, ProcessEvent) and message.event == "respawned" \
+                and message.detail != "already":
+            self._restarts[message.node] = self._restarts.get(message.node, 0) + 1
+
+
+def new_directory(root: Path, name: str) -> Path:
+    """Make the directory of a run and return it."""
+    directory = root / (time.strftime("%Y%m%d-%H%M%S-") + name)
+    directory.mkdir(parents=True, exist_ok=True)
+    return directory
