@@ -111,12 +111,13 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
     spec = msgspec.structs.replace(spec, timing=derive_timeouts(spec.mobile, spec.timing))
     spec = _resolve_timing_names(spec, file)
     finding = find_nonsense(spec)
-    enabled = spec.without_disabled()
-    if finding is None and enabled is not spec:
-        finding = find_nonsense_of_rest(enabled)
+    if finding is None:
+        enabled = spec.without_disabled()
+        finding = find_nonsense_of_rest(enabled) if enabled is not spec else None
+        spec = enabled
     if finding is not None:
         raise SpecificationError(file, finding.path, finding.problem, *finding.value)
-    return enabled
+    return spec
 
 
 def _find_unwritable(value: object, path: str) -> Iterator[tuple[str, float]]:
