@@ -29,6 +29,9 @@ from manager.zbdd import EMPTY, UNIT, Diagram, Families, TooManyNodesError, deep
 BOUNDS = (30_000, 300_000, 1_000_000, 5_000_000, 20_000_000)
 """Nodes of a decision diagram: each bound is tried with every variable order before the next."""
 
+_LISTING_LEVELS = 800
+"""Modules within modules, and events in one, for listing; counting has no such limit."""
+
 Progress = Callable[[str], None]
 
 
@@ -93,7 +96,18 @@ class CutSets:
         Args:
             limit: No more than so many.
             max_order: None with more events than this.
+
+        Raises:
+            TooLargeError: The tree is nested too deeply to list its sets; they can be counted.
         """
+        depth: dict[str, int] = {}
+        for name, module in self._modules.items():  # inner ones come first
+            depth[name] = 1 + max((depth.get(entry, 0) for entry in module.names), default=0)
+        levels = max((depth[name] + len(module.names) for name, module in self._modules.items()),
+                     default=0)
+        if levels > _LISTING_LEVELS:
+            raise TooLargeError(f"nested {levels} levels deep, too deeply to list the sets; they "
+                                "can be counted, --count")
         left = self.count if limit is None else limit
         for size in range(len(self.sizes) if max_order is None else
                           min(len(self.sizes), max_order + 1)):
@@ -330,6 +344,7 @@ def _prepare(formula: Formula) -> tuple[dict[str, Connective], list[str]]:
         return gates, []
     if not formula.is_monotone:
         return gates, [formula.top]  # below a negation a module's cut sets are not its own
+    gates = _without_aliases(gates, formula.top)
     modules = _modules(gates, formula.top)
     users: dict[str, int] = {}
     for gate in gates.values():
@@ -349,6 +364,20 @@ def _prepare(formula: Formula) -> tuple[dict[str, Connective], list[str]]:
             gates[name] = Connective(both, 1 if gate.low == 1 else len(both), len(both))
     modules = _modules(gates, formula.top)
     return gates, modules
+
+
+def _without_aliases(gates: dict[str, Connective], top: str) -> dict[str, Connective]:
+    """Take out gates that only pass one input on; `gates` has inputs before what uses them."""
+    stands_for: dict[str, str] = {}
+    left: dict[str, Connective] = {}
+    for name, gate in gates.items():
+        inputs = tuple(stands_for.get(entry, entry) for entry in gate.inputs)
+        gate = msgspec.structs.replace(gate, inputs=inputs)  # noqa: PLW2901
+        if len(gate.inputs) == 1 and gate.low == 1 and name != top:
+            stands_for[name] = gate.inputs[0]
+        else:
+            left[name] = gate
+    return left
 
 
 def _modules(gates: dict[str, Connective], top: str) -> list[str]:

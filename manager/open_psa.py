@@ -26,6 +26,9 @@ REFERENCES = ("event", "gate", "basic-event", "house-event")
 MAX_DEPTH = 10_000
 """Nesting of XML elements beyond which a file is refused."""
 
+_PATH_SHOWN = 300
+"""Characters of a path beyond which nothing is added to it."""
+
 _ASIDE = frozenset({"label", "attributes"})
 _DEFINITIONS = {"define-gate": "gate", "define-basic-event": "basic-event",
                 "define-house-event": "house-event"}
@@ -195,7 +198,7 @@ class _Reader:
         place = definition.place[:-1]
         while pending:  # nested formulas become gates named after the one they are in
             own, body, path = pending.pop()
-            here = f"{path}/{body.tag}"
+            here = f"{path}/{body.tag}" if len(path) < _PATH_SHOWN else f"{path[:_PATH_SHOWN]}..."
             if body.tag in REFERENCES:
                 self._gates[own] = Connective((self._refer(body, place, here),), 1, 1)
                 continue

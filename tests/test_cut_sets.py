@@ -145,7 +145,10 @@ def test_thousands_of_gates_in_a_chain_are_no_problem():
     gates = {f"g{i}": any_of(f"g{i + 1}", f"e{i}") if i % 2 else all_of(f"g{i + 1}", f"e{i}")
              for i in range(5000)}
     gates["g5000"] = any_of("last")
-    assert CutSets(formula(gates)).count == 2501
+    found = CutSets(formula(gates))
+    assert found.count == 2501
+    with pytest.raises(TooLargeError, match="levels deep, too deeply to list the sets"):
+        list(found.sets())
 
 
 def test_max_order_and_limit_cut_the_list_and_not_the_count():

@@ -107,7 +107,10 @@ def _load(options: argparse.Namespace) -> tuple[SystemSpec | None, Formula]:
 
 def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: argparse.Namespace
           ) -> int:
-    sets = list(found.sets(options.limit, options.max_order))
+    try:
+        sets = list(found.sets(options.limit, options.max_order))
+    except TooLargeError as error:
+        raise NoEffectError(f"{options.file}: {error}") from None
     guarded = guard(spec, sets) if spec is not None and not options.top else ()
     if options.json:
         print_json({
