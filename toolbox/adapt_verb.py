@@ -27,7 +27,7 @@ _EXAMPLES = {
     Action.DISABLE: "  rampart adapt disable FTM7\n  rampart adapt disable DM7   and what uses it",
     Action.RETUNE: "  rampart adapt retune RM3 deadline_s=2.5\n"
                    "  rampart adapt retune DM1 margin_m=0.7\n"
-                   "  rampart adapt retune FTM3 detect='DM3 or DM2'",
+                   "  rampart adapt retune FTM2 detect='DM2 or DM6'",
     Action.REPLACE: "  rampart adapt replace FTM7 ftm7.toml",
     Action.SET: "  rampart adapt set strategy guarded-repair\n"
                 "  rampart adapt set order safer autonomy",
@@ -49,7 +49,7 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
                "  rampart adapt enable FTM7\n"
                "  rampart adapt retune RM3 deadline_s=2.5\n"
                "  rampart adapt retune DM1 margin_m=0.7        a parameter of the module\n"
-               "  rampart adapt retune FTM3 detect='DM3 or DM2'\n"
+               "  rampart adapt retune FTM2 detect='DM2 or DM6'\n"
                "  rampart adapt replace FTM7 ftm7.toml         the new table, without the name\n\n"
                "exit code: 0 changed; 1 refused, or nobody answered; 2 bad usage")
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
