@@ -56,6 +56,9 @@ class Strategy(Protocol):
     rules: dict[int, str]
     """What each rule says, as the end of a sentence that begins with "because"."""
 
+    def __hash__(self) -> int:
+        """Strategies are told apart by identity."""
+
     def choose(self, active: tuple[str, ...], arrangement: Arrangement, late: Late) -> Decision:
         """Decide, without a certificate.
 

@@ -12,6 +12,7 @@ recovery module, which know nothing of each other. Each has a file of its own:
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
+from functools import lru_cache
 
 from manager.arrangement import Arrangement, arrange
 from manager.decision import NOTHING_ACTIVE, Decision, Late, Strategy
@@ -67,6 +68,7 @@ class Decider:
         self.strategy = strategy
         self.arrangement = arrangement
         self._chosen: dict[tuple[tuple[str, ...], Late], Decision] = {}
+        self._decided: dict[tuple[tuple[str, ...], Late], Decision] = {}
         self._explained: dict[Decision, Decision] = {}
 
     def choose(self, active: tuple[str, ...], late: Late = frozenset()) -> Decision:
@@ -80,6 +82,16 @@ class Decider:
                 self._chosen.clear()
             decision = self._chosen[question] = self.strategy.choose(
                 active, self.arrangement, question[1])
+        return decision
+
+    def decide(self, active: tuple[str, ...], late: Late = frozenset()) -> Decision:
+        """Decide with a certificate; `active` is in declared sequence."""
+        question = (active, late)
+        decision = self._decided.get(question)
+        if decision is None:
+            if len(self._decided) >= MEMORY:
+                self._decided.clear()
+            decision = self._decided[question] = self.explain(self.choose(active, late))
         return decision
 
     def explain(self, decision: Decision) -> Decision:
@@ -104,9 +116,8 @@ def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,  # noqa: P
         UnknownElementError: `active` names something that is no mechanism.
         UnknownStrategyError: No such strategy.
     """
-    arrangement = arrange(mechanisms, tree, order)
-    found = find_strategy(strategy)
-    names = mechanisms.sort(active)
-    if not names:
-        return NOTHING_ACTIVE
-    return found.explain(found.choose(names, arrangement, frozenset(late)), arrangement)
+    decider = _decider(find_strategy(strategy), arrange(mechanisms, tree, order))
+    return decider.decide(mechanisms.sort(active), frozenset(late))
+
+
+_decider = lru_cache(maxsize=64)(Decider)
