@@ -19,6 +19,7 @@ ALLOWED: dict[str, set[str]] = {
     "actors.operator": {"actors.runtime", "actors", "airport", "manager"},
     "actors.detection": {"actors.runtime", "actors", "airport", "manager"},
     "actors.recovery": {"actors.runtime", "actors", "airport", "manager"},
+    "actors.stub": {"actors.runtime", "actors", "actors.detection", "actors.recovery"},
     "actors.supervision": {"actors.runtime", "actors", "airport", "manager"},
     "sim": {"actors.runtime", "actors", "actors.supervision", "airport", "manager"},
     "toolbox": {"actors.runtime", "actors", "actors.supervision", "actors.operator", "airport",

@@ -451,10 +451,11 @@ def test_it_repeats_what_is_wanted_and_shows_that_it_lives():
     in_whole_system(scenario)
 
 
-def test_it_hears_only_modules_and_resets_and_commands_all_recovery_modules():
+def test_it_hears_only_modules_and_people_and_commands_all_recovery_modules():
     member = Member("ftm_manager", FtmManager, {})
     assert heard(member) == {
-        "detection/{name}": None, "recovery/{name}/state": None, "manager/reset": None}
+        "detection/{name}": None, "recovery/{name}/state": None, "manager/reset": None,
+        "manager/adapt": None}
     assert published(member)["recovery/{name}/command"] is None
     assert published(member)["heartbeat/{name}"] == ("ftm_manager",)
 
