@@ -25,6 +25,7 @@ class Arrangement:
     Attributes:
         repairs: Recoveries that bring something back, as a bitmask of `order`.
         compound: Whether a mechanism runs more than one recovery.
+        depth: How many mechanisms stand above each mechanism in the FTMTree.
         asks: Recoveries of each mechanism, as a bitmask of `order`.
     """
 
@@ -35,6 +36,7 @@ class Arrangement:
         self.repairs = order.mask(
             name for name, contract in mechanisms.contracts.items() if contract.kind.repairs)
         self.compound = any(len(way) > 1 for way in mechanisms.recover.values())
+        self.depth = {name: tree.up_set[bit].bit_count() - 1 for name, bit in tree.number.items()}
         self._width = len(tree.names)
         self._ftms = (1 << self._width) - 1
         self._bits = {

@@ -44,7 +44,9 @@ class MissionFirst:
         tree, order, mechanisms = arrangement.tree, arrangement.order, arrangement.mechanisms
         if tree.root in active:
             return Decision(active, 3, mechanisms.recover[tree.root], (tree.root,))
-        in_time = tree.mask(name for name in active if name not in late)
+        climbed = bool(late) and not late.isdisjoint(active)
+        in_time = (tree.mask(n for n in active if n not in late) if climbed
+                   else arrangement.masks(active)[0])
         asking: dict[str, None] = {}
         for name in active:
             if tree.below[tree.number[name]] & in_time:
@@ -52,10 +54,9 @@ class MissionFirst:
             while name in late and tree.parents[name]:
                 name = str(tree.parents[name])  # noqa: PLW2901 climbing
             asking[name] = None
-        mask = tree.mask(asking)
-        highest = [name for name in asking
-                   if not tree.up_set[tree.number[name]] & mask & ~tree.bit[name]]
-        ranked = sorted(highest, key=lambda n: -tree.up_set[tree.number[n]].bit_count())
+        # Of barriers in time none is above another already.
+        highest = tree.maximal(asking) if climbed else asking
+        ranked = sorted(highest, key=arrangement.depth.__getitem__, reverse=True)
         demanded = arrangement.demanded(ranked)
         mask = order.mask(demanded)
         ranked_recoveries = sorted(
@@ -68,7 +69,6 @@ class MissionFirst:
                 mask |= order.bit[recovery]
         sakes = mechanisms.sort(
             n for n in highest if arrangement.asks[n] & mask)
-        climbed = bool(late) and not late.isdisjoint(active)
         return Decision(active, 2 if climbed else 1, tuple(taken), sakes)
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:

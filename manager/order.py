@@ -131,11 +131,18 @@ class PartialOrder:
         bit = self.greatest_in(self.mask(names))
         return None if bit < 0 else self.names[bit]
 
+    def maximal_in(self, mask: int) -> tuple[str, ...]:
+        """Return the members of a set that no other member is above, greater ones first."""
+        names = []
+        while mask:  # the lowest bit is maximal, and whatever is below it is not
+            bit = (mask & -mask).bit_length() - 1
+            names.append(self.names[bit])
+            mask &= ~(self.below[bit] | 1 << bit)
+        return tuple(names)
+
     def maximal(self, names: Iterable[str]) -> tuple[str, ...]:
         """Return the members that no other member is above."""
-        mask = self.mask(names)
-        return tuple(name for name in self.members(mask)
-                     if not mask & self.up_set[self.number[name]] & ~self.bit[name])
+        return self.maximal_in(self.mask(names))
 
     def chain(self, upper: str, lower: str) -> tuple[str, ...]:
         """Return a longest-to-read chain from `upper` down to `lower`, both included.

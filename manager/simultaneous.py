@@ -36,7 +36,7 @@ class Simultaneous:
         while True:
             if len(sakes) == 1:  # all its parts, even if one dominates another
                 return Decision(active, rule, recover[sakes[0]], sakes)
-            maximal = order.maximal(arrangement.demanded(sakes))
+            maximal = order.maximal_in(arrangement.masks(sakes)[1])
             mask = order.mask(maximal)
             clash = order.mask(n for n in maximal if not arrangement.can_join(n, mask))
             if not clash:

@@ -290,3 +290,27 @@ def test_the_paper_s_strategy_leaves_a_dead_node_dead_where_repair_under_guard_r
     assert "osmosis_control respawned" not in stories["safety-first"]
     assert "RM2 and RM3, rule 2 for FTM2, FTM4" in stories["guarded-repair"]
     assert "in shadow safety-first would run RM2" in stories["guarded-repair"]
+
+
+def test_an_adapted_system_outlives_whatever_runs_it(tmp_path):
+    def strategy() -> str:
+        return str(json.loads(run.tool("status", "--json").stdout)["manager"]["strategy"])
+
+    with RealRun(tmp_path, "--mission", "A", "--rate", "1") as run:
+        run.wait_for("goal 1/3")
+        before = run.pid("DM1")
+        assert run.tool("adapt", "retune", "DM1", "margin_m=0.7").returncode == 0
+        run.wait_until(lambda: run.pid("DM1") not in {None, before}, 5, "DM1 is not anew")
+        assert run.tool("adapt", "set", "strategy", "guarded-repair").returncode == 0
+        assert strategy() == "guarded-repair"
+        refused = run.tool("adapt", "retune", "DM2", "timeout_s=-1")
+        assert refused.returncode == 1
+        assert "timeout_s" in refused.stdout + refused.stderr
+        for names in (("ftm_manager",), ("supervisor",), ("ftm_manager",),
+                      ("spawner_a", "spawner_b"), ("ftm_manager",)):
+            old = {name: run.kill(name) for name in names}
+            run.wait_until(lambda o=old: all(
+                run.pid(n) not in {None, pid} for n, pid in o.items()), 15, f"{names} not back")
+            run.wait_until(lambda: strategy() == "guarded-repair", 5, f"forgotten with {names}")
+        cut = run.tool("cut-sets", "--live")
+        assert cut.returncode == 0, cut.stderr

@@ -41,6 +41,7 @@ class SpawnerClient:
     def __init__(self, port: int) -> None:
         self._port = port
         self._connections: dict[str, socket.socket] = {}
+        self._adapt: Adapt | None = None
 
     def fork(
         self, names: tuple[str, ...], incarnation: int, known: dict[str, int] | None = None
@@ -70,20 +71,26 @@ class SpawnerClient:
             raise SpawnerUnavailableError("spawner_a: no answer")
 
     def adapt(self, adapted: AdaptedSystem) -> None:
-        """Have both spawners fork by a changed system from now on."""
-        request = Adapt(msgspec.json.encode(adapted).decode())
+        """Have the spawners fork by a changed system from now on, those still to come included."""
+        self._adapt = Adapt(msgspec.json.encode(adapted).decode())
         for name in NAMES:
-            self.ask(name, request)  # one that is dead is forked anew by the other, changed
+            self.ask(name, self._adapt)
 
     def ask(self, name: str, request: Request) -> Reply | None:
         """Send a request and return the reply, or None if the spawner is dead or was hung."""
         for _ in range(2):  # a kept connection may be to a spawner that has been replaced
-            connection = self._connections.pop(name, None) or self._connect(name)
+            connection = self._connections.pop(name, None)
+            requests = [request]
+            if connection is None:
+                connection = self._connect(name)
+                if self._adapt is not None and request is not self._adapt:
+                    requests.insert(0, self._adapt)  # it may have loaded the file as it was
             if connection is None:
                 return None
             try:
-                connection.send(msgspec.json.encode(request))
-                data = connection.recv(MAX_DATAGRAM)
+                for one in requests:
+                    connection.send(msgspec.json.encode(one))
+                    data = connection.recv(MAX_DATAGRAM)
             except TimeoutError:
                 _kill_peer(connection)
                 connection.close()

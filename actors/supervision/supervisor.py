@@ -86,6 +86,8 @@ class Supervisor(Actor):
                 self._processes[self._layout.unit_of[node]].incarnation = incarnation
         adapted: AdaptedSystem | None = context.shared.get("adapted")
         self._version = (0, adapted.version if adapted else 0)
+        if adapted is not None:
+            self._spawner.adapt(adapted)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
         self._loop = asyncio.get_running_loop()
 
