@@ -1,6 +1,6 @@
-"""Virtual time for tests of actors: an event loop that jumps to its next timer.
+"""Virtual time for tests of actors.
 
-`run(scenario)` calls the coroutine function on such a loop; `System` starts actors on one hub.
+`run(scenario)` calls a coroutine function on a virtual loop; `System` starts actors on one hub.
 """
 
 from __future__ import annotations
@@ -15,30 +15,11 @@ import systems
 from actors.runtime.actor import Actor, Context
 from actors.runtime.clock import Clock
 from actors.runtime.virtual_bus import Hub, VirtualBus
+from actors.runtime.virtual_loop import VirtualLoop
 from manager.specification import SystemSpec, parse_specification
 
 A = TypeVar("A", bound=Actor)
 T = TypeVar("T")
-
-
-class VirtualLoop(asyncio.SelectorEventLoop):
-    """A loop whose time stands still while it works, and jumps when it would wait."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._now = 0.0
-
-    def time(self) -> float:
-        return self._now
-
-    def jump(self, seconds: float) -> None:
-        """Let time pass unseen, as for a process that is stopped."""
-        self._now += seconds
-
-    def _run_once(self) -> None:
-        if not self._ready and self._scheduled:
-            self._now = max(self._now, self._scheduled[0]._when)
-        super()._run_once()
 
 
 def run(scenario: Callable[[], Coroutine[Any, Any, T]]) -> T:

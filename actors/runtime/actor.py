@@ -59,6 +59,7 @@ class Context:
         bus: this actor's access to the bus, not yet open.
         parameters: the node's parameters from the system spec.
         shared: read-only objects loaded once for the whole run ("system", "airport", ...).
+        pid: number of the process that it lives in.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Context:
     bus: Bus
     parameters: Mapping[str, Any] = field(default_factory=dict)
     shared: Mapping[str, Any] = field(default_factory=dict)
+    pid: int = field(default_factory=os.getpid)
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:
@@ -130,6 +132,7 @@ class Actor:
         self._rejected = 0
         self._timer_count = 0
         self._stopping = False
+        self._abandoned = False
         self._timers: set[asyncio.TimerHandle] = set()
         self._diagnostics: dict[str, tuple[float, int]] = {}
         self._states: dict[str, tuple[Topic[Any], Outgoing]] = {}
@@ -237,6 +240,18 @@ class Actor:
         """End the actor after the items that already wait."""
         self._mailbox.put_latest("stop", self._stop)
 
+    def abandon(self) -> None:
+        """Have nothing more run when its task is cancelled: in virtual time what SIGKILL does."""
+        self._abandoned = True
+
+    def hold(self, held: bool) -> None:
+        """Handle nothing while held: in virtual time what SIGSTOP and a wedged loop do."""
+        self._mailbox.hold(held)
+
+    def slow_down(self, pace_s: float) -> None:
+        """Take so many virtual seconds for each item, as on a machine that is overloaded."""
+        self._mailbox.pace_s = pace_s
+
     # -- the three phases -----------------------------------------------------------------------
 
     async def run(self) -> None:
@@ -281,6 +296,8 @@ class Actor:
         for handle in self._timers:
             handle.cancel()
         self._timers.clear()
+        if self._abandoned:
+            return
         try:
             self.on_stop()
         finally:
@@ -366,7 +383,7 @@ class Actor:
 
     def _beat(self) -> None:
         self.publish(HEARTBEAT, Heartbeat(
-            os.getpid(), self._progress, self.heartbeat_period_s, self._rejected,
+            self.context.pid, self._progress, self.heartbeat_period_s, self._rejected,
             self._mailbox.overflowed))
 
     # -- newcomers ------------------------------------------------------------------------------

@@ -19,6 +19,10 @@ class Mailbox:
     """Items in order of first arrival; a newer item with the same `slot` takes the old one's place.
 
     All methods run on the actor's event loop.
+
+    Attributes:
+        overflowed: Commands refused because too many waited.
+        pace_s: Virtual seconds that each item takes; 0, except for a process that is slow.
     """
 
     def __init__(
@@ -30,7 +34,9 @@ class Mailbox:
         self._latest: dict[str, Any] = {}
         self._commands = 0
         self._waiter: asyncio.Future[None] | None = None
+        self._held = False
         self.overflowed = 0
+        self.pace_s = 0.0
 
     def __len__(self) -> int:
         return len(self._order)
@@ -68,7 +74,9 @@ class Mailbox:
 
     async def get(self) -> Any:
         """Wait for an item, remove and return it."""
-        while not self._order:
+        if self.pace_s:
+            await asyncio.sleep(self.pace_s)
+        while not self._order or self._held:
             self._waiter = asyncio.get_running_loop().create_future()
             try:
                 await self._waiter
@@ -76,6 +84,12 @@ class Mailbox:
                 self._waiter = None
         return self.take()
 
+    def hold(self, held: bool) -> None:
+        """Give out nothing while held: in virtual time a process that is stopped or wedged."""
+        self._held = held
+        if self._order:
+            self._wake()
+
     def _wake(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
+        if self._waiter is not None and not self._held and not self._waiter.done():
             self._waiter.set_result(None)

@@ -1,23 +1,65 @@
-"""A bus inside one process, for tests and virtual time: no sockets, no threads, no delay."""
+"""A bus inside one process, for virtual time and tests: no sockets, no threads.
+
+What lies between two nodes is up to a `Network`: it says when each copy of a message arrives.
+Without one everything arrives at once.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 from actors.runtime.bus import Deliver, PeerChange
 from actors.runtime.topic import Topic
+
+Tap = Callable[[str, str, bytes], None]
+"""Sees each message as it is sent: source, key, payload."""
+
+
+class Network(Protocol):
+    """When messages arrive."""
+
+    def arrivals(self, source: str, reader: str, now_s: float) -> Sequence[float]:
+        """Return the times at which copies of a message sent now arrive; none if it is lost."""
 
 
 class Hub:
     """What the buses of one virtual system share: subscriptions and living nodes."""
 
-    def __init__(self) -> None:
-        self.subscriptions: list[tuple[re.Pattern[str], Deliver, VirtualBus]] = []
+    def __init__(self, network: Network | None = None) -> None:
+        self.network = network
+        self.taps: list[Tap] = []
         self.alive: dict[str, set[int]] = {}
-        self.watchers: list[tuple[str, PeerChange, VirtualBus]] = []
+        self._subscriptions: list[tuple[re.Pattern[str], Deliver, VirtualBus]] = []
+        self._routes: dict[str, list[tuple[Deliver, VirtualBus]]] = {}
+        self._watchers: list[tuple[str, PeerChange, VirtualBus]] = []
+
+    def subscribe(self, expression: str, deliver: Deliver, bus: VirtualBus) -> None:
+        """Have messages on keys that match delivered to a bus."""
+        pattern = re.compile(re.escape(expression).replace(r"\*", "[^/]+"))
+        self._subscriptions.append((pattern, deliver, bus))
+        self._routes.clear()
+
+    def watch(self, node: str, changed: PeerChange, bus: VirtualBus) -> None:
+        """Have the coming and going of a node told to a bus."""
+        self._watchers.append((node, changed, bus))
+
+    def remove(self, bus: VirtualBus) -> None:
+        """Forget a bus."""
+        self._subscriptions = [s for s in self._subscriptions if s[2] is not bus]
+        self._watchers = [w for w in self._watchers if w[2] is not bus]
+        self._routes.clear()
+
+    def routes(self, key: str) -> list[tuple[Deliver, VirtualBus]]:
+        """Return who hears a key, in the order of subscription."""
+        found = self._routes.get(key)
+        if found is None:
+            found = self._routes[key] = [
+                (deliver, bus) for pattern, deliver, bus in self._subscriptions
+                if pattern.fullmatch(key)]
+        return found
 
     def announce(self, node: str, incarnation: int, *, alive: bool) -> None:
         """Tell the watchers that a node appeared or vanished."""
@@ -26,7 +68,7 @@ class Hub:
             lives.add(incarnation)
         else:
             lives.discard(incarnation)
-        for watched, changed, bus in list(self.watchers):
+        for watched, changed, bus in list(self._watchers):
             if watched == node:
                 bus.soon(lambda c=changed: c(node, incarnation, alive))  # type: ignore[misc]
 
@@ -39,9 +81,11 @@ class VirtualBus:
         self._node = node
         self._incarnation = incarnation
         self._open = False
+        self._loop: asyncio.AbstractEventLoop | None = None
 
     async def open(self) -> None:
         """Join the hub."""
+        self._loop = asyncio.get_running_loop()
         self._open = True
         self._hub.announce(self._node, self._incarnation, alive=True)
 
@@ -51,26 +95,42 @@ class VirtualBus:
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:  # noqa: ARG002
         """Send to all present subscribers of the key."""
-        for pattern, deliver, bus in self._hub.subscriptions:
-            if pattern.fullmatch(key):
-                bus.soon(lambda d=deliver: d(key, payload))  # type: ignore[misc]
+        loop, hub = self._loop, self._hub
+        if not self._open or loop is None:
+            return
+        for tap in hub.taps:
+            tap(self._node, key, payload)
+        network = hub.network
+        for deliver, bus in hub.routes(key):
+            if network is None:
+                loop.call_soon(bus.arrive, deliver, key, payload)
+                continue
+            for at_s in network.arrivals(self._node, bus._node, loop.time()):
+                loop.call_at(at_s, bus.arrive, deliver, key, payload)
+
+    def arrive(self, deliver: Deliver, key: str, payload: bytes) -> None:
+        """Hand a message over, if somebody is still there to take it."""
+        if self._open:
+            deliver(key, payload)
 
     def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:  # noqa: ARG002
         """Have `deliver` called for each message on keys that match."""
-        pattern = re.compile(re.escape(key_expression).replace(r"\*", "[^/]+"))
-        self._hub.subscriptions.append((pattern, deliver, self))
+        self._hub.subscribe(key_expression, deliver, self)
 
     def watch(self, node: str, changed: PeerChange) -> None:
         """Have `changed` called now if the node lives, and whenever it appears or vanishes."""
-        self._hub.watchers.append((node, changed, self))
+        self._hub.watch(node, changed, self)
         for incarnation in sorted(self._hub.alive.get(node, ())):
             self.soon(lambda i=incarnation: changed(node, i, True))  # type: ignore[misc]
+
+    def cut(self) -> None:
+        """Send and receive nothing any more, as when the process is killed; nobody is told yet."""
+        self._open = False
+        self._hub.remove(self)
 
     async def close(self) -> None:
         """Leave the hub."""
         if not self._open:
             return
-        self._open = False
-        self._hub.subscriptions = [s for s in self._hub.subscriptions if s[2] is not self]
-        self._hub.watchers = [w for w in self._hub.watchers if w[2] is not self]
+        self.cut()
         self._hub.announce(self._node, self._incarnation, alive=False)

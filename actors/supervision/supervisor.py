@@ -15,11 +15,6 @@ silent Safety Pilot trips the dead man.
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import os
-import select
-import signal
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -37,10 +32,14 @@ from actors.messages import (
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
 from actors.runtime.topic import Topic
-from actors.supervision.process_title import find_processes, is_stopped, process_state
+from actors.supervision.processes import (
+    OsProcesses,
+    Processes,
+    ProcessHandle,
+    SpawnerUnavailableError,
+)
 from actors.supervision.restart_policy import RestartPolicy
 from actors.supervision.run_plan import Layout, RunPlan, Unit, adapted_system
-from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 from manager.adaptation import changed_actors
 from manager.specification import Kind, SystemSpec
 
@@ -56,12 +55,12 @@ _DEAD = (NodeState.CRASHED, NodeState.GIVEN_UP)
 
 @dataclass(slots=True)
 class _Process:
-    """One process of the run as the supervisor knows it. Times are wall seconds."""
+    """One process of the run as the supervisor knows it. Times are the event loop's seconds."""
 
     unit: Unit
     policy: RestartPolicy = field(default_factory=RestartPolicy)
     pid: int = 0
-    pidfd: int = -1
+    handle: ProcessHandle | None = None
     incarnation: int = 0
     state: NodeState = NodeState.CRASHED
     started_s: float = 0.0
@@ -79,7 +78,8 @@ class Supervisor(Actor):
         self._plan: RunPlan = context.shared["plan"]
         self._spec: SystemSpec = context.shared["system"]
         self._layout = Layout(self._plan, self._spec)
-        self._spawner = SpawnerClient(self._plan.base_port)
+        self._machine: Processes = context.shared.get("processes") or OsProcesses(
+            self._plan.base_port, self._plan.launcher_pid)
         self._processes = {u.name: _Process(u) for u in self._layout.units.values()}
         for node, incarnation in context.shared.get("known_incarnations", {}).items():
             if node in self._layout.unit_of:
@@ -87,7 +87,7 @@ class Supervisor(Actor):
         adapted: AdaptedSystem | None = context.shared.get("adapted")
         self._version = (0, adapted.version if adapted else 0)
         if adapted is not None:
-            self._spawner.adapt(adapted)
+            self._machine.adapt(adapted)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
         self._loop = asyncio.get_running_loop()
 
@@ -102,8 +102,7 @@ class Supervisor(Actor):
 
     def on_start(self) -> None:
         """Adopt what lives, start what does not, in the order of the spec."""
-        living = {p.names: p for p in find_processes(self._plan.base_port)
-                  if p.launcher == self._plan.launcher_pid}
+        living = {p.names: p for p in self._machine.living()}
         for process in self._processes.values():
             found = living.get(tuple(n.name for n in process.unit.nodes))
             if found is not None:
@@ -114,22 +113,13 @@ class Supervisor(Actor):
 
     def on_stop(self) -> None:
         """End all processes in reverse order: SIGTERM, then SIGKILL for those that linger."""
-        poll = select.poll()
-        waiting = {}
+        handles = []
         for process in reversed(self._processes.values()):
-            self._unwatch(process, close=False)
-            if process.pidfd >= 0 and process.state is not NodeState.CRASHED:
-                self._signal(process, signal.SIGTERM)
-                poll.register(process.pidfd, select.POLLIN)
-                waiting[process.pidfd] = process
-        deadline = time.monotonic() + STOP_GRACE_S
-        while waiting and (left := deadline - time.monotonic()) > 0:
-            for fd, _ in poll.poll(left * 1000):
-                poll.unregister(fd)
-                del waiting[fd]
-        for process in waiting.values():
-            self._signal(process, signal.SIGKILL)
-        self._spawner.close()
+            if process.handle is not None and process.state is not NodeState.CRASHED:
+                process.handle.ignore()
+                handles.append(process.handle)
+        self._machine.end(handles, STOP_GRACE_S)
+        self._machine.close()
 
     # -- what it hears --------------------------------------------------------------------------
 
@@ -143,7 +133,7 @@ class Supervisor(Actor):
             self._adopt(process, message.pid, header.incarnation)
         if header.incarnation != process.incarnation:
             return
-        process.heard_s[header.source] = time.monotonic()
+        process.heard_s[header.source] = self._loop.time()
         if process.state in (NodeState.STARTING, NodeState.STOPPED, NodeState.WEDGED):
             resumed = process.state is not NodeState.STARTING
             process.state = NodeState.RUNNING
@@ -168,7 +158,7 @@ class Supervisor(Actor):
         except ValueError as error:
             self.report_diagnostic("adaptation", " ".join(str(error).split()), message.change)
             return
-        self._spawner.adapt(message)
+        self._machine.adapt(message)
         changed = changed_actors(self._spec, layout.spec)
         self._layout, self._spec = layout, layout.spec
         for unit in {self._layout.unit_of[name] for name in changed}:
@@ -199,7 +189,7 @@ class Supervisor(Actor):
     @every(0.1)
     def check(self) -> None:
         """Look for processes whose loops are silent."""
-        now = time.monotonic()
+        now = self._loop.time()
         for process in self._processes.values():
             if process.state is NodeState.STARTING:
                 if now - process.started_s > START_TIMEOUT_S:
@@ -216,7 +206,8 @@ class Supervisor(Actor):
         self._publish_table()
 
     def _silent(self, process: _Process, nodes: list[str]) -> None:
-        state = NodeState.STOPPED if is_stopped(process.pid) else NodeState.WEDGED
+        stopped = process.handle is not None and process.handle.stopped()
+        state = NodeState.STOPPED if stopped else NodeState.WEDGED
         self._event(process, state.value, self.name, f"no heartbeat from {', '.join(nodes)}")
         self._lost(process, state)
 
@@ -244,9 +235,10 @@ class Supervisor(Actor):
     # -- acting ---------------------------------------------------------------------------------
 
     def _respawn(self, process: _Process, by: str) -> None:
-        delay_s = process.policy.delay_s(time.monotonic())
-        self._unwatch(process, close=False)
-        self._signal(process, signal.SIGKILL)
+        delay_s = process.policy.delay_s(self._loop.time())
+        if process.handle is not None:
+            process.handle.ignore()
+            process.handle.kill()
         if delay_s is None:
             process.state = NodeState.GIVEN_UP
             self._event(process, "given up", by, (
@@ -254,7 +246,7 @@ class Supervisor(Actor):
             self._publish_table()
             return
         process.respawning = True
-        if delay_s > 0 or not self._is_gone(process):
+        if delay_s > 0 or not _is_gone(process):
             # The port is free only when the old process is: a few more milliseconds.
             self.call_later(max(delay_s, 0.002) * self.clock.rate,
                             lambda: self._finish_respawn(process, by))
@@ -262,17 +254,17 @@ class Supervisor(Actor):
             self._finish_respawn(process, by)
 
     def _finish_respawn(self, process: _Process, by: str) -> None:
-        if not self._is_gone(process):
+        if not _is_gone(process):
             self.call_later(0.002 * self.clock.rate, lambda: self._finish_respawn(process, by))
             return
-        process.policy.restarted(time.monotonic())
+        process.policy.restarted(self._loop.time())
         self._spawn(process, by)
 
     def _spawn(self, process: _Process, by: str) -> None:
         names = tuple(n.name for n in process.unit.nodes)
         incarnation = process.incarnation + 1
         try:
-            pid = self._spawner.fork(names, incarnation)
+            pid = self._machine.fork(names, incarnation)
         except SpawnerUnavailableError as error:
             self.report_diagnostic("fork", str(error), process.unit.name)
             self.call_later(_RETRY_S * self.clock.rate, lambda: self._spawn(process, by))
@@ -282,7 +274,7 @@ class Supervisor(Actor):
         process.respawning = False
         self._watch(process, pid, incarnation)
         process.state = NodeState.STARTING
-        process.started_s = time.monotonic()
+        process.started_s = self._loop.time()
         self._event(process, "started" if first else "respawned", by)
         self._publish_table()
 
@@ -291,7 +283,7 @@ class Supervisor(Actor):
         self._watch(process, pid, incarnation)
         if process.pid:
             process.state = NodeState.RUNNING
-            now = time.monotonic()
+            now = self._loop.time()
             process.heard_s = {n.name: now for n in process.unit.nodes}
             self._event(process, "adopted", self.name)
 
@@ -299,32 +291,16 @@ class Supervisor(Actor):
         self._unwatch(process)
         process.pid, process.incarnation, process.heard_s = pid, incarnation, {}
         try:
-            process.pidfd = os.pidfd_open(pid)
+            process.handle = self._machine.hold(pid, lambda: self._mailbox.put_latest(
+                f"exit {pid}", lambda: self._exited(process, pid)))
         except ProcessLookupError:
             self._event(process, "crashed", self.name, "it ended before it could be watched")
             self._lost(process, NodeState.CRASHED)
-            return
-        self._loop.add_reader(process.pidfd, self._pidfd_readable, process, process.pidfd, pid)
 
-    def _pidfd_readable(self, process: _Process, pidfd: int, pid: int) -> None:
-        self._loop.remove_reader(pidfd)
-        self._mailbox.put_latest(f"exit {pid}", lambda: self._exited(process, pid))
-
-    def _unwatch(self, process: _Process, *, close: bool = True) -> None:
-        if process.pidfd < 0:
-            return
-        self._loop.remove_reader(process.pidfd)
-        if close:
-            os.close(process.pidfd)
-            process.pidfd = -1
-
-    def _signal(self, process: _Process, number: signal.Signals) -> None:
-        if process.pidfd >= 0:
-            with contextlib.suppress(ProcessLookupError):
-                signal.pidfd_send_signal(process.pidfd, number)
-
-    def _is_gone(self, process: _Process) -> bool:
-        return process.pid == 0 or process_state(process.pid) in "XZ"
+    def _unwatch(self, process: _Process) -> None:
+        if process.handle is not None:
+            process.handle.close()
+            process.handle = None
 
     # -- what it says ---------------------------------------------------------------------------
 
@@ -334,7 +310,7 @@ class Supervisor(Actor):
                 node.name, event, process.pid, process.incarnation, by, detail))
 
     def _publish_table(self) -> None:
-        rows = [NodeInfo(self.name, Kind.SUPERVISION.value, os.getpid(), NodeState.RUNNING,
+        rows = [NodeInfo(self.name, Kind.SUPERVISION.value, self.context.pid, NodeState.RUNNING,
                          self.context.incarnation, self.context.incarnation - 1)]
         rows += [
             NodeInfo(node.name, node.kind.value, p.pid, p.state, p.incarnation,
@@ -342,3 +318,7 @@ class Supervisor(Actor):
             for p in self._processes.values() for node in p.unit.nodes
         ]
         self.publish(topics.NODES, NodeTable(tuple(rows)))
+
+
+def _is_gone(process: _Process) -> bool:
+    return process.handle is None or process.handle.gone()

@@ -1,0 +1,170 @@
+"""What the supervisor can do to processes, and how the kernel does it.
+
+The supervisor decides (who is dead, who is respawned when); this is the mechanism. `Processes` is
+what it asks for; `OsProcesses` is the machine. In virtual time `sim.virtual_processes` stands here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import select
+import signal
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+from actors.messages import AdaptedSystem
+from actors.supervision.process_title import find_processes, is_stopped, process_state
+from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+
+__all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerUnavailableError"]
+
+
+class Living(NamedTuple):
+    """A process of the run that is there already."""
+
+    names: tuple[str, ...]
+    pid: int
+    incarnation: int
+
+
+class ProcessHandle(Protocol):
+    """One process, held so that its number cannot come to mean another one."""
+
+    def kill(self) -> None:
+        """End it at once (SIGKILL), if it is still there."""
+
+    def gone(self) -> bool:
+        """Whether it runs no more and holds nothing, its ports included."""
+
+    def stopped(self) -> bool:
+        """Whether it was stopped from outside (SIGSTOP) and runs nothing."""
+
+    def ignore(self) -> None:
+        """Do not report its end any more."""
+
+    def close(self) -> None:
+        """Let go of it."""
+
+
+class Processes(Protocol):
+    """The processes of one run."""
+
+    def living(self) -> Sequence[Living]:
+        """Return those that are there."""
+
+    def fork(self, names: tuple[str, ...], incarnation: int) -> int:
+        """Start a process for the named actors and return its pid.
+
+        Raises:
+            SpawnerUnavailableError: Nobody could do it now.
+        """
+
+    def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
+        """Take hold of a process; `ended` is called on the event loop when it ends.
+
+        Raises:
+            ProcessLookupError: It is gone already.
+        """
+
+    def adapt(self, adapted: AdaptedSystem) -> None:
+        """Start processes by a changed system from now on."""
+
+    def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:
+        """End processes: asked to, in the sequence given, and killed if they linger."""
+
+    def close(self) -> None:
+        """Let go of everything."""
+
+
+class _OsHandle:
+    """A pidfd. It works for processes that are not children, so the living can be adopted."""
+
+    def __init__(self, pid: int, ended: Callable[[], None]) -> None:
+        self.pidfd = os.pidfd_open(pid)
+        self._pid = pid
+        self._ended = ended
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(self.pidfd, self._readable)
+
+    def _readable(self) -> None:
+        self._loop.remove_reader(self.pidfd)
+        self._ended()
+
+    def kill(self) -> None:
+        self.send(signal.SIGKILL)
+
+    def send(self, number: signal.Signals) -> None:
+        if self.pidfd >= 0:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self.pidfd, number)
+
+    def gone(self) -> bool:
+        return process_state(self._pid) in "XZ"
+
+    def stopped(self) -> bool:
+        return is_stopped(self._pid)
+
+    def ignore(self) -> None:
+        if self.pidfd >= 0:
+            self._loop.remove_reader(self.pidfd)
+
+    def close(self) -> None:
+        if self.pidfd >= 0:
+            self.ignore()
+            os.close(self.pidfd)
+            self.pidfd = -1
+
+
+class OsProcesses:
+    """Processes of this machine, forked by the run's spawners.
+
+    Args:
+        port: base port of the run.
+        launcher: pid of its launcher.
+    """
+
+    def __init__(self, port: int, launcher: int) -> None:
+        self._port = port
+        self._launcher = launcher
+        self._spawner = SpawnerClient(port)
+
+    def living(self) -> list[Living]:
+        """Return the processes of this run, found in /proc."""
+        return [Living(p.names, p.pid, p.incarnation) for p in find_processes(self._port)
+                if p.launcher == self._launcher]
+
+    def fork(self, names: tuple[str, ...], incarnation: int) -> int:
+        """Have a spawner fork; raises SpawnerUnavailableError if none answers."""
+        return self._spawner.fork(names, incarnation)
+
+    def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
+        """Open a pidfd; raises ProcessLookupError if there is no such process."""
+        return _OsHandle(pid, ended)
+
+    def adapt(self, adapted: AdaptedSystem) -> None:
+        """Tell the spawners."""
+        self._spawner.adapt(adapted)
+
+    def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:
+        """SIGTERM to all in their sequence, then SIGKILL for those that are there after a while."""
+        poll = select.poll()
+        waiting: dict[int, _OsHandle] = {}
+        for handle in handles:
+            if isinstance(handle, _OsHandle) and handle.pidfd >= 0:
+                handle.send(signal.SIGTERM)
+                poll.register(handle.pidfd, select.POLLIN)
+                waiting[handle.pidfd] = handle
+        deadline = time.monotonic() + grace_s
+        while waiting and (left := deadline - time.monotonic()) > 0:
+            for fd, _ in poll.poll(left * 1000):
+                poll.unregister(fd)
+                del waiting[fd]
+        for handle in waiting.values():
+            handle.kill()
+
+    def close(self) -> None:
+        """Close the connections to the spawners."""
+        self._spawner.close()
