@@ -143,6 +143,8 @@ def _retune(table: str, row: dict[str, Any], change: Change) -> None:
     for key, value in change.values.items():
         if key == "name":
             raise ChangeError(f"name = {value!r}: a name cannot be changed")
+        if key == "parameters" and key in known and not isinstance(value, dict):
+            raise ChangeError(f"parameters = {value!r}: must be a table of names and values")
         if key in known:
             row[key] = value
         elif "parameters" in known:

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from manager_bench import OSMOSIS, osmosis
 from test_manager_actor import Whole
@@ -135,6 +135,7 @@ JSON = st.recursive(
            ["value", "parameters", "enabled", "detect", "recover", "event", "kind", "claims",
             "deadline_s", "within_s", "timeout_s", "watch", "escalate_to", "actor", "title",
             "against", "needs"]), JSON, max_size=3))
+@example(Action.RETUNE, "DM2", {"parameters": None, "value": None})
 def test_whatever_is_asked_for_gives_a_sound_system_or_a_refusal(action, name, values):
     try:
         _, spec = adapt(DOCUMENT, Change(action, name, values), "f")
