@@ -460,6 +460,30 @@ class ObstacleCommand(Message, frozen=True):
     radius_m: float
 
 
+class ActuatorFaultKind(StrEnum):
+    """What can fail about the base's actuators."""
+
+    STUCK_WHEEL = "stuck wheel"
+    WEAK_WHEEL = "weak wheel"
+    BRAKE_FAILURE = "brake failure"
+
+
+class ActuatorFault(Message, frozen=True):
+    """Puts a fault of the base's actuators in force; 0 simulated seconds end it.
+
+    `wheel`: front left, front right, rear left or rear right; a brake failure ignores it.
+    `strength` from 0 to 1: what is left of a weak wheel's torque and speed, or of the braking
+    torque with a brake failure, whose wheels do not lock; 1 loses nothing. A stuck wheel ignores
+    it. `InjectionReport.affected` counts the 10 ms ticks in which the fault changed something.
+    """
+
+    injection: str
+    kind: ActuatorFaultKind
+    wheel: str
+    strength: float
+    duration_s: float
+
+
 class ObstacleList(Message, frozen=True):
     """The obstacles that are there now, for the map on the operator's page."""
 

@@ -82,6 +82,8 @@ STUB_TRIGGER = Topic("stub/trigger", m.StubTrigger, Qos.COMMAND, 0, "",
 TRUTH = Topic("world/truth", m.GroundTruth, Qos.STATE, 20, "map", "Ground truth.")
 OBSTACLE = Topic("world/obstacle", m.ObstacleCommand, Qos.COMMAND, 0, "map",
                  "Put an obstacle into the world or take it away.")
+ACTUATOR_FAULT = Topic("world/actuator_fault", m.ActuatorFault, Qos.COMMAND, 0, "",
+                       "Put a fault of the base's actuators in force or end it.")
 OBSTACLES = Topic("world/obstacles", m.ObstacleList, Qos.STATE, 1, "map",
                   "Obstacles present, for maps shown to people.")
 

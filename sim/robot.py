@@ -24,6 +24,9 @@ CIRCUMRADIUS_M = math.hypot(LENGTH_M, WIDTH_M) / 2
 SLIP_FACTOR = 1.0 + (WHEEL_X_M / WHEEL_Y_M) ** 2
 """Effective over real track."""
 
+WHEEL_NAMES = ("front left", "front right", "rear left", "rear right")
+"""Order of the wheels wherever there are four of something."""
+
 WheelSpeeds = tuple[float, float, float, float]
 
 
@@ -73,6 +76,10 @@ class Drive:
         limits: speeds and ramps.
         dead_man_timeout_s: brake when the last valid command is older; None switches the dead
             man off, so that the last command is kept for ever (the paper's unprotected baseline).
+
+    Attributes:
+        brake_ordered: the brake is wanted.
+        brake_share: share of its deceleration that the brake has left; below 1 it does not lock.
     """
 
     def __init__(self, limits: DriveLimits, dead_man_timeout_s: float | None) -> None:
@@ -81,6 +88,7 @@ class Drive:
         self.limits = limits
         self.dead_man_timeout_s = dead_man_timeout_s
         self.brake_ordered = False
+        self.brake_share = 1.0
         self.refused_commands = 0
         self._wanted = (0.0, 0.0)
         self._wanted_at_s = -math.inf
@@ -114,6 +122,14 @@ class Drive:
         timeout_s = self.dead_man_timeout_s
         return timeout_s is not None and self.command_age_s(now_s) > timeout_s + 1e-9
 
+    def give_way(self, linear_mps: float, angular_radps: float) -> None:
+        """Bring the ramps down to the measured speed where friction is faster than the brake.
+
+        So the drive goes on from where the base is once the brake is released, without a jerk.
+        """
+        self._linear = _between_zero_and(self._linear, linear_mps)
+        self._angular = _between_zero_and(self._angular, angular_radps)
+
     @property
     def braking(self) -> bool:
         """Whether the brake was on in the last update, ordered or by the dead man."""
@@ -122,15 +138,17 @@ class Drive:
     @property
     def locked(self) -> bool:
         """Whether the wheels are blocked: braked, and the ramp has come to zero."""
-        return self._braking and self._linear == 0.0 and self._angular == 0.0
+        stopped = self._linear == 0.0 and self._angular == 0.0
+        return self._braking and stopped and self.brake_share == 1.0
 
     def update(self, now_s: float, dt_s: float) -> WheelSpeeds:
         """Advance the ramps by `dt_s` and return the wheel speeds to servo to, rad/s."""
         limits = self.limits
         self._braking = self.brake_ordered or self.dead_man_tripped(now_s)
         if self._braking:
-            self._linear = _towards(self._linear, 0.0, limits.brake_mps2 * dt_s)
-            self._angular = _towards(self._angular, 0.0, limits.brake_radps2 * dt_s)
+            brake_s = self.brake_share * dt_s
+            self._linear = _towards(self._linear, 0.0, limits.brake_mps2 * brake_s)
+            self._angular = _towards(self._angular, 0.0, limits.brake_radps2 * brake_s)
         else:
             linear, angular = self._wanted
             slowing = self._linear * linear <= 0 or abs(linear) < abs(self._linear)
@@ -142,6 +160,12 @@ class Drive:
                 self._angular, angular, limits.angular_acceleration_radps2 * dt_s
             )
         return wheel_speeds(self._linear, self._angular)
+
+
+def _between_zero_and(value: float, bound: float) -> float:
+    if value > 0:
+        return max(0.0, min(value, bound))
+    return min(0.0, max(value, bound))
 
 
 def _towards(value: float, goal: float, step: float) -> float:

@@ -7,6 +7,7 @@ due times; each reading gets the stamp of its own due time.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from heapq import heapreplace
 
 
 class Schedule:
@@ -30,20 +31,21 @@ class Schedule:
         self._start_s = start_s
         self._keep_s = keep_s
         self._counts = dict.fromkeys(rates_hz, 0)
-
-    def _due_s(self, name: str) -> float:
-        return self._start_s + self._counts[name] * self._periods[name]
+        self._queue = [(start_s, place, name) for place, name in enumerate(rates_hz)]
 
     def due(self, now_s: float) -> Iterator[tuple[float, str]]:
         """Yield (due time, job) in order of time, up to and including `now_s`."""
+        queue = self._queue
         oldest_s = now_s - self._keep_s
-        for name, period_s in self._periods.items():
-            late_s = oldest_s - self._due_s(name)
-            if late_s > 0:
-                self._counts[name] += int(late_s / period_s) + 1
-        while True:
-            due_s, name = min((self._due_s(name), name) for name in self._periods)
-            if due_s > now_s + 1e-9:
-                return
-            self._counts[name] += 1
+        while queue[0][0] < oldest_s:
+            _, place, name = queue[0]
+            missed = int((oldest_s - queue[0][0]) / self._periods[name]) + 1
+            heapreplace(queue, (self._next_s(name, missed), place, name))
+        while queue[0][0] <= now_s + 1e-9:
+            due_s, place, name = queue[0]
+            heapreplace(queue, (self._next_s(name, 1), place, name))
             yield due_s, name
+
+    def _next_s(self, name: str, periods: int) -> float:
+        self._counts[name] += periods
+        return self._start_s + self._counts[name] * self._periods[name]

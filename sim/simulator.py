@@ -117,6 +117,21 @@ class Simulator(Actor):
             return
         self.publish(topics.OBSTACLES, self._obstacles())
 
+    @on(topics.ACTUATOR_FAULT)
+    def actuator_fault(self, message: m.ActuatorFault, header: Header) -> None:
+        """Put a fault of the actuators in force or end it, and report how it fares.
+
+        Reports go out when it is taken, when it first changes something, and when it is over; a
+        refused one is reported as finished with the reason.
+        """
+        self._advance()
+        try:
+            self._world.order_fault(message)
+        except WorldError as error:
+            self.report_diagnostic("actuator fault", str(error), header.source)
+            self._report_fault(message.injection, 0, finished=True, reason=str(error))
+        self._report_faults()
+
     # -- time -----------------------------------------------------------------------------------
 
     @every(WAKE_UP_S)
@@ -127,10 +142,23 @@ class Simulator(Actor):
     def _advance(self) -> None:
         now_s = self.clock.now()
         for due_s, job in self._schedule.due(now_s):
-            self._world.step_to(due_s)
-            self.publish(self._topics[job], self._readers[job](), stamp=due_s)
+            topic = self._topics[job]
+            if self.has_readers(topic):
+                self._world.step_to(due_s)
+                self.publish(topic, self._readers[job](), stamp=due_s)
         self._world.step_to(now_s)
+        self._report_faults()
         self._measure_speed(now_s)
+
+    def _report_faults(self) -> None:
+        for news in self._world.fault_news():
+            self._report_fault(news.injection, news.affected_ticks, finished=news.finished)
+
+    def _report_fault(
+        self, injection: str, affected: int, *, finished: bool, reason: str = ""
+    ) -> None:
+        report = m.InjectionReport(injection, self.name, affected, finished, reason)
+        self.publish(topics.INJECTION_REPORT, report)
 
     def _measure_speed(self, now_s: float) -> None:
         """Over each second, the share of the clock's time that was simulated and not skipped."""

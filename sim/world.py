@@ -13,10 +13,12 @@ import mujoco
 import numpy as np
 import shapely
 
+from actors.messages import ActuatorFault
 from airport.model import Airport
 from airport.world import WorldTruth
+from sim.actuator_faults import ActuatorFaults, FaultNews, motor_of
 from sim.clearance import Clearance, Pose, footprint
-from sim.robot import CIRCUMRADIUS_M, Drive, DriveLimits, WheelSpeeds
+from sim.robot import CIRCUMRADIUS_M, Drive, DriveLimits, WheelSpeeds, twist_from_wheels
 from sim.scene import Scene, Solid, WorldError
 from sim.sensors import (
     Floats,
@@ -48,7 +50,7 @@ SAME_CONTACT_S = 0.5
 """A contact with the same thing after a shorter break is the same collision."""
 
 LOCKED_DAMPING = 300.0
-"""Wheel damping, N m s/rad, when the brake blocks the wheels: all that moves then is the tyres."""
+"""Wheel damping, N m s/rad, of a blocked wheel, braked or stuck: all that moves is the tyre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +139,9 @@ class World:
         self._free_damping = self._damping.copy()
         self._locked = False
         self._drive = Drive(limits or DriveLimits(), dead_man_timeout_s)
+        self._torque_ranges = self._model.actuator_forcerange
+        self._faults = ActuatorFaults(motor_of(self._model, self._drive.limits))
+        self._faulty = False
         self.laser = laser or LaserSpec()
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
         self._laser = Laser(self.laser, streams[0])
@@ -174,6 +179,19 @@ class World:
         """Engage or release the brake."""
         self._drive.brake_ordered = engaged
 
+    def order_fault(self, order: ActuatorFault) -> None:
+        """Put a fault of the actuators in force from now on, or end it (duration 0).
+
+        Raises:
+            WorldError: unknown wheel, strength not in 0 to 1, impossible duration, nothing to end.
+        """
+        self._faults.order(order, self.time_s)
+        self._faulty = True
+
+    def fault_news(self) -> list[FaultNews]:
+        """Return what has happened to actuator faults since the last call, oldest first."""
+        return self._faults.take_news()
+
     # -- time -----------------------------------------------------------------------------------
 
     def step_to(self, t_s: float) -> None:
@@ -197,10 +215,13 @@ class World:
         self.time_s = self._start_s + self.skipped_s + self._ticks * TICK_S
 
     def _tick(self) -> None:
-        self._servos[:] = self._drive.update(self.time_s, TICK_S)
-        if self._drive.locked != self._locked:
-            self._locked = self._drive.locked
-            self._damping[:] = LOCKED_DAMPING if self._locked else self._free_damping
+        if self._faulty:
+            self._actuate_with_faults()
+        else:
+            self._servos[:] = self._drive.update(self.time_s, TICK_S)
+            if self._drive.locked != self._locked:
+                self._locked = self._drive.locked
+                self._damping[:] = LOCKED_DAMPING if self._locked else self._free_damping
         mujoco.mj_step(self._model, self._data, nstep=self._steps_per_tick)
         self._ticks += 1
         self._set_time()
@@ -209,6 +230,24 @@ class World:
         if self.time_s >= self._examine_at_s - 1e-9:
             self._bring_obstacles()
             self._examine()
+
+    def _actuate_with_faults(self) -> None:
+        """Apply the actuator faults; in the tick after the last one this heals the model."""
+        self._faults.expire(self.time_s)
+        self._faulty = bool(self._faults)
+        drive = self._drive
+        drive.brake_share = self._faults.brake_share
+        targets = drive.update(self.time_s, TICK_S)
+        fl, fr, rl, rr = self._wheel_v.tolist()
+        speeds = (fl, fr, rl, rr)
+        actuation = self._faults.actuate(targets, speeds, drive.braking)
+        self._servos[:] = actuation.targets_radps
+        self._torque_ranges[:] = actuation.torques_nm
+        self._locked = drive.locked
+        blocked = np.array(actuation.blocked) | self._locked
+        self._damping[:] = np.where(blocked, LOCKED_DAMPING, self._free_damping)
+        if drive.braking and drive.brake_share < 1:
+            drive.give_way(*twist_from_wheels(speeds))
 
     # -- sensors --------------------------------------------------------------------------------
 

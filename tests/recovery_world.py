@@ -147,5 +147,4 @@ class Supervisor(Actor):
 
 def hang(actor: Actor) -> None:
     """Stop an actor's loop as SIGSTOP would: it stays announced, and says nothing more."""
-    for handle in list(actor._timers):
-        handle.cancel()
+    actor.hold(True)

@@ -137,8 +137,7 @@ def test_a_node_whose_loop_hangs_is_reported_after_the_timeout():
             node = system.start("a", Node)
             system.start("DM4", Watchdog, watch=["a"], timeout_s=0.35)
             await asyncio.sleep(0.55)
-            for handle in node._timers:
-                handle.cancel()
+            node.hold(True)
             await asyncio.sleep(0.2)
             assert ear.states == ["idle"]
             await asyncio.sleep(0.2)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
+import inspect
 import socket
+import textwrap
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
@@ -16,7 +19,10 @@ from actors.runtime.bus import Bus, BusError
 from actors.runtime.clock import Clock
 from actors.runtime.envelope import encode
 from actors.runtime.virtual_bus import Hub, VirtualBus
+from actors.runtime.wiring import load_class
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
+from actors.supervision.run_plan import OBSERVER_CLASS, SUPERVISOR_CLASS
+from toolbox import systems
 
 
 class Talker(Actor):
@@ -241,3 +247,23 @@ async def test_a_newcomer_hears_the_states_of_its_partners_at_once(make_bus):
             await eventually(lambda: bool(newcomer.heard))
             assert newcomer.heard[0][0] == order
             assert newcomer.heard[0][1].stamp == 0.125
+
+
+def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
+    """Python would let it happen in silence: a node's `_held` once stopped the node's mailbox."""
+
+    def assigned(cls: type) -> set[str]:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
+        return {node.attr for node in ast.walk(tree)
+                if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
+                and isinstance(node.value, ast.Name) and node.value.id == "self"}
+
+    system = systems.load(None)
+    classes = {base for node in system.actors() for base in load_class(node.actor).__mro__
+               if issubclass(base, Actor) and base is not Actor}
+    classes |= {load_class(name) for name in (SUPERVISOR_CLASS, OBSERVER_CLASS)}
+    assert len(classes) > 15
+    own = assigned(Actor) | {name for name in vars(Actor) if name.startswith("_")
+                             and not name.startswith("__")}
+    taken = {cls.__name__: names for cls in classes if (names := assigned(cls) & own)}
+    assert taken == {}

@@ -225,7 +225,44 @@ async def test_an_injection_that_affected_nothing_says_so_and_fails(run, capsys)
     code, out, err = await run.call(capsys, "inject", "wrong-graph", "--duration", "1")
     assert code == 1
     assert "in force at simulator" in out
-    assert err == ("rampart: no effect: simulator published nothing on plan/route within 1 s\n")
+    assert err == ("rampart: no effect: simulator published nothing on plan/route within 1 s, "
+                   "or nothing that it changed\n")
+
+
+async def test_a_fault_that_changes_no_message_had_no_effect(run, capsys):
+    code, _, err = await run.call(
+        capsys, "inject", "--topic", "localization/pose", "--mode", "corrupt", "--set", "x_m=1",
+        "--duration", "1")
+    assert code == 1
+    assert "no effect: simulator" in err
+
+
+async def test_a_permanent_fault_is_waited_for_until_its_first_effect_and_goes_on(run, capsys):
+    code, out, _ = await run.call(
+        capsys, "inject", "stuck:localization/pose", "--duration", "inf")
+    assert code == 0
+    assert "in force at simulator until its process ends" in out
+    assert "affects localization/pose, and goes on" in out
+    _, out, _ = await run.call(
+        capsys, "topic", "echo", "localization/pose", "-n", "3", "--json")
+    assert len({json.loads(line)["message"]["y_m"] for line in out.splitlines()}) == 1
+
+
+async def test_a_permanent_fault_without_effect_is_ended_and_said_to_have_none(run, capsys):
+    code, _, err = await run.call(capsys, "inject", "drop:plan/route", "--duration", "inf")
+    assert code == 1
+    assert "no effect: simulator published nothing on plan/route within 10 s" in err
+    assert run.node.orders[-1].duration_s == 0.0
+
+
+async def test_a_fault_that_does_not_fit_its_messages_is_refused_by_the_node(
+        run, capsys, monkeypatch):
+    monkeypatch.setattr("toolbox.inject_verbs.flaw", lambda *_: "")
+    code, _, err = await run.call(
+        capsys, "inject", "--topic", "localization/pose", "--mode", "corrupt",
+        "--noise", "x_m=-1", "--duration", "1")
+    assert code == 1
+    assert "no effect: refused by simulator: noise_fields 'x_m' = -1" in err
 
 
 async def test_an_injection_into_a_node_that_is_none_is_refused(run, capsys):

@@ -6,13 +6,11 @@ import csv
 import io
 import json
 
-import msgspec
 import pytest
 
 from actors import messages as m
 from actors import topics
-from actors.runtime.injection import FaultGate
-from sim.faults import CATALOGUE, find_fault
+from sim.faults import find_fault
 from toolbox import systems
 from toolbox.inject_verbs import choose
 from toolbox.main import build_parser, main
@@ -106,7 +104,22 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     (["table", "--differing"], ["--differing", "--strategy"]),
     (["table", "--strategy", "safety-first", "--strategy", "bravely"], ["'bravely'"]),
     (["table", "--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
-    (["inject", "gremlins"], ["'gremlins'", "known: command-not-updated"]),
+    (["inject", "gremlins"], ["'gremlins'", "`rampart inject --list`"]),
+    (["inject", "laser-dropuot"], ["did you mean laser-dropout?"]),
+    (["inject", "laser-drift"], ["'laser-drift'", "quartz"]),
+    (["inject", "drop:no/such"], ["'drop:no/such'", "no topic"]),
+    (["inject", "melt:plan/route"], ["'melt:plan/route'", "drop, freeze"]),
+    (["inject", "corrupt:summit_xl/brake"], ["no number", "BrakeCommand"]),
+    (["inject", "drop:world/truth"], ["judge"]),
+    (["inject", "drop:inject/report"], ["injections themselves"]),
+    (["inject", "drop:detection/{name}"], ["no topic"]),
+    (["inject", "wrong-graph", "--add", "x_m=1"], ["--add", "--topic"]),
+    (["inject", "wrong-graph", "--share", "0"], ["--share 0"]),
+    (["inject", "wrong-graph", "--share", "1.5"], ["--share 1.5"]),
+    (["inject", "wrong-graph", "--share", "nan"], ["--share nan"]),
+    (["inject", "wrong-graph", "--on", "1"], ["--off"]),
+    (["inject", "wrong-graph", "--on", "1", "--off", "inf"], ["--off inf"]),
+    (["inject", "wrong-graph", "--on", "-1", "--off", "1"], ["--on -1"]),
     (["inject"], ["--list"]),
     (["inject", "wrong-graph", "--topic", "plan/route"], ["either"]),
     (["inject", "wrong-graph", "--mode", "drop"], ["--mode"]),
@@ -125,6 +138,10 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     (["inject", "--topic", "localization/pose", "--mode", "corrupt", "--set", "x_m"],
      ["FIELD=VALUE"]),
     (["inject", "--topic", "plan/route", "--mode", "corrupt", "--ramp", "step=1"], ["float"]),
+    (["inject", "--topic", "plan/route", "--mode", "corrupt", "--add", "reason=1"], ["number"]),
+    (["inject", "--topic", "plan/route", "--mode", "corrupt", "--add", "step=lots"], ["step=lots"]),
+    (["inject", "--topic", "localization/pose", "--mode", "corrupt", "--noise", "x_m=-1"],
+     ["'x_m' = -1", "0 or more"]),
     (["inject", "--topic", "plan/route", "--mode", "corrupt", "--keep-ends", "step"], ["list"]),
     (["topic", "info", "no/such"], ["'no/such'", "localization/pose"]),
     (["topic", "echo", "localization/pose/x"], ["'localization/pose/x'"]),
@@ -154,33 +171,46 @@ def test_without_a_run_each_verb_says_so_and_exits_2(capsys, monkeypatch, argume
 
 def test_the_catalogue_is_listed_with_who_should_see_each_fault(capsys):
     assert main(["inject", "--list", "--json"]) == 0
-    listed = {f["name"]: f["detected_by"] for f in json.loads(told(capsys))}
+    listed = {f["name"]: f["detected_by"] for f in json.loads(told(capsys))
+              if f["group"] == "paper"}
     assert listed == {
         "command-not-updated": ["DM2"], "command-out-of-bounds": ["DM3"],
         "localization-not-updated": ["DM6"], "prohibited-area": ["DM1"], "wrong-graph": ["DM1"]}
 
 
-SAMPLES = {
-    "control/command": m.Twist(0.5, 0.1),
-    "localization/pose": m.Pose(1.0, 2.0, 0.3),
-    "plan/route": m.Route("1", 0, m.Mode.TAXI, True, ((0.0, 0.0), (1.0, 1.0), (2.0, 0.0)), ""),
-}
+def test_the_list_has_a_part_for_each_group_and_a_line_for_each_topic(capsys):
+    assert main(["inject", "--list"]) == 0
+    text = told(capsys)
+    lines = {line.split()[0]: line for line in text.splitlines() if line}
+    assert {"command-not-updated", "laser-dropout", "localization/pose"} <= set(lines)
+    assert lines["summit_xl/brake"].endswith("all but corrupt")
+    assert "world/truth" not in lines
+    assert "inject/report" not in lines
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
-def test_every_fault_of_the_catalogue_changes_a_real_message(name):
-    gate = FaultGate()
-    for order in find_fault(name).orders("i"):
-        topic, key = resolve(order.topic)
-        first, later = SAMPLES[order.topic], SAMPLES[order.topic]
-        if order.topic != "plan/route":
-            later = type(first)(*(value + 1 for value in msgspec.structs.astuple(first)))
-        gate.remember(key, gate.apply(key, first, 0.0, 0.0))
-        assert gate.order(order, 1.0) == ""
-        out = gate.apply(key, later, 3.0, 3.0)
-        assert type(out.body) is topic.type
-        assert out.body != later
-        assert gate.expire(order.injection) == 1
+def test_a_fault_with_a_name_can_be_made_rarer_intermittent_and_random_in_another_way():
+    options = build_parser().parse_args([
+        "inject", "gps-noise", "--share", "0.3", "--on", "1", "--off", "4", "--seed", "7"])
+    (order,) = choose(options).orders("i")
+    assert (order.share, order.on_s, order.off_s, order.seed) == (0.3, 1.0, 4.0, 7)
+    assert order.noise_fields == find_fault("gps-noise").disturbances[0].noise_fields
+
+
+def test_another_seed_corrupts_a_topic_with_other_numbers():
+    first, again, other = (
+        choose(build_parser().parse_args(["inject", "corrupt:plan/route", "--seed", seed]))
+        .disturbances[0].add_fields for seed in ("1", "1", "2"))
+    assert first == again != other
+
+
+def test_biases_and_noise_are_put_together_from_options_also_for_arrays():
+    options = build_parser().parse_args([
+        "inject", "--topic", "summit_xl/scan", "--mode", "corrupt", "--add", "ranges_f32=0.4",
+        "--noise", "ranges_f32=0.2", "--set", "range_max_m=9", "--seed", "3"])
+    (order,) = choose(options).orders("i1", 4.0)
+    assert order == m.Injection(
+        "i1", "summit_xl/scan", "corrupt", 4.0, set_fields={"range_max_m": 9.0},
+        add_fields={"ranges_f32": 0.4}, noise_fields={"ranges_f32": 0.2}, seed=3)
 
 
 def test_a_fault_of_ones_own_is_put_together_from_options():

@@ -1,30 +1,50 @@
-"""`rampart inject`: disturb a topic where it is published, and say whether it had an effect."""
+"""`rampart inject`: choose a fault of the catalogue, or describe one, and have it injected."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
-import math
-import uuid
 from typing import Any
 
 import msgspec
 
 from actors import topics
-from actors.messages import Injection, InjectionReport
-from actors.runtime.envelope import Header
-from actors.runtime.injection import MODES
+from actors.runtime.corruption import InjectionError, field_type, is_array
+from actors.runtime.injection import MODES, flaw
 from actors.runtime.topic import ROOT, Topic
-from sim.faults import CATALOGUE, Disturbance, Fault, UnknownFaultError, find_fault
-from toolbox.output import NoEffectError, UsageError, print_json, print_table, say, unknown
-from toolbox.session import Session, connect
+from sim.faults import (
+    PAPER_FAULTS,
+    SENSOR_FAULTS,
+    Disturbance,
+    Fault,
+    UnknownFaultError,
+    find_fault,
+)
+from sim.topic_faults import modes_of, published_keys, systematic_faults
+from toolbox import systems
+from toolbox.injecting import run_fault
+from toolbox.output import UsageError, print_json, print_table, say
 from toolbox.topic_catalogue import resolve
 
-_TAKE_HOLD_S = 1.5
-"""Real seconds within which a publisher answers, even when it is just being respawned."""
-
 _DEFAULT_DURATION_S = 5.0
+
+_EPILOG = """examples:
+  rampart inject --list                           what there is
+  rampart inject command-out-of-bounds --duration 3
+  rampart inject prohibited-area --at-once
+  rampart inject laser-stuck --duration inf       permanent: until the node's process ends
+  rampart inject gps-dropout --on 1 --off 4 --duration 30
+                                                  intermittent: 1 s without GPS, 4 s with
+  rampart inject drop:localization/pose           any mode on any topic ...
+  rampart inject corrupt:plan/route --seed 7      ... here with other wrong numbers
+  rampart inject drop:control/command --share 0.3 three messages in ten are lost
+your own:
+  rampart inject --topic localization/pose --mode delay --delay 0.8
+  rampart inject --topic localization/pose --mode corrupt --ramp x_m=0.25
+  rampart inject --topic control/command --mode corrupt --set angular_radps=2.5
+  rampart inject --topic summit_xl/scan --mode corrupt --add ranges_f32=0.4 \\
+                 --noise ranges_f32=0.2
+Fields are those of `rampart topic info TOPIC`; one inside another is written pose.x_m."""
 
 
 def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
@@ -34,28 +54,37 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
         description="Inject a fault of the catalogue, or disturb any topic, for a while. It\n"
                     "acts in the node that publishes the topic. The verb waits for its end and\n"
                     "says how many messages were affected; if none was, it says so and exits 1.\n"
+                    "For a permanent fault it waits until the first message was affected.\n"
                     "Ctrl-C ends the fault at once. Durations are simulated seconds.",
-        epilog="examples:\n  rampart inject --list\n"
-               "  rampart inject command-out-of-bounds --duration 3\n"
-               "  rampart inject prohibited-area --at-once\n"
-               "  rampart inject --topic localization/pose --mode delay --delay 0.8\n"
-               "  rampart inject --topic localization/pose --mode corrupt --ramp x_m=0.25\n"
-               "  rampart inject --topic control/command --mode corrupt --set angular_radps=2.5")
-    parser.add_argument("fault", nargs="?", metavar="FAULT", help="a name from --list")
+        epilog=_EPILOG)
+    parser.add_argument("fault", nargs="?", metavar="FAULT",
+                        help="a name from --list, or MODE:TOPIC")
     parser.add_argument("--list", action="store_true", help="list the catalogue (needs no run)")
     parser.add_argument("--duration", type=float, metavar="S",
-                        help="simulated seconds; default the fault's own, else 5")
+                        help="simulated seconds, inf for permanent; default the fault's own, "
+                             f"else {_DEFAULT_DURATION_S:g}")
     parser.add_argument("--at-once", action="store_true",
                         help="return as soon as the fault is in force; do not wait for its end")
     parser.add_argument("--json", action="store_true", help="print JSON")
+    when = parser.add_argument_group("which messages")
+    when.add_argument("--share", type=float, metavar="P",
+                      help="probability that a message is affected, up to 1 (default)")
+    when.add_argument("--on", type=float, metavar="S", help="intermittent: in force for S ...")
+    when.add_argument("--off", type=float, metavar="S", help="... and away for S, repeating")
+    when.add_argument("--seed", type=int, metavar="N",
+                      help="of share, noise and the numbers of corrupt:TOPIC; default 0")
     own = parser.add_argument_group("a fault of your own, instead of FAULT")
     own.add_argument("--topic", metavar="KEY", help="e.g. control/command or detection/DM2")
-    own.add_argument("--mode", help=", ".join(MODES))
+    own.add_argument("--mode", metavar="MODE", help=", ".join(MODES))
     own.add_argument("--delay", type=float, metavar="S", help="for delay: simulated seconds")
     own.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE",
-                     help="for corrupt: overwrite a field; may be repeated")
+                     help="for corrupt: overwrite a field; may be repeated, as all below")
+    own.add_argument("--add", action="append", default=[], metavar="FIELD=BIAS",
+                     help="for corrupt: add BIAS to a number, or to each of an array")
     own.add_argument("--ramp", action="append", default=[], metavar="FIELD=RATE",
-                     help="for corrupt: add RATE per simulated second; may be repeated")
+                     help="for corrupt: add RATE per simulated second")
+    own.add_argument("--noise", action="append", default=[], metavar="FIELD=SIGMA",
+                     help="for corrupt: add Gaussian noise of this standard deviation")
     own.add_argument("--keep-ends", action="append", default=[], metavar="FIELD",
                      help="for corrupt: keep only first and last element of a list")
     parser.set_defaults(run=inject)
@@ -67,10 +96,10 @@ def inject(options: argparse.Namespace) -> int:
         _print_catalogue(as_json=options.json)
         return 0
     fault = choose(options)
-    if options.duration is not None and not (
-            math.isfinite(options.duration) and options.duration > 0):
-        raise UsageError(f"--duration {options.duration:g}: must be seconds above 0")
-    return asyncio.run(_inject(options, fault))
+    if options.duration is not None and not options.duration > 0:
+        raise UsageError(f"--duration {options.duration:g}: must be seconds above 0, or inf")
+    return asyncio.run(run_fault(
+        fault, options.duration, options.port, at_once=options.at_once, as_json=options.json))
 
 
 def choose(options: argparse.Namespace) -> Fault:
@@ -81,200 +110,120 @@ def choose(options: argparse.Namespace) -> Fault:
     """
     if (options.fault is None) == (options.topic is None):
         raise UsageError("give either a FAULT of the catalogue (rampart inject --list) or --topic")
-    if options.fault is not None:
-        for name in ("mode", "delay", "set", "ramp", "keep_ends"):
-            if getattr(options, name):
-                raise UsageError(f"--{name.replace('_', '-')} goes with --topic, not with a "
-                                 "FAULT of the catalogue")
-        try:
-            return find_fault(options.fault)
-        except UnknownFaultError as error:
-            raise UsageError(str(error)) from None
+    if options.share is not None and not 0 < options.share <= 1:
+        raise UsageError(f"--share {options.share:g}: must be above 0, and at most 1")
+    if (options.on is None) != (options.off is None):
+        raise UsageError("--on S and --off S go together")
+    for name in ("on", "off"):
+        value = getattr(options, name)
+        if value is not None and not 0 < value < float("inf"):
+            raise UsageError(f"--{name} {value:g}: must be seconds above 0")
+    fault = _own_fault(options) if options.fault is None else _known_fault(options)
+    return fault.varied(share=options.share, on_s=options.on, off_s=options.off)
+
+
+def _known_fault(options: argparse.Namespace) -> Fault:
+    for name in ("mode", "delay", "set", "add", "ramp", "noise", "keep_ends"):
+        if getattr(options, name):
+            raise UsageError(f"--{name.replace('_', '-')} goes with --topic, not with a "
+                             "FAULT of the catalogue")
+    try:
+        return find_fault(options.fault, options.seed or 0)
+    except UnknownFaultError as error:
+        raise UsageError(str(error)) from None
+
+
+def _own_fault(options: argparse.Namespace) -> Fault:
     topic, key = resolve(options.topic)
     if "*" in key:
         raise UsageError(f"--topic {options.topic}: name one member of the family, "
                          f"e.g. {topic.key.replace('{name}', 'DM1')}")
     if options.mode not in MODES:
         raise UsageError(f"--mode {options.mode}: must be one of {', '.join(MODES)}")
-    corrupt = options.set or options.ramp or options.keep_ends
-    if bool(corrupt) != (options.mode == "corrupt"):
-        raise UsageError("--mode corrupt goes with --set, --ramp or --keep-ends, and no other "
-                         "mode does")
+    changes = (options.set, options.add, options.ramp, options.noise, options.keep_ends)
+    if any(changes) != (options.mode == "corrupt"):
+        raise UsageError("--mode corrupt goes with --set, --add, --ramp, --noise or --keep-ends, "
+                         "and no other mode does")
     if (options.delay is not None) != (options.mode == "delay"):
         raise UsageError("--mode delay goes with --delay S, and no other mode does")
-    if options.delay is not None and not (math.isfinite(options.delay) and options.delay > 0):
+    if options.delay is not None and not 0 < options.delay < float("inf"):
         raise UsageError(f"--delay {options.delay:g}: must be seconds above 0")
     disturbance = Disturbance(
         key.removeprefix(f"{ROOT}/"), options.mode, options.delay or 0.0,
-        dict(_assignment("--set", text, topic) for text in options.set),
-        dict(_ramp(text, topic) for text in options.ramp),
-        tuple(_sequence(name, topic) for name in options.keep_ends))
+        set_fields=dict(_setting(text, topic) for text in options.set),
+        add_fields=dict(_amount("--add", text, topic) for text in options.add),
+        ramp_fields=dict(_amount("--ramp", text, topic) for text in options.ramp),
+        noise_fields=dict(_amount("--noise", text, topic) for text in options.noise),
+        keep_ends=tuple(options.keep_ends),
+        seed=options.seed or 0)
+    reason = flaw(disturbance.order("", _DEFAULT_DURATION_S), topic.type)
+    if reason:
+        raise UsageError(f"--topic {options.topic}: {reason}")
     return Fault(f"{options.mode} {disturbance.topic}", "", (disturbance,), (),
                  _DEFAULT_DURATION_S)
 
 
-def field_type(topic: Topic[Any], path: str) -> Any:
-    """Return the type of a field given as `name` or `outer.inner`.
-
-    Raises:
-        UsageError: the message has no such field.
-    """
-    kind: Any = topic.type
-    for name in path.split("."):
-        known = ({f.name: f.type for f in msgspec.structs.fields(kind)}
-                 if isinstance(kind, type) and issubclass(kind, msgspec.Struct) else {})
-        if name not in known:
-            listed = ", ".join(f.name for f in msgspec.structs.fields(topic.type))
-            raise UsageError(f"field {path!r}: {topic.type.__name__} has no such field; "
-                             f"known: {listed}")
-        kind = known[name]
-    return kind
-
-
-def _assignment(option: str, text: str, topic: Topic[Any]) -> tuple[str, Any]:
+def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
+    """Return field, value as text, and the field's type."""
     name, equals, value = text.partition("=")
     if not equals:
         raise UsageError(f"{option} {text}: must be FIELD=VALUE")
-    kind = field_type(topic, name)
     try:
-        parsed = msgspec.json.decode(value)
-    except msgspec.DecodeError:
-        parsed = value
+        return name, value, field_type(topic.type, name)
+    except InjectionError as error:
+        raise UsageError(str(error)) from None
+
+
+def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
+    name, value, kind = _split("--set", text, topic)
+    if is_array(name, kind):
+        kind = float  # it fills the array
+    if kind is str:
+        return name, value
     try:
-        msgspec.convert(parsed, kind)
-    except msgspec.ValidationError as error:
-        raise UsageError(f"{option} {text}: {error}") from None
-    return name, parsed
-
-
-def _ramp(text: str, topic: Topic[Any]) -> tuple[str, float]:
-    name, value = _assignment("--ramp", text, topic)
-    if field_type(topic, name) is not float:
-        raise UsageError(f"--ramp {text}: must be FIELD=RATE with a field that is a float")
-    return name, float(value)
-
-
-def _sequence(name: str, topic: Topic[Any]) -> str:
-    if getattr(field_type(topic, name), "__origin__", None) not in (tuple, list):
-        raise UsageError(f"--keep-ends {name}: not a list")
-    return name
-
-
-class _Watch:
-    """What the nodes have reported about one injection."""
-
-    def __init__(self, order: Injection) -> None:
-        self.order = order
-        self.reports: dict[str, InjectionReport] = {}
-
-    def hear(self, report: InjectionReport) -> None:
-        if report.injection == self.order.injection:
-            self.reports[report.node] = report
-
-    @property
-    def taken(self) -> bool:
-        return bool(self.reports)
-
-    @property
-    def refused(self) -> str:
-        return next((f"{r.node}: {r.reason}" for r in self.reports.values() if r.reason), "")
-
-    @property
-    def finished(self) -> bool:
-        return self.taken and all(r.finished for r in self.reports.values())
-
-    @property
-    def affected(self) -> int:
-        return sum(r.affected for r in self.reports.values())
-
-
-async def _inject(options: argparse.Namespace, fault: Fault) -> int:
-    name = fault.name.replace(" ", "-").replace("/", "-")
-    orders = fault.orders(f"{name}-{uuid.uuid4().hex[:6]}", options.duration)
-    watches = [_Watch(order) for order in orders]
-    async with connect(options.port) as session:
-        for order in orders:
-            _check_publisher(session, order.topic)
-
-        finished = asyncio.Event()
-
-        def hear(_key: str, _header: Header, report: InjectionReport) -> None:
-            for watch in watches:
-                watch.hear(report)
-            if all(watch.finished for watch in watches):
-                finished.set()
-
-        session.listen(topics.INJECTION_REPORT, topics.INJECTION_REPORT.at(), hear)
+        found = msgspec.convert(msgspec.json.decode(value), kind)
+    except (msgspec.DecodeError, msgspec.ValidationError):
         try:
-            for watch in watches:
-                await _take_hold(session, watch)
-                if not options.json:
-                    say(f"{fault.name}: {watch.order.mode} {watch.order.topic} in force at "
-                        f"{', '.join(watch.reports)} for {watch.order.duration_s:g} s")
-            if not options.at_once:
-                longest_s = max(w.order.duration_s for w in watches)
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(finished.wait(), session.real_s(longest_s) + 1.0)
-        except asyncio.CancelledError:
-            await _end(session, watches)
-            raise
-    if options.json:
-        print_json({
-            "fault": fault.name,
-            "effective": None if options.at_once else all(w.affected > 0 for w in watches),
-            "injections": [
-                {"id": w.order.injection, "topic": w.order.topic, "mode": w.order.mode,
-                 "nodes": list(w.reports), "duration_s": w.order.duration_s,
-                 "affected": w.affected, "finished": w.finished} for w in watches]})
-    if options.at_once:
-        return 0
-    for watch in watches:
-        _judge(watch)
-        if not options.json:
-            say(f"{fault.name}: over, {watch.affected} messages on {watch.order.topic} affected")
-    return 0
+            found = msgspec.convert(value, kind, strict=False)
+        except msgspec.ValidationError as error:
+            raise UsageError(f"--set {text}: {error}") from None
+    return name, msgspec.to_builtins(found)
 
 
-async def _take_hold(session: Session, watch: _Watch) -> None:
-    if not await session.command(topics.INJECT, watch.order, lambda: watch.taken, _TAKE_HOLD_S):
-        raise NoEffectError(f"no effect: no node publishes {watch.order.topic} in this run")
-    if watch.refused:
-        raise NoEffectError(f"no effect: refused by {watch.refused}")
-
-
-async def _end(session: Session, watches: list[_Watch]) -> None:
-    """End the injections now: an order of the same id with no duration."""
-    for watch in watches:
-        over = msgspec.structs.replace(watch.order, duration_s=0.0)
-        await session.command(topics.INJECT, over, lambda w=watch: w.finished, 0.5)  # type: ignore[misc]
-
-
-def _judge(watch: _Watch) -> None:
-    where = ", ".join(watch.reports)
-    if not watch.finished:
-        raise NoEffectError(f"effect unknown: {where} did not report the end of "
-                            f"{watch.order.injection}; it was probably restarted")
-    if watch.affected == 0:
-        raise NoEffectError(f"no effect: {where} published nothing on {watch.order.topic} within "
-                            f"{watch.order.duration_s:g} s")
-
-
-def _check_publisher(session: Session, key: str) -> None:
-    topic, _ = resolve(key)
-    if topic.is_family:
-        head, tail = topic.key.split("{name}")
-        member = key[len(head):len(key) - len(tail)]
-        if member not in session.run.nodes:
-            raise unknown("node", member, session.run.nodes)
+def _amount(option: str, text: str, topic: Topic[Any]) -> tuple[str, float]:
+    name, value, _ = _split(option, text, topic)
+    try:
+        return name, float(value)
+    except ValueError:
+        raise UsageError(f"{option} {text}: must be FIELD=NUMBER") from None
 
 
 def _print_catalogue(*, as_json: bool) -> None:
+    keys = published_keys(systems.load(None))
     if as_json:
-        print_json([{"name": f.name, "title": f.title, "detected_by": f.detected_by,
-                     "duration_s": f.duration_s,
-                     "topics": [d.topic for d in f.disturbances]} for f in CATALOGUE.values()])
-    else:
+        everything = (*PAPER_FAULTS.values(), *SENSOR_FAULTS.values(), *systematic_faults(keys))
+        print_json([{"name": f.name, "title": f.title, "group": f.group,
+                     "detected_by": f.detected_by, "duration_s": f.duration_s,
+                     "topics": [d.topic for d in f.disturbances]} for f in everything])
+        return
+    for title, faults in (("the paper's faults", PAPER_FAULTS), ("sensors", SENSOR_FAULTS)):
+        say(f"{title}:")
         print_table(("fault", "seen by", "s", "what happens"),
                     [(f.name, " ".join(f.detected_by), f"{f.duration_s:g}", f.title)
-                     for f in CATALOGUE.values()])
-        say("crashes: kill-node NODE, or kill -9 PID")
+                     for f in faults.values()])
+        say()
+    say(f"any topic, as MODE:TOPIC; MODE is one of {', '.join(MODES)}:")
+    print_table(("topic", "modes"), list(_modes_by_topic(keys).items()))
+    say()
+    say("crashes: kill-node NODE, or kill -9 PID")
+
+
+def _modes_by_topic(keys: tuple[str, ...]) -> dict[str, str]:
+    """Return key of each declared topic → its modes in words; a family counts once."""
+    rows: dict[str, str] = {}
+    for key in keys:
+        modes = modes_of(key)
+        if modes:
+            missing = [mode for mode in MODES if mode not in modes]
+            rows[resolve(key)[0].key] = f"all but {', '.join(missing)}" if missing else "all"
+    return {topic.key: rows[topic.key] for topic in topics.ALL if topic.key in rows}

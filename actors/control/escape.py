@@ -99,6 +99,8 @@ class Escape:
 
     def _relevant(self, echoes: Array, s_m: float) -> Array:
         """Echoes not yet behind, and near enough to the corridor to matter; sorted by s."""
+        if not len(echoes):
+            return echoes
         behind_m = self._hull.half_length_m + 0.15
         ahead = echoes[:, 0] - s_m
         width = self._limits.max_deviation_m + self._hull.half_width_m + self._limits.clearance_m
@@ -114,7 +116,7 @@ class Escape:
         to something whose far side may reach the line, so the line is not free before it is
         behind.
         """
-        if abs(n_m) < self._hull.half_width_m:
+        if not len(near) or abs(n_m) < self._hull.half_width_m:
             return near
         aside = near[:, 1] * math.copysign(1.0, n_m)
         upto_m = max(s_m + self._hull.length_m, self._until_m + 0.3 if self.side else -math.inf)
@@ -126,6 +128,8 @@ class Escape:
         return np.asarray(joint[np.argsort(joint[:, 0], kind="stable")])
 
     def _gap(self, near: Array, s_m: float, n_m: float) -> float:
+        if not len(near):
+            return math.inf
         lane = np.abs(near[:, 1] - n_m) < self._hull.half_width_m + self._limits.least_clearance_m
         ahead = near[lane & (near[:, 0] > s_m), 0]
         return float(ahead.min()) - s_m if len(ahead) else math.inf
@@ -188,7 +192,8 @@ class Escape:
 
     @staticmethod
     def _is_free(echoes: Array, offset_m: float, keep_off_m: float) -> bool:
-        return not bool(np.any(np.abs(echoes[:, 1] - offset_m) < keep_off_m - 1e-9))
+        return not len(echoes) or not bool(
+            np.any(np.abs(echoes[:, 1] - offset_m) < keep_off_m - 1e-9))
 
     @staticmethod
     def _free_from(echoes: Array, side: int, keep_off_m: float) -> float:

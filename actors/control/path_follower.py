@@ -229,6 +229,8 @@ class PathFollower:
             top * max(math.cos(min(curve, math.pi) / 2) ** 2, 0.35),
             max(braking_speed(direct_m - limits.arrival_radius_m / 2, braking), 0.2),
         ]
+        if not len(points):
+            return min(speeds)
         ahead = points[points[:, 0] > -self._hull.half_length_m]
         if len(ahead):
             nearest_m = float(self._hull.distance(ahead).min())

@@ -8,8 +8,10 @@ and signed lateral offset, positive to the left.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,15 +71,25 @@ def scan_points(
     A range that is not finite, not positive or at `range_max_m` is no echo. A payload that is
     not a whole number of float32 is cut to whole ones.
     """
-    ranges = np.frombuffer(ranges_f32[: len(ranges_f32) // 4 * 4], dtype="<f4").astype(float)
-    angles = angle_min_rad + angle_increment_rad * np.arange(len(ranges))
-    echo = np.isfinite(ranges) & (ranges > 0.0) & (ranges < range_max_m * (1 - 1e-6))
-    points = np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))
-    return np.asarray(points[echo])
+    ranges = np.frombuffer(ranges_f32[: len(ranges_f32) // 4 * 4], dtype="<f4")
+    echo = (ranges > 0.0) & (ranges < range_max_m * (1 - 1e-6))  # no NaN passes a comparison
+    if not echo.any():
+        return NO_POINTS
+    rays = _rays(len(ranges), angle_min_rad, angle_increment_rad)
+    return np.asarray(ranges[echo, None] * rays[echo])
+
+
+@lru_cache(maxsize=16)
+def _rays(count: int, angle_min_rad: float, angle_increment_rad: float) -> Array:
+    """Unit vectors of a sweep's rays, shape (count, 2)."""
+    angles = angle_min_rad + angle_increment_rad * np.arange(count)
+    return np.column_stack((np.cos(angles), np.sin(angles)))
 
 
 def to_map(points: Array, x_m: float, y_m: float, yaw_rad: float) -> Array:
     """Move points from `base_link` at the given pose into `map`."""
+    if not len(points):
+        return points
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.asarray(points @ np.array(((cos, sin), (-sin, cos))) + (x_m, y_m))
 
@@ -117,11 +129,17 @@ class Polyline:
         self._starts = vertices[:-1]
         self._directions = steps / self._lengths[:, None]
         self._arc = np.concatenate(((0.0,), np.cumsum(self._lengths)))
+        # The same as plain numbers: for one point at a time they are ten times as fast.
+        self._arc_m: list[float] = self._arc.tolist()
+        self._segments: list[tuple[float, float, float, float, float]] = [
+            (*start, *direction, length) for start, direction, length in zip(
+                self._starts.tolist(), self._directions.tolist(), self._lengths.tolist(),
+                strict=True)]
 
     @property
     def length_m(self) -> float:
         """Length of the whole polyline."""
-        return float(self._arc[-1])
+        return self._arc_m[-1]
 
     @property
     def end(self) -> Point:
@@ -131,13 +149,14 @@ class Polyline:
     def point_at(self, s_m: float) -> Point:
         """Return the point at an arc length; beyond the ends the outer segments go on straight."""
         index = self._segment_at(s_m)
-        x_m, y_m = self._starts[index] + self._directions[index] * (s_m - self._arc[index])
-        return float(x_m), float(y_m)
+        x_m, y_m, along_x, along_y, _ = self._segments[index]
+        beyond_m = s_m - self._arc_m[index]
+        return x_m + along_x * beyond_m, y_m + along_y * beyond_m
 
     def heading_at(self, s_m: float) -> float:
         """Return the direction of travel at an arc length, in `map`."""
-        direction = self._directions[self._segment_at(s_m)]
-        return math.atan2(direction[1], direction[0])
+        _, _, along_x, along_y, _ = self._segments[self._segment_at(s_m)]
+        return math.atan2(along_y, along_x)
 
     def smooth_heading_at(self, s_m: float, span_m: float = 0.6) -> float:
         """Return the direction of travel, turning gradually within `span_m` of a corner."""
@@ -148,8 +167,13 @@ class Polyline:
         return math.atan2(y_to - y_from, x_to - x_from)
 
     def _segment_at(self, s_m: float) -> int:
-        index = int(np.searchsorted(self._arc, s_m, side="right")) - 1
-        return min(max(index, 0), len(self._lengths) - 1)
+        return min(max(bisect_right(self._arc_m, s_m) - 1, 0), len(self._segments) - 1)
+
+    def _stretch(self, s_from_m: float, s_to_m: float) -> tuple[int, int]:
+        """Return the segments of a stretch, which is cut to the route: first, and one past."""
+        low = self._segment_at(min(max(s_from_m, 0.0), self.length_m))
+        high = self._segment_at(min(max(s_to_m, 0.0), self.length_m - 1e-9)) + 1
+        return low, max(high, low + 1)
 
     def coordinates(self, points: Array, s_from_m: float, s_to_m: float) -> Array:
         """Return (s, n) of points in `map`, shape (k, 2), by the nearest segment of a stretch.
@@ -161,9 +185,9 @@ class Polyline:
             s_from_m: start of the stretch of route looked at.
             s_to_m: end of that stretch; it is cut to the route.
         """
-        low = self._segment_at(min(max(s_from_m, 0.0), self.length_m))
-        high = self._segment_at(min(max(s_to_m, 0.0), self.length_m - 1e-9)) + 1
-        high = max(high, low + 1)
+        if not len(points):
+            return NO_POINTS
+        low, high = self._stretch(s_from_m, s_to_m)
         along = self._directions[low:high]
         relative = points[:, None, :] - self._starts[None, low:high, :]
         ahead = np.einsum("ksi,si->ks", relative, along)
@@ -187,5 +211,17 @@ class Polyline:
                 everywhere, which is how a respawned follower resumes.
         """
         reach = (0.0, self.length_m) if near_s_m is None else (near_s_m - 2.0, near_s_m + 4.0)
-        s, n = self.coordinates(np.array(((x_m, y_m),)), *reach)[0]
-        return Projection(float(s), float(n), self._segment_at(float(s)))
+        low, high = self._stretch(*reach)
+        best = (math.inf, 0.0, 0.0)
+        for index in range(low, high):
+            x0_m, y0_m, along_x, along_y, length_m = self._segments[index]
+            dx_m, dy_m = x_m - x0_m, y_m - y0_m
+            ahead_m = along_x * dx_m + along_y * dy_m
+            left_m = along_x * dy_m - along_y * dx_m
+            foot_m = min(max(ahead_m, 0.0), length_m)
+            distance_m = math.hypot(ahead_m - foot_m, left_m)
+            if distance_m < best[0]:
+                best = (distance_m, self._arc_m[index] + foot_m,
+                        -distance_m if left_m < 0.0 else distance_m)
+        _, s_m, n_m = best
+        return Projection(s_m, n_m, self._segment_at(s_m))

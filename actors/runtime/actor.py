@@ -25,7 +25,7 @@ import msgspec
 from actors.runtime.bus import Bus
 from actors.runtime.clock import Clock
 from actors.runtime.envelope import ArrivalGuard, Header, RejectedError, encode
-from actors.runtime.injection import FaultGate, Outgoing
+from actors.runtime.injection import FaultGate, News
 from actors.runtime.mailbox import Mailbox
 from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection, InjectionReport
 from actors.runtime.timer import Timer
@@ -126,7 +126,13 @@ class Actor:
         self._bus = context.bus
         self._guard = ArrivalGuard()
         self._faults = FaultGate()
-        self._mailbox = Mailbox(on_overflow=self._overflowed)
+        self._injection_ends: dict[str, Timer] = {}
+        self._mailbox = Mailbox(on_overflow=self._overflowed, on_item=self._wake)
+        self._ended: asyncio.Future[None] | None = None
+        self._awake = False
+        self._idle = False
+        self._on_hold = False
+        self._pace_s = 0.0
         self._sequence = 0
         self._progress = 0
         self._rejected = 0
@@ -134,8 +140,10 @@ class Actor:
         self._stopping = False
         self._abandoned = False
         self._timers: set[asyncio.TimerHandle] = set()
+        self._tickers: list[_Ticker] = []
         self._diagnostics: dict[str, tuple[float, int]] = {}
-        self._states: dict[str, tuple[Topic[Any], Outgoing]] = {}
+        self._states: dict[str, tuple[Topic[Any], msgspec.Struct, float]] = {}
+        self._keys: dict[tuple[str, str | None], str] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
 
     # -- what a subclass may override -----------------------------------------------------------
@@ -193,22 +201,24 @@ class Actor:
         Raises:
             ValueError: the topic is not declared in `outputs`.
         """
+        key = self._keys.get((topic.key, name)) or self._key(topic, name)
+        if stamp is None:
+            stamp = self.clock.now()
+        if topic.qos is Qos.STATE and topic.rate_hz < _REPEATED_SOON_HZ:
+            self._states[key] = (topic, body, stamp)
+        self._disturb_and_send(topic, key, body, stamp)
+
+    def _key(self, topic: Topic[Any], name: str | None) -> str:
         if topic.key not in self._may_publish:
             raise ValueError(f"{type(self).__name__} publishes {topic.key}, "
                              "which its outputs do not declare")
         key = topic.at(name or self.name) if topic.is_family else topic.at()
-        now = self.clock.now()
-        try:
-            out = self._faults.apply(key, body, now if stamp is None else stamp, now)
-        except ValueError as error:
-            self.report_diagnostic("fault injection", str(error), key)
-            return
-        if out is None:
-            return
-        if out.delay_s > 0:
-            self.call_later(out.delay_s, lambda: self._send(topic, key, out))
-        else:
-            self._send(topic, key, out)
+        self._keys[topic.key, name] = key
+        return key
+
+    def has_readers(self, topic: Topic[Any]) -> bool:
+        """Whether somebody may be listening to one of its topics, as far as the bus can know."""
+        return self._bus.has_readers(self._key(topic, None))
 
     def call_later(self, delay_s: float, call: Callable[[], None]) -> Timer:
         """Have `call` made as a mailbox item after `delay_s` simulated seconds."""
@@ -246,11 +256,14 @@ class Actor:
 
     def hold(self, held: bool) -> None:
         """Handle nothing while held: in virtual time what SIGSTOP and a wedged loop do."""
-        self._mailbox.hold(held)
+        self._on_hold = held
+        self._idle = False
+        self._wake()
 
     def slow_down(self, pace_s: float) -> None:
         """Take so many virtual seconds for each item, as on a machine that is overloaded."""
-        self._mailbox.pace_s = pace_s
+        self._pace_s = pace_s
+        self._idle = False
 
     # -- the three phases -----------------------------------------------------------------------
 
@@ -262,12 +275,13 @@ class Actor:
             Exception: whatever a handler raised.
         """
         await self._bus.open()
+        self._ended = asyncio.get_running_loop().create_future()
+        self._awake = True  # nothing is handled before `on_start`
         try:
             self._set_up()
-            while not self._stopping:
-                item = await self._mailbox.get()
-                item()
-                self._progress += 1
+            self._awake = False
+            self._wake()
+            await self._ended
         except asyncio.CancelledError:
             raise
         except Exception as error:
@@ -275,6 +289,58 @@ class Actor:
             raise
         finally:
             await self._tear_down()
+
+    def _wake(self) -> None:
+        """See to it that the mailbox is worked off.
+
+        Not at once if messages arrive in bursts: what is overtaken within one need not be handled.
+        """
+        if not self._awake and self._ended is not None:
+            self._awake = True
+            if self._bus.bursts:
+                self._ended.get_loop().call_soon(self._work)
+            else:
+                self._work()
+
+    def _rest(self) -> None:
+        """The mailbox is empty. Whether the next item may be handled without a stay in it?"""
+        self._awake = False
+        self._idle = not (self._bus.bursts or self._on_hold or self._pace_s
+                          or self._ended is None or self._ended.done())
+
+    def _handle(self, item: Callable[..., None], *what: Any) -> None:
+        """Handle an item at once, if idle, and then what it has put into the mailbox."""
+        self._awake, self._idle = True, False
+        try:
+            item(*what)
+            self._progress += 1
+        except Exception as error:
+            if self._ended is not None:
+                self._ended.set_exception(error)
+            self._rest()
+            return
+        if self._mailbox.waiting:
+            self._work()
+        else:
+            self._awake, self._idle = False, True
+
+    def _work(self) -> None:
+        mailbox, ended = self._mailbox, self._ended
+        if ended is None or ended.done() or self._on_hold:
+            self._rest()
+            return
+        try:
+            while mailbox.waiting and not self._stopping:
+                mailbox.take()()
+                self._progress += 1
+                if self._pace_s:
+                    ended.get_loop().call_later(self._pace_s, self._work)
+                    return  # still awake: whatever arrives meanwhile waits
+        except Exception as error:
+            ended.set_exception(error)
+        if self._stopping and not ended.done():
+            ended.set_result(None)
+        self._rest()
 
     def _set_up(self) -> None:
         for topic, method in self._handlers:
@@ -296,6 +362,8 @@ class Actor:
         for handle in self._timers:
             handle.cancel()
         self._timers.clear()
+        for ticker in self._tickers:
+            ticker.cancel()
         if self._abandoned:
             return
         try:
@@ -329,12 +397,14 @@ class Actor:
             if admitted is None:
                 return
             header, body = admitted
-            if topic.qos is Qos.COMMAND:
+            if self._idle:
+                self._handle(handler, body, header)
+            elif command:
                 self._mailbox.put(lambda: handler(body, header))
             else:
-                self._mailbox.put_latest(f"{key} {handler.__name__}",
-                                         lambda: handler(body, header))
+                self._mailbox.put_latest(f"{key} {name}", lambda: handler(body, header))
 
+        command, name = topic.qos is Qos.COMMAND, handler.__name__
         return deliver
 
     def _peer_changed(self, node: str, incarnation: int, alive: bool) -> None:
@@ -344,13 +414,31 @@ class Actor:
     def _overflowed(self, _item: Any) -> None:
         self.report_diagnostic("mailbox full", "a command was refused", self.name)
 
-    def _send(self, topic: Topic[Any], key: str, out: Outgoing) -> None:
+    def _disturb_and_send(
+        self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float
+    ) -> None:
+        faults = self._faults
+        if not faults.in_force:
+            self._send(topic, key, body, stamp)
+            return
+        out = faults.apply(key, body, stamp, self.clock.now())
+        if out is not None and out.delay_s > 0:
+            self.call_later(
+                out.delay_s, lambda: self._send(topic, key, out.body, out.stamp, out.copies))
+        elif out is not None:
+            self._send(topic, key, out.body, out.stamp, out.copies)
+        for news in faults.take_news():
+            self._tell_injection(news)
+
+    def _send(
+        self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float, copies: int = 1
+    ) -> None:
         self._sequence += 1
-        header = Header(self.name, self.context.incarnation, self._sequence, out.stamp)
-        self._faults.remember(key, out)
-        if topic.qos is Qos.STATE and topic.rate_hz < _REPEATED_SOON_HZ:
-            self._states[key] = (topic, out)
-        self._bus.publish(topic, key, encode(header, out.body))
+        self._faults.last[key] = (body, stamp)
+        header = Header(self.name, self.context.incarnation, self._sequence, stamp)
+        payload = encode(header, body)
+        for _ in range(copies):
+            self._bus.publish(topic, key, payload)
 
     # -- timers ---------------------------------------------------------------------------------
 
@@ -367,19 +455,15 @@ class Actor:
         return handle
 
     def _start_timer(self, period_s: float, method: str) -> None:
-        call = getattr(self, method)
-        slot = f"timer {method}"
+        ticker = _Ticker(self, period_s, method)
+        self._tickers.append(ticker)
+        ticker.arm(self.clock.now() + period_s)
 
-        def schedule(due_s: float) -> None:
-            self._at(self.clock.source_time(due_s), lambda: tick(due_s))
-
-        def tick(due_s: float) -> None:
+    def _tick(self, slot: str, call: Callable[[], None]) -> None:
+        if self._idle:
+            self._handle(call)
+        else:
             self._mailbox.put_latest(slot, call)
-            next_s = due_s + period_s
-            now = self.clock.now()
-            schedule(next_s if next_s > now else now + period_s)  # late: skip, do not catch up
-
-        schedule(self.clock.now() + period_s)
 
     def _beat(self) -> None:
         self.publish(HEARTBEAT, Heartbeat(
@@ -391,34 +475,86 @@ class Actor:
     def _on_hello(self, _hello: Hello, header: Header) -> None:
         if header.source == self.name:
             return
-        for key, (topic, out) in list(self._states.items()):
-            self._send(topic, key, out)
+        for key, (topic, body, stamp) in list(self._states.items()):
+            self._disturb_and_send(topic, key, body, stamp)
 
     # -- fault injection ------------------------------------------------------------------------
 
     def _on_injection(self, order: Injection, _header: Header) -> None:
-        if not self._publishes(order.topic):
+        topic = self._published(order.topic)
+        if topic is None:
             return
-        reason = self._faults.order(order, self.clock.now())
+        reason = self._faults.order(order, self.clock.now(), topic.type)
         self.publish(INJECTION_REPORT, InjectionReport(
             order.injection, self.name, 0, bool(reason), reason))
-        if not reason:
-            self.call_later(order.duration_s, lambda: self._injection_over(order.injection))
+        if reason:
+            return
+        self._forget_injection_end(order.injection)  # of an earlier order with the same id
+        if order.duration_s <= 0:
+            self._injection_over(order.injection)
+        elif order.duration_s < math.inf:
+            self._injection_ends[order.injection] = self.call_later(
+                order.duration_s, lambda: self._injection_over(order.injection))
 
     def _injection_over(self, injection: str) -> None:
+        self._forget_injection_end(injection)
         affected = self._faults.expire(injection)
         self.publish(INJECTION_REPORT, InjectionReport(
             injection, self.name, affected, True, ""))
 
-    def _publishes(self, key: str) -> bool:
+    def _tell_injection(self, news: News) -> None:
+        """Report the first effect of an injection, or that it ended early and why."""
+        if news.finished:
+            self._forget_injection_end(news.injection)
+            self.report_diagnostic("fault injection", news.reason, news.topic)
+        self.publish(INJECTION_REPORT, InjectionReport(
+            news.injection, self.name, news.affected, news.finished, news.reason))
+
+    def _forget_injection_end(self, injection: str) -> None:
+        timer = self._injection_ends.pop(injection, None)
+        if timer is not None:
+            timer.cancel()
+
+    def _published(self, key: str) -> Topic[Any] | None:
         for topic in (*self.outputs, *BASE_OUTPUTS):
             if not topic.is_family and topic.key == key:
-                return True
+                return topic
             if topic.is_family:
                 names = self.output_names(topic, self.name, self.parameters)
                 head, tail = topic.key.split("{name}")
                 member = key[len(head):len(key) - len(tail)] if tail else key[len(head):]
                 if key.startswith(head) and key.endswith(tail) and (
                         names is None or member in names):
-                    return True
-        return False
+                    return topic
+        return None
+
+
+class _Ticker:
+    """A periodic timer of an actor. One that is late skips; it does not catch up."""
+
+    __slots__ = ("_actor", "_call", "_clock", "_due_s", "_handle", "_loop", "_period_s", "_slot")
+
+    def __init__(self, actor: Actor, period_s: float, method: str) -> None:
+        self._actor = actor
+        self._clock = actor.clock
+        self._loop = asyncio.get_running_loop()
+        self._period_s = period_s
+        self._call = getattr(actor, method)
+        self._slot = f"timer {method}"
+        self._due_s = 0.0
+        self._handle: asyncio.TimerHandle | None = None
+
+    def arm(self, due_s: float) -> None:
+        """Tick next at a simulated time."""
+        self._due_s = due_s
+        self._handle = self._loop.call_at(self._clock.source_time(due_s), self._fire)
+
+    def cancel(self) -> None:
+        """Tick no more."""
+        if self._handle is not None:
+            self._handle.cancel()
+
+    def _fire(self) -> None:
+        now_s, next_s = self._clock.now(), self._due_s + self._period_s
+        self.arm(next_s if next_s > now_s else now_s + self._period_s)
+        self._actor._tick(self._slot, self._call)

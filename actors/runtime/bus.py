@@ -19,7 +19,14 @@ class BusError(Exception):
 
 
 class Bus(Protocol):
-    """Publish and subscribe on keys, and know who lives."""
+    """Publish and subscribe on keys, and know who lives.
+
+    Attributes:
+        bursts: Whether several messages may be delivered one after the other before the event
+            loop turns again.
+    """
+
+    bursts: bool
 
     async def open(self) -> None:
         """Join the bus and announce this node as alive.
@@ -30,6 +37,9 @@ class Bus(Protocol):
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
         """Send to all present subscribers of the key, without waiting for them."""
+
+    def has_readers(self, key: str) -> bool:
+        """Whether somebody hears a key now; True if that cannot be known."""
 
     def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:
         """Have `deliver` called for each message on keys that match."""

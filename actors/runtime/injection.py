@@ -2,116 +2,221 @@
 
 A fault on a topic acts in the process that publishes it, so every reader sees the same fault,
 and it is the real bus that carries (or does not carry) the result.
+
+What counts as affected is a message that left otherwise than it came: a freeze of a robot that
+stands still, or a speed set to the value it has anyway, is no effect, and a fault that never had
+one must not be counted as survived. What the readers make of it is not known here: a duplicate
+counts although it is refused on arrival.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from random import Random
 from typing import Any
 
-import msgspec
-
+from actors.runtime.corruption import InjectionError, check_fields, corrupt
 from actors.runtime.messages import Injection
 from actors.runtime.topic import ROOT
+from actors.runtime.topics import INJECT, INJECTION_REPORT
 
-MODES = ("drop", "freeze", "delay", "corrupt")
+MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "corrupt")
+
+UNTOUCHED = (INJECT.key, INJECTION_REPORT.key)
+"""Keys that carry injections and their results, and therefore cannot be disturbed."""
 
 
 @dataclass(slots=True)
 class Outgoing:
-    """One message as it leaves: `delay_s` is added before it is sent."""
+    """One message as it leaves: `delay_s` later, and `copies` times the same payload."""
 
     body: Any
     stamp: float
     delay_s: float = 0.0
+    copies: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class News:
+    """What became of an injection: its first effect, or (with a reason) its early end."""
+
+    injection: str
+    topic: str
+    affected: int
+    finished: bool
+    reason: str
 
 
 @dataclass(slots=True)
 class _Active:
     order: Injection
+    key: str
     since_s: float
+    draw: Random
     affected: int = 0
     frozen: Outgoing | None = None
+
+    def strikes(self, now_s: float) -> bool:
+        """Whether a message that leaves now is one of those to be affected."""
+        order = self.order
+        period_s = order.on_s + order.off_s
+        if period_s > 0 and (now_s - self.since_s) % period_s >= order.on_s:
+            return False
+        return order.share >= 1.0 or self.draw.random() < order.share
 
 
 @dataclass(slots=True)
 class FaultGate:
-    """The injections in force in one actor. Pure: time is an argument."""
+    """The injections in force in one actor. Pure: time is an argument, chance is seeded.
 
-    _active: dict[str, _Active] = field(default_factory=dict)
-    _last: dict[str, Outgoing] = field(default_factory=dict)
+    Several on one topic act in the order in which they were ordered.
 
-    def order(self, injection: Injection, now_s: float) -> str:
-        """Put an injection in force; return the reason if it cannot be, else an empty text."""
-        if injection.mode not in MODES:
-            return f"mode = {injection.mode!r}: must be one of {', '.join(MODES)}"
-        self._active[injection.injection] = _Active(injection, now_s)
+    Attributes:
+        in_force: injections by id; while empty, nothing needs to pass the gate.
+        last: body and stamp last sent per key, by whoever sends, so that a freeze has something
+            to repeat.
+    """
+
+    in_force: dict[str, _Active] = field(default_factory=dict)
+    last: dict[str, tuple[Any, float]] = field(default_factory=dict)
+    _news: list[News] = field(default_factory=list)
+
+    def order(self, injection: Injection, now_s: float, kind: type[Any] | None = None) -> str:
+        """Put an injection in force; return the reason if it cannot be, else an empty text.
+
+        Args:
+            injection: takes the place of one with the same id, whose count goes on.
+            now_s: now, simulated seconds.
+            kind: type of the topic's messages, if known, to check the fields against.
+        """
+        reason = flaw(injection, kind)
+        if reason:
+            return reason
+        before = self.in_force.pop(injection.injection, None)
+        self.in_force[injection.injection] = _Active(
+            injection, f"{ROOT}/{injection.topic}", now_s, Random(injection.seed),  # noqa: S311
+            before.affected if before else 0)
         return ""
 
     def expire(self, injection: str) -> int:
         """End an injection and return how many messages it changed."""
-        active = self._active.pop(injection, None)
+        active = self.in_force.pop(injection, None)
         return active.affected if active else 0
 
     def apply(self, key: str, body: Any, stamp: float, now_s: float) -> Outgoing | None:
         """Return the message as the faults in force leave it, or None if it is dropped.
 
-        Raises:
-            ValueError: a corruption names a field that the message does not have.
+        A fault that turns out not to fit the message ends here, is told by `take_news`, and
+        leaves the message alone.
         """
         out = Outgoing(body, stamp)
-        if not self._active:
+        if not self.in_force:
             return out
-        for active in self._active.values():
-            if f"{ROOT}/{active.order.topic}" != key:
+        for active in [a for a in self.in_force.values() if a.key == key]:
+            if not active.strikes(now_s):
+                active.frozen = None  # the next freeze repeats what is healthy now
                 continue
-            order = active.order
-            if order.mode == "drop":
+            try:
+                changed = self._disturb(active, out, now_s)
+            except InjectionError as error:
+                del self.in_force[active.order.injection]
+                self._tell(active, str(error))
+                continue
+            if changed is None or changed != out:
                 active.affected += 1
+                if active.affected == 1:
+                    self._tell(active)
+            if changed is None:
                 return None
-            if order.mode == "delay":
-                out.delay_s += order.delay_s
-            elif order.mode == "freeze":
-                active.frozen = active.frozen or self._last.get(key) or out
-                out = Outgoing(active.frozen.body, active.frozen.stamp, out.delay_s)
-            else:
-                out.body = corrupt(out.body, order, now_s - active.since_s)
-            active.affected += 1
+            out = changed
         return out
 
-    def remember(self, key: str, out: Outgoing) -> None:
-        """Keep the last message per key, so that a freeze has something to repeat."""
-        self._last[key] = out
+    def take_news(self) -> list[News]:
+        """Return what has become of injections since the last call."""
+        if not self._news:
+            return self._news
+        news, self._news = self._news, []
+        return news
+
+    def _disturb(self, active: _Active, out: Outgoing, now_s: float) -> Outgoing | None:
+        order = active.order
+        match order.mode:
+            case "drop":
+                return None
+            case "delay":
+                return Outgoing(out.body, out.stamp, out.delay_s + order.delay_s, out.copies)
+            case "duplicate":
+                return Outgoing(out.body, out.stamp, out.delay_s, out.copies + 1)
+            case "corrupt":
+                body = corrupt(out.body, order, now_s - active.since_s, active.draw)
+                return Outgoing(body, out.stamp, out.delay_s, out.copies)
+        if active.frozen is None:
+            last = self.last.get(active.key)
+            active.frozen = Outgoing(*last) if last else out
+        stamp = active.frozen.stamp if order.mode == "freeze" else out.stamp
+        return Outgoing(active.frozen.body, stamp, out.delay_s, out.copies)
+
+    def _tell(self, active: _Active, reason: str = "") -> None:
+        self._news.append(News(
+            active.order.injection, active.order.topic, active.affected, bool(reason), reason))
 
 
-def corrupt(body: Any, order: Injection, elapsed_s: float) -> Any:
-    """Return the body with fields set, ramped and shortened as the order says.
+def flaw(order: Injection, kind: type[Any] | None = None) -> str:
+    """Return what is wrong with an injection, in one line, or an empty text.
 
-    Raises:
-        ValueError: no such field, or the value does not fit it.
+    Args:
+        order: the injection.
+        kind: type of the topic's messages; None leaves the fields unchecked.
     """
-    data = msgspec.to_builtins(body, builtin_types=(bytes,))
-    for path, value in order.set_fields.items():
-        holder, name = _resolve(data, path)
-        holder[name] = value
-    for path, rate in order.ramp_fields.items():
-        holder, name = _resolve(data, path)
-        holder[name] = holder[name] + rate * elapsed_s
-    for path in order.keep_ends:
-        holder, name = _resolve(data, path)
-        if len(holder[name]) > 2:
-            holder[name] = [holder[name][0], holder[name][-1]]
-    try:
-        return msgspec.convert(data, type(body), builtin_types=(bytes,))
-    except msgspec.ValidationError as error:
-        raise ValueError(f"corrupt {type(body).__name__}: {error}") from None
+    for wrong in (_wrong_kind, _wrong_time, _wrong_number):
+        if reason := wrong(order):
+            return reason
+    if kind is not None and order.mode == "corrupt":
+        try:
+            check_fields(kind, order)
+        except InjectionError as error:
+            return str(error)
+    return ""
 
 
-def _resolve(data: dict[str, Any], path: str) -> tuple[dict[str, Any], str]:
-    *outer, name = path.split(".")
-    holder: Any = data
-    for chunk in outer:
-        holder = holder.get(chunk) if isinstance(holder, dict) else None
-    if not isinstance(holder, dict) or name not in holder:
-        raise ValueError(f"field {path!r}: no such field")
-    return holder, name
+def _wrong_kind(order: Injection) -> str:
+    if order.mode not in MODES:
+        return f"mode = {order.mode!r}: must be one of {', '.join(MODES)}"
+    if order.topic in UNTOUCHED:
+        return f"topic = {order.topic!r}: it carries injections and cannot be disturbed"
+    changes = (order.set_fields, order.ramp_fields, order.add_fields, order.noise_fields,
+               order.keep_ends)
+    if order.mode == "corrupt" and not any(changes):
+        return "mode = 'corrupt': no field is set, ramped, added to, made noisy or shortened"
+    return ""
+
+
+def _wrong_time(order: Injection) -> str:
+    if not order.duration_s >= 0:
+        return f"duration_s = {order.duration_s:g}: must be 0 or more, inf for permanent"
+    for name, value_s in (("delay_s", order.delay_s), ("on_s", order.on_s),
+                          ("off_s", order.off_s)):
+        if not (value_s >= 0 and math.isfinite(value_s)):
+            return f"{name} = {value_s:g}: must be seconds, 0 or more"
+    if (order.on_s > 0) != (order.off_s > 0):
+        return (f"on_s = {order.on_s:g}, off_s = {order.off_s:g}: an intermittent fault needs "
+                "both above 0, any other both 0")
+    if order.mode == "delay" and not order.delay_s > 0:
+        return "delay_s = 0: must be above 0 for a delay"
+    return ""
+
+
+def _wrong_number(order: Injection) -> str:
+    if not 0 <= order.share <= 1:
+        return f"share = {order.share:g}: must be between 0 and 1"
+    rules: tuple[tuple[str, dict[str, float], Callable[[float], bool], str], ...] = (
+        ("ramp_fields", order.ramp_fields, math.isfinite, "finite"),
+        ("add_fields", order.add_fields, math.isfinite, "finite"),
+        ("noise_fields", order.noise_fields, lambda x: 0 <= x < math.inf, "finite, 0 or more"))
+    for what, numbers, fits, right in rules:
+        for path, value in numbers.items():
+            if not fits(value):
+                return f"{what} {path!r} = {value:g}: must be {right}"
+    return ""

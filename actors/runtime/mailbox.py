@@ -6,7 +6,6 @@ silently: a full queue is counted and handed to `on_overflow`.
 
 from __future__ import annotations
 
-import asyncio
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -20,33 +19,37 @@ class Mailbox:
 
     All methods run on the actor's event loop.
 
+    Args:
+        capacity: Commands that may wait.
+        on_overflow: Called with a command that is refused because too many wait.
+        on_item: Called whenever something was put in.
+
     Attributes:
+        waiting: Slots of the items that wait, oldest first; empty if nothing does.
         overflowed: Commands refused because too many waited.
-        pace_s: Virtual seconds that each item takes; 0, except for a process that is slow.
     """
 
     def __init__(
-        self, capacity: int = COMMAND_CAPACITY, on_overflow: Callable[[Any], None] | None = None
+        self, capacity: int = COMMAND_CAPACITY, on_overflow: Callable[[Any], None] | None = None,
+        on_item: Callable[[], None] = lambda: None,
     ) -> None:
         self._capacity = capacity
         self._on_overflow = on_overflow
-        self._order: deque[tuple[str | None, Any]] = deque()
+        self._on_item = on_item
+        self.waiting: deque[tuple[str | None, Any]] = deque()
         self._latest: dict[str, Any] = {}
         self._commands = 0
-        self._waiter: asyncio.Future[None] | None = None
-        self._held = False
         self.overflowed = 0
-        self.pace_s = 0.0
 
     def __len__(self) -> int:
-        return len(self._order)
+        return len(self.waiting)
 
     def put_latest(self, slot: str, item: Any) -> None:
         """Add an item, or replace the one that waits in the same slot."""
         if slot not in self._latest:
-            self._order.append((slot, None))
+            self.waiting.append((slot, None))
         self._latest[slot] = item
-        self._wake()
+        self._on_item()
 
     def put(self, item: Any) -> bool:
         """Add an item that must be handled; False if the queue is full."""
@@ -56,8 +59,8 @@ class Mailbox:
                 self._on_overflow(item)
             return False
         self._commands += 1
-        self._order.append((None, item))
-        self._wake()
+        self.waiting.append((None, item))
+        self._on_item()
         return True
 
     def take(self) -> Any:
@@ -66,30 +69,8 @@ class Mailbox:
         Raises:
             IndexError: the mailbox is empty.
         """
-        slot, item = self._order.popleft()
+        slot, item = self.waiting.popleft()
         if slot is None:
             self._commands -= 1
             return item
         return self._latest.pop(slot)
-
-    async def get(self) -> Any:
-        """Wait for an item, remove and return it."""
-        if self.pace_s:
-            await asyncio.sleep(self.pace_s)
-        while not self._order or self._held:
-            self._waiter = asyncio.get_running_loop().create_future()
-            try:
-                await self._waiter
-            finally:
-                self._waiter = None
-        return self.take()
-
-    def hold(self, held: bool) -> None:
-        """Give out nothing while held: in virtual time a process that is stopped or wedged."""
-        self._held = held
-        if self._order:
-            self._wake()
-
-    def _wake(self) -> None:
-        if self._waiter is not None and not self._held and not self._waiter.done():
-            self._waiter.set_result(None)

@@ -38,10 +38,20 @@ class Diagnostic(Message, frozen=True):
 class Injection(Message, frozen=True):
     """A fault to inject where `topic` (key below `rampart/`) is published.
 
-    `mode`: drop, freeze, delay, corrupt. `delay_s` counts only with delay; the rest only with
-    corrupt: `set_fields` overwrites fields, `ramp_fields` adds rate * elapsed seconds to them,
-    `keep_ends` shortens sequences to their first and last element. A field of a nested struct
-    is named `outer.inner`. Durations are simulated seconds; 0 ends the injection at once.
+    Modes: `drop` sends nothing; `freeze` repeats the last healthy message with its old stamp;
+    `stuck` repeats its body with fresh stamps; `delay` sends `delay_s` later; `duplicate` sends
+    the same payload twice; `corrupt` changes fields. The `*_fields` and `keep_ends` count only
+    with corrupt: `set_fields` overwrites, `ramp_fields` adds rate * elapsed seconds, `add_fields`
+    adds a bias, `noise_fields` adds Gaussian noise of that standard deviation, `keep_ends`
+    shortens sequences to their first and last element. A field of a nested struct is named
+    `outer.inner`, through sequences too; numbers in sequences and `*_f32` arrays are changed
+    element by element, and `*_rad` stays in (-pi, pi].
+
+    Durations are simulated seconds. `duration_s` 0 ends the injection at once; infinity is
+    permanent: it lasts as long as the publishing process. `share` is the probability that a
+    message is affected. With `on_s` and `off_s` the fault is intermittent: in force for `on_s`,
+    away for `off_s`, and so on from the moment of injection. All that is random comes from
+    `seed`.
     """
 
     injection: str
@@ -52,6 +62,12 @@ class Injection(Message, frozen=True):
     set_fields: dict[str, Any] = {}
     ramp_fields: dict[str, float] = {}
     keep_ends: tuple[str, ...] = ()
+    add_fields: dict[str, float] = {}
+    noise_fields: dict[str, float] = {}
+    share: float = 1.0
+    on_s: float = 0.0
+    off_s: float = 0.0
+    seed: int = 0
 
 
 class InjectionReport(Message, frozen=True):

@@ -76,6 +76,8 @@ class Hub:
 class VirtualBus:
     """One node's access to a `Hub`."""
 
+    bursts = False
+
     def __init__(self, hub: Hub, node: str, incarnation: int = 1) -> None:
         self._hub = hub
         self._node = node
@@ -101,17 +103,25 @@ class VirtualBus:
         for tap in hub.taps:
             tap(self._node, key, payload)
         network = hub.network
+        now_s = loop.time()
         for deliver, bus in hub.routes(key):
             if network is None:
                 loop.call_soon(bus.arrive, deliver, key, payload)
                 continue
-            for at_s in network.arrivals(self._node, bus._node, loop.time()):
-                loop.call_at(at_s, bus.arrive, deliver, key, payload)
+            for at_s in network.arrivals(self._node, bus._node, now_s):
+                if at_s > now_s:
+                    loop.call_at(at_s, bus.arrive, deliver, key, payload)
+                else:
+                    loop.call_soon(bus.arrive, deliver, key, payload)
 
     def arrive(self, deliver: Deliver, key: str, payload: bytes) -> None:
         """Hand a message over, if somebody is still there to take it."""
         if self._open:
             deliver(key, payload)
+
+    def has_readers(self, key: str) -> bool:
+        """Whether somebody hears a key now."""
+        return bool(self._hub.routes(key))
 
     def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:  # noqa: ARG002
         """Have `deliver` called for each message on keys that match."""

@@ -69,6 +69,8 @@ class ZenohBus:
         dial: endpoints of the partners.
     """
 
+    bursts = True
+
     def __init__(
         self, node: str, incarnation: int, listen: str | None, dial: Iterable[str]
     ) -> None:
@@ -115,6 +117,10 @@ class ZenohBus:
                 else zenoh.CongestionControl.DROP,
             )
         publisher.put(payload)
+
+    def has_readers(self, key: str) -> bool:  # noqa: ARG002
+        """Not asked of the network: somebody may be listening."""
+        return True
 
     def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:  # noqa: ARG002
         """Have `deliver` called on the event loop for each message on keys that match."""

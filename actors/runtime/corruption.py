@@ -1,0 +1,203 @@
+"""What a corruption does to the body of a message, and whether it fits the message at all.
+
+A field is named by its path, `outer.inner`; a path through a sequence means that field of each
+element. A number is changed wherever it stands: alone, in (nested) sequences, and in `*_f32`
+fields, which are little-endian float32 arrays as bytes. A `*_rad` field is an angle and is
+brought back to (-pi, pi] when something was added to it; one that was set is left as it was set,
+so that an angle out of range can be injected too.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from array import array
+from collections.abc import Callable, Iterator
+from random import Random
+from typing import Any
+
+import msgspec
+
+from actors.runtime.messages import Injection
+
+Change = Callable[[float], float]
+
+
+class InjectionError(ValueError):
+    """An injection does not fit the message it is for; the text is one line."""
+
+
+def field_type(kind: type[Any], path: str) -> Any:
+    """Return the declared type of a field of a message type.
+
+    Raises:
+        InjectionError: the message has no such field.
+    """
+    found: Any = kind
+    for name in path.split("."):
+        fields = _fields(_element(found))
+        if name not in fields:
+            raise InjectionError(f"field {path!r}: {kind.__name__} has no such field; "
+                                 f"known: {', '.join(_fields(kind)) or 'none'}")
+        found = fields[name]
+    return found
+
+
+def is_array(name: str, kind: Any) -> bool:
+    """Whether a field is a float32 array as bytes."""
+    return kind is bytes and name.endswith("_f32")
+
+
+def check_fields(kind: type[Any], order: Injection) -> None:
+    """Check a corruption against the type of the messages that it is for.
+
+    Raises:
+        InjectionError: a field does not exist, or the change does not fit its type.
+    """
+    for path, value in order.set_fields.items():
+        _check_value(kind, path, value)
+    for path in order.add_fields:
+        _check_number(kind, path, "add_fields", whole=True)
+    for path in order.ramp_fields:
+        _check_number(kind, path, "ramp_fields", whole=False)
+    for path in order.noise_fields:
+        _check_number(kind, path, "noise_fields", whole=False)
+    for path in order.keep_ends:
+        if getattr(field_type(kind, path), "__origin__", None) not in (tuple, list):
+            raise InjectionError(f"keep_ends {path!r}: not a list")
+
+
+def corrupt(body: Any, order: Injection, elapsed_s: float, draw: Random) -> Any:
+    """Return the body changed as the order says: set, ramped, biased, made noisy, shortened.
+
+    Args:
+        body: the message; it stays as it is.
+        order: what to change.
+        elapsed_s: since the injection began, s.
+        draw: source of the noise.
+
+    Raises:
+        InjectionError: no such field, or the value does not fit it.
+    """
+    data = msgspec.to_builtins(body, builtin_types=(bytes,))
+    for path, value in order.set_fields.items():
+        for holder, name in _places(data, path):
+            fill = is_array(name, type(holder[name])) and not isinstance(value, bytes)
+            holder[name] = _changed(name, holder[name], lambda _: value) if fill else value  # noqa: B023
+    for path, rate in order.ramp_fields.items():
+        _add(data, path, lambda x: x + rate * elapsed_s)  # noqa: B023
+    for path, bias in order.add_fields.items():
+        _add(data, path, lambda x: x + bias)  # noqa: B023
+    for path, sigma in order.noise_fields.items():
+        _add(data, path, lambda x: x + draw.gauss(0.0, sigma))  # noqa: B023
+    for path in order.keep_ends:
+        for holder, name in _places(data, path):
+            if len(holder[name]) > 2:
+                holder[name] = [holder[name][0], holder[name][-1]]
+    try:
+        return msgspec.convert(data, type(body), builtin_types=(bytes,))
+    except msgspec.ValidationError as error:
+        raise InjectionError(f"corrupt {type(body).__name__}: {error}") from None
+
+
+def wrap(angle_rad: float) -> float:
+    """Return the angle in (-pi, pi]; what is no finite number stays what it is."""
+    if not math.isfinite(angle_rad):
+        return angle_rad
+    turned = math.remainder(angle_rad, 2 * math.pi)
+    return math.pi if turned <= -math.pi else turned
+
+
+def _add(data: Any, path: str, change: Change) -> None:
+    for holder, name in _places(data, path):
+        holder[name] = _changed(name, holder[name], change)
+
+
+def _changed(name: str, value: Any, change: Change) -> Any:
+    """Return a value with the change made to each number in it."""
+    if isinstance(value, tuple | list):
+        return [_changed(name, v, change) for v in value]
+    if is_array(name, type(value)):
+        return _changed_array(name, value, change)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InjectionError(f"field {name!r}: {type(value).__name__} is no number")
+    changed = change(value)
+    if isinstance(value, float):
+        return wrap(changed) if name.endswith("_rad") else changed
+    if not math.isfinite(changed):
+        raise InjectionError(f"field {name!r}: {changed:g} is no whole number")
+    return round(changed)
+
+
+def _changed_array(name: str, value: bytes, change: Change) -> bytes:
+    numbers = array("f")
+    try:
+        numbers.frombytes(value)
+    except ValueError:
+        raise InjectionError(
+            f"field {name!r}: {len(value)} bytes are no whole number of float32") from None
+    if sys.byteorder == "big":
+        numbers.byteswap()
+    out = array("f", map(change, numbers))
+    if sys.byteorder == "big":
+        out.byteswap()
+    return out.tobytes()
+
+
+def _places(data: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
+    """Yield each dictionary that holds the field, with the field's name."""
+    *outer, name = path.split(".")
+    holders = [data]
+    for chunk in outer:
+        holders = [inner for holder in holders for inner in _flat(_member(holder, chunk, path))]
+    for holder in holders:
+        _member(holder, name, path)
+        yield holder, name
+
+
+def _member(holder: Any, name: str, path: str) -> Any:
+    if not isinstance(holder, dict) or name not in holder:
+        raise InjectionError(f"field {path!r}: no such field")
+    return holder[name]
+
+
+def _flat(value: Any) -> Iterator[Any]:
+    if isinstance(value, tuple | list):
+        for element in value:
+            yield from _flat(element)
+    else:
+        yield value
+
+
+def _element(kind: Any) -> Any:
+    """Return what a (nested) sequence type holds, or the type itself."""
+    while getattr(kind, "__origin__", None) in (tuple, list):
+        kind = kind.__args__[0]
+    return kind
+
+
+def _fields(kind: Any) -> dict[str, Any]:
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return {f.name: f.type for f in msgspec.structs.fields(kind)}
+    return {}
+
+
+def _check_number(kind: type[Any], path: str, what: str, *, whole: bool) -> None:
+    leaf = _element(field_type(kind, path))
+    if leaf is float or is_array(path, leaf) or (whole and leaf is int):
+        return
+    raise InjectionError(f"{what} {path!r}: {getattr(leaf, '__name__', leaf)} is no "
+                         f"{'number' if whole else 'float'}")
+
+
+def _check_value(kind: type[Any], path: str, value: Any) -> None:
+    declared = field_type(kind, path)
+    if is_array(path, declared):
+        if isinstance(value, bool) or not isinstance(value, bytes | int | float):
+            raise InjectionError(f"set_fields {path!r} = {value!r}: must be a number that fills "
+                                 "the array, or its bytes")
+        return
+    try:
+        msgspec.convert(value, declared, builtin_types=(bytes,))
+    except msgspec.ValidationError as error:
+        raise InjectionError(f"set_fields {path!r} = {value!r}: {error}") from None

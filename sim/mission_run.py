@@ -1,0 +1,103 @@
+"""What makes a run a mission: judge, end, record and console, whether it is real or virtual.
+
+Whoever runs the robot makes a `MissionRun`, gives its sinks to the observer, asks it now and then
+whether the run is over, and has it conclude.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from actors import topics
+from actors.messages import ControlStatus, GroundTruth, MissionStatus, ProcessEvent
+from actors.runtime.actor import Header
+from actors.runtime.clock import Clock
+from actors.runtime.topic import Topic
+from actors.supervision.run_plan import RunPlan
+from airport.model import Airport, Mission
+from sim.console import Console
+from sim.judge import Judge, Verdict
+from sim.observer import JudgeSink, Sink
+from sim.report_record import RunRecord, RunRecorder
+from sim.run_end import RunEnd
+
+LAUNCHER = "launch.py"
+
+
+class MissionRun:
+    """One mission on one airport.
+
+    Args:
+        plan: What is run.
+        airport: Where.
+        mission: What is to be done.
+        strategy: Of the manager, empty without FTMs.
+        patience_s: Simulated seconds without progress after which it is over.
+        console: For the story; None keeps quiet.
+    """
+
+    def __init__(self, plan: RunPlan, airport: Airport, mission: Mission, *, strategy: str,
+                 patience_s: float, console: Console | None = None) -> None:
+        self.plan = plan
+        self.airport = airport
+        self.mission = mission
+        self.judge = Judge(mission.goals)
+        self.console = console
+        self.strategy = strategy if plan.ftm else ""
+        self._end = RunEnd(patience_s)
+        self._recorder = RunRecorder(
+            plan.run_id, airport, mission, seed=plan.seed, rate=plan.rate, strategy=self.strategy)
+        self._brought_back = 0
+
+    def sinks(self, clock: Clock) -> list[Sink]:
+        """Return what wants to hear the run's messages."""
+
+        def to_end(_topic: Topic[Any], message: Any, _header: Header) -> None:
+            if isinstance(message, MissionStatus):
+                self._end.mission(message, clock.now())
+            elif isinstance(message, ControlStatus):
+                self._end.control(message, clock.now())
+            elif isinstance(message, GroundTruth):
+                self._end.truth(clock.now())
+
+        sinks: list[Sink] = [to_end, JudgeSink(self.judge), self._recorder.feed]
+        return [*sinks, self.console.take] if self.console else sinks
+
+    def brought_back(self, name: str, now_s: float) -> None:
+        """Note that the launcher has brought somebody back."""
+        self._brought_back += 1
+        if self.console:
+            self.console.line(now_s, f"{name} brought back")
+        self._recorder.feed(
+            topics.PROCESS_EVENT,
+            ProcessEvent(name, "respawned", 0, self._brought_back, LAUNCHER, ""),
+            Header(LAUNCHER, 1, self._brought_back, now_s))
+
+    def over(self, now_s: float) -> str | None:
+        """Return why the run is over, or None while it goes on."""
+        return self._end.ended(now_s)
+
+    def conclude(self, now_s: float, why: str) -> RunRecord:
+        """Return the record of the run with the judge's verdict."""
+        verdict = self.verdict()
+        reasons = () if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}")
+        return self._recorder.record(
+            "success" if verdict.success else "fail", "safe" if verdict.safe else "unsafe",
+            reasons, now_s)
+
+    def verdict(self) -> Verdict:
+        """Return the judge's verdict on what was seen so far."""
+        return self.judge.verdict()
+
+
+def summary(record: RunRecord, **more: str) -> dict[str, Any]:
+    """Return what scripts rely on: the last line of stdout with --json."""
+    return {
+        "mission": record.mission, "safety": record.safety, "reasons": list(record.reasons),
+        "duration_s": round(record.duration_s, 2),
+        "lights": [msgspec.to_builtins(light) for light in record.lights],
+        "decisions": [msgspec.to_builtins(decision) for decision in record.decisions],
+        "restarts": record.restarts, **more,
+    }

@@ -1,0 +1,68 @@
+"""How long things take between processes, as measured on real ones and kept in `timing.toml`.
+
+In virtual time nothing takes any time by itself. What passes between the sending of a message and
+its arrival, between a death and its discovery, between a fork and the new process's first word,
+is drawn from the distributions that `python -m benchmarks.timing` has measured.
+"""
+
+from __future__ import annotations
+
+import bisect
+import random
+import tomllib
+from functools import lru_cache
+from pathlib import Path
+
+import msgspec
+
+_FILE = Path(__file__).with_name("timing.toml")
+
+
+class Timing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Distributions as quantiles: evenly spaced from the minimum to the maximum, milliseconds.
+
+    Attributes:
+        message_ms: From sending to the reader's mailbox.
+        death_ms: From SIGKILL to the readers of the liveliness token.
+        exit_ms: From SIGKILL to the supervisor, by pidfd.
+        start_ms: From fork to the new process's first message.
+        supervisor_back_ms: From the supervisor's SIGKILL to its successor's fork.
+    """
+
+    message_ms: tuple[float, ...]
+    death_ms: tuple[float, ...]
+    exit_ms: tuple[float, ...]
+    start_ms: tuple[float, ...]
+    supervisor_back_ms: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        for name in self.__struct_fields__:
+            values = getattr(self, name)
+            if len(values) < 2 or values[0] < 0 or list(values) != sorted(values):
+                raise ValueError(f"{name} = {values}: must be two or more ascending milliseconds")
+
+
+@lru_cache(maxsize=1)
+def measured() -> Timing:
+    """Return what was measured."""
+    with _FILE.open("rb") as file:
+        return msgspec.convert(tomllib.load(file), Timing)
+
+
+def draw(quantiles_ms: tuple[float, ...], rng: random.Random) -> float:
+    """Draw from a distribution given by quantiles: linear in between; seconds."""
+    at = rng.random() * (len(quantiles_ms) - 1)
+    low = int(at)
+    here, there = quantiles_ms[low], quantiles_ms[low + 1]
+    return (here + (there - here) * (at - low)) * 1e-3
+
+
+def share_below(quantiles_ms: tuple[float, ...], value_ms: float) -> float:
+    """Return the share of a distribution that lies below a value."""
+    if value_ms <= quantiles_ms[0]:
+        return 0.0
+    if value_ms >= quantiles_ms[-1]:
+        return 1.0
+    i = bisect.bisect_right(quantiles_ms, value_ms)
+    low, high = quantiles_ms[i - 1], quantiles_ms[i]
+    return (i - 1 + (value_ms - low) / (high - low)) / (len(quantiles_ms) - 1)

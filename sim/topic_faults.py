@@ -1,0 +1,196 @@
+"""The systematic faults: every topic that a node publishes, with every mode, as `MODE:TOPIC`.
+
+`corrupt:TOPIC` needs no knowledge of the message. It adds a constant offset to every number in
+it, also to those in nested structs, sequences and arrays. The offset is drawn once per fault from
+a range that its unit makes plausible (`SPREADS`): the message stays one that a node could have
+sent, and each number in it is wrong, every time by the same. Its sign is random, but durations,
+illuminances, intensities and whole numbers only grow, since hardly any of them can be negative;
+whole numbers by 1 to 3. Truth values, words and texts stay. So does `pid`: the supervisor kills
+by it, and a wrong one may be a stranger's process.
+
+The topics below `world/` are left out, because the judge goes by them and a fault there would
+falsify the verdict, and so are those that carry the injections themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from random import Random
+from typing import Any
+
+import msgspec
+
+from actors import topics
+from actors.runtime.corruption import is_array
+from actors.runtime.injection import MODES, UNTOUCHED
+from actors.runtime.topic import ROOT, Topic
+from actors.runtime.wiring import heard, published
+from actors.supervision.run_plan import DEFAULT_PORT, OBSERVER, Layout, RunPlan
+from manager.specification import SystemSpec
+from sim.disturbance import Disturbance, Fault, UnknownFaultError
+
+GROUP = "topic"
+DURATION_S = 10.0
+
+DELAY_S = 1.5
+"""Delay of `delay:TOPIC`: half as long again as the longest freshness timeout that is derived
+for the shipped system (0.99 s), so that a delay is one that somebody should see."""
+
+SPREADS: tuple[tuple[str, float, float], ...] = (
+    ("_m", 0.5, 3.0), ("_rad", 0.3, 1.5), ("_mps", 0.2, 0.8), ("_radps", 0.2, 1.0),
+    ("_mps2", 0.5, 2.0), ("_s", 1.0, 10.0), ("_lux", 200.0, 1000.0), ("_cd", 50.0, 150.0),
+    ("_f32", 0.3, 1.5), ("waypoints", 0.5, 3.0), ("", 0.1, 0.5),
+)
+"""End of a field's name → least and greatest offset; the first that fits counts. The last is for
+numbers without a unit, such as ratios and stick positions."""
+
+_ONLY_GROW = ("_s", "_lux", "_cd")
+
+_ANY_RUN = RunPlan("", DEFAULT_PORT, rate=1.0, seed=0, system_file="", strategy="", airport="",
+                   mission="", obstacles=0, ftm=True, hmi_port=0)
+"""Which keys a system publishes follows from its spec; nothing in the plan of a run matters."""
+
+_TITLES = {
+    "drop": "nothing on {} arrives",
+    "freeze": "{} repeats its last message, old stamp included",
+    "stuck": "{} repeats its last content with fresh stamps",
+    "delay": "{} arrives " + f"{DELAY_S:g} s late",
+    "duplicate": "each message on {} is sent twice",
+    "corrupt": "each number on {} is wrong by a constant",
+}
+
+
+def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
+    """Return the fault `MODE:TOPIC`.
+
+    Args:
+        mode: one of `MODES`.
+        key: of a declared topic or one member of a family, with or without `rampart/`.
+        seed: of the offsets that `corrupt` draws, and of the gate's chance.
+
+    Raises:
+        UnknownFaultError: no such mode or topic, or the two do not go together.
+    """
+    short = key.removeprefix("/").removeprefix(f"{ROOT}/")
+    if mode not in MODES:
+        raise UnknownFaultError(f"unknown fault {f'{mode}:{key}'!r}: the mode must be one of "
+                                f"{', '.join(MODES)}")
+    topic = _declared(short)
+    if topic is None:
+        raise UnknownFaultError(f"unknown fault {f'{mode}:{key}'!r}: no topic has this key; "
+                                "see `rampart topic list`")
+    if reason := _closed(short):
+        raise UnknownFaultError(f"no fault {f'{mode}:{key}'!r}: {reason}")
+    if reason := _senseless(mode, topic.type):
+        raise UnknownFaultError(f"no fault {f'{mode}:{key}'!r}: {reason}")
+    what = Disturbance(
+        short, mode, DELAY_S if mode == "delay" else 0.0,
+        add_fields=plausible_offsets(topic.type, Random(f"{short} {seed}"))  # noqa: S311
+        if mode == "corrupt" else {}, seed=seed)
+    return Fault(f"{mode}:{short}", _TITLES[mode].format(short), (what,), (), DURATION_S, GROUP)
+
+
+def systematic_faults(keys: Iterable[str], seed: int = 0) -> tuple[Fault, ...]:
+    """Return every fault `MODE:TOPIC` of the given topics.
+
+    Args:
+        keys: of single topics, e.g. those that `published_keys` finds; those that must not be
+            disturbed are passed over, and so are modes that make no sense on a topic.
+        seed: see `topic_fault`.
+
+    Raises:
+        UnknownFaultError: a key is none.
+    """
+    return tuple(topic_fault(mode, key, seed) for key in keys for mode in modes_of(key))
+
+
+def modes_of(key: str) -> tuple[str, ...]:
+    """Return the modes in which a topic can fail; none for one that must not be disturbed.
+
+    Raises:
+        UnknownFaultError: there is no such topic.
+    """
+    topic = _declared(key)
+    if topic is None:
+        raise UnknownFaultError(f"no topic has the key {key!r}; see `rampart topic list`")
+    if _closed(key):
+        return ()
+    return tuple(mode for mode in MODES if not _senseless(mode, topic.type))
+
+
+def published_keys(spec: SystemSpec) -> tuple[str, ...]:
+    """Return the keys that the nodes of a system and its supervisor publish, families spelt out.
+
+    Raises:
+        ValueError: the spec names an actor class that does not exist.
+    """
+    members = [m for m in Layout(_ANY_RUN, spec).members.values() if m.name != OBSERVER]
+    wanted: dict[str, dict[str, None]] = {}
+    for member in members:
+        for key, names in heard(member).items():
+            wanted.setdefault(key, {}).update(dict.fromkeys(names or ()))
+    found: dict[str, None] = {}
+    for member in members:
+        for key, names in published(member).items():
+            # A node that may publish any member of a family publishes those that somebody hears.
+            chosen = wanted.get(key, {}) if names is None else names
+            spelt = [key.replace("{name}", n) for n in chosen] if "{name}" in key else [key]
+            found.update(dict.fromkeys(spelt))
+    return tuple(sorted(found))
+
+
+def plausible_offsets(kind: type[msgspec.Struct], draw: Random) -> dict[str, float]:
+    """Return an offset for every number in a message type: path → amount, never 0."""
+    offsets: dict[str, float] = {}
+    for path, leaf in _numbers(kind):
+        sign = 1.0 if path.endswith(_ONLY_GROW) else draw.choice((-1.0, 1.0))
+        if leaf is int:
+            offsets[path] = draw.randint(1, 3)
+        else:
+            least, most = next((a, b) for end, a, b in SPREADS if path.endswith(end))
+            offsets[path] = round(sign * draw.uniform(least, most), 3)
+    return offsets
+
+
+def _numbers(kind: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield path and type of each number in a type, through structs and sequences."""
+    if getattr(kind, "__origin__", None) in (tuple, list):
+        yield from _numbers(kind.__args__[0], path)
+    elif isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        for f in msgspec.structs.fields(kind):
+            if f.name != "pid":
+                yield from _numbers(f.type, f"{path}.{f.name}" if path else f.name)
+    elif kind in (int, float) or is_array(path, kind):
+        yield path, kind
+
+
+def _declared(key: str) -> Topic[Any] | None:
+    """Return the topic of a concrete key."""
+    for topic in topics.ALL:
+        if not topic.is_family:
+            if key == topic.key:
+                return topic
+            continue
+        head, tail = topic.key.split("{name}")
+        member = key[len(head):len(key) - len(tail)]
+        if key == f"{head}{member}{tail}" and member and not set("/*{}") & set(member):
+            return topic
+    return None
+
+
+def _senseless(mode: str, kind: type[msgspec.Struct]) -> str:
+    """Return why a message type cannot fail in a mode, or an empty text."""
+    if mode == "corrupt" and next(_numbers(kind), None) is None:
+        return f"there is no number to corrupt in a {kind.__name__}"
+    if mode == "stuck" and not msgspec.structs.fields(kind):
+        return f"a {kind.__name__} has no content that could be stuck"
+    return ""
+
+
+def _closed(key: str) -> str:
+    """Return why a topic must not be disturbed, or an empty text."""
+    if key.startswith("world/"):
+        return "the judge goes by world/, a fault there would falsify the verdict"
+    if key in UNTOUCHED:
+        return "it carries the injections themselves"
+    return ""
