@@ -12,28 +12,23 @@ import sys
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
-from actors import topics
-from actors.messages import ControlStatus, GroundTruth, MissionStatus, NodeTable, ProcessEvent
-from actors.runtime.actor import Context, Header
-from actors.runtime.clock import Clock
-from actors.runtime.topic import Topic
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher, LaunchError
-from actors.supervision.run_plan import DEFAULT_PORT, OBSERVER, RunPlan, load_system
+from actors.supervision.run_plan import DEFAULT_PORT, RunPlan, load_system
 from airport.formats import load_airport, load_mission
-from airport.model import Airport, Mission
 from manager.specification import SystemSpec
 from manager.strategies import STRATEGIES
 from sim.console import Console
-from sim.judge import Judge
-from sim.observer import JudgeSink, Observer
+from sim.injector import can_be_hit
+from sim.mission_run import MissionRun, summary
+from sim.network import NETWORKS, find_network
+from sim.process_run import ProcessRun
 from sim.report import write_report
-from sim.report_record import RunRecord, RunRecorder
-from sim.run_end import RunEnd
+from sim.report_record import RunRecord
+from sim.scenario import action_of, parse_fault
+from sim.virtual_run import VirtualRun
 from sim.watched_run import WatchedRun, new_directory
 
 ROOT = Path(__file__).resolve().parent
@@ -46,6 +41,8 @@ examples:
   python launch.py --mission A --obstacles 2        two obstacles on the way
   python launch.py --rate 4 --no-hmi --json         four times real time, result as JSON
   python launch.py --no-ftm                         the paper's baseline, without fault tolerance
+  python launch.py --virtual --seed 7               in seconds, and every time the same
+  python launch.py --virtual --fault kill:osmosis_control@30 --fault gps-bias@goal2+5
   python launch.py --system cell                    the manipulator cell, with stand-in nodes
   python launch.py --airport my/airport.graph --mission my/MISSION_A.miss
 while it runs, from another shell:
@@ -93,6 +90,17 @@ def parser() -> argparse.ArgumentParser:
                    "when it is interrupted)")
     p.add_argument("--report", metavar="DIR", help="where the report goes (default: "
                    "reports/TIME-MISSION)")
+    p.add_argument("--virtual", action="store_true",
+                   help="run in virtual time: all actors in this process, many times faster than "
+                   "real; the same --seed gives the same run, to the byte")
+    p.add_argument("--network", metavar="NAME", default="measured",
+                   help=f"with --virtual, what lies between the nodes: {', '.join(NETWORKS)} "
+                   "(default: measured)")
+    p.add_argument("--fault", metavar="FAULT[@WHEN][+S]", action="append", default=[],
+                   help="a fault to inject (repeatable): one of `rampart inject --list`, "
+                   "MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE, slow:NODE, stuck-wheel, "
+                   "weak-wheel, brake-failure, obstacle-ahead; WHEN is simulated seconds or goalN "
+                   "(default: 10), S how long it lasts")
     p.add_argument("--json", action="store_true",
                    help="last line of stdout is one JSON object with the result")
     return p
@@ -103,129 +111,89 @@ class UsageError(Exception):
 
 
 class Run:
-    """One run from the parsed options to the exit code."""
+    """One mission from the parsed options to the exit code, on processes or in virtual time."""
 
     def __init__(self, options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> None:
         self._options = options
-        self.spec = spec
+        self._spec = spec
         if options.duration is not None:
             raise UsageError(f"--duration {options.duration:g}: a mission ends by itself; "
                              "--patience S ends one that makes no progress")
-        airport_name = _existing_path(options.airport or self.spec.airport)
-        mission_name = _existing_path(options.mission or self.spec.mission)
-        self.airport: Airport = load_airport(airport_name)
-        self.mission: Mission = load_mission(mission_name, self.airport)
-        if options.obstacles > len(self.airport.obstacles):
-            raise UsageError(f"--obstacles {options.obstacles}: {self.airport.name} has places for "
-                             f"{len(self.airport.obstacles)}")
-        self.directory = Path(options.report) if options.report else new_directory(
-            ROOT / "reports", self.mission.name)
-        self.directory.mkdir(parents=True, exist_ok=True)
-        self.launcher = Launcher(
-            msgspec.structs.replace(plan, airport=airport_name, mission=mission_name,
-                                    error_log=str(self.directory.resolve() / "errors.log")),
-            f"{self.mission.name} on {self.airport.name}")
-        self.judge = Judge(self.mission.goals)
-        self.end = RunEnd(options.patience)
-        self.console = Console(sys.stderr)
-        self._interrupted = ""
-        self._guards_restarted = 0
+        airport_name = _existing_path(options.airport or spec.airport)
+        mission_name = _existing_path(options.mission or spec.mission)
+        airport = load_airport(airport_name)
+        mission = load_mission(mission_name, airport)
+        if options.obstacles > len(airport.obstacles):
+            raise UsageError(f"--obstacles {options.obstacles}: {airport.name} has places for "
+                             f"{len(airport.obstacles)}")
+        self._scenario = [parse_fault(text) for text in options.fault]
+        for i, planned in enumerate(self._scenario):
+            action_of(planned, f"f{i}", can_be_hit(spec))  # refused now rather than in mid-run
+        self._directory = Path(options.report) if options.report else new_directory(
+            ROOT / "reports", mission.name)
+        self._directory.mkdir(parents=True, exist_ok=True)
+        self._plan = msgspec.structs.replace(
+            plan, airport=airport_name, mission=mission_name,
+            error_log=str(self._directory.resolve() / "errors.log"))
+        self._console = Console(sys.stderr)
+        self._mission = MissionRun(
+            self._plan, airport, mission, strategy=spec.strategy, patience_s=options.patience,
+            console=self._console)
 
-    async def run(self) -> int:
-        """Run the mission and return the exit code.
+    def on_processes(self) -> int:
+        """Run the mission on processes and return the exit code.
 
         Raises:
             LaunchError: the system cannot be started.
         """
-        loop = asyncio.get_running_loop()
-        self.launcher.begin()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, self._interrupt, signal.Signals(number).name)
-        try:
-            await self.launcher.load()
-            await self.launcher.start()
-            return await self._observe()
-        finally:
-            await self.launcher.end()
+        return asyncio.run(self._on_processes())
 
-    def _interrupt(self, name: str) -> None:
-        if self._interrupted:  # the second time it is meant
-            self.launcher.abort()
-            raise SystemExit(EXIT_FAILED)
-        self._interrupted = f"interrupted by {name}"
+    async def _on_processes(self) -> int:
+        title = f"{self._mission.mission.name} on {self._mission.airport.name}"
+        run = ProcessRun(Launcher(self._plan, title), self._spec, self._mission, self._scenario)
+        _interruptible(run)
+        return self._conclude(await run.run())
 
-    async def _observe(self) -> int:
-        plan = self.launcher.plan
-        clock = Clock(plan.origin_s, plan.rate)
-        recorder = RunRecorder(
-            plan.run_id, self.airport, self.mission, seed=plan.seed, rate=plan.rate,
-            strategy=self.spec.strategy if plan.ftm else "")
+    def in_virtual_time(self) -> int:
+        """Run the mission in virtual time and return the exit code."""
+        run = VirtualRun(self._plan, self._spec, self._mission, scenario=self._scenario,
+                         network=find_network(self._options.network))
+        self._console.virtual_banner(self._mission.airport.name, self._mission.mission,
+                                     self._plan, self._spec.strategy)
+        result = run.run()
+        self._console.close()
+        self._console.speed(result.speed, result.messages, result.trace)
+        for name, error in result.failures:
+            print(f"launch.py: {name} failed: {error}", file=sys.stderr)
+        return self._conclude(result.record, trace=result.trace)
 
-        def brought_back(name: str) -> None:
-            self._guards_restarted += 1
-            self.console.line(clock.now(), f"{name} brought back")
-            recorder.feed(
-                topics.PROCESS_EVENT,
-                ProcessEvent(name, "respawned", 0, self._guards_restarted, "launch.py", ""),
-                Header("launch.py", 1, self._guards_restarted, clock.now()))
-
-        self.launcher.on_restart = brought_back
-
-        def to_launcher(_topic: Topic[Any], message: Any, _header: Header) -> None:
-            if isinstance(message, NodeTable):
-                self.launcher.supervisor_heard(message)
-
-        def to_end(_topic: Topic[Any], message: Any, _header: Header) -> None:
-            if isinstance(message, MissionStatus):
-                self.end.mission(message, clock.now())
-            elif isinstance(message, ControlStatus):
-                self.end.control(message, clock.now())
-            elif isinstance(message, GroundTruth):
-                self.end.truth(clock.now())
-
-        ports = dict(self.launcher.ports)
-        bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()))
-        sinks = [to_launcher, to_end, JudgeSink(self.judge), recorder.feed, self.console.take]
-        observer = Observer(Context(OBSERVER, 1, clock, bus, {}, {"sinks": sinks}))
-        task = asyncio.create_task(observer.run())
-        self.console.banner(self.airport.name, self.mission, plan, self.spec.strategy)
-        try:
-            why = None
-            while why is None and not self._interrupted and not task.done():
-                await asyncio.sleep(0.05)
-                why = self.end.ended(clock.now())
-            if task.done():
-                await task
-        finally:
-            observer.stop()
-            await asyncio.gather(task, return_exceptions=True)
-            self.console.close()
-        return self._conclude(recorder, clock.now(), self._interrupted or why or "ended")
-
-    def _conclude(self, recorder: RunRecorder, now_s: float, why: str) -> int:
-        verdict = self.judge.verdict()
-        reasons = () if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}")
-        record = recorder.record(
-            "success" if verdict.success else "fail", "safe" if verdict.safe else "unsafe",
-            reasons, now_s)
-        html, data = write_report(record, self.directory)
-        self.console.conclusion(record, html)
+    def _conclude(self, record: RunRecord, **more: str) -> int:
+        html, data = write_report(record, self._directory)
+        self._console.conclusion(record, html)
+        for fault in record.faults:
+            if not fault.effective:
+                print(f"launch.py: fault {fault.fault} had no effect: {fault.reason}",
+                      file=sys.stderr)
         if self._options.json:
-            print(json.dumps(_summary(record, html, data)), flush=True)
-        if not verdict.safe:
+            print(json.dumps(summary(record, report=str(html), record=str(data), **more)),
+                  flush=True)
+        if record.safety != "safe":
             return EXIT_UNSAFE
-        return EXIT_SUCCESS if verdict.success else EXIT_FAILED
+        return EXIT_SUCCESS if record.mission == "success" else EXIT_FAILED
 
 
-def _summary(record: RunRecord, html: Path, data: Path) -> dict[str, Any]:
-    """Return what scripts rely on: the last line of stdout with --json."""
-    return {
-        "mission": record.mission, "safety": record.safety, "reasons": list(record.reasons),
-        "duration_s": round(record.duration_s, 2),
-        "lights": [msgspec.to_builtins(light) for light in record.lights],
-        "decisions": [msgspec.to_builtins(decision) for decision in record.decisions],
-        "restarts": record.restarts, "report": str(html), "record": str(data),
-    }
+def _interruptible(run: ProcessRun | WatchedRun) -> None:
+    """Have SIGINT and SIGTERM end a run in order; the second one is meant."""
+
+    def interrupt(name: str) -> None:
+        if run.interrupted:
+            run.launcher.abort()
+            raise SystemExit(EXIT_FAILED)
+        run.interrupted = f"interrupted by {name}"
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(
+            number, interrupt, signal.Signals(number).name)
 
 
 def _plan(options: argparse.Namespace) -> tuple[RunPlan, SystemSpec]:
@@ -246,7 +214,7 @@ def _plan(options: argparse.Namespace) -> tuple[RunPlan, SystemSpec]:
 
 async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> int:
     """Run a system that drives nowhere, until its time is over or somebody ends it."""
-    for option in ("mission", "airport", "obstacles"):
+    for option in ("mission", "airport", "obstacles", "fault", "virtual"):
         if getattr(options, option):
             raise UsageError(f"--{option} {getattr(options, option)}: {spec.name} has no [robot] "
                              "and drives nowhere")
@@ -255,15 +223,7 @@ async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -
     directory.mkdir(parents=True, exist_ok=True)
     run = WatchedRun(plan, spec, options.duration, directory, sys.stderr)
 
-    def interrupt(name: str) -> None:
-        if run.interrupted:  # the second time it is meant
-            run.launcher.abort()
-            raise SystemExit(EXIT_FAILED)
-        run.interrupted = f"interrupted by {name}"
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(
-            number, interrupt, signal.Signals(number).name)
+    _interruptible(run)
     await run.run()
     if options.json:
         print(json.dumps(run.summary()), flush=True)
@@ -283,6 +243,11 @@ def _check(options: argparse.Namespace) -> None:
         if not 1024 <= port <= LAST_PORT:
             raise UsageError(f"{name} {port}: must be between 1024 and {LAST_PORT}, below the "
                              "ports that the kernel gives to outgoing connections")
+    if options.network != "measured" and not options.virtual:
+        raise UsageError(f"--network {options.network}: only with --virtual; Zenoh carries the "
+                         "messages of real processes")
+    if options.virtual and options.network not in NETWORKS:
+        raise UsageError(f"--network {options.network}: unknown; known: {', '.join(NETWORKS)}")
     for option, name in (("--strategy", options.strategy), ("--shadow", options.shadow)):
         if name and name not in STRATEGIES:
             raise UsageError(f"{option} {name}: unknown strategy; known: {', '.join(STRATEGIES)}")
@@ -301,7 +266,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         plan, spec = _plan(options)
         if spec.mobile is None:
             return asyncio.run(_watch(options, plan, spec))
-        return asyncio.run(Run(options, plan, spec).run())
+        run = Run(options, plan, spec)
+        return run.in_virtual_time() if options.virtual else run.on_processes()
     except (UsageError, LaunchError, ValueError, OSError) as error:
         print("launch.py: " + " ".join(str(error).split()), file=sys.stderr)
         return EXIT_USAGE

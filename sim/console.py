@@ -54,6 +54,18 @@ class Console:
             self._print(f"Operator's page: http://127.0.0.1:{plan.hmi_port}/")
         self._print("Try from another shell: kill-node osmosis_control")
 
+    def virtual_banner(
+        self, airport: str, mission: Mission, plan: RunPlan, strategy: str
+    ) -> None:
+        """Say what is about to run in virtual time."""
+        mode = strategy if plan.ftm else "no fault tolerance"
+        self._print(f"Rampart: mission {mission.name} ({len(mission.goals)} goals) on {airport}, "
+                    f"{mode}, virtual time, seed {plan.seed}")
+
+    def speed(self, times: float, messages: int, trace: str) -> None:
+        """Say how fast virtual time went, and by what the run can be recognised."""
+        self._print(f"{times:.0f} times real time, {messages} messages, trace {trace[:16]}")
+
     def take(self, _topic: Topic[Any], message: Any, header: Header) -> None:
         """Take one message of the run."""
         at = header.stamp

@@ -22,6 +22,7 @@ from sim.judge import Judge, Verdict
 from sim.observer import JudgeSink, Sink
 from sim.report_record import RunRecord, RunRecorder
 from sim.run_end import RunEnd
+from sim.scenario import FaultOutcome
 
 LAUNCHER = "launch.py"
 
@@ -79,25 +80,30 @@ class MissionRun:
         """Return why the run is over, or None while it goes on."""
         return self._end.ended(now_s)
 
-    def conclude(self, now_s: float, why: str) -> RunRecord:
-        """Return the record of the run with the judge's verdict."""
+    def conclude(self, now_s: float, why: str, faults: tuple[FaultOutcome, ...] = ()
+                 ) -> RunRecord:
+        """Return the record of the run with the judge's verdict, and what became of faults."""
         verdict = self.verdict()
         reasons = () if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}")
-        return self._recorder.record(
+        record = self._recorder.record(
             "success" if verdict.success else "fail", "safe" if verdict.safe else "unsafe",
             reasons, now_s)
+        return msgspec.structs.replace(record, faults=faults)
 
     def verdict(self) -> Verdict:
         """Return the judge's verdict on what was seen so far."""
         return self.judge.verdict()
 
 
-def summary(record: RunRecord, **more: str) -> dict[str, Any]:
+def summary(record: RunRecord, /, **more: str) -> dict[str, Any]:
     """Return what scripts rely on: the last line of stdout with --json."""
     return {
         "mission": record.mission, "safety": record.safety, "reasons": list(record.reasons),
         "duration_s": round(record.duration_s, 2),
         "lights": [msgspec.to_builtins(light) for light in record.lights],
         "decisions": [msgspec.to_builtins(decision) for decision in record.decisions],
-        "restarts": record.restarts, **more,
+        "restarts": record.restarts,
+        "faults": [{**msgspec.to_builtins(fault), "effective": fault.effective}
+                   for fault in record.faults],
+        **more,
     }

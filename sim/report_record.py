@@ -15,6 +15,7 @@ from actors.runtime.topic import Topic
 from airport.drawing import AirportDrawing, draw
 from airport.model import Airport, Mission
 from manager.words import decision_in_words
+from sim.scenario import FaultOutcome
 
 TRACK_STEP_M = 0.2
 """A track point is kept when the robot has moved this far."""
@@ -123,6 +124,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
         strategy: name of the manager's strategy, empty without FTMs.
         seed: of everything random.
         rate: simulated seconds per second.
+        faults: that were planned, and what became of them.
     """
 
     run_id: str
@@ -149,6 +151,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     strategy: str
     seed: int
     rate: float
+    faults: tuple[FaultOutcome, ...] = ()
 
 
 class RunRecorder:

@@ -12,23 +12,27 @@ import gc
 import hashlib
 import struct
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from actors.messages import NodeTable
-from actors.runtime.actor import Context, Header
+from actors.runtime.actor import Actor, Context, Header
 from actors.runtime.clock import Clock
 from actors.runtime.topic import Topic
 from actors.runtime.virtual_bus import Hub, VirtualBus
 from actors.runtime.virtual_loop import VirtualLoop
 from actors.supervision.run_plan import OBSERVER, Layout, RunPlan, load_shared
 from manager.schema import SystemSpec
+from sim.injector import INJECTOR, Injector, can_be_hit
 from sim.judge import Verdict
 from sim.mission_run import MissionRun
 from sim.network import NETWORKS, NetworkModel, SeededNetwork
 from sim.observer import Observer, Sink
 from sim.report_record import RunRecord
+from sim.scenario import PlannedFault
 from sim.virtual_processes import VirtualMachine
 
 LEAD_S = 1.0
@@ -36,6 +40,7 @@ LEAD_S = 1.0
 
 _LOOK_S = 0.05
 _CHUNK = 3000
+_HEAD = struct.Struct("<dI").pack
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,13 +78,16 @@ class Trace:
         self.messages = 0
         self._loop = loop
         self._hash = hashlib.sha256()
+        self._names: dict[tuple[str, str], bytes] = {}
         self._waiting: list[bytes] = []
 
     def __call__(self, source: str, key: str, payload: bytes) -> None:
         """Take one message."""
         self.messages += 1
-        head = struct.pack("<dI", self._loop.time(), len(payload))
-        self._waiting += (head, f"{source} {key} ".encode(), payload)
+        name = self._names.get((source, key))
+        if name is None:
+            name = self._names[source, key] = f"{source} {key} ".encode()
+        self._waiting += (_HEAD(self._loop.time(), len(payload)), name, payload)
         if len(self._waiting) > _CHUNK:
             self._flush()
 
@@ -97,21 +105,29 @@ class VirtualRun:
     """One mission in virtual time. Use: `run`, once.
 
     Args:
-        plan: What to run; its rate and ports do not matter.
+        plan: What to run; its id, rate and ports do not matter.
         spec: The system, as `run_plan.load_system` gives it.
         mission: Judge, end and record.
         network: What lies between the nodes; as measured if None.
-        shared: What actors share, as `run_plan.load_shared` gives it; loaded if None.
+        scenario: What goes wrong, and when.
+        shared: What actors share, as `run_plan.load_shared` gives it, perhaps for another seed or
+            number of obstacles; loaded if None.
     """
 
     def __init__(self, plan: RunPlan, spec: SystemSpec, mission: MissionRun,
-                 network: NetworkModel | None = None,
+                 *, network: NetworkModel | None = None, scenario: Sequence[PlannedFault] = (),
                  shared: Mapping[str, Any] | None = None) -> None:
-        self.plan = plan
+        # Nothing that differs from run to run may get into a message.
+        self.plan = msgspec.structs.replace(
+            plan, run_id=f"virtual-{plan.seed}", rate=1.0, hmi_port=0, launcher_pid=1)
         self.mission = mission
         self._spec = spec
         self._network = network or NETWORKS["measured"]
-        self._shared = shared if shared is not None else load_shared(plan, spec)
+        self._scenario = tuple(scenario)
+        loaded = shared if shared is not None else load_shared(self.plan, spec)
+        self._shared = {
+            **loaded, "system": spec, "plan": self.plan, "run_id": self.plan.run_id,
+            "seed": plan.seed, "obstacles": plan.obstacles, "hmi_port": 0}
 
     def run(self) -> VirtualResult:
         """Run to the end, on a loop of its own."""
@@ -131,7 +147,7 @@ class VirtualRun:
         begun_s = time.perf_counter()
         loop = asyncio.get_running_loop()
         clock = Clock(loop.time() + LEAD_S, source=loop.time)
-        hub = Hub(SeededNetwork(self._network, self.plan.seed, local=(OBSERVER,)))
+        hub = Hub(SeededNetwork(self._network, self.plan.seed, local=(OBSERVER, INJECTOR)))
         trace = Trace(loop)
         hub.taps.append(trace)
         layout = Layout(self.plan, self._spec)
@@ -145,17 +161,27 @@ class VirtualRun:
         sinks: list[Sink] = [to_machine, *self.mission.sinks(clock)]
         observer = Observer(Context(
             OBSERVER, 1, clock, VirtualBus(hub, OBSERVER), {}, {"sinks": sinks}, pid=1))
-        watching = asyncio.create_task(observer.run())
+        actors: list[Actor] = [observer]
+        injector = None
+        if self._scenario:
+            injector = Injector(Context(
+                INJECTOR, 1, clock, VirtualBus(hub, INJECTOR), {},
+                {"scenario": self._scenario, "hand": machine, "nodes": can_be_hit(self._spec)},
+                pid=1))
+            actors.append(injector)
+        watching = [asyncio.create_task(actor.run()) for actor in actors]
         machine.start()
         why = None
-        while why is None and not watching.done():
+        while why is None and not any(task.done() for task in watching):
             await asyncio.sleep(_LOOK_S)
             why = self.mission.over(clock.now())
         now_s = clock.now()
         machine.shut_down()
-        observer.stop()
-        await watching
-        record = self.mission.conclude(now_s, why or "ended")
+        for actor in actors:
+            actor.stop()
+        await asyncio.gather(*watching)
+        record = self.mission.conclude(
+            now_s, why or "ended", injector.outcomes() if injector else ())
         return VirtualResult(
             record, self.mission.verdict(), why or "ended", trace.digest(), trace.messages,
             time.perf_counter() - begun_s,

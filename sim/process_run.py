@@ -1,0 +1,102 @@
+"""A mission on real processes: the launcher, and in this process the observer and the injector."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from typing import Any
+
+from actors.messages import NodeTable
+from actors.runtime.actor import Actor, Context, Header
+from actors.runtime.clock import Clock
+from actors.runtime.topic import Topic
+from actors.runtime.zenoh_bus import ZenohBus, endpoint
+from actors.supervision.launcher import Launcher
+from actors.supervision.process_hand import ProcessHand
+from actors.supervision.run_plan import OBSERVER
+from manager.schema import SystemSpec
+from sim.injector import INJECTOR, Injector, can_be_hit
+from sim.mission_run import MissionRun
+from sim.observer import Observer, Sink
+from sim.report_record import RunRecord
+from sim.scenario import PlannedFault
+
+_LOOK_S = 0.05
+
+
+class ProcessRun:
+    """One mission on processes. Use: `run`, once; `interrupt` ends it early.
+
+    Args:
+        launcher: Of the processes.
+        spec: The system.
+        mission: Judge, end and record.
+        scenario: What goes wrong, and when.
+    """
+
+    def __init__(self, launcher: Launcher, spec: SystemSpec, mission: MissionRun,
+                 scenario: Sequence[PlannedFault] = ()) -> None:
+        self.launcher = launcher
+        self.interrupted = ""
+        self._spec = spec
+        self._mission = mission
+        self._scenario = tuple(scenario)
+
+    async def run(self) -> RunRecord:
+        """Start everything, run to the end, and return the record.
+
+        Raises:
+            LaunchError: The system cannot be started.
+        """
+        self.launcher.begin()
+        try:
+            await self.launcher.load()
+            await self.launcher.start()
+            return await self._observe()
+        finally:
+            await self.launcher.end()
+
+    async def _observe(self) -> RunRecord:
+        launcher, mission = self.launcher, self._mission
+        plan = launcher.plan
+        clock = Clock(plan.origin_s, plan.rate)
+        launcher.on_restart = lambda name: mission.brought_back(name, clock.now())
+
+        def to_launcher(_topic: Topic[Any], message: Any, _header: Header) -> None:
+            if isinstance(message, NodeTable):
+                launcher.supervisor_heard(message)
+
+        ports = dict(launcher.ports)
+        own = ports.pop(OBSERVER)
+        others = [endpoint(port) for port in ports.values()]
+        sinks: list[Sink] = [to_launcher, *mission.sinks(clock)]
+        actors: list[Actor] = [Observer(Context(
+            OBSERVER, 1, clock, ZenohBus(OBSERVER, 1, endpoint(own), others), {},
+            {"sinks": sinks}))]
+        injector = None
+        if self._scenario:
+            shared = {"scenario": self._scenario, "hand": ProcessHand(plan.base_port),
+                      "nodes": can_be_hit(self._spec)}
+            injector = Injector(Context(
+                INJECTOR, 1, clock, ZenohBus("", 1, None, [*others, endpoint(own)]), {}, shared))
+            actors.append(injector)
+        tasks = [asyncio.create_task(actor.run()) for actor in actors]
+        if mission.console:
+            mission.console.banner(
+                mission.airport.name, mission.mission, plan, self._spec.strategy)
+        try:
+            why = None
+            while why is None and not self.interrupted and not any(t.done() for t in tasks):
+                await asyncio.sleep(_LOOK_S)
+                why = mission.over(clock.now())
+            for task in tasks:
+                if task.done():
+                    await task
+        finally:
+            for actor in actors:
+                actor.stop()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            if mission.console:
+                mission.console.close()
+        return mission.conclude(clock.now(), self.interrupted or why or "ended",
+                                injector.outcomes() if injector else ())
