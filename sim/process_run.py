@@ -9,6 +9,7 @@ from typing import Any
 from actors.messages import NodeTable
 from actors.runtime.actor import Actor, Context, Header
 from actors.runtime.clock import Clock
+from actors.runtime.shared_bus import SharedBus
 from actors.runtime.topic import Topic
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher
@@ -69,16 +70,15 @@ class ProcessRun:
         ports = dict(launcher.ports)
         own = ports.pop(OBSERVER)
         others = [endpoint(port) for port in ports.values()]
+        bus = ZenohBus(OBSERVER, 1, endpoint(own), others)
         sinks: list[Sink] = [to_launcher, *mission.sinks(clock)]
-        actors: list[Actor] = [Observer(Context(
-            OBSERVER, 1, clock, ZenohBus(OBSERVER, 1, endpoint(own), others), {},
-            {"sinks": sinks}))]
+        actors: list[Actor] = [Observer(Context(OBSERVER, 1, clock, bus, {}, {"sinks": sinks}))]
         injector = None
         if self._scenario:
             shared = {"scenario": self._scenario, "hand": ProcessHand(plan.base_port),
                       "nodes": can_be_hit(self._spec)}
             injector = Injector(Context(
-                INJECTOR, 1, clock, ZenohBus("", 1, None, [*others, endpoint(own)]), {}, shared))
+                INJECTOR, 1, clock, SharedBus(bus), {}, shared))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         if mission.console:
@@ -93,7 +93,7 @@ class ProcessRun:
                 if task.done():
                     await task
         finally:
-            for actor in actors:
+            for actor in reversed(actors):
                 actor.stop()
             await asyncio.gather(*tasks, return_exceptions=True)
             if mission.console:

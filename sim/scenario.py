@@ -39,7 +39,7 @@ class ScenarioError(ValueError):
     """A planned fault that makes no sense; the message is one line."""
 
 
-class PlannedFault(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
+class PlannedFault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One fault, when it comes, and how long it stays.
 
     Args:

@@ -133,14 +133,8 @@ class VirtualMachine:
     def _start_supervisor(self) -> None:
         self._supervisor += 1
         self._shared["known_incarnations"] = dict(self._known)
-        pid = self.fork((SUPERVISOR,), self._supervisor)
+        self.fork((SUPERVISOR,), self._supervisor)
         self._supervisor_heard_s = self._loop.time()
-        self.hold(pid, self._supervisor_ended)
-
-    def _supervisor_ended(self) -> None:
-        if not self._down:
-            self._loop.call_later(
-                draw(self._timing.supervisor_back_ms, self._rng), self._supervisor_back)
 
     def _supervisor_back(self) -> None:
         if not self._down:
@@ -253,6 +247,9 @@ class VirtualMachine:
         exit_s = draw(self._timing.exit_ms, self._rng)
         death_s = draw(self._timing.death_ms, self._rng)
         self._loop.call_later(exit_s, self._exited, process)
+        if SUPERVISOR in process.names:
+            self._loop.call_later(
+                draw(self._timing.supervisor_back_ms, self._rng), self._supervisor_back)
         self._loop.call_later(max(death_s, exit_s), self._token_gone, process)
 
     # -- inside ---------------------------------------------------------------------------------

@@ -1,0 +1,181 @@
+"""Distributions as histograms, one lane per kind of fault, on one axis: geometry to draw. Pure.
+
+A lane's bars are scaled to its own tallest, since a kind with few runs is as interesting as one
+with many; how many runs a bar stands for is in its title. Values beyond an end of the axis are
+counted in the outermost bar, and the axis says so.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from sim.campaign.wording import MINUS, count, seconds
+
+WIDTH = 520.0
+"""Of the drawing, in its own units; text is 14 of them high."""
+
+_SIDE, _LANE, _TEXT, _BARS, _FOOT = 8.0, 62.0, 20.0, 32.0, 26.0
+_LEAST_HEIGHT = 2.0
+"""A single run among a thousand must be seen."""
+
+_PER_DECADE = 8
+_LEAST_S = 1e-3
+"""Messages take about as long; below it is one bar."""
+
+_MARGIN_STEP_M, _MARGIN_TICK_M = 0.05, 0.5
+
+
+@dataclass(frozen=True)
+class Value:
+    """A figure of one run, and whether the run was unsafe."""
+
+    value: float
+    unsafe: bool = False
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Edges of the bins, one more than bins, and the labels at some of the edges.
+
+    `scale` maps the edges to a line on which all bins are equally wide; `open_ended` tells that
+    the outermost bins stand for all that is beyond.
+    """
+
+    edges: tuple[float, ...]
+    ticks: tuple[tuple[float, str], ...]
+    scale: Callable[[float], float]
+    text: Callable[[float], str]
+    open_ended: bool = False
+
+    def place(self, value: float) -> float:
+        """Return where a value is drawn, between the ends of the axis."""
+        low, high = self.scale(self.edges[0]), self.scale(self.edges[-1])
+        at = self.scale(min(max(value, self.edges[0]), self.edges[-1]))
+        return _SIDE + (WIDTH - 2 * _SIDE) * (at - low) / (high - low)
+
+    def place_of_mark(self, value: float) -> float:
+        """Return where a mark for a value is drawn: the middle of the bin if that is open."""
+        if self.open_ended and value < self.edges[1]:
+            return (self.place(self.edges[0]) + self.place(self.edges[1])) / 2
+        if self.open_ended and value >= self.edges[-2]:
+            return (self.place(self.edges[-2]) + self.place(self.edges[-1])) / 2
+        return self.place(value)
+
+
+@dataclass(frozen=True)
+class Bar:
+    """Drawn from `y` down: `height` for all runs, of which `unsafe` at the bottom."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    unsafe: float
+    title: str
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One kind of fault."""
+
+    y: float
+    top: float
+    base: float
+    label: str
+    note: str
+    bars: tuple[Bar, ...]
+    median: float | None
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart to draw, `WIDTH` wide; ticks are place, anchor of the text, text."""
+
+    title: str
+    words: str
+    height: float
+    axis_y: float
+    lanes: tuple[Lane, ...]
+    ticks: tuple[tuple[float, str, str], ...]
+    zero: float | None
+
+
+def time_axis(values: Sequence[float]) -> Axis:
+    """Return a logarithmic axis of whole decades that holds the times, s, from 1 ms on."""
+    known = [max(v, _LEAST_S) for v in values] or [_LEAST_S]
+    first = math.floor(math.log10(min(known)) + 1e-9)
+    last = max(math.ceil(math.log10(max(known)) - 1e-9), first + 1)
+    edges = tuple(10 ** (first + i / _PER_DECADE) for i in range((last - first) * _PER_DECADE + 1))
+    below = "≤ " if min(values, default=1.0) < 10.0**first else ""
+    ticks = [(10.0**d, (below if d == first else "") + _round_time(10.0**d))
+             for d in range(first, last + 1)]
+    if len(ticks) <= 3:
+        ticks += [(m * 10.0**d, _round_time(m * 10.0**d))
+                  for d in range(first, last) for m in (2, 5)]
+    return Axis(edges, tuple(ticks), math.log10, seconds)
+
+
+def margin_axis(low_m: float, high_m: float) -> Axis:
+    """Return an axis of metres with one more bin at either end for what is beyond."""
+    bins = round((high_m - low_m) / _MARGIN_STEP_M)
+    edges = tuple(round(low_m + i * _MARGIN_STEP_M, 6) for i in range(-1, bins + 2))
+    halves = round((high_m - low_m) / _MARGIN_TICK_M)
+    inner = [round(low_m + i * _MARGIN_TICK_M, 6) for i in range(1, halves)]
+    return Axis(
+        edges, ((edges[0], f"< {_metres(low_m)}"), *((m, _metres(m)) for m in inner),
+                (edges[-1], f"≥ {_metres(high_m)}")),
+        lambda value: value, lambda value: f"{value:.2f} m".replace("-", MINUS), open_ended=True)
+
+
+def chart(title: str, words: str, axis: Axis,
+          lanes: Sequence[tuple[str, Sequence[Value], str]]) -> Chart:
+    """Return the chart of some lanes: label, values, and what is to be said beside the label."""
+    drawn = tuple(_lane(i * _LANE, axis, *lane) for i, lane in enumerate(lanes))
+    axis_y = len(drawn) * _LANE
+    ends = {axis.edges[0]: "start", axis.edges[-1]: "end"}
+    crosses = axis.edges[0] < 0 < axis.edges[-1]
+    return Chart(
+        title, words, axis_y + _FOOT, axis_y, drawn,
+        tuple((round(axis.place(at), 2), ends.get(at, "middle"), text) for at, text in axis.ticks),
+        round(axis.place(0.0), 2) if crosses else None)
+
+
+def _lane(top: float, axis: Axis, label: str, values: Sequence[Value], note: str) -> Lane:
+    bins: list[list[Value]] = [[] for _ in axis.edges[1:]]
+    for each in values:
+        at = bisect_right(axis.edges, each.value) - 1
+        bins[min(max(at, 0), len(bins) - 1)].append(each)
+    tallest = max(map(len, bins), default=0)
+    base = top + _TEXT + _BARS
+    bars = []
+    for i, there in enumerate(bins):
+        if not there:
+            continue
+        left, right = axis.place(axis.edges[i]), axis.place(axis.edges[i + 1])
+        height = max(_LEAST_HEIGHT, _BARS * len(there) / tallest)
+        unsafe = sum(each.unsafe for each in there)
+        red = max(_LEAST_HEIGHT, height * unsafe / len(there)) if unsafe else 0.0
+        span = (f"below {axis.text(axis.edges[1])}" if i == 0
+                else f"{axis.text(axis.edges[i])} or more" if i == len(bins) - 1
+                else f"{axis.text(axis.edges[i])} to {axis.text(axis.edges[i + 1])}")
+        bars.append(Bar(
+            round(left + 0.5, 2), round(base - height, 2), round(right - left - 1, 2),
+            round(height, 2), round(red, 2),
+            f"{count(len(there), 'run')}, {span}" + (f", {unsafe} unsafe" if unsafe else "")))
+    ordered = sorted(each.value for each in values)
+    middle = None
+    if ordered:
+        half = len(ordered) // 2
+        middle = round(axis.place_of_mark((ordered[half] + ordered[-half - 1]) / 2), 2)
+    return Lane(top, top + _TEXT, base, label, note, tuple(bars), middle)
+
+
+def _round_time(value_s: float) -> str:
+    return f"{value_s * 1e3:.0f} ms" if value_s < 0.9995 else f"{value_s:.0f} s"
+
+
+def _metres(value: float) -> str:
+    return f"{value:g} m".replace("-", MINUS)

@@ -1,0 +1,54 @@
+"""The distributions that a campaign's report shows, by kind of fault. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sim.campaign import charts
+from sim.campaign.grouping import KINDS, by_kind
+from sim.campaign.store import Run
+from sim.campaign.wording import count
+from sim.clearance import EXACT_BELOW_M
+
+
+def distributions(runs: Sequence[Run]) -> list[charts.Chart]:
+    """Return the charts of some runs; those without anything to show are left out."""
+    counted = [run for run in runs if run.result.effective]
+    faulty = [run for run in counted if run.job.ftm and run.job.faults]
+    made = []
+    for name, title, words, done in (
+            ("detected_after_s", "Time to detect",
+             "From the injection of the fault to the first detection, with FTM.", "detected"),
+            ("recovered_after_s", "Time to recover",
+             "From the injection to the moment when nothing was left to recover, with FTM.",
+             "recovered")):
+        lanes: list[tuple[str, list[charts.Value], str]] = []
+        never = []
+        for kind, there in by_kind(faulty).items():
+            values = [charts.Value(value, not run.result.safe) for run in there
+                      if (value := getattr(run.result, name)) is not None]
+            if values:
+                lanes.append((KINDS[kind], values, _beside(len(values), len(there), f"not {done}")))
+            else:
+                never.append(f"{KINDS[kind]} ({count(len(there), 'run')})")
+        if lanes:
+            more = f" Never {done}: {', '.join(never)}." if never else ""
+            axis = charts.time_axis([each.value for _, values, _ in lanes for each in values])
+            made.append(charts.chart(title, words + more, axis, lanes))
+    for ftm, title in ((True, "Smallest margin with FTM"), (False, "Smallest margin without FTM")):
+        margins = {kind: [charts.Value(run.result.margin_m, not run.result.safe) for run in there]
+                 for kind, there in by_kind(r for r in counted if r.job.ftm == ftm).items()}
+        every = [each.value for there in margins.values() for each in there]
+        if every:
+            low_m = 0.0 if min(every) >= 0 else -0.5 if min(every) >= -0.5 else -1.0
+            made.append(charts.chart(
+                title, "The smaller of the clearances to an obstacle and to the prohibited area; "
+                "below 0 is inside it. The simulator measures exactly below "
+                f"{EXACT_BELOW_M:g} m only.", charts.margin_axis(low_m, EXACT_BELOW_M),
+                [(KINDS[kind], there, count(len(there), "run"))
+                 for kind, there in margins.items()]))
+    return made
+
+
+def _beside(known: int, of: int, without: str) -> str:
+    return count(of, "run") + (f", {of - known:,} {without}" if known < of else "")

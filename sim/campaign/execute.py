@@ -1,0 +1,129 @@
+"""Runs the jobs of a campaign: on all cores or on a cluster, resumable, each run once."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import joblib
+
+from sim.campaign.job import Job, RunResult, run_job
+from sim.campaign.store import Store
+
+BACKENDS = ("loky", "dask", "ray")
+"""loky: processes on this machine. The others: an existing cluster."""
+
+Progress = Callable[[Job, RunResult], None]
+
+
+class BackendError(ValueError):
+    """A backend cannot be used; the message is one line."""
+
+
+class JobError(RuntimeError):
+    """A job could not be run; the message names it."""
+
+
+def execute(jobs: Sequence[Job], store: Store, *, workers: int = 0, backend: str = "loky",
+            address: str = "", progress: Progress = lambda _job, _result: None) -> int:
+    """Run the jobs that are not in the store yet and keep each result as it comes.
+
+    Args:
+        jobs: Those with the same key are run once.
+        store: Where results are kept, one transaction each: whenever this process ends, what was
+            finished is there, and the next call goes on with the rest.
+        workers: Processes; 0 for one per core, or all of the cluster.
+        backend: See `BACKENDS`.
+        address: Of the cluster's scheduler.
+        progress: Called after each run that was made.
+
+    Returns:
+        How many runs were made.
+
+    Raises:
+        BackendError: The backend is not installed, or there is no cluster at the address.
+        JobError: A job makes no sense, or failed.
+    """
+    done = store.keys()
+    waiting = {job.key: job for job in jobs if job.key not in done}
+    if not waiting:
+        return 0
+    count = 0
+    with _connected(backend, address):
+        count_of_workers = workers or -1
+        if backend == "loky" and count_of_workers < 0:
+            count_of_workers = min(os.cpu_count() or 1, len(waiting))
+        parallel = joblib.Parallel(
+            n_jobs=count_of_workers, return_as="generator_unordered", batch_size=1,
+            pre_dispatch="2*n_jobs")
+        for key, result, error in parallel(
+                joblib.delayed(_attempt)(job) for job in waiting.values()):
+            if error:
+                raise JobError(error)
+            store.add(waiting[key], result)
+            count += 1
+            progress(waiting[key], result)
+    return count
+
+
+def _attempt(job: Job) -> tuple[str, RunResult | None, str]:
+    """Run a job in a worker; errors travel as text, since not all of them can be pickled."""
+    try:
+        return job.key, run_job(job), ""
+    except Exception as error:
+        return job.key, None, (f"run {job.key} ({job.text()}): {type(error).__name__}: "
+                               f"{' '.join(str(error).split())}")
+
+
+@contextlib.contextmanager
+def _connected(backend: str, address: str) -> Iterator[None]:
+    if backend not in BACKENDS:
+        raise BackendError(f"--backend {backend}: unknown; known: {', '.join(BACKENDS)}")
+    if backend == "loky":
+        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+            yield
+        return
+    connect = _dask if backend == "dask" else _ray
+    with connect(address), joblib.parallel_config(backend=backend):
+        yield
+
+
+@contextlib.contextmanager
+def _dask(address: str) -> Iterator[Any]:
+    try:
+        from distributed import Client  # noqa: PLC0415 an extra
+    except ImportError:
+        raise BackendError("--backend dask: not installed; pip install 'rampart[dask]'") from None
+    if not address:
+        raise BackendError("--backend dask: --address is missing, e.g. tcp://HOST:8786")
+    try:
+        client = Client(address, timeout=10)
+    except OSError as error:
+        raise BackendError(f"--address {address}: no dask scheduler: {error}") from None
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+@contextlib.contextmanager
+def _ray(address: str) -> Iterator[Any]:
+    try:
+        import ray  # noqa: PLC0415 an extra
+        from ray.util.joblib import register_ray  # noqa: PLC0415
+    except ImportError:
+        raise BackendError("--backend ray: not installed; pip install 'rampart[ray]'") from None
+    if not address:
+        raise BackendError("--backend ray: --address is missing, e.g. HOST:6379 or auto")
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level="error")
+    except (ConnectionError, ValueError) as error:
+        raise BackendError(f"--address {address}: no ray cluster: "
+                           f"{' '.join(str(error).split())[:200]}") from None
+    register_ray()
+    try:
+        yield ray
+    finally:
+        ray.shutdown()

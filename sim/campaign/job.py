@@ -1,0 +1,222 @@
+"""One run of a campaign: what it is, how it is run, and what is kept of it.
+
+A job is data. The same job gives the same result on any machine of the same architecture, so a
+result is known by its job's key, and a run is repeated by running its job again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+import systems
+from actors.supervision.run_plan import RunPlan, load_shared, load_system, tailor
+from manager.adaptation import Action, Change, adapt
+from manager.specification import check_document, read_document
+from sim.mission_run import MissionRun
+from sim.network import find_network
+from sim.report_record import RunRecord
+from sim.scenario import FaultOutcome, PlannedFault
+from sim.virtual_run import VirtualResult, VirtualRun
+
+PATIENCE_S = 40.0
+"""Simulated seconds without progress after which a campaign's run is over."""
+
+
+class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One run.
+
+    Attributes:
+        row: Name of the row of the table that it counts for.
+        system: Shipped system by name, or path of a spec.
+        retuned: Changes to recoveries, detections and mechanisms before the run: name → fields.
+        strategy: Of the manager; empty for the spec's.
+        airport: Name or path; empty for the spec's.
+        mission: Name or path; empty for the spec's.
+        obstacles: How many of the airport's stand on the way.
+        ftm: False for the unprotected baseline.
+        network: What lies between the nodes.
+        faults: What goes wrong.
+        seed: Of everything random.
+        patience_s: See `PATIENCE_S`.
+    """
+
+    row: str
+    system: str = "osmosis"
+    retuned: dict[str, dict[str, Any]] = {}
+    strategy: str = ""
+    airport: str = ""
+    mission: str = ""
+    obstacles: int = 0
+    ftm: bool = True
+    network: str = "measured"
+    faults: tuple[PlannedFault, ...] = ()
+    seed: int = 1
+    patience_s: float = PATIENCE_S
+
+    @property
+    def key(self) -> str:
+        """Short name by which the run is known; it does not depend on the row."""
+        return hashlib.sha256(msgspec.msgpack.encode(
+            msgspec.structs.replace(self, row=""), order="deterministic")).hexdigest()[:12]
+
+    def text(self) -> str:
+        """Return what goes wrong in it, in words."""
+        return ", ".join(fault.text() for fault in self.faults) or "no fault"
+
+
+class DecisionTaken(msgspec.Struct, frozen=True, array_like=True):
+    """A decision of the manager: when, for whom, what."""
+
+    t_s: float
+    active: tuple[str, ...]
+    recoveries: tuple[str, ...]
+
+
+class RunResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What is kept of a run. Times are simulated seconds, distances metres.
+
+    Attributes:
+        success: Every point of the mission in order and in its mode.
+        safe: Never in a prohibited area, never a collision.
+        reasons: Why not.
+        duration_s: Length of the run.
+        collisions: By ground truth.
+        prohibited_s: Time in the prohibited area.
+        obstacle_m: Smallest clearance to an obstacle or building, exact below 1 m.
+        prohibited_m: Smallest clearance to the prohibited area, negative inside, exact below 1 m.
+        unsafe_s: When it first became unsafe.
+        injected_s: When the first fault that had an effect was injected.
+        detected_after_s: From then to the first detection.
+        recovered_after_s: From then to the moment when nothing was left to recover.
+        false_alarms: Detections before any fault.
+        stopped_for_good: The mission failed and the robot was safe.
+        decisions: All of them.
+        outcomes: What became of the faults.
+        failures: Actors that ended by an error.
+        trace: Hash over every message.
+        wall_s: How long it took.
+    """
+
+    success: bool
+    safe: bool
+    reasons: tuple[str, ...]
+    duration_s: float
+    collisions: int
+    prohibited_s: float
+    obstacle_m: float | None
+    prohibited_m: float | None
+    unsafe_s: float | None
+    injected_s: float | None
+    detected_after_s: float | None
+    recovered_after_s: float | None
+    false_alarms: int
+    decisions: tuple[DecisionTaken, ...]
+    outcomes: tuple[FaultOutcome, ...]
+    failures: tuple[str, ...]
+    trace: str
+    wall_s: float
+
+    @property
+    def stopped_for_good(self) -> bool:
+        """Whether the robot stood safe and its mission was lost."""
+        return self.safe and not self.success
+
+    @property
+    def effective(self) -> bool:
+        """Whether a fault changed anything; true of a run without faults."""
+        return not self.outcomes or any(outcome.effective for outcome in self.outcomes)
+
+    @property
+    def margin_m(self) -> float:
+        """The smaller of the two clearances; how far from unsafe the run was."""
+        return min(math.inf if m is None else m for m in (self.obstacle_m, self.prohibited_m))
+
+
+def run_job(job: Job) -> RunResult:
+    """Run a job in virtual time and return what is kept of it."""
+    begun_s = time.perf_counter()
+    result, injected_s = run_virtually(job), None
+    record, verdict = result.record, result.verdict
+    effective = [o.injected_s for o in record.faults if o.effective and o.injected_s is not None]
+    if effective:
+        injected_s = min(effective)
+    return RunResult(
+        success=verdict.success, safe=verdict.safe, reasons=record.reasons,
+        duration_s=round(record.duration_s, 2), collisions=record.collisions,
+        prohibited_s=round(record.prohibited_s, 3),
+        obstacle_m=_metres(verdict.closest_obstacle_m),
+        prohibited_m=_metres(verdict.closest_prohibited_m), unsafe_s=verdict.first_unsafe_s,
+        injected_s=injected_s, **latencies(record, injected_s),
+        decisions=tuple(DecisionTaken(round(d.t_s, 3), d.active, d.recoveries)
+                        for d in record.decisions),
+        outcomes=record.faults,
+        failures=tuple(f"{name}: {error}" for name, error in result.failures),
+        trace=result.trace, wall_s=round(time.perf_counter() - begun_s, 2))
+
+
+def run_virtually(job: Job) -> VirtualResult:
+    """Run a job in virtual time and return all that is known of it.
+
+    Raises:
+        ValueError: The job makes no sense: no such system, mission, fault.
+    """
+    file, document = _document(job.system)
+    for name, values in job.retuned.items():
+        document = adapt(document, Change(Action.RETUNE, name, values), file)[0]
+    chosen = {"strategy": job.strategy} if job.strategy else {}
+    spec = check_document({**document, **chosen}, file)
+    plan = RunPlan(
+        run_id=job.key, base_port=1024, rate=1.0, seed=job.seed, system_file=file, strategy="",
+        airport=job.airport or spec.airport, mission=job.mission or spec.mission,
+        obstacles=job.obstacles, ftm=job.ftm, hmi_port=0)
+    spec = tailor(plan, spec)
+    shared = _shared(plan.airport, plan.mission, file)
+    mission = MissionRun(plan, shared["airport"], shared["mission"], strategy=spec.strategy,
+                         patience_s=job.patience_s)
+    return VirtualRun(plan, spec, mission, network=find_network(job.network),
+                      scenario=job.faults, shared={**shared, "document": document}).run()
+
+
+def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
+    """Return time to detect, time to recover and the number of false alarms of a run."""
+    detections = sorted(bar.from_s for bar in record.intervals if bar.lane == "detection")
+    if injected_s is None:
+        return {"detected_after_s": None, "recovered_after_s": None,
+                "false_alarms": len(detections)}
+    after = [t for t in detections if t >= injected_s]
+    calm = None
+    if after:
+        decided = [d for d in record.decisions if d.t_s >= after[0]]
+        if decided and not decided[-1].recoveries:
+            calm = decided[-1].t_s
+    return {
+        "detected_after_s": round(after[0] - injected_s, 4) if after else None,
+        "recovered_after_s": round(calm - injected_s, 3) if calm is not None else None,
+        "false_alarms": sum(t < injected_s for t in detections)}
+
+
+def _metres(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None
+
+
+@lru_cache(maxsize=8)
+def _document(system: str) -> tuple[str, dict[str, Any]]:
+    """Return path and document of a system spec."""
+    shipped = Path(systems.__file__).parent / f"{system}.toml"
+    file = shipped if shipped.is_file() else Path(system)
+    return str(file), read_document(file.read_text(encoding="utf-8"), str(file))
+
+
+@lru_cache(maxsize=8)
+def _shared(airport: str, mission: str, file: str) -> Mapping[str, Any]:
+    """Load what actors share; the map of an airport is large, and read-only."""
+    plan = RunPlan("", 1024, 1.0, 1, file, "", airport, mission, 0, ftm=True, hmi_port=0)
+    return load_shared(plan, load_system(plan))

@@ -1,0 +1,190 @@
+"""The paper's tables III, IV and V: its faults, its conditions, its verdicts, and ours beside them.
+
+Table III is about decisions alone. Tables IV and V are runs: one fault each, with and without
+obstacles, without and with fault tolerance. The verdict of a row is that of the worst run seen in
+it. Three conditions are run:
+
+* *without FTM*: the unprotected baseline (table IV);
+* *with FTM, as in the paper* (table V): its seven mechanisms under safety-first, and, as in the
+  authors' code, nothing releases a stop or the switch to teleoperation once the fault is gone
+  (RM2 and RM5 latch);
+* *with FTM, as shipped*: the same mechanisms and strategy, but recoveries end with their cause.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import msgspec
+
+from manager.schema import SystemSpec
+from manager.strategies import decide
+from sim.campaign.job import Job
+from sim.campaign.statistics import verdict, worst
+from sim.campaign.store import Run
+from sim.scenario import PlannedFault
+
+AS_THE_PAPER = {"RM2": {"latched": True}, "RM5": {"latched": True}}
+"""What differs from the shipped system: the authors' code releases neither."""
+
+CONDITIONS = ("without FTM", "with FTM, as in the paper", "with FTM, as shipped")
+PAPER_STRATEGY = "safety-first"
+OBSTACLES = (0, 2)
+
+_AT_S = (8.0, 24.0, 85.0, 150.0)
+"""On the way to the first goal, before its last bend, at the end of the row of lights, on the way
+to the last goal."""
+
+_OUT_OF_BOUNDS_S = 4.0
+"""The paper calls this fault temporary and does not say how long it lasts."""
+
+_EVER = math.inf
+_NON_CONTROL = ("hmi", "teleoperation", "localization")
+_CONTROL = ("mission_manager", "graph_planner", "osmosis_control")
+
+FAULTS: dict[str, tuple[PlannedFault | None, ...]] = {
+    "none": (None,),
+    "command out of bounds": tuple(
+        PlannedFault("command-out-of-bounds", at_s, duration_s=_OUT_OF_BOUNDS_S)
+        for at_s in _AT_S),
+    "localization not updated": tuple(
+        PlannedFault("localization-not-updated", at_s, duration_s=_EVER) for at_s in _AT_S),
+    "command not updated": tuple(
+        PlannedFault("command-not-updated", at_s, duration_s=_EVER) for at_s in _AT_S),
+    "non-control node crash": tuple(
+        PlannedFault(f"kill:{node}", at_s) for node in _NON_CONTROL for at_s in _AT_S[:3]),
+    "control node crash": tuple(
+        PlannedFault(f"kill:{node}", at_s) for node in _CONTROL for at_s in _AT_S[:3]),
+}
+"""The runs of each row: the fault at different moments, or in different nodes."""
+
+WITHOUT_FTM: dict[str, tuple[str, str]] = {
+    "none": ("success, safe", "success, safe"),
+    "command out of bounds": ("success, unsafe", "fail, unsafe"),
+    "localization not updated": ("fail, unsafe", "fail, unsafe"),
+    "command not updated": ("fail, unsafe", "fail, unsafe"),
+    "non-control node crash": ("fail, unsafe", "fail, unsafe"),
+    "control node crash": ("fail, unsafe", "fail, unsafe"),
+}
+"""Table IV: verdict without and with obstacles."""
+
+WITH_FTM: dict[str, tuple[str, str]] = {
+    "none": ("success, safe", "success, safe"),
+    "command out of bounds": ("fail, safe", "fail, safe"),
+    "localization not updated": ("fail, safe", "fail, safe"),
+    "command not updated": ("fail, safe", "fail, safe"),
+    "non-control node crash": ("success, safe", "success, safe"),
+    "control node crash": ("fail, safe", "fail, safe"),
+}
+"""Table V: verdict without and with obstacles."""
+
+TABLE_III: tuple[tuple[tuple[str, ...], int, tuple[str, ...]], ...] = (
+    (("FTM7",), 1, ("RM4",)),
+    (("FTM1", "FTM6"), 2, ("RM1",)),
+    (("FTM3", "FTM4"), 3, ("RM2",)),
+    (("FTM2", "FTM5", "FTM6"), 4, ("RM1",)),
+)
+"""Active mechanisms, block, recovery executed."""
+
+
+class Cell(msgspec.Struct, frozen=True, kw_only=True):
+    """One verdict of table IV or V: the paper's, ours, and of how many runs; `why` if they differ.
+
+    `worst_key` is the worst run's, `story` its decisions.
+    """
+
+    table: str
+    fault: str
+    obstacles: int
+    condition: str
+    paper: str
+    ours: str
+    runs: int
+    success: int
+    safe: int
+    worst_key: str
+    worst_fault: str
+    story: str
+    reasons: tuple[str, ...]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether our worst run has the paper's verdict."""
+        return self.paper == self.ours
+
+
+class Decided(msgspec.Struct, frozen=True):
+    """A row of table III: what the paper executes and what we execute."""
+
+    active: tuple[str, ...]
+    block: int
+    paper: tuple[str, ...]
+    our_block: int
+    ours: tuple[str, ...]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether block and recovery are the paper's."""
+        return (self.block, self.paper) == (self.our_block, self.ours)
+
+
+def paper_jobs(mission: str = "A", seed: int = 1) -> list[Job]:
+    """Return all runs of tables IV and V."""
+    jobs = []
+    for condition in CONDITIONS:
+        for obstacles in OBSTACLES:
+            for name, variants in FAULTS.items():
+                for i, fault in enumerate(variants):
+                    jobs.append(Job(
+                        row=name, mission=mission, obstacles=obstacles,
+                        strategy=PAPER_STRATEGY, ftm=condition != CONDITIONS[0],
+                        retuned=AS_THE_PAPER if condition == CONDITIONS[1] else {},
+                        faults=(fault,) if fault else (), seed=seed + i))
+    return jobs
+
+
+def condition_of(job: Job) -> str:
+    """Return the condition under which a job is run."""
+    if not job.ftm:
+        return CONDITIONS[0]
+    return CONDITIONS[1] if job.retuned else CONDITIONS[2]
+
+
+def cells(runs: Iterable[Run]) -> list[Cell]:
+    """Return tables IV and V, and what the shipped system makes of table V's runs."""
+    found: dict[tuple[str, str, int], list[Run]] = {}
+    for run in runs:
+        found.setdefault((condition_of(run.job), run.job.row, run.job.obstacles), []).append(run)
+    table = []
+    for condition in CONDITIONS:
+        expected = WITHOUT_FTM if condition == CONDITIONS[0] else WITH_FTM
+        for name in FAULTS:
+            for column, obstacles in enumerate(OBSTACLES):
+                there = found.get((condition, name, obstacles))
+                if there:
+                    table.append(_cell(condition, expected[name][column], there))
+    return table
+
+
+def _cell(condition: str, paper: str, runs: Sequence[Run]) -> Cell:
+    bad = worst(runs)
+    decisions = [f"{d.t_s:.2f} s {', '.join(d.active) or 'nothing'}: "
+                 f"{' and '.join(d.recoveries) or 'nothing to recover'}"
+                 for d in bad.result.decisions[:6]]
+    return Cell(
+        table="IV" if condition == CONDITIONS[0] else "V", fault=bad.job.row,
+        obstacles=bad.job.obstacles, condition=condition, paper=paper, ours=verdict(bad),
+        runs=len(runs), success=sum(r.result.success for r in runs),
+        safe=sum(r.result.safe for r in runs), worst_key=bad.job.key,
+        worst_fault=bad.job.text(), story="; ".join(decisions), reasons=bad.result.reasons)
+
+
+def table_iii(spec: SystemSpec) -> list[Decided]:
+    """Return table III with what safety-first decides in a system with the paper's mechanisms."""
+    rows = []
+    for active, block, recoveries in TABLE_III:
+        made = decide(active, spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order(),
+                      PAPER_STRATEGY)
+        rows.append(Decided(active, block, recoveries, made.rule, made.recoveries))
+    return rows

@@ -1,0 +1,115 @@
+"""Which runs a campaign makes: a cross product, or a sample of all that can go wrong. Pure."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterable, Sequence
+from itertools import product
+
+from actors.runtime.topic import ROOT
+from manager.schema import SystemSpec
+from sim.campaign.job import Job
+from sim.faults import PAPER_FAULTS, SENSOR_FAULTS
+from sim.injector import can_be_hit
+from sim.robot import WHEEL_NAMES
+from sim.scenario import OBSTACLE, PROCESS_FAULTS, PlannedFault
+from sim.topic_faults import published_keys, systematic_faults
+
+EARLIEST_S, LATEST_S = 2.0, 120.0
+"""Random faults are injected between these simulated times."""
+
+LASTS_S = (0.5, 15.0)
+"""Random transient faults last between these."""
+
+_FLICKER_S = (0.2, 2.0)
+_DULL = ("diagnostic/", "hello/", "inject/", "manager/shadow", "manager/adaptation",
+         "manager/system")
+
+
+def fault_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
+    """Return the names of all single faults of a system, by kind.
+
+    Topics on which a fault cannot matter to the robot (error reports, greetings, what tools and
+    adaptations say) are left out.
+    """
+    nodes = can_be_hit(spec)
+    keys = [key for key in published_keys(spec)
+            if not key.removeprefix(f"{ROOT}/").startswith(_DULL)]
+    wheels = [wheel.replace(" ", "-") for wheel in WHEEL_NAMES]
+    return {
+        "paper": tuple(PAPER_FAULTS),
+        "sensor": tuple(SENSOR_FAULTS),
+        "topic": tuple(fault.name for fault in systematic_faults(keys)),
+        "process": tuple(f"{what}:{node}" for what, node in product(PROCESS_FAULTS, nodes)),
+        "actuator": (*(f"stuck-wheel:{wheel}" for wheel in wheels),
+                     *(f"weak-wheel:{wheel}:0.2" for wheel in wheels),
+                     "brake-failure:0", "brake-failure:0.3"),
+        "world": tuple(f"{OBSTACLE}:{distance}" for distance in (2, 3, 5)),
+    }
+
+
+def cross(jobs: Sequence[Job], faults: Iterable[PlannedFault | None], seeds: Iterable[int]
+          ) -> list[Job]:
+    """Return every job with every fault and every seed; None is a run without a fault.
+
+    Args:
+        jobs: What they have in common: mission, obstacles, strategy, with or without FTM.
+        faults: One per run.
+        seeds: Of the runs.
+    """
+    return [_with(job, (fault,) if fault else (), seed)
+            for job, fault, seed in product(jobs, list(faults), list(seeds))]
+
+
+def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *, seed: int,
+           together: int = 1) -> list[Job]:
+    """Return random runs: kind, fault, moment, length and pattern are drawn.
+
+    A kind is drawn first, then a fault of it, so that the few faults of the actuators weigh as
+    much as the hundreds of topics. A third of the faults is permanent, a third transient, a third
+    intermittent if it hits messages, else transient.
+
+    Args:
+        jobs: To choose from.
+        groups: Of fault names, see `fault_groups`.
+        runs: How many.
+        seed: Of the choice and of the runs; a longer sample begins with the shorter one.
+        together: How many faults at once.
+
+    Raises:
+        ValueError: No jobs or faults to choose from.
+    """
+    kinds = [kind for kind, names in groups.items() if names]
+    if not jobs or not kinds:
+        raise ValueError("campaign: there is nothing to choose from")
+    chosen = []
+    for number in range(runs):
+        dice = random.Random(f"campaign {seed} {number}")  # noqa: S311 no secret
+        faults = tuple(_random_fault(dice, groups, kinds) for _ in range(together))
+        chosen.append(_with(dice.choice(list(jobs)), faults, dice.randrange(1, 2**31)))
+    return chosen
+
+
+def _random_fault(dice: random.Random, groups: dict[str, tuple[str, ...]], kinds: Sequence[str]
+                  ) -> PlannedFault:
+    kind = dice.choice(kinds)
+    fault = dice.choice(groups[kind])
+    at_s = round(dice.uniform(EARLIEST_S, LATEST_S), 2)
+    lasts_s = round(math.exp(dice.uniform(*map(math.log, LASTS_S))), 2)
+    pattern = dice.choice(("permanent", "transient", "intermittent"))
+    seed = dice.randrange(1000)
+    if kind == "process":  # a killed process stays killed, a wedged one wedged
+        return PlannedFault(fault, at_s)
+    if pattern == "intermittent" and kind in {"paper", "sensor", "topic"}:
+        on_s, off_s = (round(dice.uniform(*_FLICKER_S), 2) for _ in range(2))
+        return PlannedFault(fault, at_s, duration_s=math.inf, on_s=on_s, off_s=off_s, seed=seed)
+    return PlannedFault(fault, at_s, seed=seed,
+                        duration_s=math.inf if pattern == "permanent" else lasts_s)
+
+
+def _with(job: Job, faults: tuple[PlannedFault, ...], seed: int) -> Job:
+    names = " + ".join(fault.fault for fault in faults) or "none"
+    return Job(row=names, system=job.system, retuned=job.retuned, strategy=job.strategy,
+               airport=job.airport, mission=job.mission, obstacles=job.obstacles, ftm=job.ftm,
+               network=job.network, faults=faults, seed=seed, patience_s=job.patience_s)

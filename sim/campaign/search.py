@@ -1,0 +1,174 @@
+"""The search for the unsafe: an optimiser drives fault, time and place to the smallest margin.
+
+Sampling finds what is common; what is rare and bad is found by following the margin down. The
+optimiser is a tree-structured Parzen estimator (Bergstra et al. 2011, by Optuna): it handles the
+mix of names and numbers, and a space in which some numbers exist only with some names. An unsafe
+run is then shrunk: everything that it does not need is taken away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from sim.campaign.job import Job, RunResult, run_job
+from sim.campaign.plan import EARLIEST_S
+from sim.scenario import OBSTACLE, PlannedFault
+
+if TYPE_CHECKING:
+    import optuna
+
+LATEST_S = 150.0
+_LASTS_S = (0.3, 60.0)
+_OBSTACLE_M = (1.2, 6.0)
+
+Run = Callable[[Sequence[Job]], Sequence[RunResult]]
+"""Runs jobs, perhaps at the same time, and returns their results in the same order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Space:
+    """Where to look.
+
+    Args:
+        bases: What the runs have in common; the optimiser chooses among them.
+        groups: Names of faults by kind.
+        sudden_obstacle: Whether an obstacle may appear ahead of the robot as well.
+    """
+
+    bases: tuple[Job, ...]
+    groups: Mapping[str, tuple[str, ...]]
+    sudden_obstacle: bool = True
+
+    def job(self, trial: optuna.Trial, seed: int) -> Job:
+        """Return the run that the optimiser asks for."""
+        base = self.bases[trial.suggest_int("base", 0, len(self.bases) - 1)]
+        kind = trial.suggest_categorical("kind", sorted(self.groups))
+        fault = trial.suggest_categorical(f"fault of {kind}", self.groups[kind])
+        at_s = round(trial.suggest_float("at_s", EARLIEST_S, LATEST_S), 2)
+        lasts_s = None if kind == "process" else round(
+            trial.suggest_float("lasts_s", *_LASTS_S, log=True), 2)
+        faults = [PlannedFault(fault, at_s, duration_s=lasts_s)]
+        if self.sudden_obstacle and trial.suggest_categorical("obstacle", [False, True]):
+            ahead_m = round(trial.suggest_float("obstacle_m", *_OBSTACLE_M), 2)
+            after_s = round(trial.suggest_float("obstacle_after_s", 0.0, 10.0), 2)
+            faults.append(PlannedFault(f"{OBSTACLE}:{ahead_m:g}", round(at_s + after_s, 2)))
+        return msgspec.structs.replace(
+            base, row=" + ".join(f.fault for f in faults), faults=tuple(faults), seed=seed)
+
+
+def margin(result: RunResult) -> float:
+    """Return what the optimiser makes small: the margin, metres; below 0 it was unsafe.
+
+    A run that was unsafe for longer, or more often, is further below.
+    """
+    if result.safe:
+        return result.margin_m
+    return -result.prohibited_s - result.collisions
+
+
+def search(space: Space, budget: int, run: Run, *, seed: int, at_once: int = 1,
+           seen: Callable[[Job, RunResult], None] = lambda _job, _result: None
+           ) -> list[tuple[Job, RunResult]]:
+    """Look for small margins; return all runs made, the worst first.
+
+    Args:
+        space: Where to look.
+        budget: How many runs to make.
+        run: See `Run`.
+        seed: Of the optimiser and the runs.
+        at_once: How many runs are asked for before the first of them is back.
+        seen: Called after each run.
+
+    Raises:
+        ImportError: Optuna is not installed.
+    """
+    import optuna  # noqa: PLC0415 an extra
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    sampler = optuna.samplers.TPESampler(
+        seed=seed, n_startup_trials=max(10, budget // 4), multivariate=True, group=True,
+        constant_liar=True, warn_independent_sampling=False)
+    study = optuna.create_study(direction="minimize", sampler=sampler)
+    made: list[tuple[Job, RunResult]] = []
+    while len(made) < budget:
+        trials = [study.ask() for _ in range(min(at_once, budget - len(made)))]
+        jobs = [space.job(trial, seed) for trial in trials]
+        for trial, job, result in zip(trials, jobs, run(jobs), strict=True):
+            study.tell(trial, margin(result) if result.effective else 2.0)
+            made.append((job, result))
+            seen(job, result)
+    return sorted(made, key=lambda pair: margin(pair[1]))
+
+
+def shrink(job: Job, run: Callable[[Job], RunResult] = run_job,
+           tried: Callable[[Job, bool], None] = lambda _job, _unsafe: None) -> Job:
+    """Return a smaller run that is unsafe still.
+
+    Takes away in turn, as long as the run stays unsafe: whole faults, the airport's obstacles,
+    the pattern of a fault, half of its duration, digits of its time, the seed.
+
+    Args:
+        job: An unsafe run.
+        run: How to run one.
+        tried: Called with each attempt and whether it was unsafe.
+
+    Raises:
+        ValueError: The run is not unsafe.
+    """
+
+    def unsafe(candidate: Job) -> bool:
+        found = not run(candidate).safe
+        tried(candidate, found)
+        return found
+
+    if not unsafe(job):
+        raise ValueError(f"run {job.key} ({job.text()}) is safe: there is nothing to shrink")
+    smaller = True
+    while smaller:
+        smaller = False
+        for candidate in _smaller(job):
+            if candidate != job and unsafe(candidate):
+                job, smaller = candidate, True
+                break
+    return job
+
+
+def _smaller(job: Job) -> list[Job]:
+    """Return simpler runs, the most simplified first."""
+    found: list[Job] = []
+
+    def change(**values: Any) -> None:
+        found.append(msgspec.structs.replace(job, **values))
+
+    for i in range(len(job.faults)):
+        if len(job.faults) > 1:
+            change(faults=(*job.faults[:i], *job.faults[i + 1:]))
+    if job.obstacles:
+        change(obstacles=0)
+    for i, fault in enumerate(job.faults):
+        for simpler in _simpler(fault):
+            change(faults=(*job.faults[:i], simpler, *job.faults[i + 1:]))
+    if job.seed != 1:
+        change(seed=1)
+    return found
+
+
+def _simpler(fault: PlannedFault) -> list[PlannedFault]:
+    replace = msgspec.structs.replace
+    found = []
+    if fault.on_s or fault.off_s or fault.share < 1:
+        found.append(replace(fault, on_s=0.0, off_s=0.0, share=1.0))
+    if fault.seed:
+        found.append(replace(fault, seed=0))
+    if fault.duration_s is not None and fault.duration_s > 0.2:
+        shorter = 20.0 if fault.duration_s > 40 else round(fault.duration_s / 2, 2)
+        found.append(replace(fault, duration_s=shorter))
+    for digits in (-1, 0, 1):
+        rounded = round(fault.at_s, digits)
+        if rounded != fault.at_s and rounded > 0:
+            found.append(replace(fault, at_s=rounded))
+    return found

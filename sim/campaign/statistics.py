@@ -1,0 +1,144 @@
+"""What a campaign's runs add up to. Pure."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Sequence
+
+import msgspec
+
+from sim.campaign.store import Run
+
+CONFIDENCE_Z = 1.959963984540054
+"""Two-sided 95 %."""
+
+
+class Rate(msgspec.Struct, frozen=True):
+    """A share of runs with its 95 % confidence interval (Wilson 1927)."""
+
+    count: int
+    of: int
+    low: float
+    high: float
+
+    @property
+    def share(self) -> float:
+        """The share seen; not a number if there were no runs."""
+        return self.count / self.of if self.of else math.nan
+
+
+class Spread(msgspec.Struct, frozen=True):
+    """A figure over some runs: how many have it, minimum, median, 95th percentile, maximum."""
+
+    n: int
+    least: float
+    median: float
+    p95: float
+    most: float
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """All runs with one fault under one condition.
+
+    `ineffective` runs, in which the fault changed nothing, count for nothing else.
+    """
+
+    fault: str
+    obstacles: int
+    ftm: bool
+    strategy: str
+    runs: int
+    ineffective: int
+    success: Rate
+    safe: Rate
+    worst: str
+    worst_key: str
+    stopped_for_good: int
+    undetected: int
+    false_alarms: int
+    detected_after_s: Spread | None
+    recovered_after_s: Spread | None
+    obstacle_m: Spread | None
+    prohibited_m: Spread | None
+
+
+def rate(count: int, of: int) -> Rate:
+    """Return a share with its interval; (0, 1) if there were no runs."""
+    if of == 0:
+        return Rate(0, 0, 0.0, 1.0)
+    z2 = CONFIDENCE_Z**2
+    share = count / of
+    middle = (share + z2 / (2 * of)) / (1 + z2 / of)
+    half = CONFIDENCE_Z / (1 + z2 / of) * math.sqrt(
+        share * (1 - share) / of + z2 / (4 * of * of))
+    # At the ends the formula gives 0 and 1 but for rounding.
+    low = 0.0 if count == 0 else max(0.0, middle - half)
+    high = 1.0 if count == of else min(1.0, middle + half)
+    return Rate(count, of, low, high)
+
+
+def spread(values: Iterable[float | None]) -> Spread | None:
+    """Return the spread of those values that there are, or None if there are none."""
+    known = sorted(v for v in values if v is not None and math.isfinite(v))
+    if not known:
+        return None
+    return Spread(len(known), known[0], statistics.median(known),
+                  known[min(len(known) - 1, math.ceil(0.95 * len(known)) - 1)], known[-1])
+
+
+def verdict(run: Run) -> str:
+    """Return "success, safe" and the like."""
+    return (f"{'success' if run.result.success else 'fail'}, "
+            f"{'safe' if run.result.safe else 'unsafe'}")
+
+
+def badness(run: Run) -> tuple[bool, bool, float]:
+    """Return how bad a run was, to sort by: unsafe, failed, and how little room was left."""
+    return (not run.result.safe, not run.result.success, -run.result.margin_m)
+
+
+def worst(runs: Iterable[Run]) -> Run:
+    """Return the worst run: the verdict of a row is that of its worst run (paper, section V)."""
+    return max(runs, key=badness)
+
+
+def table(runs: Iterable[Run]) -> list[Row]:
+    """Return one row per fault, obstacles, FTM and strategy, in order of first appearance."""
+    rows: dict[tuple[str, int, bool, str], list[Run]] = {}
+    for run in runs:
+        job = run.job
+        rows.setdefault((job.row, job.obstacles, job.ftm, job.strategy), []).append(run)
+    return [_row(*condition, found) for condition, found in rows.items()]
+
+
+def total(runs: Sequence[Run], name: str) -> Row:
+    """Return all runs as one row."""
+    return _row(name, -1, True, "", list(runs))
+
+
+def _row(fault: str, obstacles: int, ftm: bool, strategy: str, runs: list[Run]) -> Row:
+    counted = [run for run in runs if run.result.effective]
+    results = [run.result for run in counted]
+    bad = worst(counted or runs)
+    return Row(
+        fault=fault, obstacles=obstacles, ftm=ftm, strategy=strategy, runs=len(runs),
+        ineffective=len(runs) - len(counted),
+        success=rate(sum(r.success for r in results), len(results)),
+        safe=rate(sum(r.safe for r in results), len(results)),
+        worst=verdict(bad) if counted else "no effect", worst_key=bad.job.key,
+        stopped_for_good=sum(r.stopped_for_good for r in results),
+        undetected=sum(bool(r.outcomes) and r.detected_after_s is None for r in results),
+        false_alarms=sum(r.false_alarms for r in results),
+        detected_after_s=spread(r.detected_after_s for r in results),
+        recovered_after_s=spread(r.recovered_after_s for r in results),
+        obstacle_m=spread(r.obstacle_m for r in results),
+        prohibited_m=spread(r.prohibited_m for r in results))
+
+
+def as_json(row: Row) -> dict[str, object]:
+    """Return a row as scripts get it: counts, and everything else under names of its own."""
+    more = msgspec.to_builtins(row)
+    return {**more, "success": row.success.count, "safe": row.safe.count,
+            "success_interval": [row.success.low, row.success.high],
+            "safe_interval": [row.safe.low, row.safe.high]}

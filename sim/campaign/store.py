@@ -1,0 +1,95 @@
+"""Where a campaign's results are kept: an SQLite file, each run once, safe against any end."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from sim.campaign.job import Job, RunResult
+
+FILE_NAME = "runs.sqlite"
+
+_SCHEMA = """
+create table if not exists about (name text primary key, value text not null);
+create table if not exists runs (
+    key text primary key, job blob not null, result blob not null,
+    finished_at text not null default current_timestamp);
+"""
+_FORMAT = "1"
+
+
+class StoreError(ValueError):
+    """The file cannot be used; the message is one line."""
+
+
+class Run(NamedTuple):
+    """A run that was made."""
+
+    job: Job
+    result: RunResult
+
+
+class Store:
+    """Results by the keys of their jobs.
+
+    Args:
+        directory: Of the campaign; it is made if need be.
+
+    Raises:
+        StoreError: There is a file that is no store, or one of another version.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        directory.mkdir(parents=True, exist_ok=True)
+        self.path = directory / FILE_NAME
+        try:
+            self._database = sqlite3.connect(self.path, timeout=30.0)
+            self._database.execute("pragma journal_mode = wal")
+            self._database.executescript(_SCHEMA)
+            self._database.execute(
+                "insert or ignore into about values ('format', ?)", (_FORMAT,))
+            self._database.commit()
+            found = self._database.execute(
+                "select value from about where name = 'format'").fetchone()[0]
+        except sqlite3.DatabaseError as error:
+            raise StoreError(f"{self.path}: no store of campaign results: {error}") from None
+        if found != _FORMAT:
+            raise StoreError(f"{self.path}: format {found}, this program reads {_FORMAT}; "
+                             "choose another --out")
+
+    def keys(self) -> set[str]:
+        """Return the keys of the runs that are there."""
+        return {key for (key,) in self._database.execute("select key from runs")}
+
+    def add(self, job: Job, result: RunResult) -> None:
+        """Keep a run; one that is there already stays as it is."""
+        with self._database:
+            self._database.execute(
+                "insert or ignore into runs (key, job, result) values (?, ?, ?)",
+                (job.key, msgspec.msgpack.encode(job), msgspec.msgpack.encode(result)))
+
+    def find(self, key: str) -> Run | None:
+        """Return the run whose key begins so, if there is exactly one."""
+        found = self._database.execute(
+            "select job, result from runs where key like ? limit 2", (f"{key}%",)).fetchall()
+        return _run(*found[0]) if len(found) == 1 else None
+
+    def runs(self, keys: set[str] | None = None) -> Iterator[Run]:
+        """Yield the runs in the order in which they were made; all, or those with the keys."""
+        for key, job, result in self._database.execute(
+                "select key, job, result from runs order by rowid"):
+            if keys is None or key in keys:
+                yield _run(job, result)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._database.close()
+
+
+def _run(job: bytes, result: bytes) -> Run:
+    return Run(msgspec.msgpack.decode(job, type=Job),
+               msgspec.msgpack.decode(result, type=RunResult))

@@ -1,0 +1,105 @@
+"""The network of a virtual run: seeded, measured, and as bad as it is told to be."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+
+import pytest
+
+from sim.network import NETWORKS, NetworkModel, SeededNetwork, find_network
+from sim.timing import Timing, draw, measured, share_below
+
+EVEN = Timing((0.0, 10.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
+
+
+def ways(network: SeededNetwork, count: int = 4000, step_s: float = 0.001):
+    return [(i * step_s, network.arrivals("a", "b", i * step_s)) for i in range(count)]
+
+
+def test_the_same_seed_gives_the_same_arrivals_and_another_seed_others():
+    model = NETWORKS["lossy"]
+    assert ways(SeededNetwork(model, 1)) == ways(SeededNetwork(model, 1))
+    assert ways(SeededNetwork(model, 1)) != ways(SeededNetwork(model, 2))
+
+
+def test_over_one_link_nothing_is_lost_nothing_comes_twice_and_nothing_overtakes():
+    for name in ("measured", "jittery"):
+        arrivals = [at for _, at in ways(SeededNetwork(NETWORKS[name], 3))]
+        assert all(len(at) == 1 for at in arrivals)
+        times = [at[0] for at in arrivals]
+        assert times == sorted(times)
+
+
+def test_no_message_arrives_before_it_was_sent():
+    for model in NETWORKS.values():
+        assert all(at >= sent for sent, found in ways(SeededNetwork(model, 4)) for at in found)
+
+
+def test_the_ideal_network_takes_no_time():
+    assert all(found == (sent,) for sent, found in ways(SeededNetwork(NETWORKS["ideal"], 1)))
+
+
+def test_delays_are_drawn_from_the_measured_distribution():
+    network = SeededNetwork(NETWORKS["measured"], 5, EVEN)
+    delays = [network.arrivals("a", "b", i)[0] - i for i in range(5000)]
+    assert 0.0 <= min(delays) < 0.0002
+    assert 0.0098 < max(delays) <= 0.01
+    tenths = Counter(int(delay * 1000) for delay in delays)
+    assert all(400 < tenths[i] < 600 for i in range(10))
+
+
+def test_loss_duplication_and_overtaking_come_as_often_as_said():
+    network = SeededNetwork(NetworkModel(
+        "x", "", extra_s=0.05, loss=0.1, duplication=0.2, reordering=1.0), 6)
+    found = [at for _, at in ways(network, 10_000)]
+    copies = Counter(map(len, found))
+    assert copies[0] / 10_000 == pytest.approx(0.1, abs=0.01)
+    assert copies[2] / 10_000 == pytest.approx(0.9 * 0.2, abs=0.015)
+    assert (network.lost, network.duplicated) == (copies[0], copies[2])
+    assert network.overtaken > 1000
+    times = [at[0] for at in found if at]
+    assert times != sorted(times)
+
+
+def test_the_observer_hears_all_at_once_whatever_the_network_does():
+    network = SeededNetwork(NetworkModel("x", "", loss=1.0), 1, local=("observer",))
+    assert network.arrivals("a", "observer", 5.0) == (5.0,)
+    assert network.arrivals("observer", "a", 5.0) == (5.0,)
+    assert network.arrivals("a", "b", 5.0) == ()
+
+
+@pytest.mark.parametrize(("field", "value"), [
+    ("loss", 1.5), ("duplication", -0.1), ("reordering", float("nan")), ("extra_s", -1.0)])
+def test_an_impossible_network_is_refused(field, value):
+    with pytest.raises(ValueError, match=field):
+        NetworkModel("x", "", **{field: value})
+
+
+def test_an_unknown_network_is_refused_with_those_that_there_are():
+    with pytest.raises(ValueError, match="unknown network 'wet'; known: measured, ideal"):
+        find_network("wet")
+
+
+def test_what_was_measured_is_plausible_and_complete():
+    timing = measured()
+    for name in timing.__struct_fields__:
+        assert len(getattr(timing, name)) == 21, name
+    assert 0.05 < timing.message_ms[10] < 5
+    assert timing.exit_ms[10] < timing.death_ms[10] < timing.start_ms[10]
+
+
+def test_drawing_follows_the_quantiles():
+    quantiles = (1.0, 2.0, 10.0)
+    dice = random.Random(1)
+    drawn = [draw(quantiles, dice) * 1e3 for _ in range(4000)]
+    for value in (1.5, 2.0, 6.0):
+        below = sum(d < value for d in drawn) / len(drawn)
+        assert below == pytest.approx(share_below(quantiles, value), abs=0.03)
+    assert (share_below(quantiles, 0.5), share_below(quantiles, 11.0)) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("values", [(1.0,), (2.0, 1.0), (-1.0, 1.0)])
+def test_quantiles_that_are_none_are_refused(values):
+    with pytest.raises(ValueError, match="message_ms"):
+        Timing(values, (1.0, 1.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))

@@ -1,0 +1,107 @@
+"""Planned faults: how they are written, what they become, and what is refused."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from actors.messages import ActuatorFaultKind
+from sim.campaign.plan import fault_groups
+from sim.disturbance import UnknownFaultError
+from sim.injector import can_be_hit
+from sim.scenario import (
+    OnActuators,
+    OnProcess,
+    OnTopics,
+    OnWorld,
+    PlannedFault,
+    ScenarioError,
+    action_of,
+    parse_fault,
+)
+from toolbox import systems
+
+SYSTEM = systems.load(None)
+NODES = can_be_hit(SYSTEM)
+
+
+@pytest.mark.parametrize(("text", "planned"), [
+    ("kill:osmosis_control", PlannedFault("kill:osmosis_control", 10.0)),
+    ("kill:osmosis_control@30", PlannedFault("kill:osmosis_control", 30.0)),
+    ("gps-bias@12.5+5", PlannedFault("gps-bias", 12.5, duration_s=5.0)),
+    ("gps-bias+5", PlannedFault("gps-bias", 10.0, duration_s=5.0)),
+    ("drop:localization/pose@1+inf", PlannedFault("drop:localization/pose", 1.0,
+                                                  duration_s=math.inf)),
+    ("laser-stuck@goal2", PlannedFault("laser-stuck", 0.0, 2)),
+    ("laser-stuck@goal2:5+3", PlannedFault("laser-stuck", 5.0, 2, 3.0)),
+    ("weak-wheel:rear-left:0.3@7", PlannedFault("weak-wheel:rear-left:0.3", 7.0)),
+])
+def test_what_is_typed_is_what_is_meant(text, planned):
+    assert parse_fault(text) == planned
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("", "must be FAULT"), ("@3", "must be FAULT"), ("x@soon", "WHEN 'soon': must be simulated"),
+    ("x@-1", "WHEN '-1'"), ("x@inf", "WHEN 'inf'"), ("x@nan", "WHEN 'nan'"),
+    ("x@3+long", "DURATION 'long': must be simulated seconds, or inf"),
+    ("x+", "DURATION ''"), ("x@goal0", "goals are counted from 1"), ("x@goalx", "goalx"),
+    ("x@goal1:z", "WHEN 'z'"),
+])
+def test_what_makes_no_sense_is_refused_in_one_line(text, words):
+    with pytest.raises(ScenarioError, match=words) as caught:
+        parse_fault(text)
+    assert "\n" not in str(caught.value)
+
+
+@given(st.sampled_from(["gps-bias", "kill:DM1", "drop:control/command"]),
+       st.floats(0, 1e3).map(lambda x: round(x, 2)), st.integers(0, 5),
+       st.none() | st.floats(0, 100).map(lambda x: round(x, 2)) | st.just(math.inf))
+def test_text_and_plan_say_the_same(fault, at_s, goal, duration_s):
+    planned = PlannedFault(fault, at_s, goal, duration_s)
+    assert parse_fault(planned.text()) == planned
+
+
+def test_every_fault_of_the_catalogue_becomes_an_action():
+    groups = fault_groups(SYSTEM)
+    kinds = {"paper": OnTopics, "sensor": OnTopics, "topic": OnTopics, "process": OnProcess,
+             "actuator": OnActuators, "world": OnWorld}
+    assert set(groups) == set(kinds)
+    for group, names in groups.items():
+        assert len(names) == len(set(names)) > 0
+        for name in names:
+            assert isinstance(action_of(PlannedFault(name), "f1", NODES), kinds[group]), name
+
+
+def test_faults_of_topics_carry_pattern_seed_and_duration():
+    action = action_of(PlannedFault("gps-noise", 3.0, duration_s=math.inf, share=0.5, on_s=1.0,
+                                    off_s=2.0, seed=9), "f7", NODES)
+    order = action.orders[0]
+    assert (order.injection, order.duration_s, order.share) == ("f7", math.inf, 0.5)
+    assert (order.on_s, order.off_s, order.seed) == (1.0, 2.0, 9)
+
+
+def test_a_wheel_and_its_strength_are_named():
+    order = action_of(PlannedFault("weak-wheel:rear-left:0.3", duration_s=4.0), "f1", NODES).order
+    assert (order.kind, order.wheel, order.strength, order.duration_s) == (
+        ActuatorFaultKind.WEAK_WHEEL, "rear left", 0.3, 4.0)
+
+
+@pytest.mark.parametrize(("fault", "words"), [
+    ("kill:nobody", "no node 'nobody'; there are: supervisor, "),
+    ("kill", "no node ''"), ("kill:simulator", "no node 'simulator'"),
+    ("slow:DM1:x", "must be one number between 0 and 60"),
+    ("stuck-wheel:fifth", "no wheel 'fifth'; there are: front-left"),
+    ("weak-wheel:rear-left:2", "must be one number between 0 and 1"),
+    ("brake-failure:0.1:2", "must be one number"), ("obstacle-ahead:far", "must be one number"),
+])
+def test_an_impossible_detail_is_refused(fault, words):
+    with pytest.raises(ScenarioError, match=words):
+        action_of(PlannedFault(fault), "f1", NODES)
+
+
+def test_an_unknown_fault_is_refused():
+    with pytest.raises(UnknownFaultError):
+        action_of(PlannedFault("gremlins"), "f1", NODES)

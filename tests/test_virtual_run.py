@@ -1,0 +1,162 @@
+"""Whole missions in virtual time: deterministic to the byte, and the same as on processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from real_run import RealRun
+from stub_actors import ROOT
+
+from sim.campaign.job import Job, run_job, run_virtually
+from sim.scenario import PlannedFault, parse_fault
+
+SHORT = parse_fault("kill:mission_manager@6")
+"""Loses the mission, so the run is over after ten simulated seconds."""
+
+
+def job(*faults: str, **changes) -> Job:
+    return Job(row="test", mission="A", faults=tuple(map(parse_fault, faults)), **changes)
+
+
+def decisions(result):
+    return [(d.active, d.recoveries) for d in result.decisions]
+
+
+def test_a_mission_without_a_fault_succeeds_without_a_decision():
+    result = run_job(job())
+    assert (result.success, result.safe, result.decisions) == (True, True, ())
+    assert (result.false_alarms, result.failures) == (0, ())
+    assert result.detected_after_s is None
+    assert result.obstacle_m > 0.3
+    assert result.prohibited_m > 0.3
+
+
+@pytest.mark.parametrize("network", ["measured", "lossy"])
+def test_the_same_seed_gives_the_same_run_to_the_byte_and_another_seed_another(network):
+    first = run_job(job(SHORT.text(), "gps-noise@1", network=network))
+    again = run_job(job(SHORT.text(), "gps-noise@1", network=network))
+    other = run_job(job(SHORT.text(), "gps-noise@1", network=network, seed=2))
+    assert first.trace == again.trace != other.trace
+    assert len(first.trace) == 64
+
+
+def test_the_trace_does_not_depend_on_the_process_it_is_made_in():
+    traces = set()
+    for seed in ("0", "1", "4711"):
+        done = subprocess.run(
+            [sys.executable, "launch.py", "--virtual", "--mission", "A", "--seed", "5", "--fault",
+             "kill:mission_manager@6", "--fault", "wedge:DM2@3", "--json", "--report",
+             f"reports/trace-{os.getpid()}"],
+            cwd=ROOT, env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True,
+            check=False)
+        assert done.returncode == 1, done.stderr
+        result = json.loads(done.stdout.splitlines()[-1])
+        assert [fault["effective"] for fault in result["faults"]] == [True, True]
+        traces.add(result["trace"])
+    assert len(traces) == 1
+
+
+def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():
+    stale = "command-not-updated@8+inf"
+    bare, guarded = run_job(job(stale, ftm=False)), run_job(job(stale))
+    assert (bare.safe, guarded.safe) == (False, True)
+    assert bare.unsafe_s > 8
+    assert decisions(guarded)[0] == (("FTM2",), ("RM2",))
+    assert guarded.stopped_for_good
+    assert 0.9 < guarded.detected_after_s < 1.1
+
+
+def test_a_killed_process_is_detected_respawned_and_the_mission_goes_on():
+    result = run_job(job("kill:osmosis_control@20"))
+    assert (result.success, result.safe) == (True, True)
+    assert decisions(result) == [(("FTM4",), ("RM3",)), ((), ())]
+    assert 0 < result.detected_after_s < 0.1
+    assert result.detected_after_s < result.recovered_after_s < 0.5
+
+
+@pytest.mark.parametrize("what", ["stop", "wedge"])
+def test_a_stopped_or_wedged_process_is_detected_by_its_silence(what):
+    result = run_job(job(f"{what}:graph_planner@12", SHORT.text().replace("@6", "@20")))
+    assert decisions(result)[0] == (("FTM4",), ("RM3",))
+    assert 0.3 < result.detected_after_s < 0.6
+
+
+def test_a_slow_process_is_slow():
+    usual = run_job(job(SHORT.text()))
+    slow = run_job(job(SHORT.text(), "slow:osmosis_control:0.3@2"))
+    assert slow.outcomes[1].effective
+    assert slow.trace != usual.trace
+    assert len(slow.decisions) > len(usual.decisions)  # its heart beats too seldom
+
+
+def test_killed_guards_come_back_and_the_mission_goes_on():
+    record = run_virtually(job("kill:supervisor@12", "kill:ftm_manager@14", "kill:safety_pilot@16",
+                               "kill:supervisor@18", "kill:graph_planner@18.01")).record
+    assert (record.mission, record.safety) == ("success", "safe")
+    assert record.restarts == {"supervisor": 2, "ftm_manager": 1, "safety_pilot": 1,
+                               "graph_planner": 1}
+
+
+def test_a_wedged_supervisor_is_replaced():
+    record = run_virtually(job("wedge:supervisor@8", SHORT.text().replace("@6", "@12"))).record
+    assert record.restarts == {"supervisor": 1, "mission_manager": 1}
+
+
+def test_a_fault_without_effect_says_so():
+    result = run_job(job("imu-bias@2", "kill:DM1@900", SHORT.text()))
+    assert [o.effective for o in result.outcomes] == [False, False, True]
+    assert [o.reason for o in result.outcomes] == [
+        "it changed nothing", "its moment never came", ""]
+
+
+def test_an_obstacle_appears_ahead_and_is_passed_or_waited_for():
+    result = run_job(job("obstacle-ahead:3@15"))
+    assert result.outcomes[0].effective
+    assert result.safe
+    assert 0 < result.obstacle_m < 1
+
+
+def test_a_fault_can_be_planned_for_a_goal():
+    result = run_job(job("kill:mission_manager@goal2:1"))
+    assert 25 < result.injected_s < 50
+    assert not result.success
+
+
+def test_the_baseline_has_no_fault_tolerance_at_all():
+    result = run_job(job("kill:localization@8", ftm=False))
+    assert result.decisions == ()
+    assert not result.success
+
+
+def test_a_job_survives_the_way_to_another_process_and_back():
+    import pickle
+
+    first = Job(row="x", faults=(PlannedFault("gps-bias", 3.0, duration_s=float("inf")),))
+    assert pickle.loads(pickle.dumps(first)).key == first.key
+    assert Job(row="other", faults=first.faults).key == first.key
+    assert Job(row="x", faults=first.faults, seed=2).key != first.key
+
+
+@pytest.mark.processes
+@pytest.mark.timeout(180)
+def test_virtual_and_real_runs_take_the_same_decisions_and_come_to_the_same_verdict(tmp_path):
+    faults = ("kill:osmosis_control@6", "command-out-of-bounds@10+2", "wedge:graph_planner@16",
+              "localization-not-updated@21+3", "kill:localization@28", "stop:hmi@31+5",
+              "kill:mission_manager@36")
+    virtual = run_job(job(*faults))
+    arguments = [x for fault in faults for x in ("--fault", fault)]
+    with RealRun(tmp_path, "--mission", "A", "--rate", "1", *arguments) as run:
+        code, real = run.result(120)
+    assert code == 1
+    assert (real["mission"], real["safety"]) == ("fail", "safe")
+    assert (virtual.success, virtual.safe) == (False, True)
+    assert all(fault["effective"] for fault in real["faults"]), real["faults"]
+    assert all(o.effective for o in virtual.outcomes), virtual.outcomes
+    seen = [(tuple(d["active"]), tuple(d["recoveries"])) for d in real["decisions"]]
+    assert seen == decisions(virtual), run.story
+    for one, other in zip(real["decisions"], virtual.decisions, strict=True):
+        assert one["t_s"] == pytest.approx(other.t_s, abs=0.35)

@@ -1,0 +1,380 @@
+"""`rampart campaign`: thousands of runs in virtual time with faults, and what came of them."""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import shlex
+import sys
+from collections.abc import Iterable, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from manager.schema import SystemSpec
+from manager.strategies import STRATEGIES
+from sim.campaign.execute import BACKENDS, BackendError, JobError, execute
+from sim.campaign.job import PATIENCE_S, Job, RunResult, run_virtually
+from sim.campaign.paper_tables import cells, paper_jobs, table_iii
+from sim.campaign.plan import cross, fault_groups, sample
+from sim.campaign.report import Campaign, worth_showing, write_campaign_report
+from sim.campaign.statistics import Rate, Row, Spread, as_json, table, total
+from sim.campaign.store import Run, Store, StoreError
+from sim.disturbance import UnknownFaultError
+from sim.injector import can_be_hit
+from sim.network import NETWORKS
+from sim.report import write_report
+from sim.report_record import RunRecord
+from sim.scenario import PlannedFault, ScenarioError, action_of, parse_fault
+from toolbox import systems
+from toolbox.output import NoEffectError, UsageError, print_json, print_table, say, unknown
+
+_EPILOG = """examples:
+  rampart campaign --paper                       the paper's tables, beside the paper's verdicts
+  rampart campaign --runs 200                    200 random single faults
+  rampart campaign --runs 200 --together 2       ... pairs of faults
+  rampart campaign --fault 'kill:*' --seeds 5    every process killed, five seeds each
+  rampart campaign --fault gps-bias@20+5 --obstacles 0,2 --ftm both
+  rampart campaign --list                        the faults that there are
+  rampart campaign --replay 3f2a --out DIR       repeat one run of DIR and write its report
+  rampart campaign --search 200                  look for the fault with the smallest margin
+The same command goes on where it was interrupted; each run is made once. Results, with a report,
+are in --out.
+
+exit code: 0 no unsafe run with fault tolerance, 1 there was one, 2 bad usage"""
+
+
+def add(verbs: Any, formatter: Any) -> None:
+    """Add the verb to the parser."""
+    parser = verbs.add_parser(
+        "campaign", formatter_class=formatter, help="run many missions with faults in them",
+        description="Run missions in virtual time with faults injected, on all cores, and say how\n"
+                    "often the robot succeeded and whether it was always safe.",
+        epilog=_EPILOG)
+    what = parser.add_argument_group("what is run")
+    what.add_argument("--paper", action="store_true", help="tables III, IV and V of the paper")
+    what.add_argument("--runs", type=int, metavar="N", help="N random faults of all kinds")
+    what.add_argument("--fault", action="append", default=[], metavar="FAULT[@WHEN][+S]",
+                      help="this fault; may be repeated, and be a pattern of names: 'gps-*'")
+    what.add_argument("--together", type=int, default=1, metavar="K",
+                      help="with --runs: K faults in each (default 1)")
+    what.add_argument("--kinds", metavar="K,...", help="with --runs: only these kinds of faults "
+                      "(paper, sensor, topic, process, actuator, world)")
+    what.add_argument("--search", type=int, metavar="N",
+                      help="N runs of an optimiser that looks for the smallest safety margin")
+    what.add_argument("--replay", metavar="RUN", help="repeat a run of --out by its key")
+    what.add_argument("--list", action="store_true", help="list the faults that there are")
+    how = parser.add_argument_group("under which conditions")
+    how.add_argument("--system", metavar="SPEC", default="osmosis",
+                     help="file, or name of a shipped system (default: osmosis)")
+    how.add_argument("--mission", metavar="NAME", default="A", help="default: A")
+    how.add_argument("--airport", metavar="NAME", default="", help="default: the system's")
+    how.add_argument("--obstacles", metavar="N,...", default="0,2",
+                     help="how many of the airport's; several are crossed, or drawn from with "
+                     "--runs (default: 0,2)")
+    how.add_argument("--ftm", choices=("on", "off", "both"), default="on",
+                     help="fault tolerance, the paper's baseline, or both (default: on)")
+    how.add_argument("--strategy", action="append", default=[], metavar="NAME",
+                     help="of the manager; may be repeated (default: the system's)")
+    how.add_argument("--network", default="measured", metavar="NAME",
+                     help=f"{', '.join(NETWORKS)} (default: measured)")
+    how.add_argument("--seed", type=int, default=1, metavar="N", help="default: 1")
+    how.add_argument("--seeds", type=int, default=1, metavar="N",
+                     help="with --fault: so many runs of each, from --seed on (default: 1)")
+    how.add_argument("--patience", type=float, default=PATIENCE_S, metavar="S",
+                     help=f"simulated seconds without progress that end a run "
+                     f"(default: {PATIENCE_S:g})")
+    where = parser.add_argument_group("where")
+    where.add_argument("--out", metavar="DIR",
+                       help="default: reports/campaign-NAME, by what is run")
+    where.add_argument("--jobs", type=int, default=0, metavar="N",
+                       help="processes (default: one per core)")
+    where.add_argument("--backend", default="loky", choices=BACKENDS,
+                       help="loky is this machine; dask and ray are existing clusters")
+    where.add_argument("--address", default="", metavar="A", help="of the cluster's scheduler")
+    parser.add_argument("--json", action="store_true", help="print the rows as JSON")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the campaign, or what else was asked for."""
+    spec = systems.load(options.system)
+    if spec.mobile is None:
+        raise UsageError(f"--system {options.system}: it has no [robot] and drives no mission")
+    if options.list:
+        return _list(spec, as_json=options.json)
+    if options.replay:
+        return _replay(options)
+    _check(options)
+    if options.search is not None:
+        from toolbox.search_verb import hunt  # noqa: PLC0415 it is rarely asked for
+        return hunt(options, spec, _base_jobs(options))
+    name, jobs = _choose(options, spec)
+    directory = _directory(options, name)
+    try:
+        store = Store(directory)
+        made = _execute(options, jobs, store)
+        keys = {job.key for job in jobs}
+        runs = _in_order(store.runs(keys), jobs)
+        store.close()
+    except (StoreError, BackendError) as error:
+        raise UsageError(str(error)) from None
+    except JobError as error:
+        raise UsageError(f"{error}; what was finished is in {directory}") from None
+    _show(options, spec, runs, made)
+    page = _write_report(options, spec, directory, runs)
+    if not options.json:
+        say(f"\nReport: {page}")
+    return 1 if any(r.job.ftm and not r.result.safe for r in runs) else 0
+
+
+# -- choosing ----------------------------------------------------------------------------------
+
+
+def _check(options: argparse.Namespace) -> None:
+    chosen = [name for name, given in (
+        ("--paper", options.paper), ("--runs", options.runs is not None),
+        ("--fault", options.fault), ("--search", options.search is not None)) if given]
+    if len(chosen) != 1:
+        raise UsageError("give one of --paper, --runs N, --fault FAULT, --search N; "
+                         f"given: {', '.join(chosen) or 'none'}")
+    for name, value, least in (("--runs", options.runs, 1), ("--together", options.together, 1),
+                               ("--seeds", options.seeds, 1), ("--search", options.search, 1),
+                               ("--jobs", options.jobs, 0)):
+        if value is not None and value < least:
+            raise UsageError(f"{name} {value}: must be {least} or more")
+    if not options.patience > 0:
+        raise UsageError(f"--patience {options.patience:g}: must be above 0")
+    if options.network not in NETWORKS:
+        raise unknown("network", options.network, NETWORKS)
+    for strategy in options.strategy:
+        if strategy not in STRATEGIES:
+            raise unknown("strategy", strategy, STRATEGIES)
+
+
+def _base_jobs(options: argparse.Namespace) -> list[Job]:
+    """Return what the runs have in common, crossed."""
+    try:
+        obstacles = [int(n) for n in options.obstacles.split(",")]
+    except ValueError:
+        raise UsageError(f"--obstacles {options.obstacles}: must be numbers, e.g. 0,2") from None
+    ftm = {"on": (True,), "off": (False,), "both": (False, True)}[options.ftm]
+    jobs = [Job(row="", system=options.system, strategy=strategy, airport=options.airport,
+                mission=options.mission, obstacles=n, ftm=with_ftm, network=options.network,
+                patience_s=options.patience)
+            for with_ftm, strategy, n in product(ftm, options.strategy or [""], obstacles)]
+    _try_world(jobs)
+    return jobs
+
+
+def _try_world(jobs: Sequence[Job]) -> None:
+    """Refuse a mission, airport or number of obstacles that does not exist before any run."""
+    from airport.formats import load_airport, load_mission  # noqa: PLC0415 heavy
+    job = jobs[0]
+    spec = systems.load(job.system)
+    try:
+        airport = load_airport(job.airport or spec.airport)
+        load_mission(job.mission or spec.mission, airport)
+    except ValueError as error:
+        raise UsageError(" ".join(str(error).split())) from None
+    for each in jobs:
+        if not 0 <= each.obstacles <= len(airport.obstacles):
+            raise UsageError(f"--obstacles {each.obstacles}: {airport.name} has places for "
+                             f"{len(airport.obstacles)}")
+
+
+def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Job]]:
+    """Return a name for what is run, and the runs."""
+    if options.paper:
+        return "paper", paper_jobs(options.mission, options.seed)
+    jobs = _base_jobs(options)
+    groups = fault_groups(spec)
+    if options.runs is not None:
+        if options.kinds:
+            wanted = options.kinds.split(",")
+            for kind in wanted:
+                if kind not in groups:
+                    raise unknown("kind", kind, groups)
+            groups = {kind: groups[kind] for kind in wanted}
+        together = f"-{options.together}" if options.together > 1 else ""
+        return f"sample{together}", sample(
+            jobs, groups, options.runs, seed=options.seed, together=options.together)
+    faults = list(_planned(options.fault, spec, groups))
+    return "faults", cross(jobs, faults, range(options.seed, options.seed + options.seeds))
+
+
+def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str, ...]]
+             ) -> Iterable[PlannedFault | None]:
+    every = [name for names in groups.values() for name in names]
+    nodes = can_be_hit(spec)
+    for text in texts:
+        if text == "none":
+            yield None
+            continue
+        try:
+            planned = parse_fault(text)
+            found = fnmatch.filter(every, planned.fault)
+            if not found:
+                action_of(planned, "f1", nodes)
+                found = [planned.fault]
+        except (ScenarioError, UnknownFaultError) as error:
+            raise UsageError(f"--fault {text}: {error}") from None
+        for name in found:
+            yield PlannedFault(name, planned.at_s, planned.goal, planned.duration_s)
+
+
+def _directory(options: argparse.Namespace, name: str) -> Path:
+    return Path(options.out) if options.out else Path("reports") / f"campaign-{name}"
+
+
+# -- running -----------------------------------------------------------------------------------
+
+
+def _execute(options: argparse.Namespace, jobs: Sequence[Job], store: Store) -> int:
+    unique = {job.key for job in jobs}
+    done = len(unique & store.keys())
+    unsafe = 0
+    with tqdm(total=len(unique), initial=done, unit="run", file=sys.stderr, smoothing=0.05,
+              disable=not sys.stderr.isatty() and None) as bar:
+
+        def progress(job: Job, result: RunResult) -> None:
+            nonlocal unsafe
+            if job.ftm and not result.safe:
+                unsafe += 1
+                bar.write(f"unsafe: {job.key} {job.text()}", file=sys.stderr)
+            bar.set_postfix(unsafe=unsafe, refresh=False)
+            bar.update()
+
+        return execute(jobs, store, workers=options.jobs, backend=options.backend,
+                       address=options.address, progress=progress)
+
+
+def _in_order(runs: Iterable[Run], jobs: Sequence[Job]) -> list[Run]:
+    """Return the runs in the order of their jobs, with the rows that these name."""
+    results = {run.job.key: run.result for run in runs}
+    return [Run(job, results[job.key]) for job in jobs if job.key in results]
+
+
+def _replay(options: argparse.Namespace) -> int:
+    if not options.out:
+        raise UsageError("--replay RUN: --out DIR is missing: the campaign that the run is of")
+    directory = Path(options.out)
+    if not directory.is_dir():
+        raise UsageError(f"--out {options.out}: no such directory")
+    try:
+        store = Store(directory)
+    except StoreError as error:
+        raise UsageError(str(error)) from None
+    found = store.find(options.replay)
+    store.close()
+    if found is None:
+        raise UsageError(f"--replay {options.replay}: no run, or several, of this key in "
+                         f"{directory}")
+    again = run_virtually(found.job)
+    same = again.trace == found.result.trace
+    html, data = write_report(again.record, directory / "replays")
+    if options.json:
+        print_json({"run": found.job.key, "job": found.job, "same_trace": same,
+                    "report": str(html), "record": str(data)})
+    else:
+        say(f"{found.job.key}: {found.job.text()}\n"
+            f"{again.record.mission}, {again.record.safety}; "
+            f"{'; '.join(again.record.reasons) or 'as it should be'}\n"
+            f"{'the same run, to the byte' if same else 'NOT the same run: the program changed'}\n"
+            f"Report: {html}")
+    if not same:
+        raise NoEffectError(f"run {found.job.key}: the trace is not the one in the store")
+    return 0
+
+
+# -- showing -----------------------------------------------------------------------------------
+
+
+def _show(options: argparse.Namespace, spec: SystemSpec, runs: Sequence[Run], made: int) -> None:
+    rows = table(runs)
+    if options.json:
+        print_json([as_json(row) for row in rows])
+        return
+    if options.paper:
+        _show_paper(spec, runs)
+    else:
+        shown = sorted(rows, key=lambda row: (row.safe.share if row.safe.of else 2.0,
+                                              row.success.share if row.success.of else 2.0))
+        print_table(
+            ("fault", "obst.", "FTM", "strategy", "runs", "no effect", "success", "safe", "worst",
+             "detected after", "smallest clearance"),
+            [_cells(row) for row in shown[:60]])
+        if len(shown) > 60:
+            say(f"... and {len(shown) - 60} rows more, in the report")
+    say(f"\n{len(runs)} runs, {made} of them made now")
+    protected = [run for run in runs if run.job.ftm]
+    if protected:
+        all_of_them = total(protected, "all")
+        say(f"with fault tolerance: {_rate(all_of_them.safe)} safe, {_rate(all_of_them.success)} "
+            f"successful, {all_of_them.ineffective} without effect")
+
+
+def _cells(row: Row) -> tuple[Any, ...]:
+    clearance = min((s.least for s in (row.obstacle_m, row.prohibited_m) if s), default=None)
+    return (row.fault, row.obstacles, "yes" if row.ftm else "no", row.strategy or "-", row.runs,
+            row.ineffective, _share(row.success), _share(row.safe), row.worst,
+            _milliseconds(row.detected_after_s),
+            "-" if clearance is None else f"{clearance:.2f} m")
+
+
+def _share(found: Rate) -> str:
+    return f"{found.count}/{found.of}"
+
+
+def _rate(found: Rate) -> str:
+    return (f"{found.count} of {found.of} ({100 * found.share:.1f} %, 95 % interval "
+            f"{100 * found.low:.2f} to {100 * found.high:.2f} %)" if found.of else "none")
+
+
+def _milliseconds(found: Spread | None) -> str:
+    return "-" if found is None else f"{found.median * 1e3:.0f} ms, at most {found.most * 1e3:.0f}"
+
+
+def _show_paper(spec: SystemSpec, runs: Sequence[Run]) -> None:
+    say("Table III: what is executed\n")
+    print_table(("active", "block", "paper", "ours", ""), [
+        (", ".join(row.active), row.block, ", ".join(row.paper), ", ".join(row.ours),
+         "agrees" if row.agrees else f"DIFFERS: block {row.our_block}")
+        for row in table_iii(spec)])
+    for title in ("IV", "V"):
+        say(f"\nTable {title}: mission and safety, worst run of each row\n")
+        print_table(("condition", "fault", "obst.", "paper", "ours", "runs", "success", "safe", ""),
+                    [(c.condition, c.fault, c.obstacles, c.paper, c.ours, c.runs, c.success,
+                      c.safe, "agrees" if c.agrees else f"differs: run {c.worst_key}")
+                     for c in cells(runs) if c.table == title])
+    for cell in cells(runs):
+        if not cell.agrees:
+            say(f"\n{cell.condition}, {cell.fault}, {cell.obstacles} obstacles: paper "
+                f"{cell.paper}, ours {cell.ours}; worst run {cell.worst_key}, "
+                f"{cell.worst_fault}\n  "
+                f"{cell.story or 'no decision'}\n  {'; '.join(cell.reasons) or 'nothing amiss'}")
+
+
+def _list(spec: SystemSpec, *, as_json: bool) -> int:
+    groups = fault_groups(spec)
+    if as_json:
+        print_json(groups)
+        return 0
+    for kind, names in groups.items():
+        say(f"{kind} ({len(names)})")
+        for name in names:
+            say(f"  {name}")
+    return 0
+
+
+def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path,
+                  runs: Sequence[Run]) -> Path:
+    worst: dict[str, RunRecord] = {
+        run.job.key: run_virtually(run.job).record for run in worth_showing(runs)}
+    about = Campaign(
+        title="The paper's tables" if options.paper else "Fault-injection campaign",
+        command=f"rampart {shlex.join(sys.argv[1:])}", seed=options.seed)
+    return write_campaign_report(
+        directory, about, runs, table_iii(spec) if options.paper else (), worst)
