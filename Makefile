@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test lint bench bench-respawn setup clean requirements
+.PHONY: run test lint campaign bench bench-respawn setup clean requirements
 
 run: setup
 	$(BIN)/python launch.py
@@ -19,6 +19,10 @@ lint: setup
 # Times loading, deciding and verifying; two minutes. The figures are in docs/measurements.md.
 bench: setup
 	$(BIN)/python -m pytest benchmarks -q -s
+
+# The paper's tables III to V, run by run, with a report in reports/campaign-paper; some minutes.
+campaign: setup
+	$(BIN)/rampart campaign --paper
 
 # Kills each node 20 times during a mission and measures detection and recovery; five minutes.
 bench-respawn: setup

@@ -71,18 +71,14 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 def render(run: RunRecord) -> str:
     """Return the HTML page."""
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters.update(clock=clock, clearance=clearance)
-    template = environment.from_string(
-        Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
+    template = environment().get_template("report.html")
     x0, y0, x1, y1 = _bounds(run)
     measured = [light for light in run.lights if light.verdict != "not measured"]
     return template.render(
         run=run,
         view_box=f"{x0:g} {-y1:g} {x1 - x0:g} {y1 - y0:g}",
-        track=_points(run.track),
-        believed=_points(run.believed) if _apart(run) else "",
+        track=points(run.track),
+        believed=points(run.believed) if _apart(run) else "",
         rows=_rows(run.lights),
         counts={verdict: sum(light.verdict == verdict for light in run.lights)
                 for verdict in ("ok", "dim", "out", "not measured")},
@@ -91,6 +87,15 @@ def render(run: RunRecord) -> str:
         ticks=_ticks(run.duration_s),
         headline=headline(run),
     )
+
+
+def environment() -> jinja2.Environment:
+    """Return what all reports are rendered with: pages of `sim/`, all text escaped."""
+    made = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
+        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    made.filters.update(clock=clock, clearance=clearance)
+    return made
 
 
 def headline(run: RunRecord) -> str:
@@ -134,7 +139,8 @@ def _bounds(run: RunRecord) -> tuple[float, float, float, float]:
             max([x1, *(x + 2 for x in xs)]), max([y1, *(y + 2 for y in ys)]))
 
 
-def _points(track: Sequence[tuple[float, float, float]]) -> str:
+def points(track: Sequence[tuple[float, float, float]]) -> str:
+    """Return a track, (t, x, y) each, as the points of an SVG line; y is turned over."""
     return " ".join(f"{x:g},{-y:g}" for _, x, y in track)
 
 

@@ -110,12 +110,14 @@ class VirtualRun:
         mission: Judge, end and record.
         network: What lies between the nodes; as measured if None.
         scenario: What goes wrong, and when.
+        nodes: That faults may name, whether they run or not; those of the spec if None.
         shared: What actors share, as `run_plan.load_shared` gives it, perhaps for another seed or
             number of obstacles; loaded if None.
     """
 
     def __init__(self, plan: RunPlan, spec: SystemSpec, mission: MissionRun,
                  *, network: NetworkModel | None = None, scenario: Sequence[PlannedFault] = (),
+                 nodes: Sequence[str] | None = None,
                  shared: Mapping[str, Any] | None = None) -> None:
         # Nothing that differs from run to run may get into a message.
         self.plan = msgspec.structs.replace(
@@ -124,6 +126,7 @@ class VirtualRun:
         self._spec = spec
         self._network = network or NETWORKS["measured"]
         self._scenario = tuple(scenario)
+        self._nodes = can_be_hit(spec) if nodes is None else tuple(nodes)
         loaded = shared if shared is not None else load_shared(self.plan, spec)
         self._shared = {
             **loaded, "system": spec, "plan": self.plan, "run_id": self.plan.run_id,
@@ -166,7 +169,7 @@ class VirtualRun:
         if self._scenario:
             injector = Injector(Context(
                 INJECTOR, 1, clock, VirtualBus(hub, INJECTOR), {},
-                {"scenario": self._scenario, "hand": machine, "nodes": can_be_hit(self._spec)},
+                {"scenario": self._scenario, "hand": machine, "nodes": self._nodes},
                 pid=1))
             actors.append(injector)
         watching = [asyncio.create_task(actor.run()) for actor in actors]

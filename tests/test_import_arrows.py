@@ -21,7 +21,7 @@ ALLOWED: dict[str, set[str]] = {
     "actors.recovery": {"actors.runtime", "actors", "airport", "manager"},
     "actors.stub": {"actors.runtime", "actors", "actors.detection", "actors.recovery"},
     "actors.supervision": {"actors.runtime", "actors", "airport", "manager"},
-    "sim": {"actors.runtime", "actors", "actors.supervision", "airport", "manager"},
+    "sim": {"actors.runtime", "actors", "actors.supervision", "airport", "manager", "systems"},
     "toolbox": {"actors.runtime", "actors", "actors.supervision", "actors.operator", "airport",
                 "manager", "sim", "systems"},
     "launch": {"actors.runtime", "actors", "actors.supervision", "airport", "manager", "sim"},

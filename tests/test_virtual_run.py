@@ -132,6 +132,12 @@ def test_the_baseline_has_no_fault_tolerance_at_all():
     assert not result.success
 
 
+def test_a_fault_of_a_node_that_the_baseline_lacks_has_no_effect():
+    result = run_job(job("wedge:ftm_manager@2", SHORT.text(), ftm=False))
+    assert [o.effective for o in result.outcomes] == [False, True]
+    assert result.outcomes[0].reason == "ftm_manager had no running process"
+
+
 def test_a_job_survives_the_way_to_another_process_and_back():
     import pickle
 

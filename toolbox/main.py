@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 from toolbox import (
     adapt_verb,
+    campaign_verb,
     cut_set_verbs,
     decide_verbs,
     inject_verbs,
@@ -33,6 +34,7 @@ _EPILOG = """examples:
   rampart adapt set strategy guarded-repair      change mechanisms while it runs
   rampart table                                  what the manager would decide
   rampart tree                                   see fault tree, FTMTree and orders
+  rampart campaign --paper                       break it a hundred times, and count
   rampart verify                                 prove it, or show where it fails
 `rampart VERB --help` shows more."""
 
@@ -52,6 +54,7 @@ def build_parser() -> argparse.ArgumentParser:
     inject_verbs.add(verbs, formatter, common)
     operator_verbs.add(verbs, formatter, common)
     adapt_verb.add(verbs, formatter, common)
+    campaign_verb.add(verbs, formatter)
     cut_set_verbs.add(verbs, formatter, common)
     decide_verbs.add(verbs, formatter)
     tree_verbs.add(verbs, formatter)

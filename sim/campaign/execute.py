@@ -9,11 +9,12 @@ from typing import Any
 
 import joblib
 
+from sim.campaign.defaults import BACKENDS
 from sim.campaign.job import Job, RunResult, run_job
 from sim.campaign.store import Store
 
-BACKENDS = ("loky", "dask", "ray")
-"""loky: processes on this machine. The others: an existing cluster."""
+CONNECT_TIMEOUT_S = 10.0
+"""For reaching a cluster."""
 
 Progress = Callable[[Job, RunResult], None]
 
@@ -99,7 +100,7 @@ def _dask(address: str) -> Iterator[Any]:
     if not address:
         raise BackendError("--backend dask: --address is missing, e.g. tcp://HOST:8786")
     try:
-        client = Client(address, timeout=10)
+        client = Client(address, timeout=CONNECT_TIMEOUT_S)
     except OSError as error:
         raise BackendError(f"--address {address}: no dask scheduler: {error}") from None
     try:

@@ -20,14 +20,13 @@ import systems
 from actors.supervision.run_plan import RunPlan, load_shared, load_system, tailor
 from manager.adaptation import Action, Change, adapt
 from manager.specification import check_document, read_document
+from sim.campaign.defaults import PATIENCE_S
+from sim.injector import can_be_hit
 from sim.mission_run import MissionRun
 from sim.network import find_network
 from sim.report_record import RunRecord
 from sim.scenario import FaultOutcome, PlannedFault
 from sim.virtual_run import VirtualResult, VirtualRun
-
-PATIENCE_S = 40.0
-"""Simulated seconds without progress after which a campaign's run is over."""
 
 
 class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -177,12 +176,12 @@ def run_virtually(job: Job) -> VirtualResult:
         run_id=job.key, base_port=1024, rate=1.0, seed=job.seed, system_file=file, strategy="",
         airport=job.airport or spec.airport, mission=job.mission or spec.mission,
         obstacles=job.obstacles, ftm=job.ftm, hmi_port=0)
-    spec = tailor(plan, spec)
+    nodes, spec = can_be_hit(spec), tailor(plan, spec)
     shared = _shared(plan.airport, plan.mission, file)
     mission = MissionRun(plan, shared["airport"], shared["mission"], strategy=spec.strategy,
                          patience_s=job.patience_s)
     return VirtualRun(plan, spec, mission, network=find_network(job.network),
-                      scenario=job.faults, shared={**shared, "document": document}).run()
+                      scenario=job.faults, nodes=nodes, shared={**shared, "document": document}).run()
 
 
 def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:

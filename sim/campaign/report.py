@@ -127,7 +127,7 @@ def headline(runs: Sequence[Run]) -> str:
             parts.append(f"{name} {_many(counted, 'unsafe', more)}; "
                          f"{_many(counted, 'complete')}.")
     if lost := sum(not run.result.effective for run in faulty):
-        parts.append(f"In {_runs(lost)} more the fault had no effect.")
+        parts.append(f"In {_runs(lost)}{' more' if parts else ''} the fault had no effect.")
     return " ".join(parts).replace(" %", "\N{NO-BREAK SPACE}%")
 
 
@@ -160,17 +160,20 @@ def _many(runs: Sequence[Run], what: str, more: str = "") -> str:
 
 def _figures(runs: Sequence[Run]) -> list[tuple[str, str, str]]:
     """Return name, value and class of the figures at the top; of runs with FTM and a fault."""
-    row = total([run for run in runs if run.job.ftm and run.job.faults], "")
+    figures = [("runs in all", f"{len(runs):,}", "")]
+    protected = [run for run in runs if run.job.ftm and run.job.faults]
+    if not any(run.result.effective for run in protected):
+        return figures
+    row = total(protected, "")
     unsafe = row.safe.of - row.safe.count
     return [
-        ("runs in all", f"{len(runs):,}", ""),
+        *figures,
         ("with FTM and an effective fault", f"{row.safe.of:,}", ""),
-        ("of these unsafe", f"{unsafe:,}" if row.safe.of else NONE,
-         ("bad-text" if unsafe else "good-text") if row.safe.of else ""),
-        ("mission completed", f"{percent(row.success.share)} %" if row.safe.of else NONE, ""),
+        ("of these unsafe", f"{unsafe:,}", "bad-text" if unsafe else "good-text"),
+        ("mission completed", f"{percent(row.success.share)} %", ""),
         ("detected after, median",
          seconds(row.detected_after_s.median if row.detected_after_s else None), ""),
-        ("stopped for good", f"{row.stopped_for_good:,}" if row.safe.of else NONE, ""),
+        ("stopped for good", f"{row.stopped_for_good:,}", ""),
     ]
 
 

@@ -8,6 +8,7 @@ run is then shrunk: everything that it does not need is taken away.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -89,9 +90,11 @@ def search(space: Space, budget: int, run: Run, *, seed: int, at_once: int = 1,
     import optuna  # noqa: PLC0415 an extra
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    sampler = optuna.samplers.TPESampler(
-        seed=seed, n_startup_trials=max(10, budget // 4), multivariate=True, group=True,
-        constant_liar=True, warn_independent_sampling=False)
+    with warnings.catch_warnings():  # three of its options are called experimental
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        sampler = optuna.samplers.TPESampler(
+            seed=seed, n_startup_trials=max(10, budget // 4), multivariate=True, group=True,
+            constant_liar=True)
     study = optuna.create_study(direction="minimize", sampler=sampler)
     made: list[tuple[Job, RunResult]] = []
     while len(made) < budget:

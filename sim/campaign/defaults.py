@@ -1,0 +1,7 @@
+"""What the command line needs to know of campaigns before any of them is loaded."""
+
+PATIENCE_S = 40.0
+"""Simulated seconds without progress after which a campaign's run is over."""
+
+BACKENDS = ("loky", "dask", "ray")
+"""loky: processes on this machine. The others: an existing cluster."""

@@ -1,0 +1,389 @@
+"""Campaigns: which runs are made, that each is made once whatever happens, and what is counted."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections import Counter
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stub_actors import ROOT
+
+from sim.campaign import execute as execution
+from sim.campaign.execute import BackendError, JobError, execute
+from sim.campaign.job import Job, RunResult, run_job
+from sim.campaign.paper_tables import CONDITIONS, FAULTS, cells, paper_jobs, table_iii
+from sim.campaign.plan import cross, fault_groups, sample
+from sim.campaign.search import Space, margin, search, shrink
+from sim.campaign.statistics import badness, rate, spread, table, total, worst
+from sim.campaign.store import Run, Store, StoreError
+from sim.scenario import FaultOutcome, PlannedFault
+from toolbox import systems
+from toolbox.main import main as rampart
+
+SYSTEM = systems.load(None)
+GROUPS = fault_groups(SYSTEM)
+BASES = [Job(row="", mission="A", obstacles=n) for n in (0, 2)]
+SHORT = PlannedFault("kill:mission_manager", 3.0)
+"""Over after seven simulated seconds, a fifth of a second of work."""
+
+
+def result(**changes) -> RunResult:
+    values = {
+        "success": True, "safe": True, "reasons": (), "duration_s": 10.0, "collisions": 0,
+        "prohibited_s": 0.0, "obstacle_m": 0.8, "prohibited_m": 0.9, "unsafe_s": None,
+        "injected_s": 5.0, "detected_after_s": 0.1, "recovered_after_s": 0.3, "false_alarms": 0,
+        "decisions": (), "outcomes": (FaultOutcome("x@5", 5.0, 3),), "failures": (),
+        "trace": "00", "wall_s": 0.1}
+    return RunResult(**{**values, **changes})
+
+
+def runs_of(*results: RunResult, **job) -> list[Run]:
+    return [Run(Job(**{"row": "x", "seed": i, **job}), r) for i, r in enumerate(results, 1)]
+
+
+# ---- which runs ------------------------------------------------------------------------------
+
+
+def test_the_cross_product_has_every_run_once():
+    faults = [None, PlannedFault("gps-bias"), PlannedFault("kill:DM1")]
+    jobs = cross(BASES, faults, range(1, 4))
+    assert len(jobs) == len({job.key for job in jobs}) == 2 * 3 * 3
+    assert Counter(job.row for job in jobs) == {"none": 6, "gps-bias": 6, "kill:DM1": 6}
+
+
+def test_a_longer_sample_begins_with_the_shorter_one_and_another_seed_is_another_sample():
+    assert sample(BASES, GROUPS, 30, seed=1)[:10] == sample(BASES, GROUPS, 10, seed=1)
+    assert sample(BASES, GROUPS, 10, seed=1) != sample(BASES, GROUPS, 10, seed=2)
+
+
+def test_a_sample_draws_all_kinds_patterns_and_conditions_alike():
+    jobs = sample(BASES, GROUPS, 3000, seed=1)
+    kind_of = {name: kind for kind, names in GROUPS.items() for name in names}
+    kinds = Counter(kind_of[job.faults[0].fault] for job in jobs)
+    assert set(kinds) == set(GROUPS)
+    assert min(kinds.values()) > 3000 / 6 * 0.8
+    assert 0.4 < sum(job.obstacles == 2 for job in jobs) / 3000 < 0.6
+    messages = [j.faults[0] for j in jobs
+                if kind_of[j.faults[0].fault] in {"paper", "sensor", "topic"}]
+    permanent = sum(f.duration_s == math.inf and not f.on_s for f in messages)
+    intermittent = sum(f.on_s > 0 for f in messages)
+    assert permanent / len(messages) == pytest.approx(1 / 3, abs=0.05)
+    assert intermittent / len(messages) == pytest.approx(1 / 3, abs=0.05)
+    assert {len(job.faults) for job in jobs} == {1}
+    assert len({job.seed for job in jobs}) > 2990
+
+
+def test_faults_come_in_pairs_and_triples_when_asked_for():
+    for together in (2, 3):
+        assert {len(j.faults) for j in sample(BASES, GROUPS, 20, seed=1, together=together)} == {
+            together}
+
+
+def test_there_is_nothing_to_draw_from_nothing():
+    with pytest.raises(ValueError, match="nothing to choose from"):
+        sample(BASES, {"paper": ()}, 3, seed=1)
+
+
+# ---- each run once ---------------------------------------------------------------------------
+
+
+def test_a_store_keeps_a_run_as_it_was_infinity_included(tmp_path):
+    store = Store(tmp_path)
+    job = Job(row="x", faults=(PlannedFault("gps-bias", 3.0, duration_s=math.inf),))
+    store.add(job, result())
+    store.add(job, result(safe=False))  # the first one stays
+    store.close()
+    again = Store(tmp_path)
+    assert list(again.runs()) == [Run(job, result())]
+    assert again.keys() == {job.key}
+    assert again.find(job.key[:4]) == Run(job, result())
+    assert again.find("zz") is None
+    again.close()
+
+
+def test_a_file_that_is_no_store_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "runs.sqlite").write_text("my shopping list\n" * 100)
+    with pytest.raises(StoreError, match="no store of campaign results"):
+        Store(tmp_path)
+    assert "shopping" in (tmp_path / "runs.sqlite").read_text()
+
+
+def test_a_store_of_another_format_is_refused(tmp_path):
+    Store(tmp_path).close()
+    with sqlite3.connect(tmp_path / "runs.sqlite") as database:
+        database.execute("update about set value = '99'")
+    database.close()
+    with pytest.raises(StoreError, match="format 99, this program reads 1"):
+        Store(tmp_path)
+
+
+def test_what_is_done_is_not_done_again(tmp_path):
+    store = Store(tmp_path)
+    jobs = cross(BASES[:1], [SHORT], range(1, 4))
+    made = []
+    assert execute(jobs[:2], store, workers=1, progress=lambda j, r: made.append(j.key)) == 2
+    assert execute(jobs, store, workers=1, progress=lambda j, r: made.append(j.key)) == 1
+    assert execute(jobs, store, workers=1) == 0
+    assert Counter(made) == {job.key: 1 for job in jobs}
+    store.close()
+
+
+def test_results_do_not_depend_on_how_many_workers_there_are(tmp_path):
+    jobs = cross(BASES[:1], [SHORT], range(1, 5))
+    traces = []
+    for workers in (1, 2):
+        store = Store(tmp_path / str(workers))
+        execute(jobs, store, workers=workers)
+        traces.append({r.job.key: r.result.trace for r in store.runs()})
+        store.close()
+    assert traces[0] == traces[1] == {job.key: run_job(job).trace for job in jobs}
+
+
+def test_a_job_that_makes_no_sense_is_named_and_what_was_finished_is_kept(tmp_path):
+    store = Store(tmp_path)
+    good, bad = cross(BASES[:1], [SHORT, PlannedFault("gremlins")], [1])
+    with pytest.raises(JobError, match=f"run {bad.key} .gremlins@10.: UnknownFaultError"):
+        execute([good, bad], store, workers=1)
+    assert store.keys() <= {good.key}
+    store.close()
+
+
+def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
+    command = [sys.executable, "-m", "toolbox.main", "campaign", "--fault",
+               "kill:mission_manager@3", "--seeds", "12", "--obstacles", "0", "--jobs", "1",
+               "--out", str(tmp_path), "--json"]
+
+    def stored() -> int:
+        if not (tmp_path / "runs.sqlite").exists():
+            return 0
+        database = sqlite3.connect(tmp_path / "runs.sqlite", timeout=10)
+        try:
+            return database.execute("select count(*) from runs").fetchone()[0]
+        except sqlite3.OperationalError:  # the table is not there yet
+            return 0
+        finally:
+            database.close()
+
+    first = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL,
+                             stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        deadline = time.monotonic() + 60
+        while stored() < 2 and time.monotonic() < deadline:
+            time.sleep(0.02)
+    finally:
+        os.killpg(first.pid, signal.SIGKILL)
+        first.wait()
+    kept = stored()
+    assert 2 <= kept < 12, "it was not killed in the middle"
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert stored() == 12
+    row, = json.loads(done.stdout)
+    assert (row["fault"], row["runs"], row["safe"], row["success"]) == (
+        "kill:mission_manager", 12, 12, 0)
+    assert row["ineffective"] == 0
+    assert (tmp_path / "report.html").read_text().startswith("<!")
+
+
+def test_the_same_jobs_run_on_a_dask_cluster(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    jobs = cross(BASES[:1], [SHORT], range(1, 4))
+    store = Store(tmp_path)
+    with distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+        assert execute(jobs, store, backend="dask", address=cluster.scheduler_address) == 3
+    traces = {r.job.key: r.result.trace for r in store.runs()}
+    store.close()
+    assert traces == {job.key: run_job(job).trace for job in jobs}
+
+
+@pytest.mark.parametrize(("backend", "address", "words"), [
+    ("dask", "", "--address is missing"), ("dask", "tcp://127.0.0.1:9", "no dask scheduler"),
+    ("ray", "", "--address is missing|not installed"), ("slurm", "", "unknown; known: loky")])
+def test_a_cluster_that_is_not_there_is_refused_in_one_line(
+        tmp_path, monkeypatch, backend, address, words):
+    monkeypatch.setattr(execution, "CONNECT_TIMEOUT_S", 0.5)
+    store = Store(tmp_path)
+    with pytest.raises(BackendError, match=words) as caught:
+        execute(cross(BASES[:1], [SHORT], [1]), store, backend=backend, address=address)
+    assert "\n" not in str(caught.value)
+    store.close()
+
+
+# ---- what is counted -------------------------------------------------------------------------
+
+
+@settings(max_examples=100)
+@given(st.integers(1, 3000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_the_interval_holds_the_share_and_narrows_with_more_runs(pair):
+    count, of = pair
+    found = rate(count, of)
+    assert 0 <= found.low <= found.share <= found.high <= 1
+    more = rate(count * 4, of * 4)
+    assert more.high - more.low < found.high - found.low
+
+
+def test_the_interval_is_wilsons():
+    # Brown, Cai, DasGupta (2001), table of examples; 0 of 10 and 5 of 10.
+    assert rate(0, 10).high == pytest.approx(0.2775, abs=1e-4)
+    assert (rate(5, 10).low, rate(5, 10).high) == pytest.approx((0.2366, 0.7634), abs=1e-4)
+    assert (rate(0, 0).low, rate(0, 0).high) == (0.0, 1.0)
+    assert (rate(2000, 2000).low, rate(2000, 2000).high) == pytest.approx((0.99808, 1.0), abs=1e-5)
+
+
+def test_a_spread_leaves_out_what_there_is_not():
+    assert spread([None, math.inf]) is None
+    found = spread([3.0, None, 1.0, 2.0])
+    assert (found.n, found.least, found.median, found.p95, found.most) == (3, 1.0, 2.0, 3.0, 3.0)
+    assert spread(range(1, 101)).p95 == 95
+
+
+def test_a_run_without_effect_is_not_counted_as_survived():
+    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
+    row, = table(runs_of(result(), result(outcomes=nothing), result(safe=False, success=False)))
+    assert (row.runs, row.ineffective) == (3, 1)
+    assert (row.safe.count, row.safe.of, row.success.count) == (1, 2, 1)
+    assert row.worst == "fail, unsafe"
+
+
+def test_a_row_of_nothing_but_ineffective_runs_says_so():
+    nothing = (FaultOutcome("x@5", None, 0, "its moment never came"),)
+    row, = table(runs_of(result(outcomes=nothing)))
+    assert (row.worst, row.safe.of, row.ineffective) == ("no effect", 0, 1)
+
+
+def test_the_worst_run_is_unsafe_before_failed_before_close():
+    close, failed, unsafe = (
+        result(obstacle_m=0.1), result(success=False), result(safe=False))
+    runs = runs_of(result(), close, failed, unsafe)
+    assert sorted(runs, key=badness) == runs
+    assert worst(runs).result is unsafe
+
+
+def test_conditions_are_rows_of_their_own():
+    runs = [run for condition in (
+        {"obstacles": 0}, {"obstacles": 2}, {"ftm": False}, {"strategy": "mission-first"})
+        for run in runs_of(result(), **condition)]
+    assert [(r.obstacles, r.ftm, r.strategy) for r in table([*runs, *runs])] == [
+        (0, True, ""), (2, True, ""), (0, False, ""), (0, True, "mission-first")]
+    assert total(runs, "all").runs == 4
+
+
+def test_undetected_and_stopped_for_good_are_counted():
+    row, = table(runs_of(result(detected_after_s=None), result(success=False)))
+    assert (row.undetected, row.stopped_for_good) == (1, 1)
+
+
+# ---- the paper -------------------------------------------------------------------------------
+
+
+def test_table_iii_is_the_papers():
+    assert [row.agrees for row in table_iii(SYSTEM)] == [True] * 4
+
+
+def test_every_row_of_the_papers_tables_is_run_under_every_condition():
+    jobs = paper_jobs()
+    assert len(jobs) == len({job.key for job in jobs})
+    assert {(j.row, j.obstacles) for j in jobs} == {(f, n) for f in FAULTS for n in (0, 2)}
+    found = cells([Run(job, result()) for job in jobs])
+    assert len(found) == len(CONDITIONS) * len(FAULTS) * 2
+    assert {cell.ours for cell in found} == {"success, safe"}
+    assert [c.agrees for c in found if c.fault == "none"] == [True] * 6
+    assert not any(c.agrees for c in found if c.fault == "command not updated")
+
+
+# ---- the search for the unsafe ---------------------------------------------------------------
+
+
+def test_the_search_goes_where_the_margin_is_small():
+    def fake(jobs):  # the nearer to 100 s and to gps-drift, the smaller the margin
+        return [result(obstacle_m=abs(j.faults[0].at_s - 100) / 100
+                       + (0.0 if j.faults[0].fault == "gps-drift" else 1.0)) for j in jobs]
+
+    pytest.importorskip("optuna")
+    space = Space(tuple(BASES), {"sensor": ("gps-bias", "gps-drift", "gps-noise")},
+                  sudden_obstacle=False)
+    made = search(space, 120, fake, seed=1, at_once=2)
+    assert len(made) == 120
+    assert [margin(r) for _, r in made] == sorted(margin(r) for _, r in made)
+    best = made[0][0].faults[0]
+    assert best.fault == "gps-drift"
+    assert abs(best.at_s - 100) < 10
+
+
+def test_what_is_unsafe_for_longer_is_further_down():
+    assert margin(result(safe=False, prohibited_s=3.0)) < margin(
+        result(safe=False, collisions=1)) < 0 < margin(result())
+
+
+def test_a_counterexample_is_shrunk_to_what_it_needs():
+    needed = PlannedFault("laser-stuck", 37.42, duration_s=31.7, on_s=1.0, off_s=0.5, seed=77)
+    job = Job(row="x", obstacles=2, seed=99, faults=(
+        PlannedFault("gps-bias", 12.0), needed, PlannedFault("kill:DM3", 50.0)))
+
+    def run(candidate: Job) -> RunResult:
+        bad = any(f.fault == "laser-stuck" and (f.duration_s or 0) >= 5 and f.at_s > 30
+                  for f in candidate.faults)
+        return result(safe=not bad)
+
+    small = shrink(job, run)
+    assert (len(small.faults), small.obstacles, small.seed) == (1, 0, 1)
+    fault, = small.faults
+    assert (fault.fault, fault.at_s, fault.on_s, fault.seed) == ("laser-stuck", 40.0, 0.0, 0)
+    assert 5 <= fault.duration_s < 10
+    with pytest.raises(ValueError, match="is safe: there is nothing to shrink"):
+        shrink(job, lambda _job: result())
+
+
+# ---- the verb --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    ((), "give one of --paper, --runs N"),
+    (("--paper", "--runs", "3"), "give one of"),
+    (("--runs", "0"), "--runs 0: must be 1 or more"),
+    (("--runs", "3", "--kinds", "gremlin"), "unknown kind 'gremlin'; known: paper, sensor"),
+    (("--fault", "gremlins"), "unknown fault 'gremlins'"),
+    (("--fault", "kill:nobody"), "no node 'nobody'"),
+    (("--fault", "gps-bias@soon"), "WHEN 'soon'"),
+    (("--runs", "3", "--obstacles", "many"), "--obstacles many: must be numbers"),
+    (("--runs", "3", "--obstacles", "99"), "--obstacles 99: Vallombre has places for 5"),
+    (("--runs", "3", "--mission", "Z"), "Z"),
+    (("--runs", "3", "--strategy", "hope"), "unknown strategy 'hope'"),
+    (("--runs", "3", "--network", "wet"), "unknown network 'wet'"),
+    (("--runs", "3", "--patience", "0"), "--patience 0"),
+    (("--replay", "ab"), "--out DIR is missing"),
+    (("--replay", "ab", "--out", "/nowhere"), "no such directory"),
+    (("--system", "cell", "--paper"), "it has no .robot."),
+])
+def test_bad_usage_is_one_line_and_exit_code_2(capsys, arguments, words):
+    assert rampart(["campaign", *arguments]) == 2
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    assert re.search(words, text), text
+
+
+def test_a_run_is_replayed_by_its_key_and_recognised(tmp_path, capsys):
+    arguments = ["campaign", "--fault", "kill:mission_manager@3", "--obstacles", "0", "--out",
+                 str(tmp_path), "--jobs", "1"]
+    assert rampart([*arguments, "--json"]) == 0
+    key = json.loads(capsys.readouterr().out)[0]["worst_key"]
+    assert rampart(["campaign", "--replay", key[:6], "--out", str(tmp_path), "--json"]) == 0
+    replayed = json.loads(capsys.readouterr().out)
+    assert (replayed["run"], replayed["same_trace"]) == (key, True)
+    assert rampart(["campaign", "--replay", "0000", "--out", str(tmp_path)]) == 2
+    assert "no run, or several" in capsys.readouterr().err
+
+
+def test_patterns_choose_faults_by_name(capsys):
+    assert rampart(["campaign", "--list", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {k: list(v) for k, v in GROUPS.items()}

@@ -1,0 +1,436 @@
+"""The report of a campaign: what it says of the runs, which it shows, and how it is written."""
+
+from __future__ import annotations
+
+import math
+import re
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from airport.drawing import draw
+from airport.formats import load_airport
+from sim.campaign import charts, paper_tables
+from sim.campaign.grouping import KINDS, by_kind, conditions, in_common, kind_of
+from sim.campaign.job import DecisionTaken, Job, RunResult
+from sim.campaign.paper_tables import Decided
+from sim.campaign.report import (
+    Campaign,
+    headline,
+    render,
+    worth_showing,
+    write_campaign_report,
+)
+from sim.campaign.statistics import badness, rate
+from sim.campaign.store import Run
+from sim.campaign.wording import interval, metres, percent, seconds
+from sim.report_record import ObstacleSeen, RunRecord, StepResult
+from sim.scenario import FaultOutcome, PlannedFault
+
+ABOUT = Campaign("A campaign", "rampart campaign --runs 3", 7)
+OUT = Path("out/my campaign")
+DRAWING = draw(load_airport("vallombre"))
+
+
+def run(fault: str = "gps-bias", *, row: str = "", affected: int = 1, ftm: bool = True,
+        obstacles: int = 0, strategy: str = "", seed: int = 1, retuned=None, **more) -> Run:
+    planned = (PlannedFault(fault, 12.0),) if fault else ()
+    job = Job(row=row or fault or "none", faults=planned, ftm=ftm, obstacles=obstacles,
+              strategy=strategy, seed=seed, retuned=retuned or {})
+    fields = {
+        "success": True, "safe": True, "reasons": (), "duration_s": 90.0, "collisions": 0,
+        "prohibited_s": 0.0, "obstacle_m": None, "prohibited_m": 0.8, "unsafe_s": None,
+        "injected_s": 12.0 if planned else None, "detected_after_s": None,
+        "recovered_after_s": None, "false_alarms": 0, "decisions": (),
+        "outcomes": tuple(FaultOutcome(p.text(), 12.0, affected) for p in planned),
+        "failures": (), "trace": "t", "wall_s": 1.0} | more
+    return Run(job, RunResult(**fields))
+
+
+def record_of(made: Run, **more) -> RunRecord:
+    fields = {
+        "run_id": made.job.key, "airport": DRAWING, "mission_name": "A", "mission": "success",
+        "safety": "safe", "reasons": (), "duration_s": 90.0, "distance_m": 9.0,
+        "track": ((0.0, 0.0, 0.0), (10.0, 2.0, 1.0), (14.0, 4.0, 3.0), (80.0, 9.0, 5.0)),
+        "believed": (), "lights": (), "steps": (StepResult("taxi", 9.0, 5.0, None),),
+        "obstacles": (ObstacleSeen("cart", 5.0, 5.0, 0.4),), "events": (), "intervals": (),
+        "decisions": (), "restarts": {}, "collisions": 0, "prohibited_s": 0.0,
+        "obstacle_clearance_m": None, "prohibited_clearance_m": 0.8, "strategy": "", "seed": 1,
+        "rate": 1.0} | more
+    return RunRecord(**fields)
+
+
+class Tables(HTMLParser):
+    """Collects the rows of all tables as lists of texts, and checks that elements are closed."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.rows: list[list[str]] = []
+        self._open: list[str] = []
+        self._cell = False
+        self.feed(page)
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        if tag in {"meta", "br", "wbr"}:
+            return
+        self._open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in {"td", "th"}:
+            self.rows[-1].append("")
+            self._cell = True
+            if tag == "th":
+                assert "scope" in dict(attrs)
+
+    def handle_startendtag(self, tag, attrs):
+        pass
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+        if tag in {"td", "th"}:
+            self._cell = False
+
+    def handle_data(self, data):
+        if self._cell:
+            self.rows[-1][-1] = f"{self.rows[-1][-1]} {' '.join(data.split())}".strip()
+
+
+def rows(page: str, first: str) -> list[list[str]]:
+    return [row for row in Tables(page).rows if row and row[0].replace(" ", "") == first]
+
+
+def text_of(page: str) -> str:
+    return " ".join(unescape(re.sub(r"<[^>]*>", "", page)).split())
+
+
+# -- the page ----------------------------------------------------------------------------------
+
+
+def test_a_campaign_without_runs_says_so_and_shows_no_table():
+    page = render(OUT, ABOUT, [])
+    assert "No run was made." in page
+    assert Tables(page).rows == []
+    assert "Distributions" not in page
+
+
+def test_a_baseline_alone_is_reported_without_figures_of_mechanisms_it_has_not():
+    page = render(OUT, ABOUT, [run("gps-bias", ftm=False, safe=False, obstacle_m=0.0)])
+    (row,) = rows(page, "gps-bias")
+    assert row[6:] == ["–", "–", "0.00 m", "0.80 m", "–", "0"]  # noqa: RUF001
+    assert "with FTM and an effective fault" not in page
+    assert headline([run(affected=0)]) == "In 1 run the fault had no effect."
+
+
+def test_a_single_run_has_its_figures_in_the_table_of_all_faults():
+    page = render(OUT, ABOUT, [run("kill:hmi", detected_after_s=0.25, recovered_after_s=1.5,
+                                   obstacle_m=0.4, prohibited_m=1.7, false_alarms=2)])
+    (row,) = rows(page, "kill:hmi")
+    assert [cell.split()[0] for cell in row[2:5]] == ["1", "1", "1"]
+    assert row[5].startswith("success, safe")
+    assert row[6:] == ["250 ms", "1.50 s", "0.40 m", "≥ 1 m", "2", "0"]
+
+
+def test_runs_without_effect_count_for_nothing_but_their_number():
+    runs = [run("gps-bias", seed=1), run("gps-bias", seed=2, safe=False, affected=0)]
+    (row,) = rows(render(OUT, ABOUT, runs), "gps-bias")
+    assert row[2] == "2 1 no effect"
+    assert row[4] == f"1 of 1 {interval(rate(1, 1))}"
+    assert "In 1 run more the fault had no effect." in headline(runs)
+    assert "none of 1 run " in headline(runs)
+
+
+def test_the_headline_gives_the_upper_bound_of_the_interval_when_no_run_was_unsafe():
+    runs = [run(seed=seed) for seed in range(1000)]
+    assert percent(rate(0, 1000).high) == "0.4"
+    assert "none of 1,000 runs" in headline(runs)
+    assert "at most 0.4\N{NO-BREAK SPACE}%" in headline(runs)
+    assert "1,000 completed the mission" in headline(runs)
+
+
+def test_the_headline_tells_runs_with_from_runs_without_fault_tolerance():
+    runs = [run(seed=1), run(seed=2, safe=False), run(seed=3, ftm=False, safe=False),
+            run("", seed=4)]
+    assert "With fault tolerance 1 of 2 runs" in headline(runs)
+    assert "Without fault tolerance 1 of 1 run " in headline(runs)
+
+
+def test_conditions_that_differ_have_rows_of_their_own_and_others_are_told_once():
+    latched = {"RM2": {"latched": True}}
+    runs = [run(obstacles=0), run(obstacles=2), run(retuned=latched), run(ftm=False)]
+    page = render(OUT, ABOUT, runs)
+    shown = [row[0] for row in Tables(page).rows if len(row) == 1]
+    assert len(shown) == 4
+    assert shown[0] == "without FTM, no obstacles"
+    assert sum("retuned" in text for text in shown) == 1
+    assert "measured network" in in_common(runs)
+    assert not any("measured" in text for text in shown)
+
+
+def test_faults_are_shown_worst_first_and_the_long_tail_is_folded():
+    runs = [run(f"drop:topic/{n}", seed=n, prohibited_m=0.5 + n / 100) for n in range(20)]
+    runs.append(run("freeze:a/b", success=False))
+    runs.append(run("freeze:c/d", safe=False, unsafe_s=20.0))
+    page = render(OUT, ABOUT, runs)
+    names = [row[0].replace(" ", "") for row in Tables(page).rows
+             if "with FTM" in "".join(row[1:2])]
+    assert names == ["freeze:c/d", "freeze:a/b", *(f"drop:topic/{n}" for n in range(20))]
+    assert "10 faults more" in page.partition("<details>")[2]
+    assert "topic/<wbr>5" in page.partition("<details>")[0].rpartition("Every fault")[2]
+
+
+def test_text_from_outside_is_escaped():
+    evil = "<script>alert('x')</script>\"&"
+    made = run("gps-bias", row=evil, safe=False, unsafe_s=20.0, reasons=(evil,), failures=(evil,))
+    record = record_of(made, obstacles=(ObstacleSeen(evil, 1.0, 1.0, 0.4),))
+    page = render(Path(evil), Campaign(evil, evil, 1, evil), [made],
+                  [Decided((evil,), 1, (evil,), 2, (evil,))], {made.job.key: record})
+    assert "<script" not in page
+    assert page.count("&lt;script&gt;") >= 8
+    Tables(page)
+
+
+def test_the_page_needs_nothing_but_itself():
+    made = run(detected_after_s=0.1)
+    page = render(OUT, ABOUT, [made], (), {made.job.key: record_of(made)})
+    assert not re.search(r"<(script|link|img|iframe)|https?://|url\((?!#)|@import", page)
+    targets = set(re.findall(r'(?:href="|url\()#([^")]*)', page))
+    assert targets <= set(re.findall(r'id="([^"]*)"', page))
+    assert len(re.findall(r'id="([^"]*)"', page)) == len(set(re.findall(r'id="([^"]*)"', page)))
+
+
+def test_errors_of_the_program_are_shown_with_their_run():
+    made = run(failures=("osmosis_control: KeyError: 'x'",))
+    text = text_of(render(OUT, ABOUT, [made, run("")]))
+    assert f"1 actor ended by an error: {made.job.key} osmosis_control: KeyError: 'x'" in text
+    assert "ended by an error" not in render(OUT, ABOUT, [run("")])
+
+
+def test_the_page_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    made = run()
+    page = write_campaign_report(tmp_path / "new", ABOUT, [made])
+    assert page == tmp_path / "new" / "report.html"
+    assert page.read_text(encoding="utf-8") == render(tmp_path / "new", ABOUT, [made])
+    before = page.read_bytes()
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_campaign_report(tmp_path / "new", ABOUT, [])
+    assert [p.name for p in page.parent.iterdir()] == ["report.html"]
+    assert page.read_bytes() == before
+
+
+# -- the paper's tables ------------------------------------------------------------------------
+
+
+def paper_runs() -> list[Run]:
+    """Return the paper's runs with the paper's verdicts."""
+    made = []
+    for job in paper_tables.paper_jobs():
+        expected = paper_tables.WITH_FTM if job.ftm else paper_tables.WITHOUT_FTM
+        mission, safety = expected[job.row][job.obstacles // 2].split(", ")
+        base = run(job.faults[0].fault if job.faults else "", success=mission == "success",
+                   safe=safety == "safe")
+        made.append(Run(job, base.result))
+    return made
+
+
+def test_the_papers_runs_are_shown_as_its_tables_beside_its_verdicts():
+    decided = [Decided(("FTM7",), 1, ("RM4",), 1, ("RM4",)),
+               Decided(("FTM1", "FTM6"), 2, ("RM1",), 3, ("RM5",))]
+    page = render(OUT, ABOUT, paper_runs(), decided)
+    assert "24 of 24 verdicts of tables IV and V agree" in text_of(page)
+    assert rows(page, "FTM7")[0][-1] == "✓ agrees"
+    assert rows(page, "FTM1,FTM6")[0][1:] == ["2", "3", "RM1", "RM5", "✗ differs"]
+    iv, v, shipped = [row for row in rows(page, "controlnodecrash") if len(row) == 7]
+    several = len(paper_tables.FAULTS["control node crash"])
+    assert iv[1:] == ["fail, unsafe", "✓ fail, unsafe", f"{several} 0 success, 0 safe"] * 2
+    assert v == shipped
+    assert v[1:3] == ["fail, safe", "✓ fail, safe"]
+    assert "Where the verdicts differ" not in page
+
+
+def test_where_a_verdict_differs_the_story_of_the_worst_run_is_told():
+    runs = paper_runs()
+    at = next(i for i, r in enumerate(runs)
+              if paper_tables.condition_of(r.job) == paper_tables.CONDITIONS[1]
+              and r.job.row == "command not updated" and r.job.obstacles == 2)
+    runs[at] = Run(runs[at].job, msgspec.structs.replace(
+        runs[at].result, safe=False, reasons=("1 collision",),
+        decisions=(DecisionTaken(12.5, ("FTM2",), ("RM2",)),)))
+    text = text_of(render(OUT, ABOUT, runs))
+    assert "23 of 24 verdicts of tables IV and V agree" in text
+    assert ("command not updated, 2 obstacles, with FTM, as in the paper: the paper has fail, "
+            "safe, our worst run fail, unsafe (1 collision).") in text
+    assert "12.50 s FTM2: RM2" in text
+    assert f"rampart campaign --replay {runs[at].job.key} --out 'out/my campaign'" in text
+
+
+def test_other_runs_are_not_taken_for_the_papers():
+    page = render(OUT, ABOUT, [run("", strategy="safety-first"), run("gps-bias")])
+    assert "Table IV" not in page
+
+
+# -- the worst runs ----------------------------------------------------------------------------
+
+
+def test_the_worst_runs_are_shown_worst_first_each_with_another_fault():
+    runs = [
+        run("gps-bias", seed=1, success=False, prohibited_m=0.3),
+        run("gps-bias", seed=2, success=False, prohibited_m=0.2),
+        run("kill:hmi", seed=3, prohibited_m=0.1),
+        run("drop:a/b", seed=4, safe=False, prohibited_m=-0.1),
+        run("drop:a/b", seed=5, safe=False, success=False, prohibited_m=-0.1),
+        run("brake-failure:0", seed=6, affected=0, prohibited_m=0.01),
+        run("", seed=7, prohibited_m=0.05),
+    ]
+    assert [r.job.seed for r in worth_showing(runs)] == [5, 2, 3]
+    assert [r.job.seed for r in worth_showing(runs, most=2)] == [5, 2]
+    assert worth_showing([]) == []
+
+
+def test_a_run_without_a_fault_is_shown_when_it_went_wrong():
+    golden = [run("", seed=1), run("", seed=2, safe=False)]
+    assert [r.job.seed for r in worth_showing(golden)] == [2]
+
+
+def test_unprotected_runs_do_not_crowd_out_those_with_fault_tolerance():
+    bare = [run(f"drop:t/{n}", seed=n, ftm=False, safe=False) for n in range(9)]
+    mild = [run(f"drop:t/{n}", seed=n, success=False) for n in range(2)]
+    assert [r.job.ftm for r in worth_showing([*bare, *mild])] == [False] * 4 + [True] * 2
+    assert [r.job.ftm for r in worth_showing(bare)] == [False] * 6
+    unsafe = run("gps-bias", safe=False, prohibited_m=0.9)
+    assert worth_showing([*bare, *mild, unsafe])[0] is unsafe
+
+
+@given(st.lists(st.tuples(st.sampled_from(["gps-bias", "drop:a/b", "kill:hmi", ""]), st.booleans(),
+                          st.booleans(), st.booleans(), st.floats(-2, 2)), max_size=30),
+       st.integers(1, 8))
+def test_no_run_that_is_left_out_is_worse_than_one_shown_of_its_fault(found, most):
+    runs = [run(fault, seed=i, success=success, safe=safe, ftm=ftm, prohibited_m=margin)
+            for i, (fault, success, safe, ftm, margin) in enumerate(found)]
+    shown = worth_showing(runs, most)
+    kinds = [(r.job.row, r.job.ftm) for r in shown]
+    assert len(shown) <= most
+    assert len(kinds) == len(set(kinds))
+    for one in shown:
+        same = [r for r in runs if (r.job.row, r.job.ftm) == (one.job.row, one.job.ftm)]
+        assert badness(one) == max(map(badness, same))
+
+
+def test_a_track_is_shown_with_its_moments_in_order_and_the_command_to_repeat_it():
+    made = run("kill:hmi", safe=False, success=False, detected_after_s=1.0, unsafe_s=20.0,
+               prohibited_m=-0.25, reasons=("0.5 s in the prohibited area",))
+    record = record_of(made)
+    page = render(OUT, ABOUT, [made], (), {made.job.key: record, "unknown": record})
+    card = page[page.index("<section"):page.index("</section>") + len("</section>")]
+    assert [(row[0], row[2]) for row in Tables(card).rows] == [
+        ("0:12.0", "fault injected"), ("0:13.0", "first detection"), ("0:20.0", "first unsafe"),
+        ("1:30.0", "end of the run")]
+    assert "smallest margin −0.25 m" in card  # noqa: RUF001 - a minus sign
+    assert "translate(2.0 -1.0)" in card  # the fault: the last place known at 12 s
+    assert "translate(4.0 -3.0)" in card  # unsafe
+    assert f"rampart campaign --replay {made.job.key} --out &#39;out/my campaign&#39;" in card
+    assert page.count("<section") == 1
+
+
+def test_a_run_that_has_no_track_is_shown_without_a_map():
+    made = run("kill:hmi", success=False)
+    page = render(OUT, ABOUT, [made], (), {made.job.key: record_of(made, track=())})
+    assert f'id="run-{made.job.key}"' in page
+    assert "Close-up of the track" not in page
+
+
+# -- grouping, charts, words -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("fault", "kind"), [
+    ("", "none"), ("wrong-graph", "paper"), ("gps-bias", "sensor"), ("drop:a/b", "topic"),
+    ("kill:hmi", "process"), ("stuck-wheel:rear-left", "actuator"), ("brake-failure:0", "actuator"),
+    ("obstacle-ahead:2", "world")])
+def test_a_fault_is_of_its_kind(fault, kind):
+    assert kind_of(run(fault).job) == kind
+    assert list(by_kind([run(fault)])) == [kind]
+    assert kind in KINDS
+
+
+def test_several_faults_are_a_kind_of_their_own():
+    job = Job(row="x", faults=(PlannedFault("gps-bias"), PlannedFault("drop:a/b")))
+    assert kind_of(job) == "several"
+
+
+def test_every_run_is_in_exactly_one_condition():
+    runs = [run(seed=s, ftm=s % 2 == 0, obstacles=s % 3, strategy=f"s{s % 5}") for s in range(60)]
+    found = conditions(runs)
+    assert sorted(r.job.seed for c in found for r in c.runs) == list(range(60))
+    assert all(r.job.ftm == c.ftm for c in found for r in c.runs)
+    assert len({c.text for c in found}) == len(found)
+
+
+@given(st.lists(st.floats(0, 1e4), min_size=1), st.booleans())
+def test_every_value_is_counted_once_in_a_chart_however_far_out(values, on_margins):
+    axis = charts.margin_axis(-1.0, 1.0) if on_margins else charts.time_axis(values)
+    made = charts.chart("t", "w", axis, [("lane", [charts.Value(v, v > 1) for v in values], "")])
+    (lane,) = made.lanes
+    counted = [int(bar.title.split()[0].replace(",", "")) for bar in lane.bars]
+    unsafe = [int(m[1]) for bar in lane.bars if (m := re.search(r"(\d+) unsafe", bar.title))]
+    assert sum(counted) == len(values)
+    assert sum(unsafe) == sum(v > 1 for v in values)
+    for bar in lane.bars:
+        assert 0 <= bar.x < bar.x + bar.width <= charts.WIDTH
+        assert lane.top <= bar.y <= lane.base
+        assert 0 <= bar.unsafe <= bar.height + 1e-9
+    assert lane.median is not None
+    assert 0 <= lane.median <= charts.WIDTH
+    places = [at for at, _, _ in sorted(made.ticks)]
+    assert places == sorted(set(places))
+
+
+@given(st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=50))
+def test_a_bar_stands_where_its_values_are(values):
+    axis = charts.time_axis(values)
+    (lane,) = charts.chart("t", "w", axis, [("", [charts.Value(v) for v in values], "")]).lanes
+    for value in values:
+        at = axis.place(value)
+        assert any(bar.x - 1 <= at <= bar.x + bar.width + 1 for bar in lane.bars)
+
+
+def test_what_lies_beyond_the_axis_of_margins_is_in_the_outermost_bars():
+    axis = charts.margin_axis(0.0, 1.0)
+    values = [charts.Value(-40.0, unsafe=True), charts.Value(0.5), charts.Value(30.0)]
+    (lane,) = charts.chart("t", "w", axis, [("", values, "")]).lanes
+    assert [bar.title for bar in lane.bars] == [
+        "1 run, below 0.00 m, 1 unsafe", "1 run, 0.50 m to 0.55 m", "1 run, 1.00 m or more"]
+
+
+def test_kinds_that_were_never_detected_are_said_not_drawn():
+    page = render(OUT, ABOUT, [run("kill:hmi", detected_after_s=0.2), run("gps-bias")])
+    assert "Never detected: sensors (1 run)." in text_of(page)
+
+
+@pytest.mark.parametrize(("share", "text"), [
+    (0.0, "0"), (1.0, "100"), (0.9996, "99.96"), (0.999999, "> 99.99"), (0.00001, "< 0.01"),
+    (0.0004, "0.04"), (0.345, "34.5"), (math.nan, "–")])  # noqa: RUF001
+def test_a_share_never_reads_as_all_or_nothing_unless_it_is(share, text):
+    assert percent(share) == text
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (None, "–"), (0.0, "0 ms"), (0.0314, "31 ms"), (0.9996, "1.00 s"), (9.996, "10.0 s"),  # noqa: RUF001
+    (99.96, "100 s"), (1234.5, "1234 s")])
+def test_a_time_has_three_digits(value, text):
+    assert seconds(value) == text
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (None, "–"), (math.inf, "–"), (1.0, "≥ 1 m"), (0.123, "0.12 m"), (-0.5, "−0.50 m")])  # noqa: RUF001
+def test_a_clearance_is_a_bound_where_the_simulator_knows_no_more(value, text):
+    assert metres(value) == text
