@@ -34,6 +34,8 @@ strategy to walk out of the trap.
 
 from __future__ import annotations
 
+from operator import attrgetter
+
 import msgspec
 
 from manager import detection_track, recovery_track
@@ -65,6 +67,9 @@ __all__ = [
     "Output", "Phase", "RecoveryHeard", "ResetAnswered", "ResetAsked", "ShadowDiffered", "State",
     "Tick", "build_arbiter",
 ]
+
+
+_is_at_rest = attrgetter("is_at_rest")
 
 
 class Arbiter:
@@ -182,6 +187,8 @@ class Arbiter:
             case ResetAsked():
                 state, answer = self._reset(state, event)
                 answers = (answer,)
+        if self._is_quiet(state, now):
+            return state, answers
         late_before = state.late
         state = self._pass_time(state, now)
         state, outputs = self._settle(state, now)
@@ -195,6 +202,19 @@ class Arbiter:
                 # It was respawned, or has not got the order yet.
                 outputs = (track.command, *outputs)
         return state, outputs + answers
+
+    def _is_quiet(self, state: State, now: float) -> bool:
+        """Tell whether nothing is active, under orders or awaited, so that time changes nothing.
+
+        Nearly always it is so, and a module of some kind is heard seventy times a second.
+        """
+        if not state.oriented or state.decision is not NOTHING_ACTIVE or state.since or state.late:
+            return False
+        timeout_s = self.rules.silence_timeout_s
+        for detection in state.detections:
+            if not detection.is_calm(now, timeout_s):
+                return False
+        return all(map(_is_at_rest, state.recoveries))
 
     def _with_detection(self, state: State, track: DetectionTrack) -> State:
         index = self._detection[track.name]
@@ -237,8 +257,11 @@ class Arbiter:
             name, True, f"reset by {event.by}" if event.by else "reset")
 
     def _pass_time(self, state: State, now: float) -> State:
-        detections = tuple(detection_track.pass_time(track, self._rules_of(state, track.name), now)
-                           for track in state.detections)
+        timeout_s = self.rules.silence_timeout_s
+        detections = tuple(
+            track if track.is_calm(now, timeout_s)
+            else detection_track.pass_time(track, self._rules_of(state, track.name), now)
+            for track in state.detections)
         believed = {track.name: track for track in detections}
         active = self._active(detections)
         recoveries = tuple(self._judge(track, believed, active, now) for track in state.recoveries)

@@ -76,6 +76,10 @@ class DetectionTrack(msgspec.Struct, frozen=True):
         """Whether it is active by its own word or by its silence, rather than only held."""
         return self.reported or self.silent
 
+    def is_calm(self, now: float, silence_timeout_s: float) -> bool:
+        """Whether it is inactive and has been heard of late: to let time pass changes nothing."""
+        return not self.active and now - self.heard_s <= silence_timeout_s
+
 
 def hear(track: DetectionTrack, rules: DetectionRules, now: float, *, active: bool, reason: str,
          nodes: tuple[str, ...], since_s: float) -> DetectionTrack:

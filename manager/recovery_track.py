@@ -89,6 +89,12 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
         """
         return self.wanted and (not self.acknowledged or self.phase is Phase.ACTING)
 
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether nothing is wanted of it, expected of it or held against it."""
+        return not (self.command.activate or self.letting_go or self.latched or self.adopted
+                    or self.failure)
+
 
 def report(track: RecoveryTrack, now: float, *, activated: bool, phase: Phase, decision: int,
            reason: str) -> RecoveryTrack:

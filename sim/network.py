@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sim.timing import Timing, draw, measured
+from sim.timing import Timing, drawer, measured
 
 __all__ = ["NETWORKS", "NetworkModel", "SeededNetwork", "find_network"]
 
@@ -84,7 +84,7 @@ class SeededNetwork:
         self.model = model
         self.lost = self.duplicated = self.overtaken = 0
         self._rng = random.Random(f"network {seed}")  # noqa: S311 no secret
-        self._quantiles = (timing or measured()).message_ms
+        self._delay_s = drawer((timing or measured()).message_ms, self._rng)
         self._local = frozenset(local)
         self._last: dict[tuple[str, str], float] = {}
         self._plain = not (model.loss or model.duplication or model.reordering)
@@ -94,24 +94,24 @@ class SeededNetwork:
         if reader in self._local or source in self._local:
             return (now_s,)
         if self._plain:
-            return (self._arrival(source, reader, now_s),)
+            return (self._arrival((source, reader), now_s),)
         model, dice = self.model, self._rng.random
         if dice() < model.loss:
             self.lost += 1
             return ()
         if dice() < model.duplication:
             self.duplicated += 1
-            return (self._arrival(source, reader, now_s), self._arrival(source, reader, now_s))
-        return (self._arrival(source, reader, now_s),)
+            link = (source, reader)
+            return (self._arrival(link, now_s), self._arrival(link, now_s))
+        return (self._arrival((source, reader), now_s),)
 
-    def _arrival(self, source: str, reader: str, now_s: float) -> float:
+    def _arrival(self, link: tuple[str, str], now_s: float) -> float:
         model = self.model
         at_s = now_s
         if model.delay:
-            at_s += draw(self._quantiles, self._rng)
+            at_s += self._delay_s()
         if model.extra_s:
             at_s += model.extra_s * self._rng.random()
-        link = (source, reader)
         last_s = self._last.get(link, 0.0)
         if at_s < last_s:
             if model.reordering and self._rng.random() < model.reordering:

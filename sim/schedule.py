@@ -27,25 +27,22 @@ class Schedule:
         for name, rate_hz in rates_hz.items():
             if not rate_hz > 0:
                 raise ValueError(f"schedule: {name}: {rate_hz}: a rate must be positive")
-        self._periods = {name: 1.0 / rate_hz for name, rate_hz in rates_hz.items()}
         self._start_s = start_s
         self._keep_s = keep_s
-        self._counts = dict.fromkeys(rates_hz, 0)
-        self._queue = [(start_s, place, name) for place, name in enumerate(rates_hz)]
+        # Due time, place in the sequence, name, count of periods, period.
+        self._queue = [(start_s, place, name, 0, 1.0 / rate_hz)
+                       for place, (name, rate_hz) in enumerate(rates_hz.items())]
 
     def due(self, now_s: float) -> Iterator[tuple[float, str]]:
         """Yield (due time, job) in order of time, up to and including `now_s`."""
-        queue = self._queue
+        queue, start_s = self._queue, self._start_s
         oldest_s = now_s - self._keep_s
         while queue[0][0] < oldest_s:
-            _, place, name = queue[0]
-            missed = int((oldest_s - queue[0][0]) / self._periods[name]) + 1
-            heapreplace(queue, (self._next_s(name, missed), place, name))
+            due_s, place, name, count, period_s = queue[0]
+            count += int((oldest_s - due_s) / period_s) + 1
+            heapreplace(queue, (start_s + count * period_s, place, name, count, period_s))
         while queue[0][0] <= now_s + 1e-9:
-            due_s, place, name = queue[0]
-            heapreplace(queue, (self._next_s(name, 1), place, name))
+            due_s, place, name, count, period_s = queue[0]
+            count += 1
+            heapreplace(queue, (start_s + count * period_s, place, name, count, period_s))
             yield due_s, name
-
-    def _next_s(self, name: str, periods: int) -> float:
-        self._counts[name] += periods
-        return self._start_s + self._counts[name] * self._periods[name]

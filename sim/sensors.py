@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import mujoco
 import numpy as np
 import numpy.typing as npt
@@ -114,8 +115,7 @@ class Laser:
         return ranges
 
 
-@dataclass(frozen=True, slots=True)
-class GpsReading:
+class GpsReading(msgspec.Struct, frozen=True, gc=False):
     """Position and velocity over ground in `map`."""
 
     x_m: float
@@ -146,8 +146,7 @@ class Gps:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class ImuReading:
+class ImuReading(msgspec.Struct, frozen=True, gc=False):
     """Heading integrated from the gyro, turning rate, and acceleration in `base_link`."""
 
     yaw_rad: float
@@ -194,8 +193,7 @@ class Imu:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class OdometryReading:
+class OdometryReading(msgspec.Struct, frozen=True, gc=False):
     """Pose in `odom` (starts at the origin) and twist in `base_link`, believed by the wheels."""
 
     x_m: float

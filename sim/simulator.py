@@ -7,11 +7,15 @@ on the way, each message with the stamp of its reading.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from actors import messages as m
 from actors import topics
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.topic import Topic
 from airport.formats import load_world
 from airport.model import Airport
 from sim.scene import WorldError
@@ -72,18 +76,18 @@ class Simulator(Actor):
             {topic.key: topic.rate_hz for topic in _JOBS}, now_s, keep_s=MAX_CATCH_UP_S
         )
         self._asked_s = now_s
-        self._readers = {
-            topics.IMU.key: self._imu,
-            topics.ODOMETRY.key: self._odometry,
-            topics.ABSOLUTE_POSE.key: self._absolute_pose,
-            topics.SCAN.key: self._scan,
-            topics.LIGHT.key: self._light,
-            topics.GPS.key: self._gps,
-            topics.BASE_STATUS.key: self._base_status,
-            topics.TRUTH.key: self._truth,
-            topics.OBSTACLES.key: self._obstacles,
+        readings: dict[Topic[Any], Callable[[], Any]] = {
+            topics.IMU: self._imu,
+            topics.ODOMETRY: self._odometry,
+            topics.ABSOLUTE_POSE: self._absolute_pose,
+            topics.SCAN: self._scan,
+            topics.LIGHT: self._light,
+            topics.GPS: self._gps,
+            topics.BASE_STATUS: self._base_status,
+            topics.TRUTH: self._truth,
+            topics.OBSTACLES: self._obstacles,
         }
-        self._topics = {topic.key: topic for topic in _JOBS}
+        self._readings = {topic.key: (topic, read) for topic, read in readings.items()}
 
     # -- inputs ---------------------------------------------------------------------------------
 
@@ -142,10 +146,10 @@ class Simulator(Actor):
     def _advance(self) -> None:
         now_s = self.clock.now()
         for due_s, job in self._schedule.due(now_s):
-            topic = self._topics[job]
+            topic, read = self._readings[job]
             if self.has_readers(topic):
                 self._world.step_to(due_s)
-                self.publish(topic, self._readers[job](), stamp=due_s)
+                self.publish(topic, read(), stamp=due_s)
         self._world.step_to(now_s)
         self._report_faults()
         self._measure_speed(now_s)

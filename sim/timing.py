@@ -10,7 +10,9 @@ from __future__ import annotations
 import bisect
 import random
 import tomllib
+from collections.abc import Callable
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -55,6 +57,20 @@ def draw(quantiles_ms: tuple[float, ...], rng: random.Random) -> float:
     low = int(at)
     here, there = quantiles_ms[low], quantiles_ms[low + 1]
     return (here + (there - here) * (at - low)) * 1e-3
+
+
+def drawer(quantiles_ms: tuple[float, ...], rng: random.Random) -> Callable[[], float]:
+    """Return a function that draws as `draw` does, bit by bit, for whoever draws all the time."""
+    pieces = [(here, there - here) for here, there in pairwise(quantiles_ms)]
+    share, count = rng.random, len(pieces)
+
+    def next_s() -> float:
+        at = share() * count
+        low = int(at)
+        here, rise = pieces[low]
+        return (here + rise * (at - low)) * 1e-3
+
+    return next_s
 
 
 def share_below(quantiles_ms: tuple[float, ...], value_ms: float) -> float:

@@ -7,8 +7,8 @@ same world runs in real time and, many times faster, on a virtual clock.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import msgspec
 import mujoco
 import numpy as np
 import shapely
@@ -53,8 +53,7 @@ LOCKED_DAMPING = 300.0
 """Wheel damping, N m s/rad, of a blocked wheel, braked or stuck: all that moves is the tyre."""
 
 
-@dataclass(frozen=True, slots=True)
-class Truth:
+class Truth(msgspec.Struct, frozen=True, gc=False):
     """Ground truth now; counters are cumulative.
 
     `obstacle_clearance_m` is from the footprint to the nearest obstacle or building
@@ -74,8 +73,7 @@ class Truth:
     prohibited_clearance_m: float
 
 
-@dataclass(frozen=True, slots=True)
-class BaseState:
+class BaseState(msgspec.Struct, frozen=True, gc=False):
     """What the base reports about itself."""
 
     brake_engaged: bool
@@ -135,6 +133,7 @@ class World:
         self._base_q, self._base_v = self._data.qpos[:7], self._data.qvel[:6]
         self._wheel_q, self._wheel_v = self._data.qpos[7:11], self._data.qvel[6:10]
         self._servos = self._data.ctrl
+        self._targets: WheelSpeeds | None = None
         self._damping = self._model.dof_damping[6:10]
         self._free_damping = self._damping.copy()
         self._locked = False
@@ -218,11 +217,13 @@ class World:
         if self._faulty:
             self._actuate_with_faults()
         else:
-            self._servos[:] = self._drive.update(self.time_s, TICK_S)
+            targets = self._drive.update(self.time_s, TICK_S)
+            if targets != self._targets:  # MuJoCo keeps them, and to write them is dear
+                self._servos[:] = self._targets = targets
             if self._drive.locked != self._locked:
                 self._locked = self._drive.locked
                 self._damping[:] = LOCKED_DAMPING if self._locked else self._free_damping
-        mujoco.mj_step(self._model, self._data, nstep=self._steps_per_tick)
+        mujoco.mj_step(self._model, self._data, self._steps_per_tick)
         self._ticks += 1
         self._set_time()
         if self._data.ncon != 4 or self._obstacle_clearance_m < NEAR_M:
@@ -242,6 +243,7 @@ class World:
         speeds = (fl, fr, rl, rr)
         actuation = self._faults.actuate(targets, speeds, drive.braking)
         self._servos[:] = actuation.targets_radps
+        self._targets = None
         self._torque_ranges[:] = actuation.torques_nm
         self._locked = drive.locked
         blocked = np.array(actuation.blocked) | self._locked

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from actors.control.polyline import Array, Hull
@@ -49,8 +50,7 @@ class EscapeLimits:
     return_slope: float = 0.6
 
 
-@dataclass(frozen=True, slots=True)
-class Deviation:
+class Deviation(msgspec.Struct, frozen=True, gc=False):
     """Where to pass: the offset from the route (left positive), and the distance to be there.
 
     `gap_m` is the distance along the route from the robot's centre to the first echo in its
@@ -137,8 +137,8 @@ class Escape:
     def _choose(self, near: Array, s_m: float, n_m: float) -> tuple[float, bool]:
         """Return offset and whether there is a way; keep or pick the side."""
         keep_off_m = self._hull.half_width_m + self._limits.least_clearance_m
-        line = near[near[:, 0] - s_m < self._limits.range_m]
-        if self._is_free(line, 0.0, keep_off_m):
+        if not len(near) or self._is_free(
+                near[near[:, 0] - s_m < self._limits.range_m], 0.0, keep_off_m):
             self.side = 0
             self._until_m = -math.inf
             return 0.0, True
@@ -193,7 +193,7 @@ class Escape:
     @staticmethod
     def _is_free(echoes: Array, offset_m: float, keep_off_m: float) -> bool:
         return not len(echoes) or not bool(
-            np.any(np.abs(echoes[:, 1] - offset_m) < keep_off_m - 1e-9))
+            np.count_nonzero(np.abs(echoes[:, 1] - offset_m) < keep_off_m - 1e-9))
 
     @staticmethod
     def _free_from(echoes: Array, side: int, keep_off_m: float) -> float:

@@ -18,6 +18,7 @@ import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 
@@ -88,6 +89,9 @@ class _Pose:
     yaw_rad: float
 
 
+_stamp_s = attrgetter("stamp_s")
+
+
 def verdict(ratio: float) -> str:
     """Return "ok", "dim" or "out" for a ratio of measured to nominal intensity."""
     if ratio < OUT_BELOW:
@@ -113,6 +117,7 @@ class LightInspection:
         self._lights = tuple(lights)
         self._limits = limits or InspectionLimits()
         self._places = np.array([(li.x_m, li.y_m) for li in self._lights]).reshape(-1, 2)
+        self._x_m, self._y_m = np.ascontiguousarray(self._places.T)
         self.judged: set[str] = set(judged)
         self._poses: deque[_Pose] = deque(maxlen=60)
         self._waiting: deque[tuple[float, float]] = deque(maxlen=60)
@@ -167,15 +172,16 @@ class LightInspection:
             place = self._sensor_at(stamp_s)
             if place is None or not self._lights:
                 continue
-            distances = np.hypot(*(self._places - place).T)
-            for index in np.flatnonzero(distances <= self._limits.fit_radius_m):
+            near = np.hypot(self._x_m - place[0], self._y_m - place[1]) <= (
+                self._limits.fit_radius_m)
+            for index in near.nonzero()[0] if np.count_nonzero(near) else ():
                 samples = self._samples.setdefault(int(index), [])
                 if samples and stamp_s - samples[0][0] > self._limits.keep_s:
                     samples.clear()
                 samples.append((stamp_s, *place, lux))
 
     def _sensor_at(self, stamp_s: float) -> Point | None:
-        after = bisect.bisect_left([pose.stamp_s for pose in self._poses], stamp_s)
+        after = bisect.bisect_left(self._poses, stamp_s, key=_stamp_s)
         if after >= len(self._poses):
             return None
         b = self._poses[after]

@@ -117,6 +117,7 @@ class LightRow:
         )
         half_m = self._hull.half_width_m + self._limits.lane_margin_m
         lane = (np.abs(echoes[:, 1]) < half_m) & (echoes[:, 0] > s_m)
-        if not lane.any():
+        ahead = echoes[lane, 0]
+        if not len(ahead):
             return math.inf
-        return float(echoes[lane, 0].min()) - s_m - self._hull.half_length_m
+        return float(ahead.min()) - s_m - self._hull.half_length_m

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from actors.control.escape import Deviation, Escape, EscapeLimits
@@ -59,8 +60,7 @@ class MotionLimits:
     obstacle_stop_m: float = 0.3
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(msgspec.Struct, frozen=True, gc=False):
     """Result of one control step: the command, and how far the robot is.
 
     `waiting` means stopped by an obstacle; `arrived` that the goal is reached; `waypoint` is the
@@ -104,7 +104,8 @@ class Ramp:
 def free_ahead(points: Array, hull: Hull, margin_m: float) -> float:
     """Free distance in metres straight ahead of the hull, in a lane `margin_m` wider a side."""
     lane = (np.abs(points[:, 1]) < hull.half_width_m + margin_m) & (points[:, 0] > 0.0)
-    return float(points[lane, 0].min()) - hull.half_length_m if lane.any() else math.inf
+    ahead = points[lane, 0]
+    return float(ahead.min()) - hull.half_length_m if len(ahead) else math.inf
 
 
 def braking_speed(distance_m: float, deceleration_mps2: float) -> float:
@@ -201,7 +202,7 @@ class PathFollower:
         target_x, target_y = cos * dx + sin * dy, cos * dy - sin * dx
         field_x, field_y = field(target_x, target_y, points, self._hull, self._gains)
         bearing = math.atan2(field_y, field_x)
-        along = wrap_angle(self._line.smooth_heading_at(s_m) - yaw_rad)
+        along = wrap_angle(heading - yaw_rad)
         outwards = wrap_angle(bearing - along) * n_m > 0.0
         if outwards and abs(n_m) > self._room.max_deviation_m:
             return along  # the corridor's edge: repulsion may not push beyond it

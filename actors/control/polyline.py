@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,6 +64,7 @@ class Hull:
         return np.asarray(outside + inside)
 
 
+@lru_cache(maxsize=4)
 def scan_points(
     ranges_f32: bytes, angle_min_rad: float, angle_increment_rad: float, range_max_m: float
 ) -> Array:
@@ -70,13 +72,18 @@ def scan_points(
 
     A range that is not finite, not positive or at `range_max_m` is no echo. A payload that is
     not a whole number of float32 is cut to whole ones.
+
+    The array is read-only: a sweep that comes again, as one without any echo does all the time,
+    gets the same one.
     """
     ranges = np.frombuffer(ranges_f32[: len(ranges_f32) // 4 * 4], dtype="<f4")
     echo = (ranges > 0.0) & (ranges < range_max_m * (1 - 1e-6))  # no NaN passes a comparison
-    if not echo.any():
+    if not np.count_nonzero(echo):
         return NO_POINTS
     rays = _rays(len(ranges), angle_min_rad, angle_increment_rad)
-    return np.asarray(ranges[echo, None] * rays[echo])
+    points = np.asarray(ranges[echo, None] * rays[echo])
+    points.flags.writeable = False
+    return points
 
 
 @lru_cache(maxsize=16)
@@ -94,8 +101,7 @@ def to_map(points: Array, x_m: float, y_m: float, yaw_rad: float) -> Array:
     return np.asarray(points @ np.array(((cos, sin), (-sin, cos))) + (x_m, y_m))
 
 
-@dataclass(frozen=True, slots=True)
-class Projection:
+class Projection(msgspec.Struct, frozen=True, gc=False):
     """Foot of a point on a polyline: arc length, lateral offset (left positive), its segment."""
 
     s_m: float

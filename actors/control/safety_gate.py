@@ -14,6 +14,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import msgspec
+
 from actors.control.polyline import NO_POINTS, Array
 from actors.control.swept_path import StoppingRoom, limited
 from actors.messages import PilotMode
@@ -73,8 +75,7 @@ class GateLimits:
     room: StoppingRoom = field(default_factory=StoppingRoom)
 
 
-@dataclass(frozen=True, slots=True)
-class Stamped:
+class Stamped(msgspec.Struct, frozen=True, gc=False):
     """A velocity command with where it comes from: the header of its message."""
 
     linear_mps: float
@@ -85,8 +86,7 @@ class Stamped:
     stamp_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class GateOutput:
+class GateOutput(msgspec.Struct, frozen=True, gc=False):
     """What goes to the base. `stopped`: the gate, not the command, keeps the robot standing."""
 
     linear_mps: float
@@ -197,8 +197,9 @@ class SafetyGate:
     @property
     def mode(self) -> PilotMode:
         """The strictest engaged order's mode, auto without any."""
-        modes = [mode for mode, _ in self._orders.values()]
-        return max(modes, key=STRICTNESS.index, default=PilotMode.AUTO)
+        if not self._orders:
+            return PilotMode.AUTO
+        return max((mode for mode, _ in self._orders.values()), key=STRICTNESS.index)
 
     def output(self, now: float) -> GateOutput:
         """Return what the base is to do now."""

@@ -9,7 +9,14 @@ from __future__ import annotations
 import math
 
 from actors.detection.freshness_monitor import FreshnessMonitor
-from actors.detection.geofence import FenceLimits, Fix, ProhibitedDistance, intrusion
+from actors.detection.geofence import (
+    DistanceBound,
+    FenceLimits,
+    Fix,
+    ProhibitedDistance,
+    intrusion,
+    reach_m,
+)
 
 
 class FenceMonitor:
@@ -27,6 +34,7 @@ class FenceMonitor:
     def __init__(self, distance_m: ProhibitedDistance, limits: FenceLimits,
                  freshness: FreshnessMonitor, hold_s: float) -> None:
         self._distance_m = distance_m
+        self._bound = DistanceBound(distance_m)
         self._limits = limits
         self._freshness = freshness
         self._hold_s = hold_s
@@ -63,7 +71,9 @@ class FenceMonitor:
             return
         self._freshness.heard(stamp_s, now_s)
         extra_m = self._limits.hysteresis_m if self._intrusion else 0.0
-        found = intrusion(fix, self._distance_m, self._limits, extra_m)
+        needed_m = reach_m(fix, self._limits, extra_m)
+        found = "" if self._bound.exceeds(fix.x_m, fix.y_m, needed_m) else intrusion(
+            fix, self._distance_m, self._limits, extra_m)
         if found:
             self._intrusion = self._intrusion or found
             self._safe_since_s = None

@@ -17,11 +17,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import msgspec
+
 ProhibitedDistance = Callable[[float, float], float]
 """Signed distance (m) from a point in `map` to the prohibited area, negative inside it."""
 
 _LEAST_STEP_M = 0.02
 """Resolution at which a grazing capsule is examined."""
+
+_ROUNDING_M = 1e-6
+"""Far more than the rounding errors of distances."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +46,7 @@ class FenceLimits:
     hysteresis_m: float = 0.1
 
 
-@dataclass(frozen=True, slots=True)
-class Fix:
+class Fix(msgspec.Struct, frozen=True, gc=False):
     """Position and velocity over ground in `map`, with the bound of the position's error."""
 
     x_m: float
@@ -58,9 +62,40 @@ class Fix:
             self.x_m, self.y_m, self.velocity_x_mps, self.velocity_y_mps, self.accuracy_m)))
 
 
+class DistanceBound:
+    """What one look at the distance says about places near it, without another look.
+
+    A distance changes by no more than the way made. An exact one costs as much as all the rest of
+    a fix, and the robot is far from the prohibited area nearly always.
+
+    Args:
+        exact: the distance.
+    """
+
+    def __init__(self, exact: ProhibitedDistance) -> None:
+        self._exact = exact
+        self._at_m = (0.0, 0.0)
+        self._distance_m = -math.inf
+
+    def exceeds(self, x_m: float, y_m: float, needed_m: float) -> bool:
+        """Whether the distance from a place is greater than needed; as the exact one would say."""
+        bound_m = self._distance_m - math.dist(self._at_m, (x_m, y_m))
+        if bound_m > needed_m + _ROUNDING_M:
+            return True
+        self._at_m, self._distance_m = (x_m, y_m), self._exact(x_m, y_m)
+        return self._distance_m > needed_m
+
+
 def stopping_distance_m(speed_mps: float, limits: FenceLimits) -> float:
     """Return how far the robot goes on: reaction and braking distance, m."""
     return speed_mps * limits.reaction_s + speed_mps**2 / (2 * limits.braking_mps2)
+
+
+def reach_m(fix: Fix, limits: FenceLimits, extra_m: float = 0.0) -> float:
+    """Return how far from the position the capsule ends, m: beyond, all is well for certain."""
+    speed_mps = math.hypot(fix.velocity_x_mps, fix.velocity_y_mps)
+    return (limits.half_diagonal_m + fix.accuracy_m + extra_m
+            + stopping_distance_m(speed_mps, limits))
 
 
 def intrusion(fix: Fix, distance_m: ProhibitedDistance, limits: FenceLimits,

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from operator import attrgetter
 
 
 @dataclass(slots=True)
@@ -25,6 +26,9 @@ class _Life:
     heard: bool = False
     gone_s: float | None = None
     failure: str = ""
+
+
+_failure = attrgetter("failure")
 
 
 class WatchdogCore:
@@ -47,7 +51,7 @@ class WatchdogCore:
     @property
     def active(self) -> bool:
         """Whether a node has failed."""
-        return any(life.failure for life in self._lives.values())
+        return any(map(_failure, self._lives.values()))  # asked with every heartbeat
 
     @property
     def nodes(self) -> tuple[str, ...]:
@@ -68,8 +72,11 @@ class WatchdogCore:
     @property
     def due_s(self) -> float:
         """When the next heartbeat is overdue."""
-        return min((life.due_s for life in self._lives.values() if not life.failure),
-                   default=math.inf)
+        due_s = math.inf
+        for life in self._lives.values():
+            if life.due_s < due_s and not life.failure:
+                due_s = life.due_s
+        return due_s
 
     def beat(self, node: str, incarnation: int, stamp_s: float, now_s: float) -> None:
         """Take note of a heartbeat that was sent at `stamp_s`."""

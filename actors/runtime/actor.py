@@ -24,7 +24,7 @@ import msgspec
 
 from actors.runtime.bus import Bus
 from actors.runtime.clock import Clock
-from actors.runtime.envelope import ArrivalGuard, Header, RejectedError, encode
+from actors.runtime.envelope import ArrivalGuard, Header, RejectedError, pack
 from actors.runtime.injection import FaultGate, News
 from actors.runtime.mailbox import Mailbox
 from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection, InjectionReport
@@ -121,6 +121,7 @@ class Actor:
     def __init__(self, context: Context) -> None:
         self.context = context
         self.name = context.name
+        self._incarnation = context.incarnation
         self.clock = context.clock
         self.parameters = context.parameters
         self._bus = context.bus
@@ -128,6 +129,7 @@ class Actor:
         self._faults = FaultGate()
         self._injection_ends: dict[str, Timer] = {}
         self._mailbox = Mailbox(on_overflow=self._overflowed, on_item=self._wake)
+        self._waiting = self._mailbox.waiting
         self._ended: asyncio.Future[None] | None = None
         self._awake = False
         self._idle = False
@@ -143,7 +145,7 @@ class Actor:
         self._tickers: list[_Ticker] = []
         self._diagnostics: dict[str, tuple[float, int]] = {}
         self._states: dict[str, tuple[Topic[Any], msgspec.Struct, float]] = {}
-        self._keys: dict[tuple[str, str | None], str] = {}
+        self._outlets: dict[tuple[str, str | None], tuple[str, bool]] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
 
     # -- what a subclass may override -----------------------------------------------------------
@@ -201,24 +203,30 @@ class Actor:
         Raises:
             ValueError: the topic is not declared in `outputs`.
         """
-        key = self._keys.get((topic.key, name)) or self._key(topic, name)
+        key, is_kept = self._outlets.get((topic.key, name)) or self._outlet(topic, name)
         if stamp is None:
             stamp = self.clock.now()
-        if topic.qos is Qos.STATE and topic.rate_hz < _REPEATED_SOON_HZ:
+        if is_kept:
             self._states[key] = (topic, body, stamp)
-        self._disturb_and_send(topic, key, body, stamp)
+        if self._faults.in_force:
+            self._disturb_and_send(topic, key, body, stamp)
+        else:
+            self._send(topic, key, body, stamp)
 
-    def _key(self, topic: Topic[Any], name: str | None) -> str:
+    def _outlet(self, topic: Topic[Any], name: str | None) -> tuple[str, bool]:
+        """Return the key of a topic, and whether its last message is kept for newcomers."""
         if topic.key not in self._may_publish:
             raise ValueError(f"{type(self).__name__} publishes {topic.key}, "
                              "which its outputs do not declare")
-        key = topic.at(name or self.name) if topic.is_family else topic.at()
-        self._keys[topic.key, name] = key
-        return key
+        outlet = (topic.at(name or self.name) if topic.is_family else topic.at(),
+                  topic.qos is Qos.STATE and topic.rate_hz < _REPEATED_SOON_HZ)
+        self._outlets[topic.key, name] = outlet
+        return outlet
 
     def has_readers(self, topic: Topic[Any]) -> bool:
         """Whether somebody may be listening to one of its topics, as far as the bus can know."""
-        return self._bus.has_readers(self._key(topic, None))
+        key, _ = self._outlets.get((topic.key, None)) or self._outlet(topic, None)
+        return self._bus.has_readers(key)
 
     def call_later(self, delay_s: float, call: Callable[[], None]) -> Timer:
         """Have `call` made as a mailbox item after `delay_s` simulated seconds."""
@@ -226,7 +234,7 @@ class Actor:
         self._timer_count += 1
         slot = f"later {self._timer_count}"
         due = self.clock.source_time(self.clock.now() + delay_s)
-        handle = self._at(due, lambda: self._mailbox.put_latest(slot, timer.fire))
+        handle = self._at(due, lambda: self._tick(slot, timer.fire))
 
         def release() -> None:
             handle.cancel()
@@ -319,7 +327,7 @@ class Actor:
                 self._ended.set_exception(error)
             self._rest()
             return
-        if self._mailbox.waiting:
+        if self._waiting:
             self._work()
         else:
             self._awake, self._idle = False, True
@@ -389,21 +397,22 @@ class Actor:
     ) -> Callable[[str, bytes], None]:
         def deliver(key: str, payload: bytes) -> None:
             try:
-                admitted = self._guard.admit(topic, key, payload)
+                message = admit(topic, key, payload)
             except RejectedError as reason:
                 self._rejected += 1
                 self.report_diagnostic("payload rejected", str(reason), key)
                 return
-            if admitted is None:
+            if message is None:
                 return
-            header, body = admitted
             if self._idle:
-                self._handle(handler, body, header)
+                handle(handler, message.body, message)
             elif command:
-                self._mailbox.put(lambda: handler(body, header))
+                self._mailbox.put(lambda: handler(message.body, message))
             else:
-                self._mailbox.put_latest(f"{key} {name}", lambda: handler(body, header))
+                self._mailbox.put_latest(
+                    f"{key} {name}", lambda: handler(message.body, message))
 
+        admit, handle = self._guard.admit, self._handle
         command, name = topic.qos is Qos.COMMAND, handler.__name__
         return deliver
 
@@ -418,9 +427,6 @@ class Actor:
         self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float
     ) -> None:
         faults = self._faults
-        if not faults.in_force:
-            self._send(topic, key, body, stamp)
-            return
         out = faults.apply(key, body, stamp, self.clock.now())
         if out is not None and out.delay_s > 0:
             self.call_later(
@@ -433,10 +439,9 @@ class Actor:
     def _send(
         self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float, copies: int = 1
     ) -> None:
-        self._sequence += 1
+        self._sequence = sequence = self._sequence + 1
         self._faults.last[key] = (body, stamp)
-        header = Header(self.name, self.context.incarnation, self._sequence, stamp)
-        payload = encode(header, body)
+        payload = pack((self.name, self._incarnation, sequence, stamp, body))
         for _ in range(copies):
             self._bus.publish(topic, key, payload)
 
@@ -476,7 +481,10 @@ class Actor:
         if header.source == self.name:
             return
         for key, (topic, body, stamp) in list(self._states.items()):
-            self._disturb_and_send(topic, key, body, stamp)
+            if self._faults.in_force:
+                self._disturb_and_send(topic, key, body, stamp)
+            else:
+                self._send(topic, key, body, stamp)
 
     # -- fault injection ------------------------------------------------------------------------
 
@@ -532,29 +540,37 @@ class Actor:
 class _Ticker:
     """A periodic timer of an actor. One that is late skips; it does not catch up."""
 
-    __slots__ = ("_actor", "_call", "_clock", "_due_s", "_handle", "_loop", "_period_s", "_slot")
+    __slots__ = (
+        "_actor", "_call", "_cancelled", "_clock", "_due_s", "_period_s", "_post_at", "_slot")
 
     def __init__(self, actor: Actor, period_s: float, method: str) -> None:
+        loop = asyncio.get_running_loop()
         self._actor = actor
         self._clock = actor.clock
-        self._loop = asyncio.get_running_loop()
+        self._post_at = getattr(loop, "post_at", loop.call_at)  # cheaper, on a virtual loop
         self._period_s = period_s
         self._call = getattr(actor, method)
         self._slot = f"timer {method}"
         self._due_s = 0.0
-        self._handle: asyncio.TimerHandle | None = None
+        self._cancelled = False
 
     def arm(self, due_s: float) -> None:
         """Tick next at a simulated time."""
         self._due_s = due_s
-        self._handle = self._loop.call_at(self._clock.source_time(due_s), self._fire)
+        self._post_at(self._clock.source_time(due_s), self._fire)
 
     def cancel(self) -> None:
         """Tick no more."""
-        if self._handle is not None:
-            self._handle.cancel()
+        self._cancelled = True
 
     def _fire(self) -> None:
-        now_s, next_s = self._clock.now(), self._due_s + self._period_s
-        self.arm(next_s if next_s > now_s else now_s + self._period_s)
-        self._actor._tick(self._slot, self._call)
+        if self._cancelled:
+            return
+        clock, actor = self._clock, self._actor
+        now_s, next_s = clock.now(), self._due_s + self._period_s
+        self._due_s = due_s = next_s if next_s > now_s else now_s + self._period_s
+        self._post_at(clock.source_time(due_s), self._fire)
+        if actor._idle:
+            actor._handle(self._call)
+        else:
+            actor._mailbox.put_latest(self._slot, self._call)

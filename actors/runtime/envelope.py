@@ -7,6 +7,7 @@ older incarnation of a node still sends after its successor was heard, and what 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -16,6 +17,7 @@ from actors.runtime.topic import Qos, Topic
 B = TypeVar("B")
 
 _REMEMBERED_COMMANDS = 64
+_COMMAND = Qos.COMMAND
 
 
 class Header(msgspec.Struct, frozen=True, gc=False):
@@ -31,25 +33,22 @@ class Header(msgspec.Struct, frozen=True, gc=False):
     stamp: float
 
 
-class Envelope(msgspec.Struct, Generic[B], frozen=True, array_like=True, gc=False):
+class Envelope(Header, Generic[B], frozen=True, array_like=True, gc=False):
     """Header and body as they travel."""
 
-    source: str
-    incarnation: int
-    sequence: int
-    stamp: float
     body: B
 
 
-_encoder = msgspec.msgpack.Encoder()
-_decoders: dict[type[Any], msgspec.msgpack.Decoder[Any]] = {}
+pack: Callable[[tuple[str, int, int, float, msgspec.Struct]], bytes] = (
+    msgspec.msgpack.Encoder().encode)
+"""Returns the payload for source, incarnation, sequence, stamp and body: `encode` in a hurry."""
+
+_decoders: dict[type[Any], Callable[[bytes], Envelope[Any]]] = {}
 
 
 def encode(header: Header, body: msgspec.Struct) -> bytes:
     """Return the payload of one message."""
-    return _encoder.encode(
-        (header.source, header.incarnation, header.sequence, header.stamp, body)
-    )
+    return pack((header.source, header.incarnation, header.sequence, header.stamp, body))
 
 
 def decode(topic: Topic[Any], payload: bytes) -> tuple[Header, Any]:
@@ -58,12 +57,14 @@ def decode(topic: Topic[Any], payload: bytes) -> tuple[Header, Any]:
     Raises:
         msgspec.MsgspecError: the payload is not a message of this topic's type.
     """
-    decoder = _decoders.get(topic.type)
-    if decoder is None:
-        decoder = msgspec.msgpack.Decoder(Envelope[topic.type])  # type: ignore[name-defined]
-        _decoders[topic.type] = decoder
-    e = decoder.decode(payload)
-    return Header(e.source, e.incarnation, e.sequence, e.stamp), e.body
+    envelope = (_decoders.get(topic.type) or _decoder(topic.type))(payload)
+    return envelope, envelope.body
+
+
+def _decoder(kind: type[Any]) -> Callable[[bytes], Envelope[Any]]:
+    decoder = msgspec.msgpack.Decoder(Envelope[kind])  # type: ignore[valid-type]
+    _decoders[kind] = decoder.decode
+    return decoder.decode
 
 
 class RejectedError(Exception):
@@ -78,34 +79,41 @@ class ArrivalGuard:
         self._last: dict[tuple[str, str], int] = {}
         self._recent: dict[tuple[str, str], deque[int]] = {}
 
-    def admit(self, topic: Topic[Any], key: str, payload: bytes) -> tuple[Header, Any] | None:
-        """Return header and body, or None for a duplicate or an overtaken sample.
+    def admit(self, topic: Topic[Any], key: str, payload: bytes) -> Envelope[Any] | None:
+        """Return the message, or None for a duplicate or an overtaken sample.
 
         Raises:
             RejectedError: it does not decode, or comes from a superseded incarnation.
         """
         try:
-            header, body = decode(topic, payload)
+            message = (_decoders.get(topic.type) or _decoder(topic.type))(payload)
         except (msgspec.MsgspecError, RecursionError) as error:
             raise RejectedError(f"not a {topic.type.__name__}: {error}") from None
-        newest = self._incarnations.get(header.source, -1)
-        if header.incarnation < newest:
-            raise RejectedError(
-                f"incarnation {header.incarnation} of {header.source} was superseded by {newest}")
-        if header.incarnation > newest:
-            self._forget(header.source)
-            self._incarnations[header.source] = header.incarnation
-        channel = (header.source, key)
-        if topic.qos is Qos.COMMAND:
-            recent = self._recent.setdefault(channel, deque(maxlen=_REMEMBERED_COMMANDS))
-            if header.sequence in recent:
+        source, sequence = message.source, message.sequence
+        if message.incarnation != self._incarnations.get(source, -1):
+            self._meet(source, message.incarnation)
+        channel = (source, key)
+        if topic.qos is _COMMAND:
+            recent = self._recent.get(channel)
+            if recent is None:
+                recent = self._recent[channel] = deque(maxlen=_REMEMBERED_COMMANDS)
+            if sequence in recent:
                 return None
-            recent.append(header.sequence)
-            return header, body
-        if header.sequence <= self._last.get(channel, -1):
+            recent.append(sequence)
+            return message
+        if sequence <= self._last.get(channel, -1):
             return None
-        self._last[channel] = header.sequence
-        return header, body
+        self._last[channel] = sequence
+        return message
+
+    def _meet(self, source: str, incarnation: int) -> None:
+        """Take another incarnation than before for the valid one, unless it is an older one."""
+        newest = self._incarnations.get(source, -1)
+        if incarnation < newest:
+            raise RejectedError(
+                f"incarnation {incarnation} of {source} was superseded by {newest}")
+        self._forget(source)
+        self._incarnations[source] = incarnation
 
     def _forget(self, source: str) -> None:
         for table in (self._last, self._recent):

@@ -25,6 +25,10 @@ class Network(Protocol):
         """Return the times at which copies of a message sent now arrive; none if it is lost."""
 
 
+Route = tuple[str, Callable[[Deliver, str, bytes], None], Deliver]
+"""Name of a reader, its bus's `arrive`, and who there takes the message."""
+
+
 class Hub:
     """What the buses of one virtual system share: subscriptions and living nodes."""
 
@@ -33,7 +37,7 @@ class Hub:
         self.taps: list[Tap] = []
         self.alive: dict[str, set[int]] = {}
         self._subscriptions: list[tuple[re.Pattern[str], Deliver, VirtualBus]] = []
-        self._routes: dict[str, list[tuple[Deliver, VirtualBus]]] = {}
+        self._routes: dict[str, list[Route]] = {}
         self._watchers: list[tuple[str, PeerChange, VirtualBus]] = []
 
     def subscribe(self, expression: str, deliver: Deliver, bus: VirtualBus) -> None:
@@ -52,12 +56,12 @@ class Hub:
         self._watchers = [w for w in self._watchers if w[2] is not bus]
         self._routes.clear()
 
-    def routes(self, key: str) -> list[tuple[Deliver, VirtualBus]]:
+    def routes(self, key: str) -> list[Route]:
         """Return who hears a key, in the order of subscription."""
         found = self._routes.get(key)
         if found is None:
             found = self._routes[key] = [
-                (deliver, bus) for pattern, deliver, bus in self._subscriptions
+                (bus.node, bus.arrive, deliver) for pattern, deliver, bus in self._subscriptions
                 if pattern.fullmatch(key)]
         return found
 
@@ -79,17 +83,18 @@ class VirtualBus:
     bursts = False
 
     def __init__(self, hub: Hub, node: str, incarnation: int = 1) -> None:
+        self.node = node
         self._hub = hub
-        self._node = node
         self._incarnation = incarnation
         self._open = False
         self._loop: asyncio.AbstractEventLoop | None = None
 
     async def open(self) -> None:
         """Join the hub."""
-        self._loop = asyncio.get_running_loop()
+        self._loop = loop = asyncio.get_running_loop()
+        self._post_at = getattr(loop, "post_at", loop.call_at)  # cheaper, on a virtual loop
         self._open = True
-        self._hub.announce(self._node, self._incarnation, alive=True)
+        self._hub.announce(self.node, self._incarnation, alive=True)
 
     def soon(self, call: Callable[[], None]) -> None:
         """Run a call on the event loop after the present one, if this bus is open then."""
@@ -97,22 +102,25 @@ class VirtualBus:
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:  # noqa: ARG002
         """Send to all present subscribers of the key."""
-        loop, hub = self._loop, self._hub
+        loop, hub, node = self._loop, self._hub, self.node
         if not self._open or loop is None:
             return
         for tap in hub.taps:
-            tap(self._node, key, payload)
+            tap(node, key, payload)
+        routes = hub.routes(key)
+        if not routes:
+            return
         network = hub.network
         now_s = loop.time()
-        for deliver, bus in hub.routes(key):
+        for reader, arrive, deliver in routes:
             if network is None:
-                loop.call_soon(bus.arrive, deliver, key, payload)
+                loop.call_soon(arrive, deliver, key, payload)
                 continue
-            for at_s in network.arrivals(self._node, bus._node, now_s):
+            for at_s in network.arrivals(node, reader, now_s):
                 if at_s > now_s:
-                    loop.call_at(at_s, bus.arrive, deliver, key, payload)
+                    self._post_at(at_s, arrive, deliver, key, payload)
                 else:
-                    loop.call_soon(bus.arrive, deliver, key, payload)
+                    loop.call_soon(arrive, deliver, key, payload)
 
     def arrive(self, deliver: Deliver, key: str, payload: bytes) -> None:
         """Hand a message over, if somebody is still there to take it."""
@@ -143,4 +151,4 @@ class VirtualBus:
         if not self._open:
             return
         self.cut()
-        self._hub.announce(self._node, self._incarnation, alive=False)
+        self._hub.announce(self.node, self._incarnation, alive=False)

@@ -180,8 +180,9 @@ def run_virtually(job: Job) -> VirtualResult:
     shared = _shared(plan.airport, plan.mission, file)
     mission = MissionRun(plan, shared["airport"], shared["mission"], strategy=spec.strategy,
                          patience_s=job.patience_s)
-    return VirtualRun(plan, spec, mission, network=find_network(job.network),
-                      scenario=job.faults, nodes=nodes, shared={**shared, "document": document}).run()
+    return VirtualRun(
+        plan, spec, mission, network=find_network(job.network), scenario=job.faults, nodes=nodes,
+        shared={**shared, "document": document}).run()
 
 
 def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
