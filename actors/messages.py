@@ -63,12 +63,17 @@ class GpsFix(Message, frozen=True):
 
 
 class LaserScan(Message, frozen=True):
-    """One sweep of the 2D laser in `base_link`; a range of `range_max_m` means no echo."""
+    """One sweep of the 2D laser in `base_link`; a range of `range_max_m` means no echo.
+
+    `reference_m` is the range to the target in the laser's housing, measured once a sweep, by which
+    it can be checked (`actors.control.laser_check`); exactly -1 for a device without one.
+    """
 
     angle_min_rad: float
     angle_increment_rad: float
     range_max_m: float
     ranges_f32: bytes
+    reference_m: float = -1.0
 
 
 class LightSample(Message, frozen=True):

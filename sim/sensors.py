@@ -51,6 +51,7 @@ class LaserSpec:
         range_max_m: also the reading when there is no echo.
         height_m: above the ground; clears the chassis, below the top of every obstacle.
         noise_m: standard deviation.
+        reference_m: distance of the target in the housing, measured once a sweep.
     """
 
     rays: int = 181
@@ -58,6 +59,7 @@ class LaserSpec:
     range_max_m: float = 8.0
     height_m: float = 0.45
     noise_m: float = 0.01
+    reference_m: float = 0.1
 
     def __post_init__(self) -> None:
         if self.rays < 2 or not self.range_max_m > 0:
@@ -91,6 +93,11 @@ class Laser:
         self._origin = np.array([0.0, 0.0, spec.height_m])
         self._groups = np.zeros(6, dtype=np.uint8)
         self._groups[SOLID_GROUP] = 1
+        self._reference_noise = Noise(rng.spawn(1)[0], 1)
+
+    def reference(self) -> float:
+        """Return the range to the target in the housing, m."""
+        return self.spec.reference_m + self.spec.noise_m * self._reference_noise.take()[0]
 
     def scan(self, model: Any, data: Any, pose: tuple[float, float, float]) -> Floats:
         """Return one sweep, m, from the first to the last ray."""

@@ -189,7 +189,8 @@ class Simulator(Actor):
         ranges = self._world.scan().astype(np.dtype("<f4")).tobytes()
         laser = self._laser
         return m.LaserScan(
-            laser.angle_min_rad, laser.angle_increment_rad, laser.range_max_m, ranges
+            laser.angle_min_rad, laser.angle_increment_rad, laser.range_max_m, ranges,
+            self._world.laser_reference(),
         )
 
     def _light(self) -> m.LightSample:

@@ -267,6 +267,10 @@ class World:
             return np.full(self.laser.rays, self.laser.range_max_m)
         return self._laser.scan(self._model, self._data, self.pose)
 
+    def laser_reference(self) -> float:
+        """The laser's measurement of the target in its housing, m; one a sweep."""
+        return self._laser.reference()
+
     def gps(self) -> GpsReading:
         """One GPS fix."""
         x_m, y_m, _ = self.pose

@@ -126,6 +126,7 @@ class SafetyGate:
         self._manager_heard_s = -math.inf
         self._points: Array = NO_POINTS
         self._scan_s = -math.inf
+        self._scan_fault = ""
         self.refused = 0
 
     def order(self, recovery: str, engaged: bool, mode: PilotMode, reason: str) -> None:
@@ -139,8 +140,12 @@ class SafetyGate:
         """Take note of the manager's sign of life."""
         self._manager_heard_s = now
 
-    def scan(self, points: Array, stamp_s: float) -> None:
-        """Take a scan: echoes in `base_link`, shape (n, 2), and when it was measured."""
+    def scan(self, points: Array, stamp_s: float, fault: str = "") -> None:
+        """Take a scan: echoes in `base_link`, shape (n, 2), and when it was measured.
+
+        One that must not be believed (`fault` says why) is as good as none.
+        """
+        self._scan_fault = fault
         self._points = points
         self._scan_s = stamp_s
 
@@ -232,6 +237,8 @@ class SafetyGate:
                 return "the manager is silent"
             if now - self._started_s < limits.settling_s:
                 return "just started, orders may not have arrived yet"
+        if self._checks.scan and self._scan_fault:
+            return self._scan_fault
         if self._checks.scan and now - self._scan_s > limits.scan_timeout_s:
             return "no fresh laser scan"
         return ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from actors import topics
+from actors.control.laser_check import LaserCheck
 from actors.control.polyline import scan_points
 from actors.control.safety_gate import GateOutput, SafetyGate, Stamped
 from actors.control.settings import checks_of, gate_of
@@ -35,6 +36,8 @@ class SafetyPilot(Actor):
         super().__init__(context)
         system = context.shared["system"]
         self._gate = SafetyGate(gate_of(system), checks_of(system), context.clock.now())
+        self._laser = LaserCheck()
+        self._laser_fault = ""
         self._sent_s = -math.inf
         self._last = GateOutput(0.0, 0.0, PilotMode.AUTO, True, "just started")
 
@@ -54,14 +57,18 @@ class SafetyPilot(Actor):
 
     @on(topics.SCAN)
     def scan(self, message: LaserScan, header: Header) -> None:
-        """Keep the latest scan, as points."""
+        """Keep the latest scan, as points; one that cannot be believed stops the robot."""
         points = scan_points(
             message.ranges_f32,
             message.angle_min_rad,
             message.angle_increment_rad,
             message.range_max_m,
         )
-        self._gate.scan(points, header.stamp)
+        fault = self._laser.fault(message.reference_m, header.stamp)
+        self._gate.scan(points, header.stamp, fault)
+        if fault != self._laser_fault:
+            self._laser_fault = fault
+            self._act()
 
     @on(topics.PILOT_ORDER)
     def order(self, message: PilotOrder, header: Header) -> None:

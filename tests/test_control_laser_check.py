@@ -1,0 +1,60 @@
+"""The laser's check of itself: which sweeps are believed."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+
+from actors.control.laser_check import LaserCheck
+from sim.campaign.job import Job, run_job
+from sim.scenario import parse_fault
+
+
+def judge(references, period_s=0.05):
+    check = LaserCheck()
+    return [check.fault(r, i * period_s) for i, r in enumerate(references)]
+
+
+def healthy(count, seed=1):
+    dice = random.Random(seed)
+    return [0.1 + dice.gauss(0, 0.01) for _ in range(count)]
+
+
+def test_a_healthy_laser_is_believed_for_an_hour():
+    assert set(judge(healthy(72_000))) == {""}
+
+
+def test_a_device_without_a_reference_is_believed():
+    assert judge([-1.0] * 10) == [""] * 10
+
+
+def test_a_laser_that_repeats_itself_is_found_out_with_the_fourth_sweep():
+    found = judge([*healthy(5), *[0.1] * 6])
+    assert found[:8] == [""] * 8
+    assert set(found[8:]) == {"the laser repeats itself"}
+
+
+@pytest.mark.parametrize("off_m", [0.5, -0.3, 0.1, math.nan, math.inf])
+def test_a_wrong_reference_is_found_out_at_once(off_m):
+    assert judge([*healthy(5), 0.1 + off_m])[5].startswith("the laser's reference is off by")
+
+
+def test_after_a_wrong_sweep_the_laser_is_not_believed_for_a_second():
+    found = judge([0.5, *healthy(40)])
+    assert [bool(why) for why in found] == [True] * 20 + [False] * 21
+
+
+@pytest.mark.parametrize("fault", [
+    "laser-stuck@26+inf", "laser-bias@26+inf", "laser-noise@26+inf", "laser-dropout@26+inf",
+    "stuck:summit_xl/scan@2+inf"])
+def test_a_robot_that_cannot_trust_its_laser_stands(fault):
+    result = run_job(Job(row="x", mission="A", obstacles=2, faults=(parse_fault(fault),)))
+    assert (result.safe, result.success) == (True, False)
+    assert result.duration_s < 26 + 43
+
+
+def test_once_the_laser_is_right_again_the_mission_goes_on():
+    result = run_job(Job(row="x", mission="A", faults=(parse_fault("laser-stuck@26+3"),)))
+    assert (result.safe, result.success) == (True, True)
