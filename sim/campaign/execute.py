@@ -16,6 +16,8 @@ from sim.campaign.store import Store
 CONNECT_TIMEOUT_S = 10.0
 """For reaching a cluster."""
 
+_ROUNDS = 4
+
 Progress = Callable[[Job, RunResult], None]
 
 
@@ -53,20 +55,30 @@ def execute(jobs: Sequence[Job], store: Store, *, workers: int = 0, backend: str
         return 0
     count = 0
     with _connected(backend, address):
-        count_of_workers = workers or -1
-        if backend == "loky" and count_of_workers < 0:
-            count_of_workers = min(os.cpu_count() or 1, len(waiting))
-        parallel = joblib.Parallel(
-            n_jobs=count_of_workers, return_as="generator_unordered", batch_size=1,
-            pre_dispatch="2*n_jobs")
-        for key, result, error in parallel(
-                joblib.delayed(_attempt)(job) for job in waiting.values()):
-            if error:
+        for key, result, error in _attempts(list(waiting.values()), workers, backend):
+            if result is None:
                 raise JobError(error)
             store.add(waiting[key], result)
             count += 1
             progress(waiting[key], result)
     return count
+
+
+def _attempts(jobs: list[Job], workers: int, backend: str
+              ) -> Iterator[tuple[str, RunResult | None, str]]:
+    """Yield what came of jobs, each as soon as it can be had."""
+    count = workers or -1
+    if backend == "loky" and count < 0:
+        count = min(os.cpu_count() or 1, len(jobs))
+    attempts = [joblib.delayed(_attempt)(job) for job in jobs]
+    if backend != "ray":
+        yield from joblib.Parallel(n_jobs=count, return_as="generator_unordered", batch_size=1,
+                                   pre_dispatch="2*n_jobs")(attempts)
+        return
+    # Ray's backend returns nothing before it has all, so it gets a handful at a time.
+    some = _ROUNDS * joblib.effective_n_jobs(count)
+    for start in range(0, len(attempts), some):
+        yield from joblib.Parallel(n_jobs=count, batch_size=1)(attempts[start:start + some])
 
 
 def _attempt(job: Job) -> tuple[str, RunResult | None, str]:
