@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-
 NO_REFERENCE_M = -1.0
 """What a device reports that has no reference target."""
 
