@@ -134,7 +134,8 @@ class Run:
         self._directory.mkdir(parents=True, exist_ok=True)
         self._plan = msgspec.structs.replace(
             plan, airport=airport_name, mission=mission_name,
-            error_log=str(self._directory.resolve() / "errors.log"))
+            error_log=str(self._directory.resolve() / "errors.log"),
+            checkpoints=str(self._directory.resolve() / "checkpoints"))
         self._console = Console(sys.stderr)
         self._mission = MissionRun(
             self._plan, airport, mission, strategy=spec.strategy, patience_s=options.patience,

@@ -137,6 +137,7 @@ class MissionPhase(StrEnum):
     IDLE = "idle"
     RUNNING = "running"
     PAUSED = "paused"
+    RETURNING = "returning home"
     SUCCEEDED = "succeeded"
     FAILED = "failed"
     CANCELLED = "cancelled"
@@ -159,8 +160,44 @@ class LightMeasurement(Message, frozen=True):
     verdict: LightVerdict
 
 
+class MissionAction(StrEnum):
+    """What can be asked of a mission under way."""
+
+    PAUSE = "pause"
+    RESUME = "resume"
+    REPLAN = "replan"
+    SKIP = "skip"
+    CANCEL = "cancel"
+    HOME = "home"
+
+
+class MissionOrder(Message, frozen=True):
+    """Asks the Mission Manager for something; the same `order` twice is one order.
+
+    `by` is who asks, `reason` why: both are kept with what comes of it.
+    """
+
+    order: str
+    action: MissionAction
+    reason: str
+    by: str
+
+
+class MissionOrderAnswer(Message, frozen=True):
+    """Whether an order was obeyed, and why not; `plan` is the number of the plan it led to."""
+
+    order: str
+    accepted: bool
+    reason: str
+    plan: int = 0
+
+
 class MissionStatus(Message, frozen=True):
-    """Where the mission is. `step` is the index of the current goal; lights measured so far."""
+    """Where the mission is. `step` is the index of the current goal; lights measured so far.
+
+    `skipped` holds the indices of goals that were left out on request, `unmeasured` names the
+    lights that the robot passed without being able to measure them.
+    """
 
     mission_id: str
     name: str
@@ -170,19 +207,28 @@ class MissionStatus(Message, frozen=True):
     step_times_s: tuple[float, ...]
     lights: tuple[LightMeasurement, ...]
     reason: str
+    skipped: tuple[int, ...] = ()
+    unmeasured: tuple[str, ...] = ()
 
 
 class GoalOrder(Message, frozen=True):
-    """The Mission Manager's current goal for the Graph Planner; `active` False means none."""
+    """The Mission Manager's current goal for the Graph Planner; `active` False means none.
+
+    On the way home `step` is the number of goals. `plan` grows with each wish for another plan.
+    """
 
     mission_id: str
     step: int
     goal: Goal
     active: bool
+    plan: int = 0
 
 
 class Route(Message, frozen=True):
-    """Way to a goal: waypoints in `map`, first is the start; empty with a `reason` if none."""
+    """Way to a goal: waypoints in `map`, first is the start; empty with a `reason` if none.
+
+    `plan` is that of the goal it was made for. Of a way round something blocked the reason says so.
+    """
 
     mission_id: str
     step: int
@@ -190,6 +236,7 @@ class Route(Message, frozen=True):
     active: bool
     waypoints: tuple[tuple[float, float], ...]
     reason: str
+    plan: int = 0
 
 
 class ControlPhase(StrEnum):
@@ -199,16 +246,55 @@ class ControlPhase(StrEnum):
     FOLLOWING = "following"
     WAITING = "waiting"
     ARRIVED = "arrived"
+    REFUSED = "refused"
+
+
+class Blockage(Message, frozen=True):
+    """Something on the route that the robot does not get past: where in `map`, and since when."""
+
+    x_m: float
+    y_m: float
+    since_s: float
 
 
 class ControlStatus(Message, frozen=True):
-    """Progress along the route of (mission, step)."""
+    """Progress along the route of (mission, step).
+
+    `blocked` holds at most one blockage, the one in front of the robot now. `reason` says why a
+    route was refused. `unmeasured` names, on arrival, lights that were passed unmeasured.
+
+    What a standby has to do as well: `back_to` holds the point in `map` to which the robot goes
+    back, if it does, `passing` says that it leaves the row to drive round something, `aside_m` how
+    far to the left of the route it means to be, and `turn_added_radps` what its yaw loop has
+    learnt.
+    """
 
     mission_id: str
     step: int
     phase: ControlPhase
     waypoint: int
     distance_to_go_m: float
+    blocked: tuple[Blockage, ...] = ()
+    reason: str = ""
+    unmeasured: tuple[str, ...] = ()
+    back_to: tuple[tuple[float, float], ...] = ()
+    passing: bool = False
+    aside_m: float = 0.0
+    turn_added_radps: float = 0.0
+
+
+class LocalizationStatus(Message, frozen=True):
+    """What the pose rests on: sources in use, and those that are not, each with the reason.
+
+    Standard deviations are infinite before there is a pose. `bridged_m` is the way made since two
+    independent sources last agreed on the position.
+    """
+
+    in_use: tuple[str, ...]
+    excluded: tuple[tuple[str, str], ...]
+    position_sd_m: float
+    heading_sd_rad: float
+    bridged_m: float
 
 
 class Joystick(Message, frozen=True):
@@ -231,20 +317,28 @@ class PilotMode(StrEnum):
 
 
 class PilotOrder(Message, frozen=True):
-    """A recovery module's order to the Safety Pilot, in force while `engaged`."""
+    """A recovery module's order to the Safety Pilot, in force while `engaged`.
+
+    `top_speed_mps` bounds the speed of what passes; 0 leaves the bound of the robot.
+    """
 
     engaged: bool
     mode: PilotMode
     reason: str
+    top_speed_mps: float = 0.0
 
 
 class PilotStatus(Message, frozen=True):
-    """What the Safety Pilot does and why: `reason` is empty while commands pass unchanged."""
+    """What the Safety Pilot does and why: `reason` is empty while commands pass unchanged.
+
+    `top_speed_mps` is the lowest bound that was ordered, 0 for none.
+    """
 
     mode: PilotMode
     stopped: bool
     reason: str
     refused_commands: int
+    top_speed_mps: float = 0.0
 
 
 class DetectionState(StrEnum):

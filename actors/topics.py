@@ -13,6 +13,8 @@ ODOMETRY = Topic("summit_xl/odom", m.Odometry, Qos.SENSOR, 50, "odom", "Wheel od
 IMU = Topic("summit_xl/imu", m.Imu, Qos.SENSOR, 100, "base_link", "Inertial measurement unit.")
 GPS = Topic("summit_xl/gps", m.GpsFix, Qos.SENSOR, 10, "map", "RTK-GPS receiver.")
 SCAN = Topic("summit_xl/scan", m.LaserScan, Qos.SENSOR, 20, "base_link", "2D laser scanner.")
+UPPER_SCAN = Topic("summit_xl/upper_scan", m.LaserScan, Qos.SENSOR, 20, "base_link",
+                   "A second laser scanner above the first, where the robot has one.")
 LIGHT = Topic("summit_xl/light", m.LightSample, Qos.SENSOR, 20, "base_link", "Light sensor.")
 BASE_STATUS = Topic("summit_xl/status", m.BaseStatus, Qos.STATE, 10, "base_link",
                     "Brake, dead man and wheel speeds.")
@@ -24,17 +26,25 @@ BRAKE = Topic("summit_xl/brake", m.BrakeCommand, Qos.COMMAND, 5, "base_link",
 # Control chain.
 MISSION_REQUEST = Topic("mission/request", m.MissionRequest, Qos.COMMAND, 0, "map",
                         "A mission from the operator.")
+MISSION_ORDER = Topic("mission/order", m.MissionOrder, Qos.COMMAND, 0, "",
+                      "Pause, resume, replan, skip, cancel or return home.")
+MISSION_ORDER_ANSWER = Topic("mission/order_answer", m.MissionOrderAnswer, Qos.COMMAND, 0, "",
+                             "Whether an order was obeyed, and why not.")
 MISSION_STATUS = Topic("mission/status", m.MissionStatus, Qos.STATE, 2, "map",
                        "Progress and results of the mission.")
 GOAL = Topic("mission/goal", m.GoalOrder, Qos.STATE, 5, "map", "The current goal.")
 ROUTE = Topic("plan/route", m.Route, Qos.STATE, 5, "map", "The way to the current goal.")
 COMMAND = Topic("control/command", m.Twist, Qos.SENSOR, 20, "base_link",
                 "Velocity that Osmosis Control computes.")
+STANDBY_COMMAND = Topic("control/standby_command", m.Twist, Qos.SENSOR, 20, "base_link",
+                        "The same, computed by a hot standby in a process of its own.")
 CONTROL_STATUS = Topic("control/status", m.ControlStatus, Qos.STATE, 5, "",
                        "Progress along the route.")
 LIGHT_MEASURED = Topic("inspection/light", m.LightMeasurement, Qos.COMMAND, 0, "",
                        "A light was measured in passing.")
 POSE = Topic("localization/pose", m.Pose, Qos.SENSOR, 20, "map", "The robot's pose.")
+LOCALIZATION_STATUS = Topic("localization/status", m.LocalizationStatus, Qos.STATE, 5, "map",
+                            "What the pose rests on, and how sure it is.")
 JOYSTICK = Topic("teleoperation/joystick", m.Joystick, Qos.SENSOR, 20, "",
                  "The operator's stick, wherever it is.")
 TELEOP_COMMAND = Topic("teleoperation/command", m.Twist, Qos.SENSOR, 20, "base_link",

@@ -5,8 +5,10 @@ in the handler of that very message, and sends the commands that come out before
 returns: between a detection and its recovery no timer is waited for. Timers only repeat what is
 in force, show that the manager lives, and let the arbiter notice silence.
 
-The manager keeps nothing on disk. One that was killed finds out what is in force from the
-recovery modules themselves, and adopts it; until it knows, it releases nothing.
+One that was killed finds out what is in force from the recovery modules themselves, and adopts it;
+until it knows, it releases nothing. What they cannot tell it has from its checkpoint
+(`manager.arbiter_memory`). That is kept *after* the commands are on their way, unlike elsewhere: an
+emergency stop does not wait for a disk, and what a command says its module knows as well.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import msgspec
 from actors import messages as m
 from actors import topics
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.checkpoint import StateFormat
 from actors.runtime.topic import Topic
 from actors.runtime.wiring import load_class
 from manager.adaptation import Action, Change, Document, adapt, describe
@@ -34,8 +37,11 @@ from manager.arbiter import (
     Tick,
     build_arbiter,
 )
+from manager.arbiter_memory import Memory, objection, recall, remember
 from manager.recovery_track import Command, Phase
 from manager.schema import SystemSpec
+
+MANAGER_STATE = StateFormat(Memory, version=1, objection=objection)
 
 DECISIONS_PER_LIFE = 10_000
 """Each incarnation numbers its decisions from a multiple of this."""
@@ -66,6 +72,7 @@ class FtmManager(Actor):
             now_s, (context.incarnation - 1) * DECISIONS_PER_LIFE)
         self._ran_s = now_s
         self._shown: m.ManagerStatus | None = None
+        self._remembered: tuple[int, tuple[str, ...]] | None = None
 
     @classmethod
     def output_names(
@@ -77,8 +84,19 @@ class FtmManager(Actor):
         return super().output_names(topic, name, parameters)
 
     def on_start(self) -> None:
-        """Say at once that the manager lives."""
+        """Say at once that the manager lives, and what it has latched."""
+        memory = self.kept(MANAGER_STATE)
+        if memory is not None:
+            self.arbiter_state = recall(
+                self._arbiter, memory, self.clock.now(), self.arbiter_state.number)
+            self.repeat()
         self._show()
+
+    @every(1.0)
+    def remember(self) -> None:
+        """Keep what a successor cannot find out."""
+        self._remembered = self.arbiter_state.number, self.arbiter_state.latched
+        self.keep(MANAGER_STATE, remember(self.arbiter_state))
 
     # -- what it hears --------------------------------------------------------------------------
 
@@ -185,6 +203,8 @@ class FtmManager(Actor):
                     self.report_diagnostic("reset refused", output.reason, output.recovery)
         if self._status() != self._shown:
             self._show()
+        if (self.arbiter_state.number, self.arbiter_state.latched) != self._remembered:
+            self.remember()
 
     def _command(self, command: Command) -> None:
         self.publish(topics.RECOVERY_COMMAND, m.RecoveryCommand(

@@ -136,6 +136,7 @@ class Layers(Table, frozen=True):
         manager_watch: The Safety Pilot stops when the FTM Manager is silent.
         supervisor_respawn: The supervisor respawns what dies and is not the manager's to respawn.
         ftm: Detection modules, recovery modules and the FTM Manager run at all.
+        checkpoints: Nodes that hold data keep it on stable storage and come back with it.
     """
 
     dead_man: bool = True
@@ -143,6 +144,7 @@ class Layers(Table, frozen=True):
     manager_watch: bool = True
     supervisor_respawn: bool = True
     ftm: bool = True
+    checkpoints: bool = True
 
 
 class Kind(StrEnum):

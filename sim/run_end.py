@@ -6,9 +6,9 @@ nothing has progressed for the patience of the person who started it, or when th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from actors.messages import ControlStatus, MissionPhase, MissionStatus
+from actors.messages import ControlPhase, ControlStatus, MissionPhase, MissionStatus
 
 SETTLE_S = 1.5
 """After the mission's end the robot gets this long to come to rest, and the records to arrive."""
@@ -17,6 +17,8 @@ LOST_AFTER_S = 3.0
 ACCEPT_WITHIN_S = 30.0
 WORLD_SILENT_S = 3.0
 _STEP_TOWARDS_GOAL_M = 0.5
+_WAYS = 10
+"""So many ways round something are followed patiently; who finds more goes to and fro."""
 
 
 @dataclass(slots=True)
@@ -24,14 +26,15 @@ class RunEnd:
     """Decides the end of one run. Times are simulated seconds.
 
     Args:
-        patience_s: longest time without progress: no new step, no light measured, and not half
-            a metre nearer to the goal.
+        patience_s: longest time without progress: no new step, no light measured, not half
+            a metre nearer to the goal, and no way round something that is on the way.
     """
 
     patience_s: float
     _mission_id: str = ""
     _progress: tuple[int, int] = (-1, -1)
     _nearest_m: float = float("inf")
+    _ways: set[str] = field(default_factory=lambda: {""})
     _progress_at_s: float = 0.0
     _over_at_s: float | None = None
     _over: str = ""
@@ -49,7 +52,11 @@ class RunEnd:
             return
         self._mission_id = status.mission_id
         progress = (status.step, len(status.lights))
-        if progress != self._progress:
+        another_way = status.phase is MissionPhase.RUNNING and status.reason not in self._ways \
+            and len(self._ways) < _WAYS
+        if another_way:
+            self._ways.add(status.reason)
+        if progress != self._progress or another_way:
             self._progress, self._progress_at_s = progress, now_s
             self._nearest_m = float("inf")
         if status.phase in (MissionPhase.SUCCEEDED, MissionPhase.FAILED, MissionPhase.CANCELLED):
@@ -58,8 +65,9 @@ class RunEnd:
             self._over = status.reason or f"mission {status.phase.value}"
 
     def control(self, status: ControlStatus, now_s: float) -> None:
-        """Take the progress along the route."""
-        if status.distance_to_go_m < self._nearest_m - _STEP_TOWARDS_GOAL_M:
+        """Take the progress along the route; only who follows it knows how far it is."""
+        if status.phase is ControlPhase.FOLLOWING and \
+                status.distance_to_go_m < self._nearest_m - _STEP_TOWARDS_GOAL_M:
             self._nearest_m, self._progress_at_s = status.distance_to_go_m, now_s
 
     def truth(self, now_s: float) -> None:

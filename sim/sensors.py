@@ -99,8 +99,8 @@ class Laser:
         """Return the range to the target in the housing, m."""
         return self.spec.reference_m + self.spec.noise_m * self._reference_noise.take()[0]
 
-    def scan(self, model: Any, data: Any, pose: tuple[float, float, float]) -> Floats:
-        """Return one sweep, m, from the first to the last ray."""
+    def cast(self, model: Any, data: Any, pose: tuple[float, float, float]) -> Floats:
+        """Return the true ranges, m, from the first to the last ray; the next call's too."""
         x_m, y_m, yaw_rad = pose
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         self._turn[0, :2] = cos, sin
@@ -111,15 +111,22 @@ class Laser:
             model, data, self._origin, self._flat, self._groups, True, -1,
             self._geoms, self._ranges, None, self.spec.rays, self.spec.range_max_m,
         )  # fmt: skip
-        top_m = self.spec.range_max_m
+        self._ranges[self._geoms < 0] = math.inf
+        return self._ranges
+
+    def sweep(self, true_m: Floats) -> Floats:
+        """Return what the device makes of true ranges, m; `range_max_m` where there is no echo."""
         if not len(self._noise):
             self._noise = self._rng.normal(0.0, self.spec.noise_m, (64, self.spec.rays))
-        ranges: Floats = self._ranges + self._noise[-1]
+        ranges: Floats = true_m + self._noise[-1]
         self._noise = self._noise[:-1]
         np.maximum(ranges, 0.0, out=ranges)
-        np.minimum(ranges, top_m, out=ranges)
-        ranges[self._geoms < 0] = top_m
+        np.minimum(ranges, self.spec.range_max_m, out=ranges)
         return ranges
+
+    def scan(self, model: Any, data: Any, pose: tuple[float, float, float]) -> Floats:
+        """Return one sweep, m, from the first to the last ray."""
+        return self.sweep(self.cast(model, data, pose))
 
 
 class GpsReading(msgspec.Struct, frozen=True, gc=False):

@@ -28,8 +28,8 @@ DEAD_MAN_TIMEOUT_S = 0.4
 MAX_CATCH_UP_S = 1.0
 
 _JOBS = (
-    topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE, topics.SCAN, topics.LIGHT, topics.GPS,
-    topics.BASE_STATUS, topics.TRUTH, topics.OBSTACLES,
+    topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE, topics.SCAN, topics.UPPER_SCAN,
+    topics.LIGHT, topics.GPS, topics.BASE_STATUS, topics.TRUTH, topics.OBSTACLES,
 )  # fmt: skip
 
 
@@ -37,7 +37,8 @@ class Simulator(Actor):
     """Runs the `World` on the actor's clock.
 
     Parameters (all optional): `seed`; `obstacles`, number of presets that take part;
-    `dead_man`, False switches it off; `dead_man_timeout_s`; `laser_range_m`; `laser_rays`.
+    `dead_man`, False switches it off; `dead_man_timeout_s`; `laser_range_m`; `laser_rays`;
+    `upper_laser`, True for a robot with a second one.
     Shared: `airport`; `world` (`airport.world.WorldTruth`), read from the airport's file if absent.
     """
 
@@ -72,22 +73,24 @@ class Simulator(Actor):
             start_s=now_s,
             max_catch_up_s=MAX_CATCH_UP_S,
         )
-        self._schedule = Schedule(
-            {topic.key: topic.rate_hz for topic in _JOBS}, now_s, keep_s=MAX_CATCH_UP_S
-        )
         self._asked_s = now_s
         readings: dict[Topic[Any], Callable[[], Any]] = {
             topics.IMU: self._imu,
             topics.ODOMETRY: self._odometry,
             topics.ABSOLUTE_POSE: self._absolute_pose,
-            topics.SCAN: self._scan,
+            topics.SCAN: lambda: self._scan(0),
             topics.LIGHT: self._light,
             topics.GPS: self._gps,
             topics.BASE_STATUS: self._base_status,
             topics.TRUTH: self._truth,
             topics.OBSTACLES: self._obstacles,
         }
+        if self.parameters.get("upper_laser", False):
+            readings[topics.UPPER_SCAN] = lambda: self._scan(1)
         self._readings = {topic.key: (topic, read) for topic, read in readings.items()}
+        self._schedule = Schedule(
+            {topic.key: topic.rate_hz for topic in _JOBS if topic in readings},
+            now_s, keep_s=MAX_CATCH_UP_S)
 
     # -- inputs ---------------------------------------------------------------------------------
 
@@ -185,12 +188,12 @@ class Simulator(Actor):
     def _absolute_pose(self) -> m.Pose:
         return m.Pose(*self._world.pose)
 
-    def _scan(self) -> m.LaserScan:
-        ranges = self._world.scan().astype(np.dtype("<f4")).tobytes()
+    def _scan(self, which: int) -> m.LaserScan:
+        ranges = self._world.scan(which).astype(np.dtype("<f4")).tobytes()
         laser = self._laser
         return m.LaserScan(
             laser.angle_min_rad, laser.angle_increment_rad, laser.range_max_m, ranges,
-            self._world.laser_reference(),
+            self._world.laser_reference(which),
         )
 
     def _light(self) -> m.LightSample:

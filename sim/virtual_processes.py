@@ -15,6 +15,7 @@ from typing import Any
 
 from actors.messages import AdaptedSystem, NodeTable
 from actors.runtime.actor import Actor, Context
+from actors.runtime.checkpoint import CheckpointStore, MemoryCheckpoints, NoCheckpoints, Shelf
 from actors.runtime.clock import Clock
 from actors.runtime.virtual_bus import Hub, VirtualBus
 from actors.supervision.processes import Living, SpawnerUnavailableError
@@ -95,6 +96,7 @@ class VirtualMachine:
     Attributes:
         failures: Actors that ended by an error, with the error.
         on_restart: Called with the name when the supervisor was brought back.
+        shelves: What the nodes have kept; it outlives their processes.
     """
 
     def __init__(self, layout: Layout, shared: Mapping[str, Any], hub: Hub, clock: Clock, *,
@@ -102,6 +104,7 @@ class VirtualMachine:
         self.failures: list[tuple[str, BaseException]] = []
         self.on_restart: Callable[[str], None] = lambda _name: None
         self.slow_start_s: dict[str, float] = {}
+        self.shelves: dict[str, Shelf] = {}
         self._layout = layout
         self._shared: dict[str, Any] = {**shared, "processes": self}
         self._hub = hub
@@ -277,7 +280,7 @@ class VirtualMachine:
             try:
                 actor = member.actor(Context(
                     name, process.incarnation, self._clock, bus, member.parameters, self._shared,
-                    process.pid))
+                    process.pid, self._store(name, process.incarnation)))
             except Exception as error:
                 self._failed(process, name, error)
                 return
@@ -288,6 +291,11 @@ class VirtualMachine:
             process.tasks.append(task)
             task.add_done_callback(
                 lambda done, n=name: self._task_done(process, n, done))  # type: ignore[misc]
+
+    def _store(self, name: str, incarnation: int) -> CheckpointStore:
+        if not self._layout.spec.layers.checkpoints:
+            return NoCheckpoints()
+        return MemoryCheckpoints(self.shelves.setdefault(name, Shelf()), incarnation)
 
     def _task_done(self, process: VirtualProcess, name: str, task: asyncio.Task[None]) -> None:
         if process.condition is Condition.ENDED:

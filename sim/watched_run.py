@@ -39,7 +39,8 @@ class WatchedRun:
     def __init__(self, plan: RunPlan, spec: SystemSpec, duration_s: float | None, directory: Path,
                  stream: TextIO) -> None:
         self.launcher = Launcher(msgspec.structs.replace(
-            plan, error_log=str(directory.resolve() / "errors.log")), spec.title)
+            plan, error_log=str(directory.resolve() / "errors.log"),
+            checkpoints=str(directory.resolve() / "checkpoints")), spec.title)
         self.interrupted = ""
         self._spec = spec
         self._duration_s = duration_s

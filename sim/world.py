@@ -142,8 +142,9 @@ class World:
         self._faults = ActuatorFaults(motor_of(self._model, self._drive.limits))
         self._faulty = False
         self.laser = laser or LaserSpec()
-        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
-        self._laser = Laser(self.laser, streams[0])
+        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5)]
+        self._lasers = (Laser(self.laser, streams[0]), Laser(self.laser, streams[4]))
+        self._echoes: tuple[int, Floats] = (-1, np.empty(0))
         self._gps = Gps(streams[1])
         self._imu = Imu(streams[2], self.pose[2], start_s)
         self._light = LightSensor(airport, truth or WorldTruth(), streams[3])
@@ -259,17 +260,21 @@ class World:
         x, y, _, qw, qx, qy, qz = self._base_q.tolist()
         return x, y, math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
 
-    def scan(self) -> Floats:
-        """One sweep of the laser, m."""
+    def scan(self, laser: int = 0) -> Floats:
+        """One sweep of a laser, m: 0 is the lower one, 1 the upper one."""
         # The clearance is from the footprint's edge, the laser in its middle: nothing in range
         # needs no rays. It may be one look old, in which the robot moves less than the radius.
         if self._obstacle_clearance_m > self.laser.range_max_m:
             return np.full(self.laser.rays, self.laser.range_max_m)
-        return self._laser.scan(self._model, self._data, self.pose)
+        # Both sweep at the same time, the lower one first: the rays are cast once.
+        if laser == 0 or self._echoes[0] != self._ticks:
+            self._echoes = (
+                self._ticks, self._lasers[0].cast(self._model, self._data, self.pose))
+        return self._lasers[laser].sweep(self._echoes[1])
 
-    def laser_reference(self) -> float:
-        """The laser's measurement of the target in its housing, m; one a sweep."""
-        return self._laser.reference()
+    def laser_reference(self, laser: int = 0) -> float:
+        """A laser's measurement of the target in its housing, m; one a sweep."""
+        return self._lasers[laser].reference()
 
     def gps(self) -> GpsReading:
         """One GPS fix."""

@@ -84,7 +84,8 @@ def test_no_route_fails_the_mission_with_the_planners_reason():
     none = m.Route("id-1", 0, Mode.TAXI, True, (), "no way")
     assert ms.routed(state, msgspec.structs.replace(none, step=1)) is state
     assert ms.routed(state, msgspec.structs.replace(none, active=False)) is state
-    assert ms.routed(state, msgspec.structs.replace(none, waypoints=((0.0, 0.0),))) is state
+    found = msgspec.structs.replace(none, waypoints=((0.0, 0.0),), reason="way round")
+    assert ms.routed(state, found).phase is MissionPhase.RUNNING
     failed = ms.routed(state, none)
     assert (failed.phase, failed.reason) == (MissionPhase.FAILED, "goal 1: no way")
 
@@ -121,6 +122,180 @@ def test_resuming_what_is_not_paused_is_refused():
 def test_the_state_survives_serialisation():
     state = ms.measured(ms.progress(running(), arrived(0), 11.0), light("A01"))
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(state), type=MissionState) == state
+
+
+# ---- orders -------------------------------------------------------------------------------------
+
+A = m.MissionAction
+ROUTE = m.Route("id-1", 0, Mode.TAXI, True, ((0.5, 0.0), (1.0, 0.0)), "")
+
+
+def order(action, number=1, by="operator"):
+    return m.MissionOrder(f"order-{number}", action, "a reason", by)
+
+
+def obeyed(state, action, number=1, now=15.0):
+    after, answer = ms.obey(state, order(action, number), now)
+    assert answer.accepted, answer.reason
+    return after
+
+
+def situations():
+    """The mission in each situation in which an order may find it."""
+    begun = ms.routed(running(), ROUTE)
+    return {
+        "none": MissionState(),
+        "running": begun,
+        "running, nowhere known": running(),
+        "paused": ms.pause(begun, "operator: lunch"),
+        "held": ms.hold(begun, "held by RM2"),
+        "held and paused": ms.hold(ms.pause(begun, "operator: lunch"), "held by RM2"),
+        "returning": obeyed(begun, A.HOME, 99),
+        "cancelled": ms.cancel(begun, "enough"),
+    }
+
+
+R, Z, H, F, C = (MissionPhase.RUNNING, MissionPhase.PAUSED, MissionPhase.RETURNING,
+                 MissionPhase.FAILED, MissionPhase.CANCELLED)
+OBEDIENCE = [
+    # situation                 pause resume replan skip  cancel home
+    ("none",                    (None, None, None, None, None, None)),
+    ("running",                 (Z,    None, R,    R,    C,    H)),
+    ("running, nowhere known",  (Z,    None, R,    R,    C,    None)),
+    ("paused",                  (None, R,    None, Z,    C,    H)),
+    ("held",                    (Z,    None, None, Z,    C,    Z)),
+    ("held and paused",         (None, Z,    None, Z,    C,    Z)),
+    ("returning",               (Z,    None, H,    None, C,    None)),
+    ("cancelled",               (None, None, None, None, None, None)),
+]
+
+
+@pytest.mark.parametrize(("situation", "action", "expected"), [
+    (situation, action, expected) for situation, row in OBEDIENCE
+    for action, expected in zip(A, row, strict=True)])
+def test_an_order_is_obeyed_or_refused_with_a_reason(situation, action, expected):
+    state = situations()[situation]
+    after, answer = ms.obey(state, order(action), 15.0)
+    assert answer.accepted == (expected is not None)
+    assert bool(answer.reason) == (expected is None)
+    assert after.phase is (expected or state.phase)
+    if expected is None:
+        assert ms.status(after) == ms.status(state), "a refused order changes nothing"
+
+
+def test_the_same_order_again_is_the_same_order_also_when_it_would_be_refused_now():
+    once, first = ms.obey(situations()["running"], order(A.SKIP), 15.0)
+    twice, second = ms.obey(once, order(A.SKIP), 16.0)
+    assert twice is once
+    assert second == first
+    over, refused = ms.obey(MissionState(), order(A.PAUSE), 1.0)
+    assert ms.obey(over, order(A.PAUSE), 2.0)[1] == refused
+
+
+def test_another_plan_is_another_goal_order_for_the_same_goal():
+    state = running()
+    again = obeyed(state, A.REPLAN)
+    assert ms.goal_order(again) == msgspec.structs.replace(ms.goal_order(state), plan=1)
+    assert again.answers[-1].plan == 1
+
+
+def test_while_a_recovery_holds_the_robot_the_mission_is_paused_with_its_reason():
+    held = ms.hold(running(), "held by RM2: DM2: command not updated")
+    assert ms.status(held).phase is MissionPhase.PAUSED
+    assert ms.status(held).reason == "held by RM2: DM2: command not updated"
+    assert not ms.goal_order(held).active
+    free = ms.hold(held, "")
+    assert (ms.status(free).phase, ms.status(free).reason) == (MissionPhase.RUNNING, "")
+    assert ms.goal_order(free) == ms.goal_order(running())
+
+
+def test_a_pause_that_was_asked_for_outlasts_a_recovery_and_the_other_way_round():
+    paused = obeyed(ms.hold(running(), "held by RM2"), A.PAUSE)
+    assert ms.status(paused).reason == "held by RM2; operator: a reason"
+    assert ms.hold(paused, "").phase is MissionPhase.PAUSED
+    resumed = obeyed(paused, A.RESUME, 2)
+    assert (resumed.phase, resumed.reason) == (MissionPhase.PAUSED, "held by RM2")
+    assert ms.hold(resumed, "").phase is MissionPhase.RUNNING
+
+
+def test_a_recovery_that_holds_before_the_mission_comes_holds_it_too():
+    state = ms.accept(ms.hold(MissionState(), "held by RM1"), REQUEST, 1.0)
+    assert (state.phase, state.reason) == (MissionPhase.PAUSED, "held by RM1")
+
+
+def test_a_skipped_goal_is_told_to_the_end():
+    state = ms.progress(obeyed(running(), A.SKIP), arrived(1), 20.0)
+    status = ms.status(state)
+    assert status.phase is MissionPhase.FAILED
+    assert status.reason == "1 of 2 goals reached, skipped: goal 1 (operator: a reason)"
+    assert status.skipped == (0,)
+    assert len(status.step_times_s) == 2
+
+
+def test_home_is_where_the_mission_began_and_the_mission_ends_there_as_cancelled():
+    state = obeyed(ms.progress(situations()["running"], arrived(0), 14.0), A.HOME)
+    assert ms.goal_order(state) == m.GoalOrder(
+        "id-1", 2, m.Goal(0.5, 0.0, Mode.TAXI), True, 0)
+    assert ms.progress(state, arrived(1), 20.0) is state, "the goal it was driving to"
+    over = ms.progress(state, arrived(2), 20.0)
+    assert (over.phase, over.reason) == (
+        MissionPhase.CANCELLED, "returned home, operator: a reason")
+
+
+def test_without_a_way_home_the_mission_has_failed():
+    state = situations()["returning"]
+    none = m.Route("id-1", 2, Mode.TAXI, True, (), "no way in the graph")
+    failed = ms.routed(state, none)
+    assert (failed.phase, failed.reason) == (MissionPhase.FAILED, "home: no way in the graph")
+
+
+def test_a_light_that_was_passed_unmeasured_is_named_until_it_is_measured():
+    state = ms.measured(running(), light("A01"))
+    report = msgspec.structs.replace(arrived(0), unmeasured=("A01", "A02", "A03"))
+    state = ms.progress(state, report, 12.0)
+    assert ms.status(state).unmeasured == ("A02", "A03")
+    assert ms.status(ms.measured(state, light("A02"))).unmeasured == ("A03",)
+
+
+def test_a_way_round_is_told_while_it_is_driven():
+    state = ms.routed(running(), msgspec.structs.replace(ROUTE, reason="way round (3, 4)"))
+    assert ms.status(state).reason == "way round (3, 4)"
+    assert ms.status(ms.progress(state, arrived(0), 12.0)).reason == ""
+
+
+@given(st.lists(st.one_of(
+    st.builds(lambda a, n: ("order", order(a, n)), st.sampled_from(A), st.integers(0, 40)),
+    st.builds(lambda why: ("hold", why), st.sampled_from(["", "held by RM2", "held by RM5"])),
+    st.builds(lambda i, n: ("accept", m.MissionRequest(f"id-{i}", "x", GOALS[:n])),
+              st.integers(0, 2), st.integers(0, 2)),
+    st.builds(lambda s, p: ("progress", arrived(s, "id-1", p)),
+              st.integers(0, 2), st.sampled_from(ControlPhase)),
+    st.builds(lambda s, w: ("route", msgspec.structs.replace(ROUTE, step=s, waypoints=w)),
+              st.integers(0, 2), st.sampled_from([(), ROUTE.waypoints]))), max_size=40))
+def test_no_order_ever_raises_and_the_phase_always_tells_whether_the_robot_has_a_goal(events):
+    state = MissionState()
+    for now, (kind, event) in enumerate(events):
+        match kind:
+            case "order":
+                state, answer = ms.obey(state, event, float(now))
+                assert answer.accepted == (answer.reason == "")
+            case "hold":
+                state = ms.hold(state, event)
+            case "accept":
+                state = ms.accept(state, event, float(now))
+            case "progress":
+                state = ms.progress(state, event, float(now))
+            case "route":
+                state = ms.routed(state, event)
+        driving = state.phase in (MissionPhase.RUNNING, MissionPhase.RETURNING)
+        assert ms.goal_order(state).active == driving
+        assert driving <= (not state.held and not state.paused)
+        assert (state.phase is MissionPhase.PAUSED) <= bool(state.held or state.paused)
+        assert len(state.step_times_s) == state.step
+        if state.phase is MissionPhase.SUCCEEDED:
+            assert not state.skipped
+            assert not state.homing
+        assert msgspec.msgpack.decode(msgspec.msgpack.encode(state), type=MissionState) == state
 
 
 @given(st.lists(st.one_of(

@@ -179,3 +179,34 @@ def test_an_illegal_transition_names_both_states():
             assert module.state is m.DetectionState.IDLE
 
     run(scenario)
+
+
+def test_it_names_the_suspected_node_and_the_life_that_was_heard_last():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            system.start("localization", Source)
+            await system.kill("localization")
+            source = system.start("localization", Source)
+            system.start("DM6", LocalizationFreshness, timeout_s=0.3, suspects=["localization"])
+            system.start("DM2", CommandFreshness, timeout_s=0.3, startup_grace_s=0.3,
+                         suspects=["osmosis_control"])
+            await system.settle()
+            for _ in range(5):
+                source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+                await asyncio.sleep(0.1)
+            await asyncio.sleep(0.5)
+            named = {report.reason: report.nodes for _, report in ear.heard if report.reason}
+            assert named == {"localization not updated for 0.3 s": ("localization#2",),
+                             "command never heard": ("osmosis_control",)}
+
+    run(scenario)
+
+
+def test_suspects_that_are_no_names_are_refused():
+    async def scenario() -> None:
+        async with System() as system:
+            with pytest.raises(ValueError, match=r"parameters.suspects = 'x': must be a list"):
+                system.start("DM6", LocalizationFreshness, suspects="x")
+
+    run(scenario)

@@ -54,3 +54,21 @@ def test_a_mission_nobody_takes_and_a_world_that_is_gone_end_the_run():
     end.truth(2.0)
     assert end.ended(2.0 + WORLD_SILENT_S) is None
     assert "the world is gone" in (end.ended(2.1 + WORLD_SILENT_S) or "")
+
+
+def test_a_way_round_something_is_progress_once_and_the_longer_way_is_measured_anew():
+    def status(reason: str) -> MissionStatus:
+        return MissionStatus("m1", "A", MissionPhase.RUNNING, 0, GOALS, (), (), reason)
+
+    end = RunEnd(10.0)
+    end.mission(status(""), 0.0)
+    end.control(going(20.0), 1.0)
+    end.mission(status("way round (3, 4)"), 9.0)
+    end.control(going(60.0), 9.1)
+    end.control(going(50.0), 17.0)
+    end.mission(status("way round (3, 4)"), 26.0)
+    assert end.ended(26.9) is None
+    assert end.ended(27.1) == "no progress for 10 s"
+    for number in range(100):
+        end.mission(status(f"way round ({number}, 4)"), 30.0 + number)
+    assert end.ended(60.0) == "no progress for 10 s", "to and fro is no progress"

@@ -49,12 +49,25 @@ class Bench:
 
 
 def test_every_topic_of_the_summit_xl_layer_and_the_world_comes_at_its_rate():
-    bench = Bench()
+    bench = Bench(upper_laser=True)
     bench.run(2.0)
     counts = Counter(key for key, _, _ in bench.sent)
     assert set(counts) == {topic.key for topic in Simulator.outputs}
     for topic in Simulator.outputs:
         assert counts[topic.key] == pytest.approx(2 * topic.rate_hz, abs=1)
+
+
+def test_a_robot_with_one_laser_has_one_and_with_two_both_see_the_same_with_noise_of_their_own():
+    one, two = Bench(), Bench(upper_laser=True)
+    for bench in (one, two):
+        bench.run(1.0)
+    assert topics.UPPER_SCAN.key not in {key for key, _, _ in one.sent}
+    assert one.last(topics.SCAN) == two.last(topics.SCAN)  # the second disturbs nothing
+    lower, upper = (np.frombuffer(two.last(topic).ranges_f32, "<f4")
+                    for topic in (topics.SCAN, topics.UPPER_SCAN))
+    assert two.last(topics.SCAN).reference_m != two.last(topics.UPPER_SCAN).reference_m
+    assert upper == pytest.approx(lower, abs=0.15)
+    assert np.array_equal(upper >= 8.0, lower >= 8.0)
 
 
 def test_each_message_is_of_its_topics_type_and_stamped_with_its_own_due_time():

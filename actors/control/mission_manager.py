@@ -2,35 +2,75 @@
 
 from __future__ import annotations
 
+import math
+
 from actors import topics
 from actors.control import mission_state
+from actors.control.mission_checkpoint import MISSION_STATE, catch_up
 from actors.control.mission_state import MissionState
-from actors.messages import ControlStatus, LightMeasurement, MissionRequest, Route
+from actors.control.parameters import names
+from actors.messages import (
+    ControlStatus,
+    LightMeasurement,
+    ManagerStatus,
+    MissionOrder,
+    MissionRequest,
+    Route,
+)
 from actors.runtime.actor import Actor, Context, Header, every, on
+
+UNCERTAIN_S = 1.0
+"""A Mission Manager that comes back waits so long for word of the step that others are at. They
+repeat it five times a second, and at once for a newcomer."""
 
 
 class MissionManager(Actor):
-    """Wires `mission_state` to its topics; see there for the machine."""
+    """Wires `mission_state` to its topics; see there for the machine.
 
-    outputs = (topics.GOAL, topics.MISSION_STATUS)
+    Parameters:
+        held_by: names of the recovery modules that hold the robot while they are activated; the
+            mission is paused then, for that reason. None by default, as in the paper.
+
+    Who holds the robot is heard from the FTM Manager's status, ten times a second, so a respawned
+    Mission Manager finds out as well.
+    """
+
+    outputs = (topics.GOAL, topics.MISSION_STATUS, topics.MISSION_ORDER_ANSWER)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.state = MissionState()
+        self._held_by = names(self.parameters, "held_by")
+        self._uncertain_until_s = -math.inf
 
     @on(topics.MISSION_REQUEST)
     def request(self, message: MissionRequest, _header: Header) -> None:
         """Take a mission, unless it was taken before."""
         self._become(mission_state.accept(self.state, message, self.clock.now()))
 
+    @on(topics.MISSION_ORDER)
+    def order(self, message: MissionOrder, _header: Header) -> None:
+        """Obey an order or refuse it, and say so."""
+        state, answer = mission_state.obey(self.state, message, self.clock.now())
+        self._become(state)
+        self.publish(topics.MISSION_ORDER_ANSWER, answer)
+
+    @on(topics.MANAGER_STATUS)
+    def manager(self, message: ManagerStatus, _header: Header) -> None:
+        """Pause while a recovery holds the robot, and go on when it is released."""
+        if self._held_by:
+            self._become(mission_state.hold(self.state, hold_reason(message, self._held_by)))
+
     @on(topics.CONTROL_STATUS)
     def progress(self, message: ControlStatus, _header: Header) -> None:
         """Step on when the current goal is reached."""
+        self._compare(message.mission_id, message.step)
         self._become(mission_state.progress(self.state, message, self.clock.now()))
 
     @on(topics.ROUTE)
     def route(self, message: Route, _header: Header) -> None:
         """Give up when there is no way."""
+        self._compare(message.mission_id, message.step)
         self._become(mission_state.routed(self.state, message))
 
     @on(topics.LIGHT_MEASURED)
@@ -39,25 +79,59 @@ class MissionManager(Actor):
         self._become(mission_state.measured(self.state, message))
 
     def on_start(self) -> None:
-        """Say at once how things stand."""
+        """Say at once how things stand.
+
+        A state from a checkpoint may be an older one. So status and goal are held back until
+        planner or control have said which step they are at, or have had the time to.
+        """
+        state = self.kept(MISSION_STATE)
+        if state is not None:
+            self.state = state
+            if state.phase in mission_state.ACTIVE:
+                self._uncertain_until_s = self.clock.now() + UNCERTAIN_S
         self.repeat_status()
         self.repeat_goal()
 
     @every(0.2)
     def repeat_goal(self) -> None:
         """Repeat the goal for whoever joined late."""
-        self.publish(topics.GOAL, mission_state.goal_order(self.state))
+        if self.clock.now() >= self._uncertain_until_s:
+            self.publish(topics.GOAL, mission_state.goal_order(self.state))
+
+    @every(1.0)
+    def remember(self) -> None:
+        """Keep the state, if that failed when it was new."""
+        self.keep(MISSION_STATE, self.state)
+
+    def _compare(self, mission_id: str, step: int) -> None:
+        """End the uncertainty after a respawn: planner or control know the step as well."""
+        if self.clock.now() < self._uncertain_until_s and mission_id == self.state.mission_id:
+            self._uncertain_until_s = -math.inf
+            self._become(catch_up(self.state, step, self.clock.now()))
+            self.repeat_status()
+            self.repeat_goal()
 
     @every(0.5)
     def repeat_status(self) -> None:
         """Repeat the status for whoever joined late."""
-        self.publish(topics.MISSION_STATUS, mission_state.status(self.state))
+        if self.clock.now() >= self._uncertain_until_s:
+            self.publish(topics.MISSION_STATUS, mission_state.status(self.state))
 
     def _become(self, state: MissionState) -> None:
         if state is self.state:
             return
         before, self.state = self.state, state
-        self.publish(topics.MISSION_STATUS, mission_state.status(state))
+        self.remember()  # before anybody acts on it
+        self.repeat_status()
         order = mission_state.goal_order(state)
         if order != mission_state.goal_order(before):
-            self.publish(topics.GOAL, order)
+            self.repeat_goal()
+
+
+def hold_reason(status: ManagerStatus, holding: tuple[str, ...]) -> str:
+    """Return which of the recoveries that can hold the robot do, and for what; "" if none does."""
+    held_by = [name for name in holding if name in status.activated]
+    if not held_by:
+        return ""
+    causes = [f"{view.name}: {view.reason}" for view in status.detections if view.active]
+    return f"held by {' and '.join(held_by)}" + (f": {'; '.join(causes)}" if causes else "")

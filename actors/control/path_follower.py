@@ -78,6 +78,8 @@ class Motion(msgspec.Struct, frozen=True, gc=False):
 Pose2 = tuple[float, float, float]
 """Planar pose (x, y, yaw) in `map`."""
 
+_ASTRAY_M = 1.0
+
 STANDSTILL = (0.0, 0.0)
 """The command of a robot that stands."""
 
@@ -101,6 +103,19 @@ class Ramp:
         return self.last
 
 
+def find_place(line: Polyline, x_m: float, y_m: float, near_s_m: float | None) -> Projection:
+    """Return where on a route a follower begins.
+
+    Where the robot was last known to be says which leg it is on, if the route comes near itself;
+    it is not believed if another leg is much nearer, for the robot may have moved since.
+    """
+    anywhere = line.project(x_m, y_m)
+    if near_s_m is None:
+        return anywhere
+    near = line.project(x_m, y_m, near_s_m)
+    return near if abs(near.n_m) <= abs(anywhere.n_m) + _ASTRAY_M else anywhere
+
+
 def free_ahead(points: Array, hull: Hull, margin_m: float) -> float:
     """Free distance in metres straight ahead of the hull, in a lane `margin_m` wider a side."""
     lane = (np.abs(points[:, 1]) < hull.half_width_m + margin_m) & (points[:, 0] > 0.0)
@@ -122,6 +137,7 @@ class PathFollower:
         limits: speeds and distances.
         gains: shape of the potential field.
         escape: room for passing obstacles.
+        near_s_m: arc length at which the robot was last known to be, for one that resumes.
     """
 
     def __init__(
@@ -131,6 +147,8 @@ class PathFollower:
         limits: MotionLimits | None = None,
         gains: FieldGains | None = None,
         escape: EscapeLimits | None = None,
+        *,
+        near_s_m: float | None = None,
     ) -> None:
         self._line = Polyline(waypoints)
         self._hull = hull or Hull()
@@ -140,7 +158,23 @@ class PathFollower:
         self._escape = Escape(self._hull, self._room)
         self._ramp = Ramp(self._limits)
         self._s_m: float | None = None
+        self._resumed_at_m = near_s_m
         self._arrived = False
+
+    @property
+    def progress_m(self) -> float | None:
+        """Arc length at which the robot is; None before the first step."""
+        return self._s_m
+
+    @property
+    def aside_m(self) -> float:
+        """The offset from the route at which the robot is to pass now, left positive."""
+        return self._escape.offset_m
+
+    def adopt_aside(self, aside_m: float) -> None:
+        """Return to the route from where another follower of it returns from."""
+        if self._escape.side == 0:
+            self._escape.offset_m = aside_m
 
     def step(
         self, x_m: float, y_m: float, yaw_rad: float, points: Array, dt_s: float
@@ -155,7 +189,10 @@ class PathFollower:
             dt_s: time since the last step, for the acceleration limits.
         """
         line, limits = self._line, self._limits
-        foot = line.project(x_m, y_m, self._s_m)
+        if self._s_m is None:
+            foot = find_place(line, x_m, y_m, self._resumed_at_m)
+        else:
+            foot = line.project(x_m, y_m, self._s_m)
         self._s_m = foot.s_m
         to_go_m = line.length_m - foot.s_m + abs(foot.n_m if foot.s_m >= line.length_m else 0.0)
         direct_m = math.dist((x_m, y_m), line.end)

@@ -159,6 +159,13 @@ class Polyline:
         beyond_m = s_m - self._arc_m[index]
         return x_m + along_x * beyond_m, y_m + along_y * beyond_m
 
+    def part(self, s_from_m: float, s_to_m: float) -> tuple[Point, ...]:
+        """Return the way between two arc lengths, backwards if the second is the smaller one."""
+        low_m, high_m = min(s_from_m, s_to_m), max(s_from_m, s_to_m)
+        corners = [self.point_at(s_m) for s_m in self._arc_m if low_m < s_m < high_m]
+        way = (self.point_at(low_m), *corners, self.point_at(high_m))
+        return way if s_from_m <= s_to_m else way[::-1]
+
     def heading_at(self, s_m: float) -> float:
         """Return the direction of travel at an arc length, in `map`."""
         _, _, along_x, along_y, _ = self._segments[self._segment_at(s_m)]

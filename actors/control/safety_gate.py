@@ -5,6 +5,8 @@ the manager's sign of life, the operator's stick, the last good command, the las
 never trusts its inputs to be there: each has an age, and what is too old counts against motion.
 
 The strictest engaged order wins: stop > teleoperation > auto. A fresh joystick pre-empts auto.
+In auto there may be two computers of the command, Osmosis Control and its standby; which of them
+drives, and what they drive when they disagree, is `actors.control.command_pair`.
 In the paper's unprotected baseline (`Checks` all off) only three things are left: the last
 command is kept and repeated, obstacles stop the robot, the joystick pre-empts.
 """
@@ -16,6 +18,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from actors.control.command_pair import CommandPair, PairLimits
 from actors.control.polyline import NO_POINTS, Array
 from actors.control.swept_path import StoppingRoom, limited
 from actors.messages import PilotMode
@@ -63,6 +66,7 @@ class GateLimits:
         settling_s: a gate that has just started (perhaps again) knows no orders yet; it lets
             nothing pass before each recovery module has had time to repeat its own.
         room: distances of the obstacle stop.
+        pair: who drives when there is a standby.
     """
 
     max_linear_mps: float = 1.0
@@ -73,6 +77,7 @@ class GateLimits:
     manager_timeout_s: float = 0.5
     settling_s: float = 0.45
     room: StoppingRoom = field(default_factory=StoppingRoom)
+    pair: PairLimits = field(default_factory=PairLimits)
 
 
 class Stamped(msgspec.Struct, frozen=True, gc=False):
@@ -98,7 +103,7 @@ class GateOutput(msgspec.Struct, frozen=True, gc=False):
 
 @dataclass(slots=True)
 class _Line:
-    """State of one command source: auto or joystick."""
+    """State of one command source: auto, its standby, or joystick."""
 
     twist: tuple[float, float] | None = None
     stamp_s: float = -math.inf
@@ -121,7 +126,10 @@ class SafetyGate:
         self._checks = checks
         self._started_s = started_s
         self._orders: dict[str, tuple[PilotMode, str]] = {}
+        self._bounds_mps: dict[str, float] = {}
         self._auto = _Line()
+        self._standby = _Line()
+        self._pair = CommandPair(limits.pair)
         self._stick = _Line()
         self._manager_heard_s = -math.inf
         self._points: Array = NO_POINTS
@@ -129,10 +137,17 @@ class SafetyGate:
         self._scan_fault = ""
         self.refused = 0
 
-    def order(self, recovery: str, engaged: bool, mode: PilotMode, reason: str) -> None:
-        """Take note of a recovery module's order; it is in force until that module ends it."""
+    def order(self, recovery: str, engaged: bool, mode: PilotMode, reason: str,
+              top_speed_mps: float = 0.0) -> None:
+        """Take note of a recovery module's order; it is in force until that module ends it.
+
+        `top_speed_mps` bounds the speed meanwhile, whoever drives; 0 or nonsense does not.
+        """
+        self._bounds_mps.pop(recovery, None)
         if engaged:
             self._orders[recovery] = (mode, reason)
+            if top_speed_mps > 0:
+                self._bounds_mps[recovery] = top_speed_mps
         else:
             self._orders.pop(recovery, None)
 
@@ -151,7 +166,25 @@ class SafetyGate:
 
     def command(self, command: Stamped, now: float) -> str:
         """Offer Osmosis Control's command; return why it was refused, or ""."""
-        return self._take(self._auto, command, now)
+        refused = self._take(self._auto, command, now)
+        if self._standby.twist is not None:
+            self._pair.active(*self._offer(self._auto, now), command.incarnation, now)
+        return refused
+
+    def standby(self, command: Stamped, now: float) -> str:
+        """Offer the command of Osmosis Control's standby; return why it was refused, or ""."""
+        refused = self._take(self._standby, command, now)
+        self._pair.standby(*self._offer(self._standby, now), command.incarnation, now)
+        return refused
+
+    def standby_drives(self, now: float) -> bool:
+        """Whether the standby's command is the one to execute now, or has a say in it."""
+        stick = now - self._stick.heard_s <= self._limits.joystick_timeout_s
+        return not stick and bool(self._wanted(stick, now)[1])
+
+    def _offer(self, line: _Line, now: float) -> tuple[tuple[float, float] | None, float]:
+        """Return what a line has to offer to the pair, and from when it is."""
+        return None if self._unusable(line, now) else line.twist, line.stamp_s
 
     def joystick(self, command: Stamped, now: float) -> str:
         """Offer Teleoperation's command; return why it was refused, or ""."""
@@ -215,16 +248,40 @@ class SafetyGate:
         stick = now - self._stick.heard_s <= self._limits.joystick_timeout_s
         if mode is PilotMode.TELEOPERATION and not stick:
             return GateOutput(0.0, 0.0, mode, True, self._why(mode) or "waiting for the joystick")
-        line = self._stick if stick else self._auto
-        reason = self._unusable(line, now)
-        if reason or line.twist is None:
-            return GateOutput(0.0, 0.0, mode, True, reason or "no command yet")
-        linear, angular = limited(*line.twist, self._points, self._limits.room)
-        reason = "the joystick pre-empts" if stick and mode is PilotMode.AUTO else ""
-        stopped = (linear, angular) == (0.0, 0.0) != line.twist
-        if abs(linear) < abs(line.twist[0]) * _SLOWED or stopped:
+        wanted, passing = self._wanted(stick, now)
+        if wanted is None:
+            return GateOutput(0.0, 0.0, mode, True, passing or "no command yet")
+        wanted, passing = self._bounded(wanted, passing)
+        linear, angular = limited(*wanted, self._points, self._limits.room)
+        reason = "the joystick pre-empts" if stick and mode is PilotMode.AUTO else passing
+        stopped = (linear, angular) == (0.0, 0.0) != wanted
+        if abs(linear) < abs(wanted[0]) * _SLOWED or stopped:
             reason = "obstacle: stopped" if linear == 0.0 else "obstacle: slowed down"
         return GateOutput(linear, angular, mode, stopped, reason)
+
+    @property
+    def top_speed_mps(self) -> float:
+        """The lowest speed that an order in force allows at most; 0 if none bounds it."""
+        return min(self._bounds_mps.values(), default=0.0)
+
+    def _bounded(self, wanted: tuple[float, float], passing: str
+                 ) -> tuple[tuple[float, float], str]:
+        """Return a command no faster than the orders allow; the turn rate is kept."""
+        top_mps = self.top_speed_mps
+        if not top_mps or abs(wanted[0]) <= top_mps:
+            return wanted, passing
+        return (math.copysign(top_mps, wanted[0]), wanted[1]), passing or "speed bounded by order"
+
+    def _wanted(self, stick: bool, now: float) -> tuple[tuple[float, float] | None, str]:
+        """Return the command to execute and what is special about it, or None and why not."""
+        line = self._stick if stick else self._auto
+        unusable = self._unusable(line, now)
+        if stick or self._standby.twist is None:
+            return (None, unusable) if unusable else (line.twist, "")
+        other = self._standby
+        return self._pair.choice(
+            (None, unusable) if unusable else (line.twist, ""),
+            None if self._unusable(other, now) else other.twist, now)
 
     def _forbidden(self, mode: PilotMode, now: float) -> str:
         """Why nobody's command may pass, or ""."""

@@ -48,6 +48,14 @@ class SafetyPilot(Actor):
         self._note(refused, header)
         self._act()
 
+    @on(topics.STANDBY_COMMAND)
+    def standby(self, message: Twist, header: Header) -> None:
+        """Offer the standby's command; act at once if it drives, else the active one's do."""
+        now = self.clock.now()
+        self._note(self._gate.standby(_stamped(message, header), now), header)
+        if self._gate.standby_drives(now):
+            self._act()
+
     @on(topics.TELEOP_COMMAND)
     def joystick(self, message: Twist, header: Header) -> None:
         """Offer the operator's command to the gate and act on the answer at once."""
@@ -73,10 +81,12 @@ class SafetyPilot(Actor):
     @on(topics.PILOT_ORDER)
     def order(self, message: PilotOrder, header: Header) -> None:
         """Obey a recovery module; a change acts at once."""
-        before = self._gate.mode
-        self._gate.order(header.source, message.engaged, message.mode, message.reason)
-        if self._gate.mode is not before:
+        before = self._gate.mode, self._gate.top_speed_mps
+        self._gate.order(header.source, message.engaged, message.mode, message.reason,
+                         message.top_speed_mps)
+        if (self._gate.mode, self._gate.top_speed_mps) != before:
             self._act()
+            self._tell()
 
     @on(topics.MANAGER_STATUS)
     def manager(self, _message: ManagerStatus, _header: Header) -> None:
@@ -107,7 +117,7 @@ class SafetyPilot(Actor):
     def _tell(self) -> None:
         last = self._last
         self.publish(topics.PILOT_STATUS, PilotStatus(
-            last.mode, last.stopped, last.reason, self._gate.refused))
+            last.mode, last.stopped, last.reason, self._gate.refused, self._gate.top_speed_mps))
 
     def _note(self, refused: str, header: Header) -> None:
         if refused:

@@ -20,8 +20,6 @@ class BoundsCheck:
         known_after_s: when idle may be claimed without a command heard; -inf for at once.
     """
 
-    nodes: tuple[str, ...] = ()
-
     def __init__(self, max_linear_mps: float, max_angular_radps: float, hold_s: float,
                  known_after_s: float = -math.inf) -> None:
         self.max_linear_mps = max_linear_mps
@@ -29,9 +27,15 @@ class BoundsCheck:
         self.hold_s = hold_s
         self.active = False
         self.reason = ""
+        self.nodes: tuple[str, ...] = ()
         self.known = known_after_s == -math.inf
         self._known_after_s = known_after_s
         self._good_since_s: float | None = None
+
+    @property
+    def good(self) -> bool:
+        """Whether the last command was good."""
+        return not self.active or self._good_since_s is not None
 
     @property
     def due_s(self) -> float:

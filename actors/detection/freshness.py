@@ -5,7 +5,7 @@ from __future__ import annotations
 from actors import messages as m
 from actors import topics
 from actors.detection.freshness_monitor import FreshnessMonitor
-from actors.detection.module import DetectionModule, number
+from actors.detection.module import DetectionModule, names_of, number
 from actors.runtime.actor import Context, Header, on
 
 
@@ -19,6 +19,8 @@ class Freshness(DetectionModule):
     Parameters:
         timeout_s: greatest admissible age of the content, s.
         hold_s: how long it must be fresh again before the module is idle, s.
+        suspects: names of nodes to be respawned when it is active, as a rule the one that
+            publishes the topic; none by default, as in the paper.
 
     The first sample of a starting system may take the spec's `startup_grace_s`. A respawned
     module joins a running system: for it the timeout itself is the grace.
@@ -36,6 +38,8 @@ class Freshness(DetectionModule):
         self.monitor = FreshnessMonitor(
             self.subject, timeout_s, number(self.parameters, "hold_s", 0.2), self.clock.now(),
             self.grace_s(timeout_s), known=self.first_life)
+        self._suspects = names_of(self.parameters, "suspects")
+        self.monitor.nodes = self._suspects
 
     def on_start(self) -> None:
         """Start waiting for the first sample."""
@@ -43,8 +47,14 @@ class Freshness(DetectionModule):
 
     def sample(self, header: Header) -> None:
         """Take note of a sample."""
-        self.monitor.heard(header.stamp, self.clock.now())
-        self.follow(self.monitor)
+        monitor = self.monitor
+        monitor.heard(header.stamp, self.clock.now())
+        if self._suspects and not monitor.active:
+            # The life that was last heard is accused: a later one has done nothing yet.
+            monitor.nodes = tuple(
+                f"{name}#{header.incarnation}" if name == header.source else name
+                for name in self._suspects)
+        self.follow(monitor)
 
 
 class CommandFreshness(Freshness):

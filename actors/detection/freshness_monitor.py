@@ -22,13 +22,15 @@ class FreshnessMonitor:
         start_s: now.
         grace_s: how long the first sample may take, s.
         known: whether idle may be claimed before anything was heard.
-    """
 
-    nodes: tuple[str, ...] = ()
+    Attributes:
+        nodes: whom to suspect; up to the owner.
+    """
 
     def __init__(self, subject: str, timeout_s: float, hold_s: float, start_s: float,
                  grace_s: float, *, known: bool = True) -> None:
         self.subject = subject
+        self.nodes: tuple[str, ...] = ()
         self.timeout_s = timeout_s
         self.hold_s = hold_s
         self.active = False

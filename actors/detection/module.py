@@ -194,3 +194,15 @@ def number(parameters: Any, name: str, default: float) -> float:
             or not (math.isfinite(value) and value >= 0):
         raise ValueError(f"parameters.{name} = {value!r}: must be a number, 0 or more")
     return float(value)
+
+
+def names_of(parameters: Any, name: str) -> tuple[str, ...]:
+    """Return a list of names among a node's parameters; none by default.
+
+    Raises:
+        ValueError: it is no list of names; the message names parameter and value.
+    """
+    value = parameters.get(name, ())
+    if isinstance(value, str) or not all(isinstance(one, str) and one for one in value):
+        raise ValueError(f"parameters.{name} = {value!r}: must be a list of node names")
+    return tuple(value)

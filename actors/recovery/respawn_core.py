@@ -9,6 +9,8 @@ so that asking twice, or asking about a node that is back already, kills nobody 
   supervisor, who holds the process's pidfd and knows better, respawns it or answers that it is
   there. This happens when this module was itself respawned and is commanded again, and when a
   stopped process was continued just in time.
+* A node that is well by all signs of life may be wrong all the same: who has compared what it says
+  names the life, `NAME#INCARNATION`, and that life is accused, a later one is not.
 * A new life that dies, or is not heard within a while, has failed as well: the next request names
   it. The supervisor counts, and gives up when there are too many.
 """
@@ -82,7 +84,7 @@ class RespawnCore:
         """Have nodes respawned: all that are named and not on their way already.
 
         Args:
-            nodes: names.
+            nodes: names, each perhaps with the incarnation that is wrong, `NAME#INCARNATION`.
             now_s: now.
             renewed: it is a new order, so that what was given up is to be tried again.
 
@@ -90,15 +92,16 @@ class RespawnCore:
             Whether there was anything to ask for.
         """
         requests = len(self._requests)
-        named = tuple(nodes)
-        self._strangers = tuple(name for name in named if name not in self._nodes)
-        for name in named:
+        named = tuple(map(accused_life, nodes))
+        self._strangers = tuple(name for name, _ in named if name not in self._nodes)
+        for name, wrong in named:
             node = self._nodes.get(name)
             if node is None:
                 continue
             if node.stage is Stage.NONE or (node.stage is Stage.FAILED and renewed) or (
-                    node.stage is Stage.BACK and self._has_failed(node, now_s)):
-                self._ask(name, node, now_s)
+                    node.stage is Stage.BACK
+                    and (self._has_failed(node, now_s) or wrong >= node.incarnation > 0)):
+                self._ask(name, node, now_s, wrong)
         return len(self._requests) > requests
 
     def release(self) -> None:
@@ -194,10 +197,16 @@ class RespawnCore:
     def _has_failed(self, node: _Node, now_s: float) -> bool:
         return node.gone_s is not None or now_s - node.heard_s >= self._overdue_s
 
-    def _ask(self, name: str, node: _Node, now_s: float) -> None:
+    def _ask(self, name: str, node: _Node, now_s: float, wrong: int = 0) -> None:
         failed = node.incarnation if self._has_failed(node, now_s) else node.incarnation - 1
-        node.ask = Ask(self._next_request, name, max(0, failed))
+        node.ask = Ask(self._next_request, name, max(0, failed, wrong))
         node.stage = Stage.ASKED
         node.asked_s = now_s
         self._next_request += 1
         self._requests.append(node.ask)
+
+
+def accused_life(node: str) -> tuple[str, int]:
+    """Return name and incarnation of `NAME#INCARNATION`; 0 if it names no life of the node."""
+    name, _, life = node.partition("#")
+    return name, int(life) if life.isdecimal() else 0

@@ -23,6 +23,7 @@ from typing import Any, ClassVar, TypeVar
 import msgspec
 
 from actors.runtime.bus import Bus
+from actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
 from actors.runtime.clock import Clock
 from actors.runtime.envelope import ArrivalGuard, Header, RejectedError, pack
 from actors.runtime.injection import FaultGate, News
@@ -60,6 +61,7 @@ class Context:
         parameters: the node's parameters from the system spec.
         shared: read-only objects loaded once for the whole run ("system", "airport", ...).
         pid: number of the process that it lives in.
+        checkpoints: where this node's state is kept.
     """
 
     name: str
@@ -69,6 +71,7 @@ class Context:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     shared: Mapping[str, Any] = field(default_factory=dict)
     pid: int = field(default_factory=os.getpid)
+    checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:
@@ -127,6 +130,9 @@ class Actor:
         self._bus = context.bus
         self._guard = ArrivalGuard()
         self._faults = FaultGate()
+        self._keeper = Keeper(
+            context.checkpoints, lambda line: self.report_diagnostic("checkpoint", line, self.name),
+            context.clock.now, expected=context.incarnation > 1)
         self._injection_ends: dict[str, Timer] = {}
         self._mailbox = Mailbox(on_overflow=self._overflowed, on_item=self._wake)
         self._waiting = self._mailbox.waiting
@@ -242,6 +248,18 @@ class Actor:
 
         timer.arm(release)
         return timer
+
+    def kept(self, form: StateFormat[S]) -> S | None:
+        """Return the state to go on from, in `on_start`: the newest sound one, or None."""
+        return self._keeper.kept(form)
+
+    def keep(self, form: StateFormat[S], state: S) -> None:
+        """Keep the whole state; to be called before the messages that follow from it are sent.
+
+        On return it survives this process. What goes wrong is reported and does not raise: the
+        node goes on without.
+        """
+        self._keeper.keep(form, state)
 
     def report_diagnostic(self, context: str, reason: str, offender: str) -> None:
         """Publish an error report, at most one a second per context and offender."""
@@ -377,6 +395,7 @@ class Actor:
         try:
             self.on_stop()
         finally:
+            self._keeper.close()
             await self._bus.close()
 
     def _stop(self) -> None:
@@ -386,6 +405,7 @@ class Actor:
         try:
             self._diagnostics.clear()
             self.report_diagnostic("handler failed", f"{type(error).__name__}: {error}", self.name)
+            self._keeper.failed()
             self.on_failure(error)
         except Exception as second:  # the first error is the one that counts
             error.add_note(f"and while reporting it: {second!r}")

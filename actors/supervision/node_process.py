@@ -18,6 +18,8 @@ from typing import Any
 
 from actors.runtime.actor import Actor, Context
 from actors.runtime.bus import BusError
+from actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
+from actors.runtime.checkpoint_store import SqliteCheckpoints
 from actors.runtime.clock import Clock
 from actors.runtime.zenoh_bus import ZenohBus
 from actors.supervision.lifeline import exit_with_launcher, kill_leftovers
@@ -37,7 +39,17 @@ def make_actor(
     member = layout.members[name]
     clock = Clock(layout.plan.origin_s, layout.plan.rate, loop.time)
     bus = ZenohBus(name, incarnation, layout.listen(name), layout.dial(name))
-    return member.actor(Context(name, incarnation, clock, bus, member.parameters, shared))
+    return member.actor(Context(name, incarnation, clock, bus, member.parameters, shared,
+                                checkpoints=make_store(layout, name, incarnation)))
+
+
+def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
+    """Return where a node of the system keeps its state; nothing is opened yet."""
+    plan = layout.plan
+    if not (plan.checkpoints and layout.spec.layers.checkpoints):
+        return NoCheckpoints()
+    return SqliteCheckpoints(
+        Path(plan.checkpoints) / f"{name}.sqlite", plan.run_id, incarnation)
 
 
 def node_main(

@@ -51,6 +51,7 @@ class RunPlan(msgspec.Struct, frozen=True):
         launcher_pid: process id of the launcher; set by it.
         error_log: file that collects tracebacks of failed nodes; "" for none.
         origin_s: reading of the monotonic clock at simulated time 0; set when all is loaded.
+        checkpoints: directory for the nodes' checkpoints; "" keeps none, whatever the spec says.
     """
 
     run_id: str
@@ -68,6 +69,7 @@ class RunPlan(msgspec.Struct, frozen=True):
     shadow: str = ""
     error_log: str = ""
     origin_s: float = 0.0
+    checkpoints: str = ""
 
 
 class Unit(msgspec.Struct, frozen=True):
@@ -115,7 +117,7 @@ def tailor(plan: RunPlan, spec: SystemSpec) -> SystemSpec:
     if not plan.ftm:
         spec = msgspec.structs.replace(spec, layers=Layers(
             dead_man=False, safety_pilot_checks=False, manager_watch=False,
-            supervisor_respawn=False, ftm=False))
+            supervisor_respawn=False, ftm=False, checkpoints=False))
     return spec
 
 

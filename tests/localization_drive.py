@@ -1,0 +1,141 @@
+"""A drive of the simulated robot, its sensors' readings, and what becomes of them under faults.
+
+The world is driven open-loop, once for all tests: nothing that localization does changes the way.
+Faults act through the project's own gate, as they do in the nodes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from shapely.geometry import box
+
+from actors import messages as m
+from actors import topics
+from actors.runtime.injection import FaultGate, Outgoing
+from actors.runtime.topic import Topic
+from airport.model import Airport, StartPose
+from sim.disturbance import Fault
+from sim.faults import find_fault
+from sim.schedule import Schedule
+from sim.world import World
+
+START_RAD = 0.7
+SOURCES = {"gps": topics.GPS, "imu": topics.IMU, "odom": topics.ODOMETRY,
+           "absolute-pose": topics.ABSOLUTE_POSE}
+
+# Seconds, m/s, rad/s: standing, straight, a bend, on the spot, backwards, a fast bend, standing.
+LEGS = ((1.5, 0.0, 0.0), (4.0, 1.0, 0.0), (3.0, 0.8, 0.4), (3.0, 1.0, 0.0), (2.5, 0.0, 1.2),
+        (3.0, 1.0, 0.0), (2.0, -0.5, 0.0), (3.0, 0.6, -0.9), (5.0, 1.0, 0.0), (2.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Reading:
+    topic: Topic[Any]
+    stamp_s: float
+    body: Any
+
+
+@dataclass(frozen=True)
+class Truth:
+    stamp_s: float
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    linear_mps: float
+    angular_radps: float
+
+    def at(self, stamp_s: float) -> tuple[float, float, float]:
+        dt_s = stamp_s - self.stamp_s
+        middle = self.yaw_rad + self.angular_radps * dt_s / 2
+        way_m = self.linear_mps * dt_s
+        return (self.x_m + way_m * math.cos(middle), self.y_m + way_m * math.sin(middle),
+                self.yaw_rad + self.angular_radps * dt_s)
+
+
+def field_airport() -> Airport:
+    return Airport("field", {"a": (0.0, 0.0), "b": (40.0, 0.0)}, (("a", "b"),),
+                   box(-60.0, -60.0, 60.0, 60.0), StartPose(0.0, 0.0, START_RAD))
+
+
+@cache
+def drive(seed: int = 1) -> tuple[Reading | Truth, ...]:
+    """Return readings and truth (at 20 Hz) in order of time."""
+    world = World(field_airport(), seed=seed)
+    rates = {**{t.key: t.rate_hz for t in SOURCES.values()}, topics.TRUTH.key: 20.0,
+             "command": 20.0}
+    schedule = Schedule(rates, 0.0, keep_s=1e9)
+    by_key = {t.key: t for t in SOURCES.values()}
+    out: list[Reading | Truth] = []
+    for due_s, key in schedule.due(sum(leg[0] for leg in LEGS)):
+        world.step_to(due_s)
+        if key == "command":
+            world.command(*_command(due_s))
+        elif key == topics.TRUTH.key:
+            t = world.truth()
+            out.append(Truth(due_s, t.x_m, t.y_m, t.yaw_rad, t.linear_mps, t.angular_radps))
+        else:
+            out.append(Reading(by_key[key], due_s, _read(world, key)))
+    return tuple(out)
+
+
+def _command(now_s: float) -> tuple[float, float]:
+    for lasts_s, linear_mps, angular_radps in LEGS:
+        if now_s < lasts_s:
+            return linear_mps, angular_radps
+        now_s -= lasts_s
+    return 0.0, 0.0
+
+
+def _read(world: World, key: str) -> m.Message:
+    if key == topics.GPS.key:
+        g = world.gps()
+        return m.GpsFix(g.x_m, g.y_m, g.velocity_x_mps, g.velocity_y_mps, g.accuracy_m)
+    if key == topics.IMU.key:
+        i = world.imu()
+        return m.Imu(i.yaw_rad, i.yaw_rate_radps, i.accel_x_mps2, i.accel_y_mps2)
+    if key == topics.ODOMETRY.key:
+        o = world.odometry()
+        return m.Odometry(m.Pose(o.x_m, o.y_m, o.yaw_rad), m.Twist(o.linear_mps, o.angular_radps))
+    return m.Pose(*world.pose)
+
+
+def fault(name: str, *, on_s: float = 0.0, off_s: float = 0.0) -> Fault:
+    return find_fault(name).varied(on_s=on_s, off_s=off_s)
+
+
+def disturbed(faults: Iterable[tuple[Fault, float, float]], seed: int = 1,
+              ) -> Iterator[tuple[float, Reading | Truth]]:
+    """Yield the drive as it arrives, with faults given as (fault, from s, to s): (now, what)."""
+    gate, late, orders = FaultGate(), [], []
+    for number, (what, from_s, to_s) in enumerate(faults):
+        orders += [(from_s, to_s, order) for order in what.orders(f"f{number}", None)]
+    for item in drive(seed):
+        now_s = item.stamp_s
+        while late and late[0][0] <= now_s:
+            yield late.pop(0)
+        for from_s, to_s, order in orders:
+            if from_s <= now_s < to_s and order.injection not in gate.in_force:
+                assert gate.order(order, now_s) == ""
+            elif now_s >= to_s:
+                gate.expire(order.injection)
+        if isinstance(item, Truth):
+            yield now_s, item
+            continue
+        key = item.topic.at()
+        out = gate.apply(key, item.body, now_s, now_s) if gate.in_force else Outgoing(
+            item.body, now_s)
+        if out is None:
+            continue
+        gate.last[key] = (out.body, out.stamp)
+        reading = Reading(item.topic, out.stamp, out.body)
+        if out.delay_s:
+            late.append((now_s + out.delay_s, reading))
+        else:
+            yield now_s, reading
+
+

@@ -1,0 +1,153 @@
+"""Two lasers: whatever happens to one of them, the other's view stays, and nothing is unseen."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from actors.control.laser_pair import LOWER, UPPER, LaserPair
+from actors.messages import LaserScan
+
+RAYS, TOP_M, PERIOD_S = 5, 8.0, 0.05
+ANGLE_MIN = -0.2
+
+
+def sweep(ranges, reference_m=0.1):
+    return LaserScan(ANGLE_MIN, 0.1, TOP_M, np.array(ranges, "<f4").tobytes(), reference_m)
+
+
+def healthy(i, ranges=(8, 8, 3, 8, 8)):
+    return sweep(ranges, 0.1 + 0.001 * math.sin(i + 1))
+
+
+def distances(view):
+    return sorted(round(float(np.hypot(*point)), 3) for point in view.points)
+
+
+class Bench:
+    """Feeds a pair sweep by sweep and keeps the view that is in force."""
+
+    def __init__(self):
+        self.pair, self.view, self.changes = LaserPair(), None, 0
+
+    def feed(self, laser, message, stamp_s):
+        view = self.pair.take(laser, message, stamp_s)
+        if view is not None:
+            self.view = view
+            self.changes += 1
+
+
+def test_one_laser_alone_gives_every_view():
+    bench = Bench()
+    for i in range(10):
+        bench.feed(LOWER, healthy(i), i * PERIOD_S)
+        assert bench.changes == i + 1
+        assert (bench.view.stamp_s, bench.view.fault) == (i * PERIOD_S, "")
+        assert distances(bench.view) == [3.0]
+
+
+def test_two_make_one_view_at_the_rate_of_one():
+    bench = Bench()
+    for i in range(20):
+        bench.feed(LOWER, healthy(i), i * PERIOD_S)
+        bench.feed(UPPER, healthy(i + 100), i * PERIOD_S)
+    assert bench.changes == 20
+
+
+def test_a_ray_is_as_short_as_the_shorter_of_the_two():
+    bench = Bench()
+    bench.feed(UPPER, healthy(1, (8, 2, 4, 8, 8)), 0.0)
+    bench.feed(LOWER, healthy(2, (1, 8, 5, 8, 8)), 0.0)
+    assert distances(bench.view) == [1.0, 2.0, 4.0]
+
+
+def broken(way, i):
+    """Return sweep and stamp of a laser with a fault, or None for silence."""
+    now_s = i * PERIOD_S
+    match way:
+        case "silent":
+            return None
+        case "stuck":
+            return sweep((8, 8, 8, 8, 8), 0.1), now_s
+        case "biased":
+            return sweep((8, 8, 3.5, 8, 8), 0.6), now_s
+        case "frozen":
+            return healthy(0, (8, 8, 8, 8, 8)), 0.0
+        case "late":
+            return healthy(i, (8, 8, 8, 8, 8)), now_s - 1.5
+    raise AssertionError(way)
+
+
+@pytest.mark.parametrize("bad", [LOWER, UPPER])
+@pytest.mark.parametrize("way", ["silent", "stuck", "biased", "frozen", "late"])
+def test_whatever_one_of_them_does_the_view_stays_fresh_and_right(bad, way):
+    bench, good = Bench(), 1 - bad
+    for i in range(100):
+        now_s = i * PERIOD_S
+        found = broken(way, i) if i >= 20 else (healthy(i + 1000), now_s)
+        if found is not None:
+            bench.feed(bad, *found)
+        bench.feed(good, healthy(i), now_s)
+        assert bench.view.fault == ""
+        assert now_s - bench.view.stamp_s <= 0.15, "the view is old"
+        if i > 30:
+            assert bench.view.stamp_s == now_s
+            assert distances(bench.view)[0] == 3.0
+
+
+@pytest.mark.parametrize("way", ["stuck", "biased"])
+def test_without_any_that_can_be_believed_there_is_no_view_and_a_reason(way):
+    bench = Bench()
+    for i in range(20):
+        for laser in (LOWER, UPPER):
+            bench.feed(laser, *broken(way, i))
+    assert "laser" in bench.view.fault
+    assert not len(bench.view.points)
+
+
+def test_if_both_are_silent_the_view_grows_old():
+    bench = Bench()
+    bench.feed(LOWER, healthy(1), 1.0)
+    assert bench.view.stamp_s == 1.0  # and no word since: its reader sees its age
+
+
+def test_one_that_comes_back_is_used_again():
+    bench = Bench()
+    for i in range(200):
+        now_s = i * PERIOD_S
+        bad = 20 <= i < 60
+        bench.feed(LOWER, sweep((8,) * 5, 0.1) if bad else healthy(i, (8, 8, 2, 8, 8)), now_s)
+        bench.feed(UPPER, healthy(i), now_s)
+    assert distances(bench.view) == [2.0]
+
+
+def test_lasers_that_differ_in_their_rays_are_not_mixed_ray_by_ray():
+    bench = Bench()
+    other = LaserScan(-1.0, 0.5, TOP_M, np.array([4, 4, 4], "<f4").tobytes(), 0.1001)
+    bench.feed(UPPER, other, 0.0)
+    bench.feed(LOWER, healthy(1), 0.0)
+    assert distances(bench.view) == [3.0]
+
+
+def test_a_number_that_is_none_hides_no_echo_of_the_other():
+    bench = Bench()
+    bench.feed(UPPER, healthy(1, (math.nan, 8, 3, 8, 8)), 0.0)
+    bench.feed(LOWER, healthy(2, (1, math.nan, math.nan, 8, 8)), 0.0)
+    assert distances(bench.view) == [1.0, 3.0]
+
+
+rays = st.lists(st.floats(0.25, 8.0, width=32), min_size=RAYS, max_size=RAYS)
+
+
+@given(rays, rays)
+def test_no_echo_of_either_is_lost_and_none_is_invented(a, b):
+    bench = Bench()
+    bench.feed(UPPER, healthy(1, a), 0.0)
+    bench.feed(LOWER, healthy(2, b), 0.0)
+    nearest = [min(x, y) for x, y in zip(a, b, strict=True)]
+    expected = sorted(r for r in nearest if r < TOP_M * (1 - 1e-6))
+    assert distances(bench.view) == pytest.approx(expected, abs=2e-3)

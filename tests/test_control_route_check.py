@@ -1,0 +1,141 @@
+"""Which routes may be driven: the planner's own may, and what a fault makes of them may not."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from random import Random
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from actors.control.closures import without
+from actors.control.route_search import plan_route
+from airport.formats import load_airport
+from airport.model import Airport, StartPose
+from airport.route_check import RouteCheck, RouteLimits
+
+AIRPORT = load_airport("vallombre")
+CHECK = RouteCheck(AIRPORT)
+PAVED = shapely.box(-3.0, -3.0, 33.0, 3.0).union(shapely.box(27.0, -3.0, 33.0, 30.0))
+CORNER = Airport("corner", {"A": (0.0, 0.0), "B": (30.0, 0.0), "C": (30.0, 27.0)},
+                 (("A", "B"), ("B", "C")), PAVED, StartPose(0.0, 0.0, 0.0))
+ALONG = ((0.0, 0.0), (30.0, 0.0), (30.0, 27.0))
+
+
+def fault(*waypoints, robot=None, goal=None, airport=CORNER):
+    return RouteCheck(airport).fault(waypoints, robot, goal)
+
+
+def places():
+    return st.sampled_from(AIRPORT.edges).flatmap(lambda edge: st.tuples(
+        st.just(edge), st.floats(0, 1), st.floats(-1.2, 1.2), st.floats(-1.2, 1.2)))
+
+
+def at(place):
+    (a, b), share, dx, dy = place
+    (x0, y0), (x1, y1) = AIRPORT.nodes[a], AIRPORT.nodes[b]
+    return x0 + share * (x1 - x0) + dx, y0 + share * (y1 - y0) + dy
+
+
+@settings(max_examples=60, deadline=None)
+@given(places(), places(), st.booleans())
+def test_every_route_that_the_planner_finds_is_a_good_one(start, goal, straight):
+    robot, target = at(start), at(goal)
+    plan = plan_route(AIRPORT.nodes, AIRPORT.edges, robot, target, straight=straight)
+    assert plan.waypoints
+    assert CHECK.fault(plan.waypoints, robot, target) == ""
+
+
+@settings(max_examples=60, deadline=None)
+@given(places(), places(), places())
+def test_so_is_every_way_round_something(start, goal, blocked):
+    nodes, edges = without(AIRPORT.nodes, AIRPORT.edges, [at(blocked)], 1.0)
+    plan = plan_route(nodes, edges, at(start), at(goal))
+    if plan.waypoints:
+        assert CHECK.fault(plan.waypoints, at(start), at(goal)) == ""
+
+
+@settings(max_examples=60, deadline=None)
+@given(places(), places())
+def test_a_straight_way_to_the_goal_is_good_only_if_it_runs_along_the_graph_on_pavement(a, b):
+    robot, target = at(a), at(b)
+    line = shapely.LineString([robot, target])
+    graph = shapely.union_all([
+        shapely.LineString([AIRPORT.nodes[p], AIRPORT.nodes[q]]) for p, q in AIRPORT.edges])
+    if CHECK.fault((robot, target), robot, target) == "":
+        assert shapely.covers(AIRPORT.allowed, line)
+        clearance_m = shapely.distance(AIRPORT.allowed.boundary, line)
+        assert clearance_m >= RouteLimits().clearance_m
+        for share in np.linspace(0, 1, 20):
+            point = line.interpolate(share, normalized=True)
+            near_end = min(math.dist(robot, (point.x, point.y)) / 12.5,
+                           math.dist(target, (point.x, point.y)) / 3.2)
+            assert near_end <= 1.0 or shapely.distance(graph, point) <= 2.0
+
+
+def test_a_straight_way_to_the_goals_of_the_missions_is_refused_but_along_runways_and_apron():
+    here, refused = (AIRPORT.start.x_m, AIRPORT.start.y_m), []
+    for goal in AIRPORT.missions["AB"].goals:
+        there = (goal.x_m, goal.y_m)
+        refused.append(bool(CHECK.fault((here, there), here, there)))
+        here = there
+    assert refused == [True, False, True, False, False]
+
+
+@settings(max_examples=40, deadline=None)
+@given(places(), places(), st.integers(0, 10**6))
+def test_a_route_that_is_shifted_as_a_whole_is_noticed_by_its_end(start, goal, seed):
+    draw = Random(seed)
+    shift = [draw.choice((-1, 1)) * draw.uniform(0.5, 3.0) for _ in "xy"]
+    plan = plan_route(AIRPORT.nodes, AIRPORT.edges, at(start), at(goal))
+    moved = tuple((x + shift[0], y + shift[1]) for x, y in plan.waypoints)
+    assert "from the goal" in CHECK.fault(moved, at(start), at(goal))
+
+
+FAULTS = {
+    "all is well": (ALONG, (0.5, 0.4), (30.0, 27.0), ""),
+    "only a point": (((5.0, 0.0),), (5.0, 1.0), (5.0, 0.0), ""),
+    "nothing": ((), None, None, "no waypoints"),
+    "not a number": (((0.0, 0.0), (math.nan, 0.0)), None, None, "not finite"),
+    "it ends elsewhere": (ALONG, None, (30.0, 20.0), "ends at (30.0, 27.0), 7.0 m from the goal"),
+    "it begins elsewhere": (ALONG, (10.0, 3.5), None, "3.5 m from the route"),
+    "the robot is on its way": (ALONG, (30.5, 14.0), (30.0, 27.0), ""),
+    "across the grass": (((0.0, 0.0), (30.0, 27.0)), None, None, "leg 1 from (0.0, 0.0) to "
+                         "(30.0, 27.0) crosses the prohibited area"),
+    "along the edge": (((0.0, 0.0), (27.0, 2.6), (30.0, 27.0)), None, None,
+                       "passes 0.40 m from the prohibited area, 0.60 m is the least"),
+    "over pavement where no edge is": (((0.0, 1.9), (26.0, 1.9)), None, None,
+                                       "leg 1 from (0.0, 1.9) to (26.0, 1.9) lies on no edge"),
+    "back to the graph": (((2.0, 2.2), (3.0, 0.0), (30.0, 0.0)), (2.0, 2.2), None, ""),
+    "off the graph to the goal": (((0.0, 0.0), (20.0, 0.0), (20.0, 2.2)), None, None, ""),
+    "off the graph on the way": (((0.0, 0.0), (9.0, 0.0), (9.0, 2.2), (20.0, 2.2), (20.0, 0.0),
+                                  (30.0, 0.0)), None, None, "leg 2"),
+    "too far along beside it": (((0.0, 0.0), (5.0, 0.0), (25.0, 2.2)), None, None,
+                                "leg 2 from (5.0, 0.0) to (25.0, 2.2) ends off the graph"),
+}
+
+
+@pytest.mark.parametrize("case", FAULTS.values(), ids=FAULTS.keys())
+def test_a_route_is_refused_with_the_leg_and_the_reason(case):
+    waypoints, robot, goal, expected = case
+    found = fault(*waypoints, robot=robot, goal=goal)
+    assert (found == "") == (expected == "")
+    assert expected in found
+
+
+def test_a_graph_whose_edge_crosses_the_grass_is_noticed_by_the_route_over_it():
+    wrong = Airport("wrong", CORNER.nodes, (*CORNER.edges, ("A", "C")), PAVED,
+                    StartPose(0.0, 0.0, 0.0))
+    plan = plan_route(wrong.nodes, wrong.edges, (0.0, 0.0), (30.0, 27.0))
+    assert len(plan.waypoints) == 2
+    assert "crosses the prohibited area" in fault(*plan.waypoints, airport=wrong)
+
+
+def test_without_a_graph_no_route_is_good():
+    bare = Airport("bare", {"A": (0.0, 0.0)}, (), PAVED, StartPose(0.0, 0.0, 0.0))
+    legs = list(itertools.pairwise(ALONG))
+    assert all("no edge" in fault(*leg, airport=bare) for leg in legs)

@@ -1,0 +1,249 @@
+"""The voted DM1: one wrong receiver neither trips it nor blinds it."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import pytest
+from detection_timeline import Ear
+from localization_drive import LEGS, Reading, Truth, disturbed, drive, fault
+from shapely.geometry import box
+from virtual_loop import System, run, shipped_system
+
+from actors import messages as m
+from actors import topics
+from actors.detection.geofence import Fix
+from actors.detection.position_vote import GPS, WHEELS, PositionVote
+from actors.detection.voted_area import VotedArea, VotedPosition
+from actors.runtime.actor import Actor
+from actors.runtime.wiring import Member, heard
+from airport.model import Airport, StartPose
+from sim.faults import SENSOR_FAULTS
+
+END_S = sum(leg[0] for leg in LEGS)
+FROM_S = 4.0
+SENSORS = ("gps", "imu", "odom", "absolute-pose")
+KEYS = [t.key for t in (topics.GPS, topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE)]
+NAMES = [name for name in SENSOR_FAULTS if name.startswith(SENSORS)]
+NAMES += [f"{mode}:{key}" for mode in ("drop", "freeze", "delay", "corrupt") for key in KEYS]
+
+
+def follow(*faults, seed=1, blind_s=10.0, blind_m=5.0):
+    """Drive with faults; return the worst error beyond its bound, and how long it knew nothing."""
+    where = VotedPosition(0.05, blind_s, blind_m)
+    worst_m, unknown, seen_s, looked_s = 0.0, 0.0, 0.0, 0.0
+    truth = None
+    for now_s, item in disturbed(faults, seed):
+        if isinstance(item, Truth):
+            truth = item
+            unknown = max(unknown, now_s - seen_s)
+            continue
+        feed(where, item, now_s)
+        if item.topic is not topics.GPS and now_s - looked_s < 0.1:
+            continue
+        looked_s, found = now_s, where.look(now_s)
+        if found is None or truth is None:
+            continue
+        fix, stamp_s = found
+        seen_s = now_s
+        x_m, y_m, _ = truth.at(stamp_s)
+        off_m = math.dist((fix.x_m, fix.y_m), (x_m, y_m))
+        worst_m = max(worst_m, off_m - fix.accuracy_m)
+    return worst_m, unknown
+
+
+def feed(where: VotedPosition, item: Reading, now_s: float) -> None:
+    body, stamp_s = item.body, item.stamp_s
+    if item.topic is topics.IMU:
+        where.vote.track.imu(stamp_s, body.yaw_rad, body.yaw_rate_radps)
+    elif item.topic is topics.ODOMETRY:
+        where.odometry(stamp_s, body.pose.yaw_rad, body.twist.linear_mps)
+    elif item.topic is topics.GPS:
+        where.gps(Fix(body.x_m, body.y_m, body.velocity_x_mps, body.velocity_y_mps,
+                      body.accuracy_m), stamp_s, now_s)
+    else:
+        where.vote.see_position(stamp_s, (body.x_m, body.y_m), now_s)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_without_a_fault_it_is_the_gps_fix(seed):
+    worst_m, unknown_s = follow(seed=seed)
+    assert worst_m < 0.06
+    assert unknown_s < 0.15
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("how", ["permanent", "intermittent"])
+def test_any_single_fault_leaves_it_a_position_that_is_right_to_decimetres(name, how):
+    what = fault(name) if how == "permanent" else fault(name, on_s=0.7, off_s=1.6)
+    worst_m, unknown_s = follow((what, FROM_S, math.inf))
+    assert worst_m < 0.4
+    assert unknown_s < 0.45  # shorter than the module's patience
+
+
+@pytest.mark.parametrize("names", [
+    ("gps-dropout", "absolute-pose-dropout"), ("gps-stuck", "absolute-pose-dropout"),
+    ("gps-bias", "absolute-pose-bias"), ("gps-dropout", "odom-dropout"),
+    ("absolute-pose-dropout", "odom-dropout"),
+])
+def test_after_two_faults_it_knows_nothing_beyond_the_bound_rather_than_something_wrong(names):
+    worst_m, unknown_s = follow(*((fault(name), FROM_S + 3 * i, math.inf)
+                                  for i, name in enumerate(names)))
+    assert worst_m < 0.6
+    assert unknown_s > 3.0
+
+
+def test_how_long_and_how_far_it_goes_on_blind_is_bounded():
+    both = [(fault(name), FROM_S, math.inf) for name in ("gps-dropout", "absolute-pose-dropout")]
+    by_way = follow(*both, blind_s=1000.0, blind_m=2.0)[1]
+    by_time = follow(*both, blind_s=1.0, blind_m=1000.0)[1]
+    never = follow(*both, blind_s=1000.0, blind_m=1000.0)[1]
+    assert END_S - FROM_S - 4.0 < by_way < by_time
+    assert by_time == pytest.approx(END_S - FROM_S - 1.0, abs=0.5)
+    assert never < 0.3
+
+
+def vote(a, gps, wheels_mps, seconds=3.0, start=0.0):
+    """A robot that drives along x with 1 m/s; a, gps: functions of time to an error along y."""
+    it = PositionVote("a")
+    for i in range(round(seconds * 50)):
+        t = start + 0.02 * i
+        it.track.imu(t, 0.0, 0.0)
+        it.track.odometry(t, 0.0, wheels_mps)
+        if i % 5 == 0 and a is not None:
+            it.see_position(t, (t, a(t)), t)
+        if i % 5 == 0 and gps is not None:
+            it.see_gps(Fix(t, gps(t), 1.0, 0.0, 0.02), t, t)
+    return it, start + 0.02 * (round(seconds * 50) - 1)
+
+
+def none(_t):
+    return 0.0
+
+
+def jump(t):
+    return 2.0 if t > 1.0 else 0.0
+
+
+def drift(t):
+    return 0.3 * max(0.0, t - 1.0)
+
+
+@pytest.mark.parametrize(("a", "gps", "wheels_mps", "agreeing", "outlier"), [
+    pytest.param(none, none, 1.0, ("a", GPS), "", id="all agree"),
+    pytest.param(none, none, 0.5, ("a", GPS), "", id="the wheels are wrong"),
+    pytest.param(jump, none, 1.0, (GPS, WHEELS), "a", id="a is wrong at once"),
+    pytest.param(none, jump, 1.0, ("a", WHEELS), GPS, id="GPS is wrong at once"),
+    pytest.param(drift, none, 1.0, (GPS, WHEELS), "a", id="a drifts"),
+    pytest.param(none, drift, 1.0, ("a", WHEELS), GPS, id="GPS drifts"),
+    pytest.param(None, none, 1.0, (GPS, WHEELS), "", id="a is missing"),
+    pytest.param(none, None, 1.0, ("a", WHEELS), "", id="GPS is missing"),
+    pytest.param(None, drift, 0.5, (), "", id="a is missing, GPS and the wheels differ"),
+    pytest.param(None, None, 1.0, (), "", id="both are missing"),
+    pytest.param(jump, drift, 0.0, (), "", id="three witnesses, three stories"),
+])
+def test_two_out_of_three(a, gps, wheels_mps, agreeing, outlier):
+    it, now_s = vote(a, gps, wheels_mps)
+    assert (it.agreeing(now_s), it.outlier) == (agreeing, outlier)
+
+
+def test_who_was_wrong_is_believed_again_when_it_agrees():
+    it, now_s = vote(lambda t: 2.0 if 1.0 < t < 2.0 else 0.0, none, 1.0)
+    assert (it.agreeing(now_s), it.outlier) == (("a", GPS), "")
+
+
+# ---- the actor -----------------------------------------------------------------------------------
+
+
+class Robot(Actor):
+    outputs = (topics.ABSOLUTE_POSE, topics.GPS, topics.IMU, topics.ODOMETRY)
+
+
+def lane() -> Airport:
+    return Airport("lane", {"a": (0.0, 0.0), "b": (40.0, 0.0)}, (("a", "b"),),
+                   box(-5.0, -2.5, 45.0, 2.5), StartPose(0.0, 0.0, 0.0))
+
+
+def states(gps_y_m, pose_y_m, seconds=6.0, gps=True, pose=True):
+    """Drive along the lane with 1 m/s; return the states that the actor reports."""
+
+    async def scenario():
+        async with System(system=shipped_system(), airport=lane()) as system:
+            ear = system.start("ear", Ear)
+            robot = system.start("robot", Robot)
+            system.start("DM1", VotedArea, margin_m=0.6, blind_s=2.0, blind_m=2.0)
+            await system.settle()
+            for i in range(round(seconds * 20)):
+                t = 0.05 * i
+                late = t >= 2.0
+                robot.publish(topics.IMU, m.Imu(0.0, 0.001 * i, 0.0, 0.0))
+                robot.publish(topics.ODOMETRY, m.Odometry(m.Pose(t, 0.0, 0.0), m.Twist(1.0, 0.0)))
+                if pose or not late:
+                    robot.publish(topics.ABSOLUTE_POSE, m.Pose(t, pose_y_m if late else 0.0, 0.0))
+                if i % 2 == 0 and (gps or not late):
+                    robot.publish(topics.GPS, m.GpsFix(t, gps_y_m if late else 0.0, 1.0, 0.0, 0.05))
+                await asyncio.sleep(0.05)
+            return ear.states, ear.heard[-1][1].reason
+
+    return run(scenario)
+
+
+@pytest.mark.parametrize(("gps_y_m", "pose_y_m", "gps", "pose", "expected"), [
+    pytest.param(0.0, 0.0, True, True, ["idle"], id="in the lane"),
+    pytest.param(2.3, 0.0, True, True, ["idle"], id="GPS alone says it is on the grass"),
+    pytest.param(0.0, 2.3, True, True, ["idle"], id="the absolute pose alone says so"),
+    pytest.param(2.3, 2.3, True, True, ["idle", "active"], id="both say so"),
+    pytest.param(0.0, 0.0, False, True, ["idle"], id="GPS is silent"),
+    pytest.param(0.0, 0.0, True, False, ["idle"], id="the absolute pose is silent"),
+    pytest.param(0.0, 0.0, False, False, ["idle", "active"], id="both are silent for 4 m"),
+])
+def test_the_actor_needs_two(gps_y_m, pose_y_m, gps, pose, expected):
+    assert states(gps_y_m, pose_y_m, gps=gps, pose=pose)[0] == expected
+
+
+def test_its_reason_says_what_it_misses():
+    assert states(0.0, 0.0, gps=False, pose=False)[1] == (
+        "position that two sources agree on not updated for 0.5 s")
+
+
+def test_a_receiver_that_is_stuck_does_not_blind_it():
+    """The robot leaves the lane while GPS repeats its last fix: the other two see it."""
+
+    async def scenario():
+        async with System(system=shipped_system(), airport=lane()) as system:
+            ear = system.start("ear", Ear)
+            robot = system.start("robot", Robot)
+            system.start("DM1", VotedArea, margin_m=0.6)
+            await system.settle()
+            x_m = y_m = 0.0
+            for i in range(100):
+                away = i >= 40
+                x_m, y_m = (x_m, y_m + 0.05) if away else (x_m + 0.05, y_m)
+                heading = math.pi / 2 if away else 0.0
+                robot.publish(topics.IMU, m.Imu(heading, 0.001 * i, 0.0, 0.0))
+                robot.publish(topics.ODOMETRY, m.Odometry(
+                    m.Pose(x_m, y_m, heading), m.Twist(1.0, 0.0)))
+                robot.publish(topics.ABSOLUTE_POSE, m.Pose(x_m, y_m, heading))
+                if i % 2 == 0:
+                    robot.publish(topics.GPS, m.GpsFix(
+                        x_m, 0.0, 0.0 if away else 1.0, 0.0, 0.05))
+                await asyncio.sleep(0.05)
+                if ear.states[-1:] == ["active"]:
+                    return y_m
+            return math.inf
+
+    assert run(scenario) < 2.5 - 0.5 - 0.25  # half the robot and its braking distance
+
+
+def test_it_does_not_hear_the_localization_that_it_guards():
+    assert set(heard(Member("DM1", VotedArea, {}))) == {
+        "summit_xl/gps", "summit_xl/imu", "summit_xl/odom", "summit_xl/absolute_pose"}
+
+
+def test_the_drive_leaves_no_doubt_that_the_faults_matter():
+    """With GPS alone, as the paper's DM1, the bias would be the error."""
+    fixes = [item for _, item in disturbed([(fault("gps-bias"), FROM_S, math.inf)])
+             if isinstance(item, Reading) and item.topic is topics.GPS]
+    honest = [item for item in drive() if isinstance(item, Reading) and item.topic is topics.GPS]
+    assert fixes[-1].body.x_m - honest[-1].body.x_m == pytest.approx(1.5)
