@@ -12,6 +12,7 @@ recovery modules themselves, and adopts it; until it knows, it releases nothing.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -201,12 +202,17 @@ class FtmManager(Actor):
         state = self.arbiter_state
         return m.ManagerStatus(state.active, state.silent, state.activated, state.latched,
                                self._strategy, state.number, tuple(
-                                   m.DetectionView(t.name, t.active, t.reason, t.nodes)
+                                   _view(t.name, t.active, t.reason, t.nodes)
                                    for t in state.detections))
 
     def _show(self) -> None:
         self._shown = self._status()
         self.publish(topics.MANAGER_STATUS, self._shown)
+
+
+@lru_cache(maxsize=256)
+def _view(name: str, active: bool, reason: str, nodes: tuple[str, ...]) -> m.DetectionView:
+    return m.DetectionView(name, active, reason, nodes)  # for nearly every message: the same again
 
 
 def forgive_absence(state: State, missed_s: float) -> State:
