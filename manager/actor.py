@@ -184,7 +184,8 @@ class FtmManager(Actor):
                         output.decision.rule, output.decision.recoveries, output.taken))
                 case ResetAnswered(granted=False):
                     self.report_diagnostic("reset refused", output.reason, output.recovery)
-        if self._status() != self._shown:
+        if (outputs or not _says_all_is_well(event) or self._shown is None
+                or not _is_calm(self._shown)) and self._status() != self._shown:
             self._show()
 
     def _command(self, command: Command) -> None:
@@ -208,6 +209,24 @@ class FtmManager(Actor):
     def _show(self) -> None:
         self._shown = self._status()
         self.publish(topics.MANAGER_STATUS, self._shown)
+
+
+def _says_all_is_well(event: Input) -> bool:
+    """Whether a report, in a system in which all is well, changes nothing that could be shown.
+
+    Such reports are nearly all that the manager hears, and to look for a change costs as much as
+    to hear one.
+    """
+    match event:
+        case DetectionHeard():
+            return not event.active
+        case RecoveryHeard():
+            return not event.activated
+    return False
+
+
+def _is_calm(status: m.ManagerStatus) -> bool:
+    return not (status.active or status.silent or status.activated or status.latched)
 
 
 @lru_cache(maxsize=256)
