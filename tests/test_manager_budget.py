@@ -139,7 +139,8 @@ def test_what_comes_too_late_is_named(change, late):
 
 
 def test_a_guard_that_is_switched_off_needs_no_time():
-    layers = changed(SPEC.layers, safety_pilot_checks=False, dead_man=False, manager_watch=False, ftm=False)
+    layers = changed(SPEC.layers, safety_pilot_checks=False, dead_man=False, manager_watch=False,
+                     ftm=False)
     assert [b.name for b in check(changed(SPEC, layers=layers))] == ["safety_pilot"]
 
 
