@@ -14,6 +14,7 @@ emergency stop does not wait for a disk, and what a command says its module know
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -201,7 +202,8 @@ class FtmManager(Actor):
                         output.decision.rule, output.decision.recoveries, output.taken))
                 case ResetAnswered(granted=False):
                     self.report_diagnostic("reset refused", output.reason, output.recovery)
-        if self._status() != self._shown:
+        if (outputs or not _says_all_is_well(event) or self._shown is None
+                or not _is_calm(self._shown)) and self._status() != self._shown:
             self._show()
         if (self.arbiter_state.number, self.arbiter_state.latched) != self._remembered:
             self.remember()
@@ -221,12 +223,35 @@ class FtmManager(Actor):
         state = self.arbiter_state
         return m.ManagerStatus(state.active, state.silent, state.activated, state.latched,
                                self._strategy, state.number, tuple(
-                                   m.DetectionView(t.name, t.active, t.reason, t.nodes)
+                                   _view(t.name, t.active, t.reason, t.nodes)
                                    for t in state.detections))
 
     def _show(self) -> None:
         self._shown = self._status()
         self.publish(topics.MANAGER_STATUS, self._shown)
+
+
+def _says_all_is_well(event: Input) -> bool:
+    """Whether a report, in a system in which all is well, changes nothing that could be shown.
+
+    Such reports are nearly all that the manager hears, and to look for a change costs as much as
+    to hear one.
+    """
+    match event:
+        case DetectionHeard():
+            return not event.active
+        case RecoveryHeard():
+            return not event.activated
+    return False
+
+
+def _is_calm(status: m.ManagerStatus) -> bool:
+    return not (status.active or status.silent or status.activated or status.latched)
+
+
+@lru_cache(maxsize=256)
+def _view(name: str, active: bool, reason: str, nodes: tuple[str, ...]) -> m.DetectionView:
+    return m.DetectionView(name, active, reason, nodes)  # for nearly every message: the same again
 
 
 def forgive_absence(state: State, missed_s: float) -> State:

@@ -17,7 +17,8 @@ v^2 / 2b the braking distance, the robot may wait at most
 * *parent*: the time in which the mechanism above detects the consequence. A respawn that takes
   longer than that is still safe, the mechanism above stops the robot, but it has masked nothing.
 * an *obstacle*, for the Safety Pilot and for the base's own dead man: `(stop distance - v^2/2b)
-  / v`; when the Safety Pilot dies, an obstacle may be just beyond the stop distance.
+  / v`; when the Safety Pilot dies, or its last sweep of the laser was made, an obstacle may be
+  just beyond the stop distance.
 
 The respawn counts where the recovery brings a node back (backward, masking), for then only the
 node's first message ends the error.
@@ -136,6 +137,8 @@ def derive_timeouts(robot: Robot | None, timing: Timing) -> Timing:
         "localization_timeout_s": noticed_s,
         "detection_silence_timeout_s": noticed_s,
         "manager_timeout_s": SHARE * (drift - timing.control_period_s - timing.actuation_s),
+        "scan_timeout_s": SHARE * (
+            time_to_obstacle_s(robot) - timing.control_period_s - timing.actuation_s),
         "dead_man_timeout_s": SHARE * time_to_obstacle_s(robot),
     }
     for field, value in derived.items():
@@ -167,6 +170,7 @@ def find_false_alarms(spec: SystemSpec) -> Iterator[tuple[str, float, str]]:
             ("heartbeat_timeout_s", "heartbeat_period_s"),
             ("command_timeout_s", "control_period_s"),
             ("localization_timeout_s", "control_period_s"),
+            ("scan_timeout_s", "control_period_s"),
             ("dead_man_timeout_s", "control_period_s"),
             ("manager_timeout_s", "manager_period_s"),
             ("detection_silence_timeout_s", "detection_period_s")):
@@ -234,6 +238,9 @@ def _of_guards(spec: SystemSpec) -> Iterator[Budget]:
     # The Safety Pilot decides in its own cycle: one to see, one to command.
     yield Budget("safety_pilot", collision, obstacle_s, timing.control_period_s,
                  timing.control_period_s, timing.actuation_s)
+    if spec.layers.safety_pilot_checks:
+        yield Budget("blind_pilot", collision, obstacle_s, timing.scan_timeout_s,
+                     timing.control_period_s, timing.actuation_s)
     if spec.layers.dead_man:
         yield Budget("dead_man", collision, obstacle_s, timing.dead_man_timeout_s, 0.0, 0.0)
     if spec.layers.manager_watch and spec.layers.ftm:

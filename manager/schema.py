@@ -99,6 +99,7 @@ class Timing(Table, frozen=True):
         heartbeat_timeout_s: Without heartbeat for so long, a node counts as crashed (DM4, 5, 7).
         command_timeout_s: Without new command for so long, it is stale (DM2).
         localization_timeout_s: Without new pose for so long, it is stale (DM6).
+        scan_timeout_s: A laser sweep older than this shows nothing: the Safety Pilot stops.
         dead_man_timeout_s: Without command for so long, the base brakes by itself.
         manager_timeout_s: Without manager status for so long, the Safety Pilot stops.
         detection_silence_timeout_s: Without report for so long, a detection module counts as
@@ -118,6 +119,7 @@ class Timing(Table, frozen=True):
     heartbeat_timeout_s: Positive = DERIVED
     command_timeout_s: Positive = DERIVED
     localization_timeout_s: Positive = DERIVED
+    scan_timeout_s: Positive = DERIVED
     dead_man_timeout_s: Positive = DERIVED
     manager_timeout_s: Positive = DERIVED
     detection_silence_timeout_s: Positive = DERIVED

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from actors.runtime.virtual_bus import Link
 from sim.timing import Timing, drawer, measured
 
 __all__ = ["NETWORKS", "NetworkModel", "SeededNetwork", "find_network"]
@@ -86,37 +87,59 @@ class SeededNetwork:
         self._rng = random.Random(f"network {seed}")  # noqa: S311 no secret
         self._delay_s = drawer((timing or measured()).message_ms, self._rng)
         self._local = frozenset(local)
-        self._last: dict[tuple[str, str], float] = {}
-        self._plain = not (model.loss or model.duplication or model.reordering)
+        self._links: dict[tuple[str, str], Link] = {}
 
-    def arrivals(self, source: str, reader: str, now_s: float) -> Sequence[float]:
-        """Return the times at which copies of a message sent now arrive; none if it is lost."""
-        if reader in self._local or source in self._local:
-            return (now_s,)
-        if self._plain:
-            return (self._arrival((source, reader), now_s),)
-        model, dice = self.model, self._rng.random
-        if dice() < model.loss:
-            self.lost += 1
-            return ()
-        if dice() < model.duplication:
-            self.duplicated += 1
-            link = (source, reader)
-            return (self._arrival(link, now_s), self._arrival(link, now_s))
-        return (self._arrival((source, reader), now_s),)
+    def link(self, source: str, reader: str) -> Link | None:
+        """Return the one link between two nodes; None if everything arrives at once."""
+        if source in self._local or reader in self._local:
+            return None
+        ends = (source, reader)
+        link = self._links.get(ends)
+        if link is None:
+            model = self.model
+            plain = not (model.extra_s or model.loss or model.duplication or model.reordering)
+            link = self._links[ends] = (
+                self._in_order() if plain and model.delay else self._troubled())
+        return link
 
-    def _arrival(self, link: tuple[str, str], now_s: float) -> float:
-        model = self.model
-        at_s = now_s
-        if model.delay:
-            at_s += self._delay_s()
-        if model.extra_s:
-            at_s += model.extra_s * self._rng.random()
-        last_s = self._last.get(link, 0.0)
-        if at_s < last_s:
-            if model.reordering and self._rng.random() < model.reordering:
-                self.overtaken += 1
-                return at_s
-            at_s = last_s
-        self._last[link] = at_s
-        return at_s
+    def _in_order(self) -> Link:
+        """Return a link that delays messages and does no more: most runs have only these."""
+        delay_s, last_s = self._delay_s, 0.0
+
+        def arrivals(now_s: float) -> Sequence[float]:
+            nonlocal last_s
+            at_s = now_s + delay_s()
+            last_s = max(last_s, at_s)
+            return (last_s,)
+
+        return arrivals
+
+    def _troubled(self) -> Link:
+        """Return a link that does to messages whatever the model says."""
+        model, dice, last_s = self.model, self._rng.random, 0.0
+
+        def arrivals(now_s: float) -> Sequence[float]:
+            if model.loss and dice() < model.loss:
+                self.lost += 1
+                return ()
+            if model.duplication and dice() < model.duplication:
+                self.duplicated += 1
+                return (arrival(now_s), arrival(now_s))
+            return (arrival(now_s),)
+
+        def arrival(now_s: float) -> float:
+            nonlocal last_s
+            at_s = now_s
+            if model.delay:
+                at_s += self._delay_s()
+            if model.extra_s:
+                at_s += model.extra_s * dice()
+            if at_s < last_s:
+                if model.reordering and dice() < model.reordering:
+                    self.overtaken += 1
+                    return at_s
+                at_s = last_s
+            last_s = at_s
+            return at_s
+
+        return arrivals

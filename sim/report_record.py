@@ -125,6 +125,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
         seed: of everything random.
         rate: simulated seconds per second.
         faults: that were planned, and what became of them.
+        narrowest_s: when the robot was nearest to an obstacle, a building or the prohibited area.
     """
 
     run_id: str
@@ -152,6 +153,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     rate: float
     faults: tuple[FaultOutcome, ...] = ()
+    narrowest_s: float | None = None
 
 
 class RunRecorder:
@@ -186,6 +188,7 @@ class RunRecorder:
         self._prohibited_s = 0.0
         self._obstacle_clearance_m = math.inf
         self._prohibited_clearance_m = math.inf
+        self._narrowest_s: float | None = None
         self._injections: dict[str, str] = {}
         self._take: dict[str, Callable[[Any, Header], None]] = {
             topics.TRUTH.key: self._truth,
@@ -245,6 +248,7 @@ class RunRecorder:
             prohibited_s=self._prohibited_s,
             obstacle_clearance_m=_finite(self._obstacle_clearance_m),
             prohibited_clearance_m=_finite(self._prohibited_clearance_m),
+            narrowest_s=self._narrowest_s,
         )
 
     # -- one method per topic -------------------------------------------------------------------
@@ -253,6 +257,9 @@ class RunRecorder:
         _append(self._track, header.stamp, truth.pose)
         self._collisions = max(self._collisions, truth.collisions)
         self._prohibited_s = max(self._prohibited_s, truth.prohibited_s)
+        if min(truth.obstacle_clearance_m, truth.prohibited_clearance_m) < min(
+                self._obstacle_clearance_m, self._prohibited_clearance_m):
+            self._narrowest_s = header.stamp
         self._obstacle_clearance_m = min(self._obstacle_clearance_m, truth.obstacle_clearance_m)
         self._prohibited_clearance_m = min(
             self._prohibited_clearance_m, truth.prohibited_clearance_m)

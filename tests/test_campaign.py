@@ -28,6 +28,7 @@ from sim.campaign.statistics import badness, rate, spread, table, total, worst
 from sim.campaign.store import Run, Store, StoreError
 from sim.scenario import FaultOutcome, PlannedFault
 from toolbox import systems
+from toolbox.campaigning import ProgressLog
 from toolbox.main import main as rampart
 
 SYSTEM = systems.load(None)
@@ -387,3 +388,12 @@ def test_a_run_is_replayed_by_its_key_and_recognised(tmp_path, capsys):
 def test_patterns_choose_faults_by_name(capsys):
     assert rampart(["campaign", "--list", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {k: list(v) for k, v in GROUPS.items()}
+
+
+def test_a_log_gets_a_line_a_minute_with_the_time_left_and_one_at_the_end():
+    log = ProgressLog(total=30, done=10)
+    lines = [log.made_one(now_s, unsafe=0) for now_s in range(100, 300, 10)]
+    assert lines[:6] == [""] * 6
+    assert lines[6] == "17 of 30 runs, 0 unsafe with FTM, 2 min left"  # 13 left, 10 s each
+    assert [i for i, line in enumerate(lines) if line] == [6, 12, 18, 19]
+    assert lines[-1] == "30 of 30 runs, 0 unsafe with FTM"

@@ -342,6 +342,19 @@ def test_a_track_is_shown_with_its_moments_in_order_and_the_command_to_repeat_it
     assert page.count("<section") == 1
 
 
+def test_the_close_up_of_a_safe_run_shows_where_it_was_narrowest():
+    made = run("kill:hmi", detected_after_s=1.0, prohibited_m=0.25)
+    record = msgspec.structs.replace(record_of(made), narrowest_s=20.0)
+    page = render(OUT, ABOUT, [made], (), {made.job.key: record})
+    card = page[page.index("<section"):page.index("</section>") + len("</section>")]
+    moments = [(row[0], row[2]) for row in Tables(card).rows]
+    assert ("0:20.0", "smallest margin") in moments
+    assert 'class="map close" viewBox="-0.5 -7.5 9.0 9.0"' in card  # round (4, 3)
+    unsafe = run("kill:hmi", safe=False, unsafe_s=12.0)
+    page = render(OUT, ABOUT, [unsafe], (), {unsafe.job.key: record})
+    assert ">smallest margin<" not in page
+
+
 def test_a_run_that_has_no_track_is_shown_without_a_map():
     made = run("kill:hmi", success=False)
     page = render(OUT, ABOUT, [made], (), {made.job.key: record_of(made, track=())})

@@ -70,14 +70,14 @@ def test_the_numbers_of_the_shipped_robot():
     assert time_to_intrusion_s(ROBOT, 0.6) == pytest.approx(0.3)
     timing = SPEC.timing
     assert (timing.command_timeout_s, timing.localization_timeout_s, timing.manager_timeout_s,
-            timing.detection_silence_timeout_s, timing.dead_man_timeout_s,
-            timing.heartbeat_timeout_s) == (0.99, 0.99, 0.99, 0.99, 0.495, 0.44)
+            timing.detection_silence_timeout_s, timing.scan_timeout_s, timing.dead_man_timeout_s,
+            timing.heartbeat_timeout_s) == (0.99, 0.99, 0.99, 0.99, 0.36, 0.495, 0.44)
 
 
 def test_everything_in_the_shipped_system_fits():
     budgets = {budget.name: budget for budget in check(SPEC)}
-    assert {"FTM1", "FTM2", "FTM3", "FTM4", "FTM5", "FTM6", "FTM7", "safety_pilot", "dead_man",
-            "manager_watch", "silent_detection"} == set(budgets)
+    assert {"FTM1", "FTM2", "FTM3", "FTM4", "FTM5", "FTM6", "FTM7", "safety_pilot",
+            "blind_pilot", "dead_man", "manager_watch", "silent_detection"} == set(budgets)
     assert all(budget.fits for budget in budgets.values())
     assert not list(find_false_alarms(SPEC))
 
@@ -128,17 +128,19 @@ def test_derived_timeouts_always_fit_whatever_the_robot(speed, brake, clearance,
 
 @pytest.mark.parametrize(("change", "late"), [
     ({"respawn_s": 0.401}, {"FTM4", "FTM5", "FTM7"}),
+    ({"scan_timeout_s": 0.401}, {"blind_pilot"}),
     ({"dead_man_timeout_s": 0.551}, {"dead_man"}),
     ({"manager_timeout_s": 1.101}, {"manager_watch"}),
     ({"detection_silence_timeout_s": 1.101}, {"silent_detection"}),
-    ({"actuation_s": 0.151}, {"FTM1", "FTM4", "FTM5", "FTM7"}),
+    ({"actuation_s": 0.151}, {"FTM1", "FTM4", "FTM5", "FTM7", "blind_pilot"}),
 ])
 def test_what_comes_too_late_is_named(change, late):
     assert late == {budget.name for budget in check(with_timing(**change)) if not budget.fits}
 
 
 def test_a_guard_that_is_switched_off_needs_no_time():
-    layers = changed(SPEC.layers, dead_man=False, manager_watch=False, ftm=False)
+    layers = changed(SPEC.layers, safety_pilot_checks=False, dead_man=False, manager_watch=False,
+                     ftm=False)
     assert [b.name for b in check(changed(SPEC, layers=layers))] == ["safety_pilot"]
 
 
@@ -148,9 +150,10 @@ def test_a_budget_explains_itself():
         "0.400) of 0.990 s before DM2 of FTM2 detects the consequence")
 
 
-def test_all_six_timeouts_are_guarded_against_false_alarms():
+def test_all_timeouts_are_guarded_against_false_alarms():
     for field, least in {"heartbeat_timeout_s": 0.3, "command_timeout_s": 0.15,
-                         "localization_timeout_s": 0.15, "dead_man_timeout_s": 0.15,
+                         "localization_timeout_s": 0.15, "scan_timeout_s": 0.15,
+                         "dead_man_timeout_s": 0.15,
                          "manager_timeout_s": 0.3, "detection_silence_timeout_s": 0.6}.items():
         assert not list(find_false_alarms(with_timing(**{field: least})))
         path, value, _ = next(find_false_alarms(with_timing(**{field: least - 0.01})))

@@ -14,7 +14,8 @@ EVEN = Timing((0.0, 10.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
 
 
 def ways(network: SeededNetwork, count: int = 4000, step_s: float = 0.001):
-    return [(i * step_s, network.arrivals("a", "b", i * step_s)) for i in range(count)]
+    link = network.link("a", "b")
+    return [(i * step_s, link(i * step_s)) for i in range(count)]
 
 
 def test_the_same_seed_gives_the_same_arrivals_and_another_seed_others():
@@ -42,7 +43,8 @@ def test_the_ideal_network_takes_no_time():
 
 def test_delays_are_drawn_from_the_measured_distribution():
     network = SeededNetwork(NETWORKS["measured"], 5, EVEN)
-    delays = [network.arrivals("a", "b", i)[0] - i for i in range(5000)]
+    link = network.link("a", "b")
+    delays = [link(i)[0] - i for i in range(5000)]
     assert 0.0 <= min(delays) < 0.0002
     assert 0.0098 < max(delays) <= 0.01
     tenths = Counter(int(delay * 1000) for delay in delays)
@@ -64,9 +66,16 @@ def test_loss_duplication_and_overtaking_come_as_often_as_said():
 
 def test_the_observer_hears_all_at_once_whatever_the_network_does():
     network = SeededNetwork(NetworkModel("x", "", loss=1.0), 1, local=("observer",))
-    assert network.arrivals("a", "observer", 5.0) == (5.0,)
-    assert network.arrivals("observer", "a", 5.0) == (5.0,)
-    assert network.arrivals("a", "b", 5.0) == ()
+    assert network.link("a", "observer") is None
+    assert network.link("observer", "a") is None
+    assert network.link("a", "b")(5.0) == ()
+
+
+def test_between_two_nodes_there_is_one_link_however_often_it_is_asked_for():
+    for model in NETWORKS.values():
+        network = SeededNetwork(model, 1)
+        assert network.link("a", "b") is network.link("a", "b")
+        assert network.link("a", "b") is not network.link("b", "a")
 
 
 @pytest.mark.parametrize(("field", "value"), [

@@ -6,6 +6,7 @@ import argparse
 import fnmatch
 import shlex
 import sys
+import time
 from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
@@ -170,8 +171,11 @@ def _execute(options: argparse.Namespace, jobs: Sequence[Job], store: Store) -> 
     unique = {job.key for job in jobs}
     done = len(unique & store.keys())
     unsafe = 0
+    # On a terminal a bar; in a log a line now and then.
+    watched = sys.stderr.isatty()
     with tqdm(total=len(unique), initial=done, unit="run", file=sys.stderr, smoothing=0.05,
-              disable=not sys.stderr.isatty() and None) as bar:
+              disable=not watched) as bar:
+        log = ProgressLog(len(unique), done)
 
         def progress(job: Job, result: RunResult) -> None:
             nonlocal unsafe
@@ -180,9 +184,44 @@ def _execute(options: argparse.Namespace, jobs: Sequence[Job], store: Store) -> 
                 bar.write(f"unsafe: {job.key} {job.text()}", file=sys.stderr)
             bar.set_postfix(unsafe=unsafe, refresh=False)
             bar.update()
+            if not watched:
+                line = log.made_one(time.monotonic(), unsafe)
+                if line:
+                    print(line, file=sys.stderr, flush=True)
 
         return execute(jobs, store, workers=options.jobs, backend=options.backend,
                        address=options.address, progress=progress)
+
+
+class ProgressLog:
+    """What to write into a log while runs are made: a line a minute, and one for the last run.
+
+    Args:
+        total: Runs of the campaign.
+        done: Those that were made before.
+    """
+
+    PERIOD_S = 60.0
+
+    def __init__(self, total: int, done: int) -> None:
+        self._total, self._done, self._before = total, done, done
+        self._begun_s: float | None = None
+        self._told_s = 0.0
+
+    def made_one(self, now_s: float, unsafe: int) -> str:
+        """Note a run, and return the line to write, mostly none."""
+        self._done += 1
+        if self._begun_s is None:  # the first run took the start of the workers on top
+            self._begun_s = self._told_s = now_s
+            self._before = self._done
+            return ""
+        left = self._total - self._done
+        if left and now_s - self._told_s < self.PERIOD_S:
+            return ""
+        self._told_s = now_s
+        minutes = (now_s - self._begun_s) / (self._done - self._before) * left / 60
+        more = f", {minutes:.0f} min left" if left else ""
+        return f"{self._done} of {self._total} runs, {unsafe} unsafe with FTM{more}"
 
 
 def _in_order(runs: Iterable[Run], jobs: Sequence[Job]) -> list[Run]:

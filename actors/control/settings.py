@@ -46,7 +46,7 @@ def gate_of(system: SystemSpec) -> GateLimits:
         max_linear_mps=robot.top_speed_mps,
         max_angular_radps=robot.top_turn_rate_radps,
         command_timeout_s=timing.command_timeout_s,
-        scan_timeout_s=timing.command_timeout_s,
+        scan_timeout_s=timing.scan_timeout_s,
         manager_timeout_s=timing.manager_timeout_s,
         room=room,
     )

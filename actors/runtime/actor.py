@@ -417,7 +417,7 @@ class Actor:
     ) -> Callable[[str, bytes], None]:
         def deliver(key: str, payload: bytes) -> None:
             try:
-                message = admit(topic, key, payload)
+                message = admit(key, payload)
             except RejectedError as reason:
                 self._rejected += 1
                 self.report_diagnostic("payload rejected", str(reason), key)
@@ -432,7 +432,7 @@ class Actor:
                 self._mailbox.put_latest(
                     f"{key} {name}", lambda: handler(message.body, message))
 
-        admit, handle = self._guard.admit, self._handle
+        admit, handle = self._guard.admission(topic), self._handle
         command, name = topic.qos is Qos.COMMAND, handler.__name__
         return deliver
 

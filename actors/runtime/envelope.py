@@ -79,32 +79,48 @@ class ArrivalGuard:
         self._last: dict[tuple[str, str], int] = {}
         self._recent: dict[tuple[str, str], deque[int]] = {}
 
-    def admit(self, topic: Topic[Any], key: str, payload: bytes) -> Envelope[Any] | None:
-        """Return the message, or None for a duplicate or an overtaken sample.
+    def admission(self, topic: Topic[Any]) -> Callable[[str, bytes], Envelope[Any] | None]:
+        """Return the check for one topic: of key and payload, as it is made of every message.
+
+        It returns the message, or None for a duplicate or an overtaken sample.
 
         Raises:
             RejectedError: it does not decode, or comes from a superseded incarnation.
         """
-        try:
-            message = (_decoders.get(topic.type) or _decoder(topic.type))(payload)
-        except (msgspec.MsgspecError, RecursionError) as error:
-            raise RejectedError(f"not a {topic.type.__name__}: {error}") from None
-        source, sequence = message.source, message.sequence
-        if message.incarnation != self._incarnations.get(source, -1):
-            self._meet(source, message.incarnation)
-        channel = (source, key)
-        if topic.qos is _COMMAND:
-            recent = self._recent.get(channel)
-            if recent is None:
-                recent = self._recent[channel] = deque(maxlen=_REMEMBERED_COMMANDS)
-            if sequence in recent:
+        decode_, kind = _decoders.get(topic.type) or _decoder(topic.type), topic.type.__name__
+        incarnations, newest = self._incarnations, self._last
+        is_fresh = self._is_fresh_command if topic.qos is _COMMAND else None
+
+        def admit(key: str, payload: bytes) -> Envelope[Any] | None:
+            try:
+                message = decode_(payload)
+            except (msgspec.MsgspecError, RecursionError) as error:
+                raise RejectedError(f"not a {kind}: {error}") from None
+            source, sequence = message.source, message.sequence
+            if message.incarnation != incarnations.get(source, -1):
+                self._meet(source, message.incarnation)
+            channel = (source, key)
+            if is_fresh is not None:
+                return message if is_fresh(channel, sequence) else None
+            if sequence <= newest.get(channel, -1):
                 return None
-            recent.append(sequence)
+            newest[channel] = sequence
             return message
-        if sequence <= self._last.get(channel, -1):
-            return None
-        self._last[channel] = sequence
-        return message
+
+        return admit
+
+    def admit(self, topic: Topic[Any], key: str, payload: bytes) -> Envelope[Any] | None:
+        """Check a single message: see `admission`."""
+        return self.admission(topic)(key, payload)
+
+    def _is_fresh_command(self, channel: tuple[str, str], sequence: int) -> bool:
+        recent = self._recent.get(channel)
+        if recent is None:
+            recent = self._recent[channel] = deque(maxlen=_REMEMBERED_COMMANDS)
+        if sequence in recent:
+            return False
+        recent.append(sequence)
+        return True
 
     def _meet(self, source: str, incarnation: int) -> None:
         """Take another incarnation than before for the valid one, unless it is an older one."""

@@ -18,15 +18,19 @@ Tap = Callable[[str, str, bytes], None]
 """Sees each message as it is sent: source, key, payload."""
 
 
+Link = Callable[[float], Sequence[float]]
+"""Way from one node to another: returns when the copies of a message sent now arrive, if any."""
+
+
 class Network(Protocol):
     """When messages arrive."""
 
-    def arrivals(self, source: str, reader: str, now_s: float) -> Sequence[float]:
-        """Return the times at which copies of a message sent now arrive; none if it is lost."""
+    def link(self, source: str, reader: str) -> Link | None:
+        """Return the one link between two nodes; None if everything arrives at once."""
 
 
-Route = tuple[str, Callable[[Deliver, str, bytes], None], Deliver]
-"""Name of a reader, its bus's `arrive`, and who there takes the message."""
+Route = tuple[Link | None, Callable[[Deliver, str, bytes], None], Deliver]
+"""The way to a reader, its bus's `arrive`, and who there takes the message."""
 
 
 class Hub:
@@ -37,7 +41,7 @@ class Hub:
         self.taps: list[Tap] = []
         self.alive: dict[str, set[int]] = {}
         self._subscriptions: list[tuple[re.Pattern[str], Deliver, VirtualBus]] = []
-        self._routes: dict[str, list[Route]] = {}
+        self._routes: dict[tuple[str, str], list[Route]] = {}
         self._watchers: list[tuple[str, PeerChange, VirtualBus]] = []
 
     def subscribe(self, expression: str, deliver: Deliver, bus: VirtualBus) -> None:
@@ -56,13 +60,14 @@ class Hub:
         self._watchers = [w for w in self._watchers if w[2] is not bus]
         self._routes.clear()
 
-    def routes(self, key: str) -> list[Route]:
-        """Return who hears a key, in the order of subscription."""
-        found = self._routes.get(key)
+    def routes(self, source: str, key: str) -> list[Route]:
+        """Return the ways from a node to all who hear a key, in the order of subscription."""
+        found = self._routes.get((source, key))
         if found is None:
-            found = self._routes[key] = [
-                (bus.node, bus.arrive, deliver) for pattern, deliver, bus in self._subscriptions
-                if pattern.fullmatch(key)]
+            link = self.network.link if self.network else _at_once
+            found = self._routes[source, key] = [
+                (link(source, bus.node), bus.arrive, deliver)
+                for pattern, deliver, bus in self._subscriptions if pattern.fullmatch(key)]
         return found
 
     def announce(self, node: str, incarnation: int, *, alive: bool) -> None:
@@ -75,6 +80,10 @@ class Hub:
         for watched, changed, bus in list(self._watchers):
             if watched == node:
                 bus.soon(lambda c=changed: c(node, incarnation, alive))  # type: ignore[misc]
+
+
+def _at_once(_source: str, _reader: str) -> Link | None:
+    return None
 
 
 class VirtualBus:
@@ -107,16 +116,12 @@ class VirtualBus:
             return
         for tap in hub.taps:
             tap(node, key, payload)
-        routes = hub.routes(key)
-        if not routes:
-            return
-        network = hub.network
         now_s = loop.time()
-        for reader, arrive, deliver in routes:
-            if network is None:
+        for link, arrive, deliver in hub.routes(node, key):
+            if link is None:
                 loop.call_soon(arrive, deliver, key, payload)
                 continue
-            for at_s in network.arrivals(node, reader, now_s):
+            for at_s in link(now_s):
                 if at_s > now_s:
                     self._post_at(at_s, arrive, deliver, key, payload)
                 else:
@@ -129,7 +134,7 @@ class VirtualBus:
 
     def has_readers(self, key: str) -> bool:
         """Whether somebody hears a key now."""
-        return bool(self._hub.routes(key))
+        return bool(self._hub.routes(self.node, key))
 
     def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:  # noqa: ARG002
         """Have `deliver` called for each message on keys that match."""

@@ -113,7 +113,7 @@ def table(runs: Iterable[Run]) -> list[Row]:
 
 
 def total(runs: Sequence[Run], name: str) -> Row:
-    """Return all runs as one row."""
+    """Return all runs as one row; there must be one at least."""
     return _row(name, -1, True, "", list(runs))
 
 

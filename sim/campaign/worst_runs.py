@@ -48,11 +48,13 @@ def track(run: Run, record: RunRecord) -> dict[str, Any]:
         ("end", "end of the run", result.duration_s),
         ("fault", "fault injected", result.injected_s),
         ("detected", "first detection", detected_s),
+        ("narrow", "smallest margin", record.narrowest_s if result.safe else None),
         ("unsafe", "first unsafe", result.unsafe_s)) if at_s is not None and record.track]
     views = []
     if record.track:
         views.append(_view(record))
-        focus = next((mark for mark in marks if mark[0] == "unsafe"), marks[0])
+        focus = next((mark for kind in ("unsafe", "narrow")
+                      for mark in marks if mark[0] == kind), marks[0])
         views.append((focus[3] - _CLOSE_UP_M / 2, focus[4] - _CLOSE_UP_M / 2,
                       _CLOSE_UP_M, _CLOSE_UP_M))
     return {
