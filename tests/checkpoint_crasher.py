@@ -2,10 +2,11 @@
 
 `python checkpoint_crasher.py DIRECTORY random|limits FIRST LAST STEP`: for each number it forks a
 child that saves states 1, 2, 3, … and acknowledges each on a pipe when `save` has returned. With
-`random` the parent kills the child after so many microseconds; with `limits` the child may write
-no file beyond so many bytes, and the kernel kills it (SIGXFSZ) in the write that would. Then the
-parent opens the file as a successor would, and prints one JSON line: the number, whether the child
-was killed, the last state acknowledged, the state found (0 for none), and the problems reported.
+`random` the parent kills the child so many microseconds after its start, or after its first
+acknowledgement; with `limits` the child may write no file beyond so many bytes, and the kernel
+kills it (SIGXFSZ) in the write that would. Then the parent opens the file as a successor would, and
+prints one JSON line: the number, whether the child was killed, the last state acknowledged, the
+state found (0 for none), and the problems reported.
 """
 
 from __future__ import annotations
@@ -68,6 +69,8 @@ def one(file: Path, mode: str, number: int, start: int) -> dict[str, object]:
             os._exit(code)
     os.close(write_end)
     if mode == "random":
+        if number // 500 % 3:  # two in three die while they save, the others perhaps earlier
+            select.select([read_end], [], [], 10)
         due = time.monotonic() + number / 1e6
         while time.monotonic() < due:
             pass

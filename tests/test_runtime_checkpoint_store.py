@@ -26,6 +26,7 @@ from actors.runtime.checkpoint import (
     GENERATIONS,
     RETRY_S,
     SOON_S,
+    BusyError,
     CheckpointError,
     CheckpointStore,
     Keeper,
@@ -353,7 +354,7 @@ def test_a_lock_that_somebody_holds_is_not_waited_for(sqlite_store, file):
     with pytest.raises(CheckpointError, match="database is locked"):
         sqlite_store(2).load()
     store = sqlite_store(2)
-    with pytest.raises(CheckpointError, match="database is locked"):
+    with pytest.raises(BusyError, match="database is locked"):
         store.save(1, b"x")
     stale.execute("ROLLBACK")
     stale.close()
@@ -563,6 +564,25 @@ def test_a_keeper_goes_on_without_a_store_tries_again_ever_more_seldom_and_says_
     desk.keeper.keep(COUNTER, Counter(2, 0))
     assert desk.told[2:] == ["checkpoints are kept again"]
     assert len(store.inner.load().records) == 2
+
+
+def test_a_store_that_is_locked_for_a_moment_is_no_trouble_and_for_long_it_is():
+    store = Broken(Shelf())
+    desk = Desk(store)
+    store.error = BusyError("n.sqlite: database is locked")
+    for moment in (0.0, 0.2, 0.4):
+        desk.now_s = moment
+        desk.keeper.keep(COUNTER, Counter(1, 0))
+    store.error = None
+    desk.now_s = 0.6
+    desk.keeper.keep(COUNTER, Counter(1, 0))
+    assert (store.attempts, desk.told) == (4, [])
+    store.error = BusyError("n.sqlite: database is locked")
+    for tick in range(100):
+        desk.now_s = 1.0 + tick / 10
+        desk.keeper.keep(COUNTER, Counter(2, 0))
+    assert desk.told == ["n.sqlite: database is locked; going on without checkpoints"]
+    assert store.attempts < 15
 
 
 def test_a_superseded_keeper_is_told_so_and_tries_no_more():

@@ -72,3 +72,14 @@ def test_a_way_round_something_is_progress_once_and_the_longer_way_is_measured_a
     for number in range(100):
         end.mission(status(f"way round ({number}, 4)"), 30.0 + number)
     assert end.ended(60.0) == "no progress for 10 s", "to and fro is no progress"
+
+
+def test_who_has_no_route_yet_or_has_arrived_does_not_say_how_near_it_came():
+    end = RunEnd(patience_s=40.0)
+    end.mission(mission(MissionPhase.RUNNING), 0.0)
+    for phase in (ControlPhase.IDLE, ControlPhase.WAITING, ControlPhase.ARRIVED):
+        end.control(ControlStatus("m1", 0, phase, 0, 0.0), 0.1)
+    end.control(going(30.0), 1.0)
+    end.control(going(20.0), 35.0)
+    assert end.ended(60.0) is None
+    assert end.ended(76.0) == "no progress for 40 s"

@@ -11,6 +11,7 @@ from actors.control.mission_state import MissionState
 from actors.control.parameters import names
 from actors.messages import (
     ControlStatus,
+    Goal,
     LightMeasurement,
     ManagerStatus,
     MissionOrder,
@@ -22,6 +23,9 @@ from actors.runtime.actor import Actor, Context, Header, every, on
 UNCERTAIN_S = 1.0
 """A Mission Manager that comes back waits so long for word of the step that others are at. They
 repeat it five times a second, and at once for a newcomer."""
+
+_SAME_POINT_M = 0.1
+"""A route that ends so near to a goal leads to it."""
 
 
 class MissionManager(Actor):
@@ -70,7 +74,7 @@ class MissionManager(Actor):
     @on(topics.ROUTE)
     def route(self, message: Route, _header: Header) -> None:
         """Give up when there is no way."""
-        self._compare(message.mission_id, message.step)
+        self._compare(message.mission_id, message.step, message.waypoints[-1:])
         self._become(mission_state.routed(self.state, message))
 
     @on(topics.LIGHT_MEASURED)
@@ -103,9 +107,17 @@ class MissionManager(Actor):
         """Keep the state, if that failed when it was new."""
         self.keep(MISSION_STATE, self.state)
 
-    def _compare(self, mission_id: str, step: int) -> None:
-        """End the uncertainty after a respawn: planner or control know the step as well."""
+    def _compare(
+        self, mission_id: str, step: int, end: tuple[tuple[float, float], ...] = ()
+    ) -> None:
+        """End the uncertainty after a respawn: planner or control know the step as well.
+
+        A later step than the checkpoint's is believed only with a way to that step's goal: if the
+        former life died because it gave a wrong goal, the others were told a wrong step.
+        """
         if self.clock.now() < self._uncertain_until_s and mission_id == self.state.mission_id:
+            if step > self.state.step and not _leads_to(end, self.state.goals[step:step + 1]):
+                return
             self._uncertain_until_s = -math.inf
             self._become(catch_up(self.state, step, self.clock.now()))
             self.repeat_status()
@@ -126,6 +138,11 @@ class MissionManager(Actor):
         order = mission_state.goal_order(state)
         if order != mission_state.goal_order(before):
             self.repeat_goal()
+
+
+def _leads_to(end: tuple[tuple[float, float], ...], goals: tuple[Goal, ...]) -> bool:
+    return any(math.dist(point, (goal.x_m, goal.y_m)) < _SAME_POINT_M
+               for point, goal in zip(end, goals, strict=False))
 
 
 def hold_reason(status: ManagerStatus, holding: tuple[str, ...]) -> str:

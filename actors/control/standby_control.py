@@ -4,9 +4,9 @@ It hears what the active one hears, and the follower finds its place on the rout
 the two agree without much of a word between them, and whoever is respawned agrees again within the
 time of an acceleration ramp. The word that is needed is the active one's intent: whether it goes
 back for a light, drives round something, how far aside it is still, and what its yaw loop has
-learnt; these depend on what has happened and not on what can be seen. Nobody reads the standby's command but the Safety Pilot, who lets it pass when the active
-one's is not usable (`command_pair`), and the comparison
-(`actors.detection.command_disagreement`).
+learnt. These depend on what has happened and not on what can be seen. Nobody reads the standby's
+command but the Safety Pilot, who lets it pass when the active one's is not usable
+(`command_pair`), and the comparison (`actors.detection.command_disagreement`).
 
 What is done once stays with the active one: progress reports and light measurements. While the
 standby drives, the mission's state waits; a light that is passed in that moment may be missed.

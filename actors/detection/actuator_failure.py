@@ -1,4 +1,4 @@
-"""DM11: actuator failure, by comparison of what the base is told with what it does."""
+"""DM13: actuator failure, by comparison of what the base is told with what it does."""
 
 from __future__ import annotations
 

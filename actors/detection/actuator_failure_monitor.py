@@ -1,4 +1,4 @@
-"""DM11's monitor: does the base move, and brake, as it is told? Pure.
+"""DM13's monitor: does the base move, and brake, as it is told? Pure.
 
 Three questions, each asked only when its answer is sure:
 

@@ -58,7 +58,7 @@ class _Apart:
     def note(self, apart: bool, now_s: float) -> bool:
         """Return whether it has differed for too long."""
         self.since_s = min(self.since_s, now_s) if apart else math.inf
-        return now_s - self.since_s >= self.patience_s
+        return now_s - self.since_s >= self.patience_s - 1e-9
 
 
 class CommandComparison:

@@ -1,4 +1,4 @@
-"""DM10: the Safety Pilot's output is wrong, or is not there."""
+"""DM12: the Safety Pilot's output is wrong, or is not there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""DM10's monitor: is what reaches the base what somebody asked the Safety Pilot for? Pure.
+"""DM12's monitor: is what reaches the base what somebody asked the Safety Pilot for? Pure.
 
 The Safety Pilot only ever takes away: it lets a command pass, slows it down, or stops. So each
 component of what the base gets is explained by a command that was given a moment ago, between that

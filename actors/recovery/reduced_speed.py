@@ -1,4 +1,4 @@
-"""RM7: go on, but slowly.
+"""RM8: go on, but slowly.
 
 A robot whose motors or brakes have lost some of their strength is master of less speed, not of
 none: a weak motor keeps up below its reduced no-load speed, and from a lower speed a stop takes
@@ -7,8 +7,9 @@ less room. The mission goes on in a degraded mode, and takes longer.
 
 from __future__ import annotations
 
+import math
+
 from actors import topics
-from actors.detection.module import number
 from actors.messages import PilotMode, PilotOrder, PilotStatus
 from actors.recovery.controlled_stop import PilotRecovery
 from actors.runtime.actor import Context, Header
@@ -21,13 +22,20 @@ class ReducedSpeed(PilotRecovery):
 
     Parameters:
         top_speed_mps: the bound.
+
+    Raises:
+        ValueError: the bound is no positive number.
     """
 
     mode = PilotMode.AUTO
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.top_speed_mps = number(self.parameters, "top_speed_mps", DEFAULT_TOP_SPEED_MPS)
+        bound = self.parameters.get("top_speed_mps", DEFAULT_TOP_SPEED_MPS)
+        if isinstance(bound, bool) or not isinstance(bound, int | float) or not (
+                0 < bound < math.inf):
+            raise ValueError(f"parameters.top_speed_mps = {bound!r}: must be a speed above 0")
+        self.top_speed_mps = float(bound)
 
     def give_order(self, *, engaged: bool) -> None:
         """Order the bound, or end the order."""

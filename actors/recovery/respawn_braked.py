@@ -1,4 +1,4 @@
-"""RM6: respawn the Safety Pilot, with the brake held meanwhile.
+"""RM7: respawn the Safety Pilot, with the brake held meanwhile.
 
 Whoever commands the wheels is wrong, and until its successor has settled nobody else does. So this
 recovery goes past it as the emergency stop does, but lets go by itself: when the new Safety Pilot

@@ -34,6 +34,12 @@ RETRY_S = (1.0, 30.0)
 """Simulated seconds after which a save that failed is tried again: at first, and at most. Each
 attempt may cost the node's loop as long as the store waits for a lock."""
 
+BUSY_S = 0.1
+"""Simulated seconds after which a save is tried again that found the store locked."""
+
+BUSY_TIMES = 5
+"""So often in a row that is no trouble yet: the store's own thread needs the lock now and then."""
+
 
 class CheckpointError(OSError):
     """A state could not be kept or found; the text is one line that names file and reason."""
@@ -41,6 +47,10 @@ class CheckpointError(OSError):
 
 class SupersededError(CheckpointError):
     """A newer incarnation of the node keeps its state; this one's is refused."""
+
+
+class BusyError(CheckpointError):
+    """Somebody else holds the store's lock; perhaps not for long."""
 
 
 class StateError(ValueError):
@@ -259,6 +269,7 @@ class Keeper:
         self._problem = ""
         self._retry_at_s = -float("inf")
         self._pause_s = RETRY_S[0]
+        self._busy = 0
         self._superseded = False
 
     def kept(self, form: StateFormat[S]) -> S | None:
@@ -298,12 +309,17 @@ class Keeper:
             self._store.save(form.version, data)
         except CheckpointError as error:
             self._kept = None
+            self._busy += 1
+            if isinstance(error, BusyError) and self._busy < BUSY_TIMES:
+                self._retry_at_s = self._now() + BUSY_S
+                return
             self._superseded = isinstance(error, SupersededError)
             self._retry_at_s = self._now() + self._pause_s
             self._pause_s = min(2 * self._pause_s, RETRY_S[1])
             self._tell(f"{error}; going on without checkpoints")
             return
         self._kept = data
+        self._busy = 0
         self._pause_s = RETRY_S[0]
         if self._failures and self._now() - self._began_s > SOON_S:
             self._note(0)

@@ -39,6 +39,7 @@ from typing import Any
 
 from actors.runtime.checkpoint import (
     GENERATIONS,
+    BusyError,
     CheckpointError,
     Loaded,
     Record,
@@ -61,6 +62,11 @@ _FAR = 8
 """At so many times its limit the log is cut whatever comes."""
 
 _DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
+
+_LOCKED = frozenset({sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED})
+
+_PAGE_BYTES = 1024
+"""A save writes the pages that it touches, whole; states are some hundreds of bytes long."""
 
 _TABLES = (
     "CREATE TABLE checkpoint (slot INTEGER PRIMARY KEY, generation INTEGER NOT NULL,"
@@ -212,6 +218,7 @@ class SqliteCheckpoints:
         (application,) = connection.execute("PRAGMA application_id").fetchone()
         if (form, application) == (0, 0) and not self._tables():
             connection.execute("PRAGMA synchronous = OFF")  # nothing in it that could be lost yet
+            connection.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
             connection.execute("PRAGMA journal_mode = WAL")
             with _transaction(connection):
                 for statement in _TABLES:
@@ -349,7 +356,8 @@ class SqliteCheckpoints:
         return self._file.with_name(self._file.name + suffix)
 
     def _error(self, error: sqlite3.Error) -> CheckpointError:
-        return CheckpointError(f"{self._file}: {' '.join(str(error).split())}")
+        kind = BusyError if _code(error) in _LOCKED else CheckpointError
+        return kind(f"{self._file}: {' '.join(str(error).split())}")
 
     def _superseded(self) -> SupersededError:
         return SupersededError(f"{self._file}: incarnation {self._incarnation} was superseded")
@@ -432,5 +440,9 @@ def _is_sound(row: tuple[Any, ...]) -> bool:
 
 
 def _is_damage(error: sqlite3.Error) -> bool:
-    code = getattr(error, "sqlite_errorcode", None)
-    return code is not None and code & 0xFF in _DAMAGED
+    return _code(error) in _DAMAGED
+
+
+def _code(error: sqlite3.Error) -> int:
+    """Return SQLite's primary result code; 0 for an error of the Python module's own."""
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF
