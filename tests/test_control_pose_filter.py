@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from detection_timeline import table
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from localization_drive import LEGS, START_RAD, Reading, Truth, disturbed, drive, fault
 
@@ -216,6 +216,7 @@ steps = st.tuples(st.floats(-0.1, 0.1), st.floats(-0.2, 0.2))
 fixes = st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(0.001, 0.5))
 
 
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])  # a busy machine
 @given(st.lists(st.tuples(steps, fixes, st.booleans()), max_size=12))
 def test_the_filter_is_the_textbook_one(moves):
     """Against the matrix form with numpy."""

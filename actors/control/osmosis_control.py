@@ -15,13 +15,14 @@ import msgspec
 from actors import topics
 from actors.control.blockage import BlockageWatch
 from actors.control.control_checkpoint import CONTROL_STATE, ControlKept, whole_row
+from actors.control.laser_pair import LOWER, UPPER, LaserPair
 from actors.control.light_inspection import LightInspection, RowLight
 from actors.control.light_ledger import LightLedger
 from actors.control.light_row import LightRow, RowLimits
 from actors.control.motion_loop import MotionLoop
 from actors.control.parameters import amount, switch
 from actors.control.path_follower import Motion, PathFollower
-from actors.control.polyline import Array, Polyline, scan_points
+from actors.control.polyline import Array, Polyline
 from actors.control.settings import hull_of, motion_of
 from actors.messages import (
     Blockage,
@@ -80,6 +81,7 @@ class OsmosisControl(Actor):
         self._inspection = LightInspection(self._lights)
         self._pose: Pose | None = None
         self._points: Array | None = None
+        self._lasers = LaserPair()
         self._route: Route | None = None
         self._follower: PathFollower | LightRow | None = None
         self._status = ControlStatus("", 0, ControlPhase.IDLE, 0, 0.0)
@@ -131,15 +133,20 @@ class OsmosisControl(Actor):
             self._begin()
 
     @on(topics.SCAN)
-    def scan(self, message: LaserScan, _header: Header) -> None:
-        """Keep the latest scan, as points."""
-        self._points = scan_points(
-            message.ranges_f32,
-            message.angle_min_rad,
-            message.angle_increment_rad,
-            message.range_max_m,
-        )
-        self._begin()
+    def scan(self, message: LaserScan, header: Header) -> None:
+        """Keep what can be seen."""
+        self._see(LOWER, message, header)
+
+    @on(topics.UPPER_SCAN)
+    def upper_scan(self, message: LaserScan, header: Header) -> None:
+        """Keep what the second laser sees, on a robot that has one."""
+        self._see(UPPER, message, header)
+
+    def _see(self, laser: int, message: LaserScan, header: Header) -> None:
+        view = self._lasers.take(laser, message, header.stamp)
+        if view is not None and not view.fault:  # the Safety Pilot stops who sees nothing
+            self._points = view.points
+            self._begin()
 
     @on(topics.LIGHT)
     def light(self, message: LightSample, header: Header) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 from actors import topics
-from actors.control.laser_check import LaserCheck
-from actors.control.polyline import scan_points
+from actors.control.laser_pair import LOWER, UPPER, LaserPair
 from actors.control.safety_gate import GateOutput, SafetyGate, Stamped
 from actors.control.settings import checks_of, gate_of
 from actors.messages import (
@@ -36,7 +35,7 @@ class SafetyPilot(Actor):
         super().__init__(context)
         system = context.shared["system"]
         self._gate = SafetyGate(gate_of(system), checks_of(system), context.clock.now())
-        self._laser = LaserCheck()
+        self._lasers = LaserPair()
         self._laser_fault = ""
         self._sent_s = -math.inf
         self._last = GateOutput(0.0, 0.0, PilotMode.AUTO, True, "just started")
@@ -65,18 +64,13 @@ class SafetyPilot(Actor):
 
     @on(topics.SCAN)
     def scan(self, message: LaserScan, header: Header) -> None:
-        """Keep the latest scan, as points; one that cannot be believed stops the robot."""
-        points = scan_points(
-            message.ranges_f32,
-            message.angle_min_rad,
-            message.angle_increment_rad,
-            message.range_max_m,
-        )
-        fault = self._laser.fault(message.reference_m, header.stamp)
-        self._gate.scan(points, header.stamp, fault)
-        if fault != self._laser_fault:
-            self._laser_fault = fault
-            self._act()
+        """Keep what can be seen; if nothing can be believed the robot stops."""
+        self._see(LOWER, message, header)
+
+    @on(topics.UPPER_SCAN)
+    def upper_scan(self, message: LaserScan, header: Header) -> None:
+        """Keep what the second laser sees, on a robot that has one."""
+        self._see(UPPER, message, header)
 
     @on(topics.PILOT_ORDER)
     def order(self, message: PilotOrder, header: Header) -> None:
@@ -103,6 +97,15 @@ class SafetyPilot(Actor):
     def repeat_status(self) -> None:
         """Repeat the status for whoever joined late."""
         self._tell()
+
+    def _see(self, laser: int, message: LaserScan, header: Header) -> None:
+        view = self._lasers.take(laser, message, header.stamp)
+        if view is None:
+            return
+        self._gate.scan(view.points, view.stamp_s, view.fault)
+        if view.fault != self._laser_fault:
+            self._laser_fault = view.fault
+            self._act()
 
     def _act(self) -> None:
         now = self.clock.now()
