@@ -14,7 +14,6 @@ emergency stop does not wait for a disk, and what a command says its module know
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -223,7 +222,7 @@ class FtmManager(Actor):
         state = self.arbiter_state
         return m.ManagerStatus(state.active, state.silent, state.activated, state.latched,
                                self._strategy, state.number, tuple(
-                                   _view(t.name, t.active, t.reason, t.nodes)
+                                   m.DetectionView(t.name, t.active, t.reason, t.nodes)
                                    for t in state.detections))
 
     def _show(self) -> None:
@@ -247,11 +246,6 @@ def _says_all_is_well(event: Input) -> bool:
 
 def _is_calm(status: m.ManagerStatus) -> bool:
     return not (status.active or status.silent or status.activated or status.latched)
-
-
-@lru_cache(maxsize=256)
-def _view(name: str, active: bool, reason: str, nodes: tuple[str, ...]) -> m.DetectionView:
-    return m.DetectionView(name, active, reason, nodes)  # for nearly every message: the same again
 
 
 def forgive_absence(state: State, missed_s: float) -> State:

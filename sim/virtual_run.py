@@ -74,20 +74,19 @@ class VirtualResult:
 class Trace:
     """A hash over all messages in the order of sending."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self) -> None:
         self.messages = 0
-        self._loop = loop
         self._hash = hashlib.sha256()
         self._names: dict[tuple[str, str], bytes] = {}
         self._waiting: list[bytes] = []
 
-    def __call__(self, source: str, key: str, payload: bytes) -> None:
+    def __call__(self, now_s: float, source: str, key: str, payload: bytes) -> None:
         """Take one message."""
         self.messages += 1
         name = self._names.get((source, key))
         if name is None:
             name = self._names[source, key] = f"{source} {key} ".encode()
-        self._waiting += (_HEAD(self._loop.time(), len(payload)), name, payload)
+        self._waiting += (_HEAD(now_s, len(payload)), name, payload)
         if len(self._waiting) > _CHUNK:
             self._flush()
 
@@ -151,7 +150,7 @@ class VirtualRun:
         loop = asyncio.get_running_loop()
         clock = Clock(loop.time() + LEAD_S, source=loop.time)
         hub = Hub(SeededNetwork(self._network, self.plan.seed, local=(OBSERVER, INJECTOR)))
-        trace = Trace(loop)
+        trace = Trace()
         hub.taps.append(trace)
         layout = Layout(self.plan, self._spec)
         machine = VirtualMachine(layout, self._shared, hub, clock, seed=self.plan.seed)

@@ -45,7 +45,7 @@ def campaign(options: argparse.Namespace) -> int:
         return _replay(options)
     _check(options)
     if options.search is not None:
-        return hunt(options, spec, _base_jobs(options))
+        return hunt(options, _groups(options, spec), _base_jobs(options))
     name, jobs = _choose(options, spec)
     directory = _directory(options, name)
     try:
@@ -125,19 +125,25 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
     if options.paper:
         return "paper", paper_jobs(options.mission, options.seed)
     jobs = _base_jobs(options)
-    groups = fault_groups(spec)
     if options.runs is not None:
-        if options.kinds:
-            wanted = options.kinds.split(",")
-            for kind in wanted:
-                if kind not in groups:
-                    raise unknown("kind", kind, groups)
-            groups = {kind: groups[kind] for kind in wanted}
+        groups = _groups(options, spec)
         together = f"-{options.together}" if options.together > 1 else ""
         return f"sample{together}", sample(
             jobs, groups, options.runs, seed=options.seed, together=options.together)
-    faults = list(_planned(options.fault, spec, groups))
+    faults = list(_planned(options.fault, spec, fault_groups(spec)))
     return "faults", cross(jobs, faults, range(options.seed, options.seed + options.seeds))
+
+
+def _groups(options: argparse.Namespace, spec: SystemSpec) -> dict[str, tuple[str, ...]]:
+    """Return the faults to draw from: of the kinds asked for, or all."""
+    groups = fault_groups(spec)
+    if not options.kinds:
+        return groups
+    wanted = options.kinds.split(",")
+    for kind in wanted:
+        if kind not in groups:
+            raise unknown("kind", kind, groups)
+    return {kind: groups[kind] for kind in wanted}
 
 
 def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str, ...]]
@@ -214,13 +220,14 @@ class ProgressLog:
         if self._begun_s is None:  # the first run took the start of the workers on top
             self._begun_s = self._told_s = now_s
             self._before = self._done
-            return ""
         left = self._total - self._done
-        if left and now_s - self._told_s < self.PERIOD_S:
-            return ""
+        more = ""
+        if left:
+            if now_s - self._told_s < self.PERIOD_S:
+                return ""
+            minutes = (now_s - self._begun_s) / (self._done - self._before) * left / 60
+            more = f", {minutes:.0f} min left"
         self._told_s = now_s
-        minutes = (now_s - self._begun_s) / (self._done - self._before) * left / 60
-        more = f", {minutes:.0f} min left" if left else ""
         return f"{self._done} of {self._total} runs, {unsafe} unsafe with FTM{more}"
 
 

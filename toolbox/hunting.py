@@ -13,24 +13,17 @@ import joblib
 import msgspec
 from tqdm import tqdm
 
-from manager.schema import SystemSpec
 from sim.campaign.job import Job, RunResult, run_job
-from sim.campaign.plan import fault_groups
 from sim.campaign.search import Space, margin, search, shrink
 from sim.campaign.store import Store, StoreError
-from toolbox.output import UsageError, print_json, print_table, say, unknown
+from toolbox.output import UsageError, print_json, print_table, say
 
 _SHRUNK_AT_MOST = 3
 
 
-def hunt(options: argparse.Namespace, spec: SystemSpec, bases: Sequence[Job]) -> int:
-    """Search, shrink what was found, and keep it."""
-    groups = fault_groups(spec)
-    if options.kinds:
-        for kind in options.kinds.split(","):
-            if kind not in groups:
-                raise unknown("kind", kind, groups)
-        groups = {kind: groups[kind] for kind in options.kinds.split(",")}
+def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases: Sequence[Job]
+         ) -> int:
+    """Search among the faults in `groups`, shrink what was found, and keep it."""
     directory = Path(options.out or "reports/campaign-search")
     try:
         store = Store(directory)
@@ -39,7 +32,7 @@ def hunt(options: argparse.Namespace, spec: SystemSpec, bases: Sequence[Job]) ->
     workers = options.jobs or os.cpu_count() or 1
     with joblib.Parallel(n_jobs=workers, batch_size=1) as pool, tqdm(
             total=options.search, unit="run", file=sys.stderr,
-            disable=not sys.stderr.isatty() and None) as bar:
+            disable=None) as bar:  # no bar into a file
 
         def run(jobs: Sequence[Job]) -> Sequence[RunResult]:
             return list(pool(joblib.delayed(run_job)(job) for job in jobs))

@@ -590,7 +590,4 @@ class _Ticker:
         now_s, next_s = clock.now(), self._due_s + self._period_s
         self._due_s = due_s = next_s if next_s > now_s else now_s + self._period_s
         self._post_at(clock.source_time(due_s), self._fire)
-        if actor._idle:
-            actor._handle(self._call)
-        else:
-            actor._mailbox.put_latest(self._slot, self._call)
+        actor._tick(self._slot, self._call)

@@ -87,13 +87,13 @@ class ArrivalGuard:
         Raises:
             RejectedError: it does not decode, or comes from a superseded incarnation.
         """
-        decode_, kind = _decoders.get(topic.type) or _decoder(topic.type), topic.type.__name__
+        unpack, kind = _decoders.get(topic.type) or _decoder(topic.type), topic.type.__name__
         incarnations, newest = self._incarnations, self._last
         is_fresh = self._is_fresh_command if topic.qos is _COMMAND else None
 
         def admit(key: str, payload: bytes) -> Envelope[Any] | None:
             try:
-                message = decode_(payload)
+                message = unpack(payload)
             except (msgspec.MsgspecError, RecursionError) as error:
                 raise RejectedError(f"not a {kind}: {error}") from None
             source, sequence = message.source, message.sequence
@@ -108,10 +108,6 @@ class ArrivalGuard:
             return message
 
         return admit
-
-    def admit(self, topic: Topic[Any], key: str, payload: bytes) -> Envelope[Any] | None:
-        """Check a single message: see `admission`."""
-        return self.admission(topic)(key, payload)
 
     def _is_fresh_command(self, channel: tuple[str, str], sequence: int) -> bool:
         recent = self._recent.get(channel)

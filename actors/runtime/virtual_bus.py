@@ -14,9 +14,8 @@ from typing import Any, Protocol
 from actors.runtime.bus import Deliver, PeerChange
 from actors.runtime.topic import Topic
 
-Tap = Callable[[str, str, bytes], None]
-"""Sees each message as it is sent: source, key, payload."""
-
+Tap = Callable[[float, str, str, bytes], None]
+"""Sees each message as it is sent: when by the loop's clock, source, key, payload."""
 
 Link = Callable[[float], Sequence[float]]
 """Way from one node to another: returns when the copies of a message sent now arrive, if any."""
@@ -41,14 +40,14 @@ class Hub:
         self.taps: list[Tap] = []
         self.alive: dict[str, set[int]] = {}
         self._subscriptions: list[tuple[re.Pattern[str], Deliver, VirtualBus]] = []
-        self._routes: dict[tuple[str, str], list[Route]] = {}
+        self._routes: dict[str, dict[str, list[Route]]] = {}
         self._watchers: list[tuple[str, PeerChange, VirtualBus]] = []
 
     def subscribe(self, expression: str, deliver: Deliver, bus: VirtualBus) -> None:
         """Have messages on keys that match delivered to a bus."""
         pattern = re.compile(re.escape(expression).replace(r"\*", "[^/]+"))
         self._subscriptions.append((pattern, deliver, bus))
-        self._routes.clear()
+        self._forget_routes()
 
     def watch(self, node: str, changed: PeerChange, bus: VirtualBus) -> None:
         """Have the coming and going of a node told to a bus."""
@@ -58,17 +57,23 @@ class Hub:
         """Forget a bus."""
         self._subscriptions = [s for s in self._subscriptions if s[2] is not bus]
         self._watchers = [w for w in self._watchers if w[2] is not bus]
-        self._routes.clear()
+        self._forget_routes()
 
-    def routes(self, source: str, key: str) -> list[Route]:
+    def routes_from(self, source: str) -> dict[str, list[Route]]:
+        """Return the table of a node's routes by key: always the same object, filled by `route`."""
+        return self._routes.setdefault(source, {})
+
+    def route(self, source: str, key: str) -> list[Route]:
         """Return the ways from a node to all who hear a key, in the order of subscription."""
-        found = self._routes.get((source, key))
-        if found is None:
-            link = self.network.link if self.network else _at_once
-            found = self._routes[source, key] = [
-                (link(source, bus.node), bus.arrive, deliver)
-                for pattern, deliver, bus in self._subscriptions if pattern.fullmatch(key)]
+        link = self.network.link if self.network else _at_once
+        found = self.routes_from(source)[key] = [
+            (link(source, bus.node), bus.arrive, deliver)
+            for pattern, deliver, bus in self._subscriptions if pattern.fullmatch(key)]
         return found
+
+    def _forget_routes(self) -> None:
+        for table in self._routes.values():
+            table.clear()
 
     def announce(self, node: str, incarnation: int, *, alive: bool) -> None:
         """Tell the watchers that a node appeared or vanished."""
@@ -94,6 +99,7 @@ class VirtualBus:
     def __init__(self, hub: Hub, node: str, incarnation: int = 1) -> None:
         self.node = node
         self._hub = hub
+        self._routes = hub.routes_from(node)
         self._incarnation = incarnation
         self._open = False
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -111,13 +117,16 @@ class VirtualBus:
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:  # noqa: ARG002
         """Send to all present subscribers of the key."""
-        loop, hub, node = self._loop, self._hub, self.node
+        loop, hub = self._loop, self._hub
         if not self._open or loop is None:
             return
-        for tap in hub.taps:
-            tap(node, key, payload)
         now_s = loop.time()
-        for link, arrive, deliver in hub.routes(node, key):
+        for tap in hub.taps:
+            tap(now_s, self.node, key, payload)
+        routes = self._routes.get(key)
+        if routes is None:
+            routes = hub.route(self.node, key)
+        for link, arrive, deliver in routes:
             if link is None:
                 loop.call_soon(arrive, deliver, key, payload)
                 continue
@@ -134,7 +143,8 @@ class VirtualBus:
 
     def has_readers(self, key: str) -> bool:
         """Whether somebody hears a key now."""
-        return bool(self._hub.routes(self.node, key))
+        routes = self._routes.get(key)
+        return bool(self._hub.route(self.node, key) if routes is None else routes)
 
     def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:  # noqa: ARG002
         """Have `deliver` called for each message on keys that match."""
