@@ -43,6 +43,7 @@ examples:
   python launch.py --no-ftm                         the paper's baseline, without fault tolerance
   python launch.py --virtual --seed 7               in seconds, and every time the same
   python launch.py --virtual --fault kill:osmosis_control@30 --fault gps-bias@goal2+5
+  python launch.py --system paper                   the paper's mechanisms and no more
   python launch.py --system cell                    the manipulator cell, with stand-in nodes
   python launch.py --airport my/airport.graph --mission my/MISSION_A.miss
 while it runs, from another shell:
@@ -63,7 +64,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--airport", metavar="NAME|FILE", help="shipped airport, a .toml, or a .graph "
                    "with its image beside it (default: the system's)")
     p.add_argument("--system", metavar="FILE", default=str(ROOT / "systems" / "osmosis.toml"),
-                   help="system spec, or name of a shipped one: osmosis, cell (default: osmosis)")
+                   help="system spec, or name of a shipped one: osmosis, paper, cell "
+                   "(default: osmosis)")
     p.add_argument("--strategy", metavar="NAME", default="",
                    help=f"one of {', '.join(STRATEGIES)} (default: the system's)")
     p.add_argument("--shadow", metavar="NAME", default="",

@@ -26,13 +26,13 @@ from manager.specification import parse_specification
 from manager.strategies import STRATEGIES, Decider, find_strategy
 from manager.verification import verify
 
-OSMOSIS = (Path(systems.__file__).parent / "osmosis.toml").read_text(encoding="utf-8")
+OSMOSIS = (Path(systems.__file__).parent / "paper.toml").read_text(encoding="utf-8")
 NAMES = sorted(STRATEGIES)
 
 
 @pytest.fixture(scope="module")
 def osmosis() -> SystemSpec:
-    return parse_specification(OSMOSIS, "osmosis.toml")
+    return parse_specification(OSMOSIS, "paper.toml")
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def test_choose_of_a_thousand_mechanisms(benchmark, large, summary, strategy, ac
 
 
 def test_load_osmosis(benchmark):
-    benchmark(lambda: arranged(parse_specification(OSMOSIS, "osmosis.toml")))
+    benchmark(lambda: arranged(parse_specification(OSMOSIS, "paper.toml")))
 
 
 def test_load_a_thousand_mechanisms(benchmark):

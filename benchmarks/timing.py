@@ -72,7 +72,7 @@ class Ear(Actor):
 
 async def measure(port: int, kills: int) -> dict[str, list[float]]:
     """Run the system and return samples in seconds."""
-    plan = RunPlan("bench", port, 1.0, 1, "systems/osmosis.toml", "", "vallombre", "AB", 0,
+    plan = RunPlan("bench", port, 1.0, 1, "systems/paper.toml", "", "vallombre", "AB", 0,
                    ftm=True, hmi_port=0)
     launcher = Launcher(plan, "timing")
     launcher.begin()

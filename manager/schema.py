@@ -1,7 +1,7 @@
 """The tables of a system specification: robot, timing, nodes, mechanisms, fault tree.
 
 One TOML file says everything that the arbiter, the launcher and the supervisor need to know;
-`systems/osmosis.toml` is the paper's and shows every field. These classes are its shape, and what
+`systems/osmosis.toml` shows every field. These classes are its shape, and what
 is checked by type alone: unknown fields, wrong types, names that are no names, negative times.
 `manager.specification` reads a file into them.
 """

@@ -27,7 +27,7 @@ TRUE_VERDICTS = {"A03": "out", "A06": "dim", "A10": "out", "B02": "dim", "B07": 
 
 def with_checkpoints(directory: Path) -> Path:
     """Write the paper's system with checkpoints."""
-    text = (ROOT / "systems" / "osmosis.toml").read_text(encoding="utf-8")
+    text = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
     assert text.count("checkpoints = false") == 1
     file = directory / "osmosis-with-checkpoints.toml"
     file.write_text(text.replace("checkpoints = false", "checkpoints = true"), encoding="utf-8")

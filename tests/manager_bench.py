@@ -22,14 +22,14 @@ from manager.arbiter import (
 )
 from manager.specification import SystemSpec, parse_specification
 
-OSMOSIS = (Path(systems.__file__).parent / "osmosis.toml").read_text(encoding="utf-8")
+OSMOSIS = (Path(systems.__file__).parent / "paper.toml").read_text(encoding="utf-8")
 DMS = ("DM1", "DM2", "DM3", "DM4", "DM5", "DM6", "DM7")
 RMS = ("RM1", "RM2", "RM3", "RM4", "RM5")
 
 
 @cache
 def osmosis() -> SystemSpec:
-    return parse_specification(OSMOSIS, "systems/osmosis.toml")
+    return parse_specification(OSMOSIS, "systems/paper.toml")
 
 
 def edited(**fields) -> SystemSpec:

@@ -21,14 +21,16 @@ from actors.supervision.run_info import RunInfo, find_runs
 class RealRun:
     """A `launch.py` process of its own ports and report directory; a context manager."""
 
-    def __init__(self, directory: Path, *arguments: str, hmi: bool = False) -> None:
+    def __init__(self, directory: Path, *arguments: str, hmi: bool = False,
+                 system: str = "paper") -> None:
         self.port = free_base_port()
         self.directory = directory
         self._stderr = directory / "stderr.txt"
         self._stdout = directory / "stdout.txt"
         self._arguments = [
-            sys.executable, str(ROOT / "launch.py"), "--json", "--port", str(self.port),
-            "--report", str(directory / "report"), *([] if hmi else ["--no-hmi"]), *arguments]
+            sys.executable, str(ROOT / "launch.py"), "--system", system, "--json",
+            "--port", str(self.port), "--report", str(directory / "report"),
+            *([] if hmi else ["--no-hmi"]), *arguments]
 
     def __enter__(self) -> RealRun:
         with self._stdout.open("w") as out, self._stderr.open("w") as err:

@@ -31,7 +31,7 @@ class Idler(Actor):
 
 def write_stub_system(directory: Path) -> Path:
     """Write the shipped system with every actor replaced by an `Idler`."""
-    text = (ROOT / "systems" / "osmosis.toml").read_text(encoding="utf-8")
+    text = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
     file = directory / "stub.toml"
     file.write_text(re.sub(r'^actor = "[^"]+"', 'actor = "stub_actors:Idler"', text,
                            flags=re.MULTILINE), encoding="utf-8")

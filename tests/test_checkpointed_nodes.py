@@ -38,7 +38,7 @@ from manager.specification import parse_specification
 
 P = m.MissionPhase
 GOALS = tuple(m.Goal(float(i), 0.0, m.Mode.TAXI) for i in range(4))
-SPEC = parse_specification((ROOT / "systems" / "osmosis.toml").read_text(), "osmosis.toml")
+SPEC = parse_specification((ROOT / "systems" / "paper.toml").read_text(), "paper.toml")
 
 
 def mission(step: int = 1, phase: m.MissionPhase = P.RUNNING, **changes) -> MissionState:
@@ -267,7 +267,7 @@ def test_a_light_whose_pass_was_cut_is_gone_back_for(short):
 
 
 def test_the_papers_system_loses_its_mission(short):
-    run = fly(short, ["kill:mission_manager@8"], system=ROOT / "systems" / "osmosis.toml")
+    run = fly(short, ["kill:mission_manager@8"], system=ROOT / "systems" / "paper.toml")
     assert (run.result.record.mission, run.result.record.safety) == ("fail", "safe")
     assert {name for name, shelf in run.shelves.items() if shelf.records} == set()
 

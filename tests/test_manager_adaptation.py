@@ -29,12 +29,12 @@ from manager.adaptation import (
 from manager.checks import find_nonsense
 from manager.specification import SpecificationError, SystemSpec, read_document
 
-DOCUMENT = read_document(OSMOSIS, "osmosis.toml")
+DOCUMENT = read_document(OSMOSIS, "paper.toml")
 
 
 def change(action: str, name: str, /, **values: Any) -> SystemSpec:
     before = copy.deepcopy(DOCUMENT)
-    _, spec = adapt(DOCUMENT, Change(Action(action), name, values), "osmosis.toml")
+    _, spec = adapt(DOCUMENT, Change(Action(action), name, values), "paper.toml")
     assert before == DOCUMENT
     return spec
 
@@ -89,24 +89,24 @@ def test_a_gate_and_an_order_and_a_strategy_are_changed():
     ("set", "airport", {"value": "x"}, "unknown setting 'airport'; known: strategy, shadow, order"),
     ("set", "strategy", {}, "set strategy: the value is missing"),
     ("set", "strategy", {"value": "bold"},
-     "osmosis.toml: $.strategy = 'bold': unknown strategy; known: guarded-repair, mission-first, "
+     "paper.toml: $.strategy = 'bold': unknown strategy; known: guarded-repair, mission-first, "
      "safety-first, simultaneous"),
     ("set", "order", {"value": "comfort"},
-     "osmosis.toml: $.order = 'comfort': unknown order; known: safer"),
-    ("disable", "RM1", {}, "osmosis.toml: $.recovery[1].escalate_to = 'RM1': RM2 escalates to it, "
+     "paper.toml: $.order = 'comfort': unknown order; known: safer"),
+    ("disable", "RM1", {}, "paper.toml: $.recovery[1].escalate_to = 'RM1': RM2 escalates to it, "
                            "and it is disabled"),
-    ("disable", "FTM1", {}, "osmosis.toml: $.mechanism[1].event = 'command_calculation_error': "
+    ("disable", "FTM1", {}, "paper.toml: $.mechanism[1].event = 'command_calculation_error': "
                             "FTM3: the FTMTree has 3 roots: FTM2, FTM3, FTM6; exactly one mechanism"
                             " may have no other above it, e.g. one on the top event"),
     ("retune", "DM2", {"timeout_s": 5.0},
-     "osmosis.toml: $.timing: the time budget does not fit: FTM2 needs 5.150 s (detection 5.000 + "
+     "paper.toml: $.timing: the time budget does not fit: FTM2 needs 5.150 s (detection 5.000 + "
      "arbitration 0.050 + actuation 0.100) of 1.250 s before the robot drifts out of the corridor"),
     ("retune", "FTM3", {"detect": "DM3 and not DM3"},
-     "osmosis.toml: $.mechanism[2].detect = 'DM3 and not DM3': it can never be active"),
+     "paper.toml: $.mechanism[2].detect = 'DM3 and not DM3': it can never be active"),
     ("retune", "RM3", {"deadline_s": "soon"},
-     "osmosis.toml: $.recovery[2].deadline_s = 'soon': Expected float, got str"),
+     "paper.toml: $.recovery[2].deadline_s = 'soon': Expected float, got str"),
     ("replace", "DM1", {"parameters": 3},
-     "osmosis.toml: $.detection[0].parameters = 3: Expected object, got int"),
+     "paper.toml: $.detection[0].parameters = 3: Expected object, got int"),
 ])
 def test_refused_in_one_line(action, name, values, message):
     with pytest.raises((ChangeError, SpecificationError)) as caught:

@@ -11,7 +11,7 @@ import manager
 from manager.schema import Kind
 from manager.specification import SpecificationError, parse_specification
 
-FILE = "systems/osmosis.toml"
+FILE = "systems/paper.toml"
 
 
 def edit(*changes: tuple[str, str]) -> str:

@@ -30,7 +30,7 @@ def run(scenario: Callable[[], Coroutine[Any, Any, T]]) -> T:
 @cache
 def shipped_system() -> SystemSpec:
     """Return the spec of the shipped system."""
-    path = Path(systems.__file__).parent / "osmosis.toml"
+    path = Path(systems.__file__).parent / "paper.toml"
     return parse_specification(path.read_text(), path.name)
 
 
