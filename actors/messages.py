@@ -196,7 +196,8 @@ class MissionStatus(Message, frozen=True):
     """Where the mission is. `step` is the index of the current goal; lights measured so far.
 
     `skipped` holds the indices of goals that were left out on request, `unmeasured` names the
-    lights that the robot passed without being able to measure them.
+    lights that the robot passed without being able to measure them. `orders` are those that would
+    be obeyed now.
     """
 
     mission_id: str
@@ -209,6 +210,7 @@ class MissionStatus(Message, frozen=True):
     reason: str
     skipped: tuple[int, ...] = ()
     unmeasured: tuple[str, ...] = ()
+    orders: tuple[MissionAction, ...] = ()
 
 
 class GoalOrder(Message, frozen=True):

@@ -9,8 +9,8 @@ from actors.runtime.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTIO
 # Summit XL layer: a real robot's driver stands behind these keys just as well.
 ABSOLUTE_POSE = Topic("summit_xl/absolute_pose", m.Pose, Qos.SENSOR, 20, "map",
                       "Absolute localization that the simulator offers, as in the paper.")
-ODOMETRY = Topic("summit_xl/odom", m.Odometry, Qos.SENSOR, 20, "odom", "Wheel odometry.")
-IMU = Topic("summit_xl/imu", m.Imu, Qos.SENSOR, 20, "base_link", "Inertial measurement unit.")
+ODOMETRY = Topic("summit_xl/odom", m.Odometry, Qos.SENSOR, 50, "odom", "Wheel odometry.")
+IMU = Topic("summit_xl/imu", m.Imu, Qos.SENSOR, 50, "base_link", "Inertial measurement unit.")
 GPS = Topic("summit_xl/gps", m.GpsFix, Qos.SENSOR, 10, "map", "RTK-GPS receiver.")
 SCAN = Topic("summit_xl/scan", m.LaserScan, Qos.SENSOR, 20, "base_link", "2D laser scanner.")
 UPPER_SCAN = Topic("summit_xl/upper_scan", m.LaserScan, Qos.SENSOR, 20, "base_link",

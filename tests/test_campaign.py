@@ -21,21 +21,31 @@ from stub_actors import ROOT
 from sim.campaign import execute as execution
 from sim.campaign.execute import BackendError, JobError, execute
 from sim.campaign.job import Job, RunResult, run_job
-from sim.campaign.paper_tables import CONDITIONS, FAULTS, cells, paper_jobs, table_iii
+from sim.campaign.paper_tables import (
+    CONDITIONS,
+    FAULTS,
+    FULL,
+    WITH_FTM,
+    cells,
+    condition_of,
+    full_jobs,
+    paper_jobs,
+    table_iii,
+)
 from sim.campaign.plan import cross, fault_groups, sample
 from sim.campaign.search import Space, margin, search, shrink
 from sim.campaign.statistics import badness, rate, spread, table, total, worst
 from sim.campaign.store import Run, Store, StoreError
 from sim.scenario import FaultOutcome, PlannedFault
-from toolbox import systems
+from toolbox import campaigning, systems
 from toolbox.campaigning import ProgressLog
 from toolbox.main import main as rampart
 
-SYSTEM = systems.load(None)
-GROUPS = fault_groups(SYSTEM)
-BASES = [Job(row="", mission="A", obstacles=n) for n in (0, 2)]
+PAPER = systems.load("paper")
+GROUPS = fault_groups(PAPER)
+BASES = [Job(row="", system="paper", mission="A", obstacles=n) for n in (0, 2)]
 SHORT = PlannedFault("kill:mission_manager", 3.0)
-"""Over after seven simulated seconds, a fifth of a second of work."""
+"""Over after seven simulated seconds of the paper's system, a fifth of a second of work."""
 
 
 def result(**changes) -> RunResult:
@@ -160,7 +170,7 @@ def test_a_job_that_makes_no_sense_is_named_and_what_was_finished_is_kept(tmp_pa
 
 
 def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
-    command = [sys.executable, "-m", "toolbox.main", "campaign", "--fault",
+    command = [sys.executable, "-m", "toolbox.main", "campaign", "--system", "paper", "--fault",
                "kill:mission_manager@3", "--seeds", "12", "--obstacles", "0", "--jobs", "1",
                "--out", str(tmp_path), "--json"]
 
@@ -288,18 +298,45 @@ def test_undetected_and_stopped_for_good_are_counted():
 
 
 def test_table_iii_is_the_papers():
-    assert [row.agrees for row in table_iii(SYSTEM)] == [True] * 4
+    assert [row.agrees for row in table_iii(PAPER)] == [True] * 4
 
 
 def test_every_row_of_the_papers_tables_is_run_under_every_condition():
     jobs = paper_jobs()
     assert len(jobs) == len({job.key for job in jobs})
+    assert {job.system for job in jobs} == {"paper"}
     assert {(j.row, j.obstacles) for j in jobs} == {(f, n) for f in FAULTS for n in (0, 2)}
     found = cells([Run(job, result()) for job in jobs])
     assert len(found) == len(CONDITIONS) * len(FAULTS) * 2
     assert {cell.ours for cell in found} == {"success, safe"}
     assert [c.agrees for c in found if c.fault == "none"] == [True] * 6
     assert not any(c.agrees for c in found if c.fault == "command not updated")
+
+
+def test_the_full_system_is_given_the_runs_of_table_v_and_keeps_its_own_strategy():
+    def what_goes_wrong(job: Job) -> tuple[object, ...]:
+        return job.row, job.faults, job.obstacles, job.seed, job.mission, job.network
+
+    jobs = full_jobs("B", seed=5)
+    assert {(j.system, j.strategy, j.ftm) for j in jobs} == {("osmosis", "", True)}
+    assert {condition_of(j) for j in jobs} == {FULL}
+    assert not any(j.retuned for j in jobs)
+    for condition in CONDITIONS[1:]:
+        assert [what_goes_wrong(j) for j in jobs] == [
+            what_goes_wrong(j) for j in paper_jobs("B", seed=5) if condition_of(j) == condition]
+    assert {j.system for j in full_jobs(system="other.toml")} == {"other.toml"}
+
+
+def test_of_the_full_system_success_and_safety_are_expected_where_the_paper_has_failure():
+    runs = [Run(job, result(success=job.row != "control node crash" or job.seed != 3,
+                            safe=job.faults[:1] != (PlannedFault("kill:hmi", 8.0),)))
+            for job in full_jobs()]
+    found = cells(runs)
+    assert [(c.fault, c.obstacles) for c in found] == [(f, n) for f in FAULTS for n in (0, 2)]
+    assert [c.paper for c in found] == [v for verdicts in WITH_FTM.values() for v in verdicts]
+    assert {c.expected for c in found} == {"success, safe"}
+    assert {(c.fault, c.ours) for c in found if not c.agrees} == {
+        ("control node crash", "fail, safe"), ("non-control node crash", "success, unsafe")}
 
 
 # ---- the search for the unsafe ---------------------------------------------------------------
@@ -351,6 +388,8 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
 @pytest.mark.parametrize(("arguments", "words"), [
     ((), "give one of --paper, --runs N"),
     (("--paper", "--runs", "3"), "give one of"),
+    (("--full",), "--full: goes with --paper only"),
+    (("--full", "--runs", "3"), "--full: goes with --paper only"),
     (("--runs", "0"), "--runs 0: must be 1 or more"),
     (("--runs", "3", "--kinds", "gremlin"), "unknown kind 'gremlin'; known: paper, sensor"),
     (("--fault", "gremlins"), "unknown fault 'gremlins'"),
@@ -364,7 +403,8 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
     (("--runs", "3", "--patience", "0"), "--patience 0"),
     (("--replay", "ab"), "--out DIR is missing"),
     (("--replay", "ab", "--out", "/nowhere"), "no such directory"),
-    (("--system", "cell", "--paper"), "it has no .robot."),
+    (("--system", "cell", "--paper"), "--system cell: it has no .robot."),
+    (("--system", "cell", "--paper", "--full"), "--system cell: it has no .robot."),
 ])
 def test_bad_usage_is_one_line_and_exit_code_2(capsys, arguments, words):
     assert rampart(["campaign", *arguments]) == 2
@@ -374,8 +414,8 @@ def test_bad_usage_is_one_line_and_exit_code_2(capsys, arguments, words):
 
 
 def test_a_run_is_replayed_by_its_key_and_recognised(tmp_path, capsys):
-    arguments = ["campaign", "--fault", "kill:mission_manager@3", "--obstacles", "0", "--out",
-                 str(tmp_path), "--jobs", "1"]
+    arguments = ["campaign", "--system", "paper", "--fault", "kill:mission_manager@3",
+                 "--obstacles", "0", "--out", str(tmp_path), "--jobs", "1"]
     assert rampart([*arguments, "--json"]) == 0
     key = json.loads(capsys.readouterr().out)[0]["worst_key"]
     assert rampart(["campaign", "--replay", key[:6], "--out", str(tmp_path), "--json"]) == 0
@@ -386,8 +426,68 @@ def test_a_run_is_replayed_by_its_key_and_recognised(tmp_path, capsys):
 
 
 def test_patterns_choose_faults_by_name(capsys):
-    assert rampart(["campaign", "--list", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {k: list(v) for k, v in GROUPS.items()}
+    for chosen, groups in ((["--system", "paper"], GROUPS),
+                           ([], fault_groups(systems.load("osmosis")))):
+        assert rampart(["campaign", "--list", "--json", *chosen]) == 0
+        assert json.loads(capsys.readouterr().out) == {k: list(v) for k, v in groups.items()}
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    """Make results up instead of running jobs; all are good but those of the key given here."""
+    bad: dict[str, RunResult] = {}
+
+    def fake(jobs, store, **_):
+        for job in jobs:
+            store.add(job, bad.get(job.key, result()))
+        return len(jobs)
+
+    monkeypatch.setattr(campaigning, "execute", fake)
+    monkeypatch.setattr(campaigning, "worth_showing", lambda _runs: [])
+    return bad
+
+
+def jobs_in(directory) -> list[Job]:
+    store = Store(directory)
+    found = [run.job for run in store.runs()]
+    store.close()
+    return found
+
+
+@pytest.mark.parametrize(("chosen", "jobs"), [
+    ((), paper_jobs()), (("--system", "osmosis"), paper_jobs(system="osmosis")),
+    (("--full",), full_jobs()), (("--full", "--system", "paper"), full_jobs(system="paper"))])
+def test_the_papers_tables_are_of_its_system_and_full_of_the_full_one_unless_one_is_named(
+        tmp_path, made_up, capsys, chosen, jobs):
+    assert rampart(["campaign", "--paper", *chosen, "--out", str(tmp_path)]) == 0
+    assert jobs_in(tmp_path) == jobs
+    assert ("Table III" in capsys.readouterr().out) == ("--full" not in chosen)
+
+
+def test_a_row_of_the_full_system_that_is_not_as_expected_is_told_and_is_exit_code_1(
+        tmp_path, made_up, capsys):
+    arguments = ["campaign", "--paper", "--full", "--json", "--out"]
+    assert rampart([*arguments, str(tmp_path / "good")]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert len(rows) == 12
+    assert {(r["expected"], r["ours"]) for r in rows} == {("success, safe",) * 2}
+    assert {r["fault"]: r["paper"] for r in rows} == {f: v[0] for f, v in WITH_FTM.items()}
+
+    lost = next(job for job in full_jobs() if job.row == "command not updated" and job.obstacles)
+    made_up[lost.key] = result(success=False, reasons=("goal 2 of 9 not reached",))
+    assert rampart([*arguments, str(tmp_path / "bad")]) == 1
+    rows = {(r["fault"], r["obstacles"]): r for r in json.loads(capsys.readouterr().out)}
+    assert {where for where, r in rows.items() if r["ours"] != r["expected"]} == {
+        ("command not updated", 2)}
+    assert rows["command not updated", 2]["success"] == 3
+
+    assert rampart(["campaign", "--paper", "--full", "--out", str(tmp_path / "bad")]) == 1
+    text = capsys.readouterr().out
+    assert text.count("  as expected") == 11
+    assert f"NOT as expected: run {lost.key}" in text
+    assert "goal 2 of 9 not reached" in text
+    page = (tmp_path / "bad" / "report.html").read_text()
+    assert "<h1>The paper&#39;s rows on the full system</h1>" in page
 
 
 def test_a_log_gets_a_line_a_minute_with_the_time_left_and_one_at_the_end():

@@ -258,6 +258,31 @@ def test_the_papers_runs_are_shown_as_its_tables_beside_its_verdicts():
     assert "Where the verdicts differ" not in page
 
 
+def test_the_papers_rows_on_the_full_system_are_a_table_of_their_own():
+    runs = [Run(job, run("gps-bias").result) for job in paper_tables.full_jobs()]
+    text = text_of(page := render(OUT, ABOUT, runs))
+    assert "The paper's rows on the full system" in text
+    assert "12 of 12 rows of table V end in success, safe on the full system." in text
+    assert "12 of 12 verdicts are as expected." in text
+    assert "the paper's. A verdict is" not in text
+    (crash,) = [row for row in rows(page, "controlnodecrash") if len(row) == 7]
+    several = len(paper_tables.FAULTS["control node crash"])
+    assert crash[1:] == [
+        "fail, safe", "✓ success, safe", f"{several} {several} success, {several} safe"] * 2
+    assert "Where the verdicts differ" not in page
+    assert "Table IV:" not in page
+
+
+def test_a_row_that_the_full_system_loses_is_told_even_if_the_paper_loses_it_too():
+    runs = [Run(job, run("gps-bias", success=job.row != "command not updated").result)
+            for job in paper_tables.full_jobs()]
+    page = render(OUT, ABOUT, runs)
+    assert "10 of 12 rows of table V end in success, safe" in text_of(page)
+    assert [row[2] for row in rows(page, "commandnotupdated") if len(row) == 7] == [
+        "✗ fail, safe why"]
+    assert "the paper has fail, safe, our worst run fail, safe" in text_of(page)
+
+
 def test_where_a_verdict_differs_the_story_of_the_worst_run_is_told():
     runs = paper_runs()
     at = next(i for i, r in enumerate(runs)

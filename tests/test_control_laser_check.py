@@ -50,11 +50,13 @@ def test_after_a_wrong_sweep_the_laser_is_not_believed_for_a_second():
     "laser-stuck@26+inf", "laser-bias@26+inf", "laser-noise@26+inf", "laser-dropout@26+inf",
     "stuck:summit_xl/scan@2+inf"])
 def test_a_robot_that_cannot_trust_its_laser_stands(fault):
-    result = run_job(Job(row="x", mission="A", obstacles=2, faults=(parse_fault(fault),)))
+    result = run_job(Job(row="x", system="paper", mission="A", obstacles=2,
+                         faults=(parse_fault(fault),)))
     assert (result.safe, result.success) == (True, False)
     assert result.duration_s < 26 + 43
 
 
 def test_once_the_laser_is_right_again_the_mission_goes_on():
-    result = run_job(Job(row="x", mission="A", faults=(parse_fault("laser-stuck@26+3"),)))
+    result = run_job(Job(row="x", system="paper", mission="A",
+                         faults=(parse_fault("laser-stuck@26+3"),)))
     assert (result.safe, result.success) == (True, True)

@@ -15,7 +15,7 @@ from hmi_browser import CHROMIUM, browser
 from actors import messages as m
 from actors import topics
 from actors.operator.hmi import Hmi
-from actors.operator.hmi_server import MAX_MESSAGE_BYTES, own_origin
+from actors.operator.hmi_server import MAX_MESSAGE_BYTES, OrderWish, own_origin
 from actors.runtime.actor import Actor, Context, Header, on
 from actors.runtime.clock import Clock
 from actors.runtime.virtual_bus import Hub, VirtualBus
@@ -28,12 +28,14 @@ RATE = 20.0
 class Others(Actor):
     """Stands for the rest of the system."""
 
-    outputs = (topics.MISSION_STATUS, topics.MANAGER_STATUS, topics.POSE, topics.DETECTION)
+    outputs = (topics.MISSION_STATUS, topics.MANAGER_STATUS, topics.POSE, topics.DETECTION,
+               topics.MISSION_ORDER_ANSWER)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.requests: list[m.MissionRequest] = []
         self.resets: list[m.Reset] = []
+        self.orders: list[m.MissionOrder] = []
         self.diagnostics: list[m.Diagnostic] = []
 
     @on(topics.MISSION_REQUEST)
@@ -43,6 +45,10 @@ class Others(Actor):
     @on(topics.RESET)
     def reset(self, message: m.Reset, _header: Header) -> None:
         self.resets.append(message)
+
+    @on(topics.MISSION_ORDER)
+    def order(self, message: m.MissionOrder, _header: Header) -> None:
+        self.orders.append(message)
 
     @on(topics.DIAGNOSTIC)
     def diagnostic(self, message: m.Diagnostic, _header: Header) -> None:
@@ -82,6 +88,11 @@ class World:
         self.others.publish(topics.MISSION_STATUS, m.MissionStatus(
             request.mission_id, request.name, m.MissionPhase.RUNNING, 0, request.goals, (), (), ""))
 
+    def say(self, phase: m.MissionPhase, *possible: m.MissionAction) -> None:
+        goals = tuple(m.Goal(g.x_m, g.y_m, m.Mode(g.mode)) for g in AIRPORT.mission("A").goals)
+        self.others.publish(topics.MISSION_STATUS, m.MissionStatus(
+            "r1/first", "A", phase, 0, goals, (), (), "", orders=possible))
+
     def say_latched(self, *names: str) -> None:
         self.others.publish(topics.MANAGER_STATUS, m.ManagerStatus(
             (), (), names, names, "safety-first", 1))
@@ -105,6 +116,21 @@ async def eventually(condition, timeout_s: float = 5.0) -> None:
     while not condition():
         assert asyncio.get_running_loop().time() < deadline, "it did not happen in time"
         await asyncio.sleep(0.005)
+
+
+@asynccontextmanager
+async def repeated(say, period_s: float = 0.02):
+    """Have something said again and again, as living nodes do."""
+    async def again() -> None:
+        while True:
+            say()
+            await asyncio.sleep(period_s)
+
+    task = asyncio.create_task(again())
+    try:
+        yield
+    finally:
+        task.cancel()
 
 
 async def served(hmi: Hmi) -> str:
@@ -196,6 +222,11 @@ async def test_a_mission_is_started_from_the_page_unless_one_runs(world):
     "", "not json", "[]", "null", "{}", '{"type": "reset"}', '{"type": "reset", "recovery": 1}',
     '{"type": "format", "disk": "c"}', '{"type": "reset", "recovery": "RM1", "extra": 1}',
     "[" * 4000, b"\xff\xfe\x00",
+    '{"type": "order"}', '{"type": "order", "action": "explode"}',
+    '{"type": "order", "action": "PAUSE"}', '{"type": "order", "action": null}',
+    '{"type": "order", "action": ["pause"]}', '{"type": "order", "action": "pause", "by": "RM6"}',
+    '{"type": "order", "action": "pause", "reason": 7}',
+    '{"type": "order", "action": "pause", "reason": "' + 201 * "x" + '"}',
 ])
 async def test_a_malformed_message_is_answered_with_an_error_and_ignored(world, text):
     async with world.hmi(hmi_port=free_port()) as hmi:
@@ -204,7 +235,46 @@ async def test_a_malformed_message_is_answered_with_an_error_and_ignored(world, 
             await page.send(text)
             assert "not understood" in (await hear(page, "error"))["text"]
             await hear(page, "state")
-    assert world.others.resets == []
+    assert (world.others.resets, world.others.orders) == ([], [])
+
+
+async def test_an_order_is_given_from_the_page_if_it_makes_sense_and_its_answer_is_shown(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with websockets.connect(f"ws://{at}/ws") as page:
+            await page.send('{"type": "order", "action": "pause"}')
+            assert (await hear(page, "error"))["text"] == "the Mission Manager was not heard yet"
+            world.say(m.MissionPhase.RUNNING, m.MissionAction.PAUSE)
+            await eventually(lambda: hmi._state.snapshot(0.0)["mission"] is not None)
+            await page.send('{"type": "order", "action": "resume"}')
+            assert (await hear(page, "error"))["text"] == (
+                "resume makes no sense while the mission is running; possible: pause")
+            await page.send('{"type": "order", "action": "pause", "reason": "runway in use"}')
+            assert (await hear(page, "done"))["text"] == "pause asked for"
+            await eventually(lambda: bool(world.others.orders))
+            order = world.others.orders[0]
+            assert (order.action, order.reason, order.by) == ("pause", "runway in use", "operator")
+            world.others.publish(topics.MISSION_ORDER_ANSWER, m.MissionOrderAnswer(
+                order.order, False, "a reason"))
+            await eventually(lambda: hmi._orders.pending is None)
+            while (state := await hear(page, "state"))["order"]["number"] == 0:
+                pass
+            assert state["order"]["text"] == "pause refused: a reason"
+            assert state["events"][-1]["text"] == "order to the mission: pause refused: a reason"
+    assert {o.order for o in world.others.orders} == {order.order}
+
+
+async def test_an_order_without_an_answer_is_repeated_to_a_mission_manager_that_comes_back(world):
+    async with world.hmi() as hmi:
+        world.say(m.MissionPhase.RUNNING, *m.MissionAction)
+        await eventually(lambda: hmi._orders._status is not None)
+        hmi._fulfil(OrderWish(m.MissionAction.HOME))
+        sent = []
+        hmi.publish = lambda topic, body, *_: topic is topics.MISSION_ORDER and sent.append(body)
+        await eventually(lambda: len(sent) >= 2)
+        await eventually(lambda: hmi._orders.pending is None)
+        assert len(set(sent)) == 1
+        assert "does not answer" in hmi._state.snapshot(0.0)["order"]["text"]
 
 
 async def test_a_huge_message_closes_that_page_only(world):
@@ -284,3 +354,46 @@ async def test_chromium_shows_the_system_resets_the_stop_and_reconnects_by_itsel
         await tab.until("document.body.classList.contains('offline')")
         async with world.hmi(incarnation=2, hmi_port=port):
             await tab.until("document.getElementById('link').textContent === 'live'")
+
+
+BUTTONS = "[...document.querySelectorAll('#orders button:enabled')].map((b) => b.dataset.order)"
+
+
+async def press(tab, key: str) -> None:
+    for kind in ("rawKeyDown", "char", "keyUp"):
+        await tab.call("Input.dispatchKeyEvent", type=kind, key=key, code="Enter",
+                       windowsVirtualKeyCode=13, text="\r" if kind == "char" else "")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+async def test_in_chromium_the_orders_that_make_sense_are_buttons_for_mouse_and_keyboard(world):
+    p, a = m.MissionPhase, m.MissionAction
+    async with world.hmi(hmi_port=free_port()) as hmi, browser() as tab:
+        await tab.show(f"http://{await served(hmi)}/")
+        await tab.until("document.getElementById('link').textContent === 'live'")
+        assert await tab.value("document.getElementById('orders').hidden") is True
+        for phase, possible in ((p.RUNNING, (a.PAUSE, a.SKIP, a.CANCEL, a.HOME)),
+                                (p.PAUSED, (a.RESUME, a.SKIP, a.CANCEL, a.HOME)),
+                                (p.RETURNING, (a.PAUSE, a.CANCEL))):
+            async with repeated(lambda phase=phase, possible=possible: world.say(phase, *possible)):
+                shown = [x.value for x in (a.PAUSE, a.RESUME, a.SKIP, a.HOME, a.CANCEL)
+                         if x in possible]
+                await tab.until(f"JSON.stringify({BUTTONS}) === '{json.dumps(shown)}'"
+                                .replace(", ", ","))
+        async with repeated(lambda: world.say(p.RUNNING, *a)):
+            await tab.until(f"{BUTTONS}.length === 5")
+            await tab.value("document.querySelector('[data-order=pause]').focus()")
+            await press(tab, "Enter")
+            await eventually(lambda: [o.action for o in world.others.orders] == [a.PAUSE])
+            world.others.publish(topics.MISSION_ORDER_ANSWER, m.MissionOrderAnswer(
+                world.others.orders[0].order, True, ""))
+            await tab.until("document.getElementById('toast').textContent === 'pause obeyed'")
+            cancel = "document.querySelector('[data-order=cancel]')"
+            await tab.value(f"{cancel}.click()")
+            assert await tab.value(f"{cancel}.textContent") == "Sure?"
+            assert len(world.others.orders) == 1
+            await tab.value(f"{cancel}.click()")
+            await eventually(lambda: world.others.orders[-1].action == a.CANCEL)
+        world.say(p.CANCELLED)
+        await tab.until("document.getElementById('orders').hidden")
+        assert tab.errors == []

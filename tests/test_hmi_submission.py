@@ -1,8 +1,18 @@
-"""When the HMI sends a mission: once it was taken, never again."""
+"""When the HMI sends a mission (once it was taken, never again), and which orders it passes on."""
 
 import pytest
 
-from actors.messages import Goal, MissionPhase, MissionRequest, MissionStatus, Mode
+from actors.messages import (
+    Goal,
+    MissionAction,
+    MissionOrderAnswer,
+    MissionPhase,
+    MissionRequest,
+    MissionStatus,
+    Mode,
+)
+from actors.operator import hmi_orders
+from actors.operator.hmi_orders import NoSenseError, Orders
 from actors.operator.hmi_submission import (
     GIVE_UP_S,
     RESPAWN_WINDOW_S,
@@ -69,7 +79,8 @@ def test_missions_from_the_page_have_ids_of_their_own_in_every_life():
     assert FIRST.mission_id not in ids
 
 
-@pytest.mark.parametrize("phase", [MissionPhase.RUNNING, MissionPhase.PAUSED])
+@pytest.mark.parametrize("phase", [
+    MissionPhase.RUNNING, MissionPhase.PAUSED, MissionPhase.RETURNING])
 def test_a_mission_is_refused_while_another_one_is_under_way(phase):
     submission = Submission("r7", 1, 0.0, FIRST)
     submission.hear(status(FIRST, phase))
@@ -91,3 +102,53 @@ def test_a_mission_from_the_page_is_withdrawn_when_nobody_takes_it_but_the_first
     first = Submission("r7", 1, 0.0, FIRST)
     assert first.expire(1e6) is None
     assert first.pending == FIRST
+
+
+def under_way(*possible: MissionAction) -> Orders:
+    orders = Orders("r7/hmi.1", "operator")
+    orders.hear(MissionStatus("r7/first", "AB", MissionPhase.RUNNING, 0, GOALS, (), (), "",
+                              orders=possible))
+    return orders
+
+
+def test_an_order_is_repeated_as_the_same_message_until_it_is_answered():
+    orders = under_way(MissionAction.PAUSE)
+    order = orders.give(MissionAction.PAUSE, " runway \n in use ", 10.0)
+    assert (order.action, order.reason, order.by) == (
+        MissionAction.PAUSE, "runway in use", "operator")
+    assert orders.expire(10.1) == ""
+    assert orders.answer(MissionOrderAnswer("another's", True, "")) == ""
+    assert orders.pending is order
+    assert orders.answer(MissionOrderAnswer(order.order, True, "")) == "pause obeyed"
+    assert orders.pending is None
+    assert orders.answer(MissionOrderAnswer(order.order, True, "")) == ""
+
+
+def test_a_refusal_comes_with_its_reason_and_the_next_order_has_another_id():
+    orders = under_way(*MissionAction)
+    first = orders.give(MissionAction.HOME, "", 10.0)
+    assert first.reason == hmi_orders.NO_REASON
+    assert orders.answer(MissionOrderAnswer(first.order, False, "no way")) == "home refused: no way"
+    assert orders.give(MissionAction.HOME, "", 11.0).order != first.order
+
+
+def test_an_order_that_makes_no_sense_in_the_present_phase_is_not_passed_on():
+    orders = Orders("r7/hmi.1", "operator")
+    with pytest.raises(NoSenseError, match="the Mission Manager was not heard yet"):
+        orders.give(MissionAction.PAUSE, "", 1.0)
+    orders = under_way(MissionAction.PAUSE, MissionAction.SKIP)
+    with pytest.raises(NoSenseError, match="resume makes no sense while the mission is running; "
+                                           "possible: pause, skip"):
+        orders.give(MissionAction.RESUME, "", 1.0)
+    orders.give(MissionAction.PAUSE, "", 1.0)
+    with pytest.raises(NoSenseError, match="pause waits for its answer"):
+        orders.give(MissionAction.SKIP, "", 1.1)
+
+
+def test_an_order_that_nobody_answers_is_withdrawn():
+    orders = under_way(MissionAction.CANCEL)
+    orders.give(MissionAction.CANCEL, "", 10.0)
+    assert orders.expire(9.9 + hmi_orders.GIVE_UP_S) == ""
+    assert orders.expire(10.0 + hmi_orders.GIVE_UP_S) == (
+        "cancel was not obeyed: the Mission Manager does not answer")
+    assert orders.pending is None

@@ -337,7 +337,7 @@ def large(count: int):
 def test_a_system_too_large_to_look_at_every_set_is_refused():
     with pytest.raises(TooLargeError) as caught:
         verify(large(15))
-    assert str(caught.value) == ("osmosis: 15 mechanisms have 32767 active sets; at most 14 "
+    assert str(caught.value) == ("paper: 15 mechanisms have 32767 active sets; at most 14 "
                                  "mechanisms can be verified exhaustively")
 
 
@@ -363,7 +363,7 @@ def test_the_command_refuses_nonsense_in_one_line(capsys, monkeypatch):
 
 
 def test_the_command_prints_json_of_the_promised_shape(capsys):
-    assert main(["verify", "--strategy", "safety-first", "--json"]) == 0
+    assert main(["verify", "--system", "paper", "--strategy", "safety-first", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert {"states", "permissiveness", "properties"} <= told.keys()
     assert told["permissiveness"] == {"safety-first": 90}
@@ -376,11 +376,11 @@ def test_the_command_prints_json_of_the_promised_shape(capsys):
 
 @pytest.mark.parametrize(("strategy", "code"), [("safety-first", 1), ("guarded-repair", 0)])
 def test_strict_the_exit_code_tells_whether_all_holds(capsys, strategy, code):
-    assert main(["verify", "--strategy", strategy, "--strict"]) == code
+    assert main(["verify", "--system", "paper", "--strategy", strategy, "--strict"]) == code
 
 
 def test_the_command_prints_a_table_the_states_and_the_traces(capsys):
-    assert main(["verify", "--strategy", "safety-first"]) == 0
+    assert main(["verify", "--system", "paper", "--strategy", "safety-first"]) == 0
     told = capsys.readouterr().out
     assert "127 active sets, " in told
     assert "FAILS in 32" in told

@@ -76,7 +76,7 @@ def test_each_message_is_of_its_topics_type_and_stamped_with_its_own_due_time():
     types = {topic.key: topic.type for topic in Simulator.outputs}
     assert all(type(body) is types[key] for key, body, _ in bench.sent)
     stamps = [stamp for key, _, stamp in bench.sent if key == topics.IMU.key]
-    assert np.diff(stamps) == pytest.approx(0.01)
+    assert np.diff(stamps) == pytest.approx(0.02)
 
 
 def test_commands_move_the_robot_and_the_brake_holds_it():

@@ -15,15 +15,15 @@ def rampart(*arguments: str, cwd=ROOT) -> subprocess.CompletedProcess[str]:
                           capture_output=True, text=True, timeout=60)
 
 
-def test_the_shipped_system_is_listed_with_its_barriers():
-    done = rampart("cut-sets")
+def test_the_papers_system_is_listed_with_its_barriers():
+    done = rampart("cut-sets", "paper")
     assert done.returncode == 0, done.stderr
     assert "7 minimal cut sets" in done.stdout
     assert "fewer than two barriers:\n  erroneous_graph: only FTM1" in done.stdout
 
 
 def test_counts_are_json_for_scripts():
-    done = rampart("cut-sets", "--count", "--json")
+    done = rampart("cut-sets", "paper", "--count", "--json")
     assert json.loads(done.stdout) == {
         "top": "moving_inside_prohibited_area", "minimal_cut_sets": 7}
 
@@ -38,7 +38,7 @@ def test_what_is_exported_is_read_again(tmp_path):
 
 
 def test_what_is_left_before_the_top():
-    done = rampart("cut-sets", "--active", "FTM2", "FTM1", "--json")
+    done = rampart("cut-sets", "paper", "--active", "FTM2", "FTM1", "--json")
     view = json.loads(done.stdout)
     assert view["left"] == {"FTM1": [], "FTM2": []}
     assert view["next_events"][0]["barriers"] == []
@@ -46,7 +46,7 @@ def test_what_is_left_before_the_top():
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["nowhere.xml"], "nowhere.xml: No such file or directory"),
-    (["--active", "FTM9"], "unknown mechanism 'FTM9'; known: FTM1"),
+    (["--active", "FTM99"], "unknown mechanism 'FTM99'; known: FTM1"),
     (["--limit", "-1"], "--limit -1: must be 0 or more"),
     (["--top", "nobody"], "unknown top 'nobody'"),
     (["nowhere.toml"], "nowhere.toml: No such file or directory"),

@@ -21,7 +21,7 @@ def test_every_topic_that_a_node_reads_is_published_by_somebody():
     lonely = [use.topic.key for use in uses(systems.load(None))
               if use.readers and use.publishers == ("tools",)]
     assert lonely == [
-        topics.INJECT.key, topics.MISSION_ORDER.key, topics.JOYSTICK.key, topics.ADAPT.key,
+        topics.INJECT.key, topics.JOYSTICK.key, topics.ADAPT.key,
         topics.OBSTACLE.key, topics.ACTUATOR_FAULT.key]
 
 

@@ -18,7 +18,15 @@ from manager.schema import SystemSpec
 from manager.strategies import STRATEGIES
 from sim.campaign.execute import BackendError, JobError, execute
 from sim.campaign.job import Job, RunResult, run_virtually
-from sim.campaign.paper_tables import cells, paper_jobs, table_iii
+from sim.campaign.paper_tables import (
+    FULL_SYSTEM,
+    PAPER_SYSTEM,
+    Cell,
+    cells,
+    full_jobs,
+    paper_jobs,
+    table_iii,
+)
 from sim.campaign.plan import cross, fault_groups, sample
 from sim.campaign.report import Campaign, worth_showing, write_campaign_report
 from sim.campaign.statistics import Rate, Row, Spread, as_json, table, total
@@ -36,6 +44,8 @@ from toolbox.output import NoEffectError, UsageError, print_json, print_table, s
 
 def campaign(options: argparse.Namespace) -> int:
     """Run the campaign, or what else was asked for."""
+    if not options.system:
+        options.system = PAPER_SYSTEM if options.paper and not options.full else FULL_SYSTEM
     spec = systems.load(options.system)
     if spec.mobile is None:
         raise UsageError(f"--system {options.system}: it has no [robot] and drives no mission")
@@ -62,13 +72,18 @@ def campaign(options: argparse.Namespace) -> int:
     page = _write_report(options, spec, directory, runs)
     if not options.json:
         say(f"\nReport: {page}")
-    return 1 if any(r.job.ftm and not r.result.safe for r in runs) else 0
+    unsafe = any(r.job.ftm and not r.result.safe for r in runs)
+    failed = options.full and not all(cell.agrees for cell in cells(runs))
+    return 1 if unsafe or failed else 0
 
 
 # -- choosing ----------------------------------------------------------------------------------
 
 
 def _check(options: argparse.Namespace) -> None:
+    if options.full and not options.paper:
+        raise UsageError("--full: goes with --paper only; it runs the paper's rows on the full "
+                         "system")
     chosen = [name for name, given in (
         ("--paper", options.paper), ("--runs", options.runs is not None),
         ("--fault", options.fault), ("--search", options.search is not None)) if given]
@@ -123,7 +138,9 @@ def _try_world(jobs: Sequence[Job]) -> None:
 def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Job]]:
     """Return a name for what is run, and the runs."""
     if options.paper:
-        return "paper", paper_jobs(options.mission, options.seed)
+        if options.full:
+            return "paper-full", full_jobs(options.mission, options.seed, options.system)
+        return "paper", paper_jobs(options.mission, options.seed, options.system)
     jobs = _base_jobs(options)
     if options.runs is not None:
         groups = _groups(options, spec)
@@ -275,9 +292,12 @@ def _replay(options: argparse.Namespace) -> int:
 def _show(options: argparse.Namespace, spec: SystemSpec, runs: Sequence[Run], made: int) -> None:
     rows = table(runs)
     if options.json:
-        print_json([as_json(row) for row in rows])
+        verdicts = _full_verdicts(runs) if options.full else {}
+        print_json([as_json(row) | verdicts.get((row.fault, row.obstacles), {}) for row in rows])
         return
-    if options.paper:
+    if options.full:
+        _show_full(runs)
+    elif options.paper:
         _show_paper(spec, runs)
     else:
         shown = sorted(rows, key=lambda row: (row.safe.share if row.safe.of else 2.0,
@@ -329,12 +349,33 @@ def _show_paper(spec: SystemSpec, runs: Sequence[Run]) -> None:
                     [(c.condition, c.fault, c.obstacles, c.paper, c.ours, c.runs, c.success,
                       c.safe, "agrees" if c.agrees else f"differs: run {c.worst_key}")
                      for c in cells(runs) if c.table == title])
-    for cell in cells(runs):
+    _show_differing(cells(runs))
+
+
+def _show_full(runs: Sequence[Run]) -> None:
+    say("The paper's rows on the full system, worst run of each row; expected in each: success, "
+        "safe\n")
+    found = cells(runs)
+    print_table(("fault", "obst.", "paper", "ours", "runs", "success", "safe", ""),
+                [(c.fault, c.obstacles, c.paper, c.ours, c.runs, c.success, c.safe,
+                  "as expected" if c.agrees else f"NOT as expected: run {c.worst_key}")
+                 for c in found])
+    _show_differing(found)
+
+
+def _show_differing(found: Iterable[Cell]) -> None:
+    for cell in found:
         if not cell.agrees:
             say(f"\n{cell.condition}, {cell.fault}, {cell.obstacles} obstacles: paper "
                 f"{cell.paper}, ours {cell.ours}; worst run {cell.worst_key}, "
                 f"{cell.worst_fault}\n  "
                 f"{cell.story or 'no decision'}\n  {'; '.join(cell.reasons) or 'nothing amiss'}")
+
+
+def _full_verdicts(runs: Sequence[Run]) -> dict[tuple[str, int], dict[str, str]]:
+    """Return what --json adds to the rows of the full system, by fault and obstacles."""
+    return {(c.fault, c.obstacles): {"paper": c.paper, "expected": c.expected, "ours": c.ours}
+            for c in cells(runs)}
 
 
 def _list(spec: SystemSpec, *, as_json: bool) -> int:
@@ -353,8 +394,9 @@ def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path
                   runs: Sequence[Run]) -> Path:
     worst: dict[str, RunRecord] = {
         run.job.key: run_virtually(run.job).record for run in worth_showing(runs)}
-    about = Campaign(
-        title="The paper's tables" if options.paper else "Fault-injection campaign",
-        command=f"rampart {shlex.join(sys.argv[1:])}", seed=options.seed)
-    return write_campaign_report(
-        directory, about, runs, table_iii(spec) if options.paper else (), worst)
+    title = "Fault-injection campaign"
+    if options.paper:
+        title = "The paper's rows on the full system" if options.full else "The paper's tables"
+    about = Campaign(title=title, command=f"rampart {shlex.join(sys.argv[1:])}", seed=options.seed)
+    decided = table_iii(spec) if options.paper and not options.full else ()
+    return write_campaign_report(directory, about, runs, decided, worst)

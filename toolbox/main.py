@@ -17,6 +17,7 @@ from toolbox import (
     cut_set_verbs,
     decide_verbs,
     inject_verbs,
+    mission_verb,
     node_verbs,
     operator_verbs,
     topic_verbs,
@@ -31,6 +32,7 @@ _EPILOG = """examples:
   rampart topic echo localization/pose           see messages go by
   rampart inject command-not-updated             break something
   rampart reset RM1                              release the emergency stop
+  rampart mission pause                          give the mission an order
   rampart adapt set strategy guarded-repair      change mechanisms while it runs
   rampart table                                  what the manager would decide
   rampart tree                                   see fault tree, FTMTree and orders
@@ -53,6 +55,7 @@ def build_parser() -> argparse.ArgumentParser:
     topic_verbs.add(verbs, formatter, common)
     inject_verbs.add(verbs, formatter, common)
     operator_verbs.add(verbs, formatter, common)
+    mission_verb.add(verbs, formatter, common)
     adapt_verb.add(verbs, formatter, common)
     campaign_verb.add(verbs, formatter)
     cut_set_verbs.add(verbs, formatter, common)

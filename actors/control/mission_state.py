@@ -358,4 +358,6 @@ def status(state: MissionState) -> MissionStatus:
         unmeasured=tuple(
             name for name in state.unmeasured
             if not any(light.light == name for light in state.lights)),
+        orders=tuple(action for action, try_out in _OBEDIENCE.items()
+                     if not isinstance(try_out(state, "", 0.0), str)),
     )

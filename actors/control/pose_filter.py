@@ -72,7 +72,7 @@ class PoseFilter:
         self._ekf: PlanarEkf | None = None
         self._wheels = OdometryCheck()
         self._gyro = ImuCheck()
-        self.imu = self._gyro.take  # at 100 Hz a call of its own would show
+        self.imu = self._gyro.take  # at 50 Hz a call of its own would show
         self._pose = PositionSource(ABSOLUTE_POSE, fresh_s=0.2, patience=4)
         self._gps = PositionSource(GPS, fresh_s=0.35, patience=3)
         self._time_s = -math.inf

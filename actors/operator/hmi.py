@@ -1,8 +1,8 @@
-"""The HMI: hands missions and resets to the controller, and shows the operator what happens.
+"""The HMI: hands missions, orders and resets to the controller, and shows what happens.
 
 A non-control node (paper, section III): memoryless, may be killed and respawned at any time. What
-it must not do after a respawn is decided in `hmi_submission`; what it shows is collected in
-`hmi_state`; the page is served by `hmi_server`.
+it must not do after a respawn is decided in `hmi_submission`, which orders make sense in
+`hmi_orders`; what it shows is collected in `hmi_state`; the page is served by `hmi_server`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,15 @@ from typing import Any
 
 from actors import messages as m
 from actors import topics
-from actors.operator.hmi_server import MissionWish, PageServer, PortError, RefusedError, Wish
+from actors.operator.hmi_orders import NoSenseError, Orders
+from actors.operator.hmi_server import (
+    MissionWish,
+    OrderWish,
+    PageServer,
+    PortError,
+    RefusedError,
+    Wish,
+)
 from actors.operator.hmi_state import HmiState
 from actors.operator.hmi_submission import (
     REPEAT_S,
@@ -37,7 +45,7 @@ class Hmi(Actor):
     parameter `port` has precedence).
     """
 
-    outputs = (topics.MISSION_REQUEST, topics.RESET)
+    outputs = (topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.RESET)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -47,6 +55,7 @@ class Hmi(Actor):
         run_id = str(shared.get("run_id", "run"))
         first = first_request(run_id, mission.name, _goals(mission)) if mission else None
         self._submission = Submission(run_id, context.incarnation, self.clock.now(), first)
+        self._orders = Orders(f"{run_id}/{context.name}.{context.incarnation}", "operator")
         self._state = HmiState()
         self._table: m.NodeTable | None = None
         self._port: int = self.parameters.get("port", shared.get("hmi_port")) or 0
@@ -86,7 +95,7 @@ class Hmi(Actor):
             self.report_diagnostic("operator's page", f"{type(error).__name__}: {error}",
                                    f"port {self._port}")
 
-    # -- missions and resets --------------------------------------------------------------------
+    # -- missions, orders and resets ------------------------------------------------------------
 
     @every(REPEAT_S)
     def _submit(self) -> None:
@@ -97,10 +106,20 @@ class Hmi(Actor):
                                          "the Mission Manager does not answer")
         if self._submission.pending is not None and system_is_up(self._table, now):
             self.publish(topics.MISSION_REQUEST, self._submission.pending)
+        self._tell(self._orders.expire(now))
+        if self._orders.pending is not None:
+            self.publish(topics.MISSION_ORDER, self._orders.pending)
+
+    def _tell(self, outcome: str) -> None:
+        """Say what became of an order, if there is anything to say."""
+        if outcome:
+            self._state.order(outcome, self.clock.now())
 
     def _fulfil(self, wish: Wish) -> str:
         if isinstance(wish, MissionWish):
             return self._start(wish.name)
+        if isinstance(wish, OrderWish):
+            return self._order(wish)
         if wish.recovery not in self._state.latched:
             waiting = ", ".join(self._state.latched) or "none"
             raise RefusedError(f"{wish.recovery[:40]!r} does not wait for a reset; "
@@ -120,6 +139,14 @@ class Hmi(Actor):
         self.publish(topics.MISSION_REQUEST, request)
         return f"mission {name} asked for"
 
+    def _order(self, wish: OrderWish) -> str:
+        try:
+            order = self._orders.give(wish.action, wish.reason, self.clock.now())
+        except NoSenseError as error:
+            raise RefusedError(str(error)) from None
+        self.publish(topics.MISSION_ORDER, order)
+        return f"{wish.action.value} asked for"
+
     def _hello(self) -> dict[str, Any]:
         airport = self._airport
         return {
@@ -136,7 +163,12 @@ class Hmi(Actor):
     @on(topics.MISSION_STATUS)
     def _mission_status(self, message: m.MissionStatus, _header: Header) -> None:
         self._submission.hear(message)
+        self._orders.hear(message)
         self._state.mission(message, self.clock.now())
+
+    @on(topics.MISSION_ORDER_ANSWER)
+    def _order_answer(self, message: m.MissionOrderAnswer, _header: Header) -> None:
+        self._tell(self._orders.answer(message))
 
     @on(topics.POSE)
     def _pose(self, message: m.Pose, header: Header) -> None:

@@ -4,9 +4,9 @@ It runs on the actor's own event loop and costs nothing while no page is open: u
 for its protocols, without its main loop (ten wake-ups a second) and without its signal handlers
 (a node's signals are its process's business).
 
-Whoever can reach the port can reset an emergency stop, so other people's web pages must not: the
-`Host` header must name loopback (against DNS rebinding) and a WebSocket's `Origin` must be this
-page's own. Programs that are no browsers send no Origin and are let in.
+Whoever can reach the port can reset an emergency stop or send the robot home, so other people's
+web pages must not: the `Host` header must name loopback (against DNS rebinding) and a WebSocket's
+`Origin` must be this page's own. Programs that are no browsers send no Origin and are let in.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import contextlib
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import urlsplit
 
 import msgspec
@@ -28,6 +28,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from actors.messages import MissionAction
 
 HOST = "127.0.0.1"
 PUSH_PERIOD_S = 0.2
@@ -67,7 +69,14 @@ class MissionWish(msgspec.Struct, tag="mission", forbid_unknown_fields=True):
     name: str
 
 
-Wish = ResetWish | MissionWish
+class OrderWish(msgspec.Struct, tag="order", forbid_unknown_fields=True):
+    """The operator wants something of the mission under way."""
+
+    action: MissionAction
+    reason: Annotated[str, msgspec.Meta(max_length=200)] = ""
+
+
+Wish = ResetWish | MissionWish | OrderWish
 _wishes = msgspec.json.Decoder(Wish)
 
 

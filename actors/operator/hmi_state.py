@@ -36,6 +36,8 @@ class HmiState:
         self._log: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
         self._decisions: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
         self._mission_id = ""
+        self._outcomes = 0
+        self._outcome = ""
 
     # -- hearing --------------------------------------------------------------------------------
 
@@ -98,6 +100,12 @@ class HmiState:
         kind = "clear" if event.event in _GOOD_NEWS else "fault"
         self.log(now_s, kind, f"{event.node} {event.event}{by}{detail}")
 
+    def order(self, outcome: str, now_s: float) -> None:
+        """Log what became of an order of the operator, and keep it to be shown."""
+        self._outcomes += 1
+        self._outcome = outcome
+        self.log(now_s, "note", f"order to the mission: {outcome}")
+
     def diagnostic(self, report: m.Diagnostic, now_s: float) -> None:
         """Log an error report of a node."""
         times = f" ({report.count} times)" if report.count > 1 else ""
@@ -124,6 +132,7 @@ class HmiState:
             "time_s": round(now_s, 2),
             "pose": self._aged("pose", now_s),
             "mission": self._mission(now_s),
+            "order": {"number": self._outcomes, "text": self._outcome},
             "route": self._route(),
             "control": self._aged("control", now_s),
             "pilot": self._aged("pilot", now_s),
@@ -165,7 +174,7 @@ class HmiState:
         return {
             "name": status.name, "phase": status.phase, "step": status.step,
             "goals": status.goals, "times_s": status.step_times_s, "reason": status.reason,
-            "stale": now_s - at_s > STALE_S,
+            "stale": now_s - at_s > STALE_S, "orders": status.orders, "skipped": status.skipped,
         }
 
     def _route(self) -> tuple[tuple[float, float], ...]:

@@ -26,7 +26,7 @@ START_ANYWAY_S = 5.0
 """A node that does not come up does not hold the mission back longer (simulated time): what is
 missing is the fault tolerance's business, not the HMI's."""
 
-_BUSY = (m.MissionPhase.RUNNING, m.MissionPhase.PAUSED)
+_BUSY = (m.MissionPhase.RUNNING, m.MissionPhase.PAUSED, m.MissionPhase.RETURNING)
 
 
 class BusyError(ValueError):

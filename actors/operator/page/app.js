@@ -1,4 +1,4 @@
-// The operator's page: shows the states that the HMI pushes, asks for resets and missions.
+// The operator's page: shows the states that the HMI pushes, asks for resets, missions, orders.
 
 import { AirportMap } from "./map.js";
 
@@ -97,6 +97,9 @@ function state(s) {
   $("clock").textContent = clock(s.time_s);
   map.show(s);
   once("mission", [s.mission, s.control && s.control.value.phase], () => mission(s));
+  orders(s.mission);
+  if (shown.order !== undefined && shown.order !== s.order.number) toast(s.order.text);
+  shown.order = s.order.number;
   once("lights", s.lights, () => lights(s.lights));
   once("safety", [s.pilot, s.manager, s.detections], () => safety(s));
   once("nodes", s.nodes, () => nodes(s.nodes));
@@ -104,11 +107,11 @@ function state(s) {
   once("events", s.events, () => events(s.events));
 }
 
-const PHASES = { running: "good", paused: "warn", succeeded: "good", failed: "bad", cancelled: "bad", idle: "" };
+const PHASES = { running: "good", paused: "warn", "returning home": "warn", succeeded: "good", failed: "bad", cancelled: "bad", idle: "" };
 
 function mission(s) {
   const m = s.mission;
-  const idle = !m || !["running", "paused"].includes(m.phase);
+  const idle = !m || !["running", "paused", "returning home"].includes(m.phase);
   $("start").hidden = !idle || !$("mission-name").options.length;
   if (!m) {
     pill("mission-phase", "warn", "Mission Manager not heard");
@@ -125,14 +128,45 @@ function mission(s) {
 }
 
 function step(m, goal, i) {
-  const done = i < m.step || m.phase === "succeeded";
+  const skipped = m.skipped.includes(i);
+  const done = !skipped && (i < m.step || m.phase === "succeeded");
   const now = i === m.step && !done;
   const lost = now && (m.phase === "failed" || m.phase === "cancelled");
-  const line = element("li", done ? "done" : lost ? "failed" : now && m.phase !== "idle" ? "now" : "");
+  const line = element("li", done ? "done" : lost ? "failed": now && m.phase !== "idle" ? "now" : "");
   line.append(element("span", "n", done ? "✓" : lost ? "✕" : i + 1),
-    element("span", "", `${goal.mode} to (${goal.x_m.toFixed(1)}, ${goal.y_m.toFixed(1)})`),
+    element("span", "", `${goal.mode} to (${goal.x_m.toFixed(1)}, ${goal.y_m.toFixed(1)})${skipped ? ", skipped" : ""}`),
     element("span", "time", done && m.times_s[i] !== undefined ? clock(m.times_s[i]) : ""));
   return line;
+}
+
+/** Offer the orders that the Mission Manager would obey now. */
+function orders(m) {
+  const possible = m && !m.stale ? m.orders : [];
+  $("orders").hidden = !m || !["running", "paused", "returning home"].includes(m.phase);
+  for (const button of $("orders").children) {
+    button.disabled = !possible.includes(button.dataset.order);
+    if (button.disabled) unsure(button);
+  }
+}
+
+/** An order that cannot be taken back wants a second press within four seconds. */
+function ask(button) {
+  if ("sure" in button.dataset && !button.classList.contains("sure")) {
+    button.dataset.label = button.textContent;
+    button.style.minWidth = `${button.offsetWidth}px`;  // it stays under the pointer
+    button.textContent = "Sure?";
+    button.classList.add("sure");
+    setTimeout(() => unsure(button), 4000);
+    return;
+  }
+  unsure(button);
+  send({ type: "order", action: button.dataset.order });
+}
+
+function unsure(button) {
+  if (!button.classList.contains("sure")) return;
+  button.classList.remove("sure");
+  button.textContent = button.dataset.label;
 }
 
 function lights(measured) {
@@ -227,6 +261,8 @@ function events(list) {
   $("events").replaceChildren(...list.slice().reverse().map((e) => logLine(e.t, e.kind, e.text)));
   if (!list.length) $("events").append(element("li", "empty", "Nothing happened so far."));
 }
+
+for (const button of $("orders").children) button.addEventListener("click", () => ask(button));
 
 $("start").addEventListener("submit", (event) => {
   event.preventDefault();
