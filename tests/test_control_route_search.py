@@ -1,6 +1,7 @@
 import itertools
 import math
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -89,6 +90,18 @@ def test_a_straight_row_loses_its_inner_nodes_and_a_bent_one_keeps_them():
     assert len(plan_route(row, edges, row["A"], row["B"]).waypoints) == 3
     bent = {**row, "M": (10.0, 4.0)}
     assert len(plan_route(bent, edges, bent["A"], bent["B"], straight=True).waypoints) == 3
+
+
+@pytest.mark.parametrize(("start", "begins"), [
+    ((-0.4, 0.4), (0.0, 0.0)),  # has come from C, not quite at A: the row is A to B
+    ((-3.0, 3.0), (-3.0, 3.0)),  # still on the way to it
+    ((6.0, 0.1), (6.0, 0.0)),  # in the middle of the row, as after a respawn
+])
+def test_a_row_begins_at_its_node_and_not_beside_it(start, begins):
+    row = {"C": (-5.0, 5.0), "A": (0.0, 0.0), "B": (20.0, 0.0)}
+    found = plan_route(row, [("C", "A"), ("A", "B")], start, row["B"], straight=True)
+    assert found.waypoints[0] == pytest.approx(begins)
+    assert found.waypoints[-1] == row["B"]
 
 
 def test_a_goal_well_off_the_line_is_turned_to_where_it_is_nearest():

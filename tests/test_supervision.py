@@ -147,6 +147,20 @@ async def test_the_supervisor_comes_back_and_adopts_the_living(tmp_path):
         assert after == before
 
 
+async def test_a_supervisor_that_stood_still_for_a_while_blames_nobody_for_it(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        before = {r.name: r.pid for r in witness.table.nodes}
+        supervisor = process(launcher.plan.base_port, "supervisor")
+        os.kill(supervisor, signal.SIGSTOP)
+        await asyncio.sleep(0.9)  # longer than a heartbeat may be missing, but not for the launcher
+        os.kill(supervisor, signal.SIGCONT)
+        os.kill(witness.pid("DM3"), signal.SIGSTOP)  # and it still sees who does stand still
+        await eventually(lambda: witness.state("DM3") == ("running", 2))
+        after = {r.name: r.pid for r in witness.table.nodes}
+        assert {n for n, pid in after.items() if pid != before[n]} == {"DM3"}
+        assert {e.node for e in witness.events if e.event in {"stopped", "wedged"}} == {"DM3"}
+
+
 async def test_a_node_that_dies_together_with_the_supervisor_gets_a_new_incarnation(tmp_path):
     async with running(tmp_path) as (launcher, witness):
         os.kill(process(launcher.plan.base_port, "supervisor"), signal.SIGKILL)

@@ -31,6 +31,7 @@ class SearchLimits:
         cut_m: a goal at most this far from the graph is headed for directly; to a farther one
             the robot turns off where it is nearest, so as to stay on the pavement.
         straight_m: a row whose inner points are within this of the straight line is straight.
+        row_begins_m: a row begins at the first node of the way if that is at most this far away.
     """
 
     node_snap_m: float = 0.3
@@ -39,6 +40,7 @@ class SearchLimits:
     approach_m: float = 2.0
     cut_m: float = 1.0
     straight_m: float = 0.5
+    row_begins_m: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +84,9 @@ def plan_route(
         edges: pairs of node names, undirected.
         start: where the robot is.
         goal: where it shall go; the route ends there exactly.
-        straight: light verification: inner waypoints of a straight row are left out.
+        straight: light verification: inner waypoints of a straight row are left out, and the row
+            begins at its node, if that is near, and not where the robot is: from there the line
+            would be at a slant and lead past beside the first light.
         blocked: edges not to be used, in either order of their ends.
         limits: snapping distances.
     """
@@ -118,6 +122,8 @@ def plan_route(
         path.insert(0, start)
     waypoints = _without_repeats(path)
     if straight:
+        if len(waypoints) > 2 and math.dist(*waypoints[:2]) <= limits.row_begins_m:
+            del waypoints[0]
         waypoints = _straightened(waypoints, limits.straight_m)
     length_m = sum(math.dist(a, b) for a, b in itertools.pairwise(waypoints))
     return PlannedRoute(tuple(waypoints), length_m, "")

@@ -175,7 +175,11 @@ class Launcher:
     async def _keep_guards(self) -> None:
         # The pidfd wakes the guard the moment the supervisor dies; the period serves the rest.
         while True:
+            begun_s = time.monotonic()
             await self._supervisor_gone(GUARD_PERIOD_S)
+            stall_s = time.monotonic() - begun_s - GUARD_PERIOD_S
+            if stall_s > GUARD_PERIOD_S:  # silence counts only while this loop turned
+                self._supervisor_heard_s += stall_s
             names = {n for p in find_processes(self.plan.base_port)
                      if p.launcher == self.plan.launcher_pid for n in p.names}
             for name in NAMES:
@@ -187,8 +191,8 @@ class Launcher:
             if SUPERVISOR in names and silent:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(self._supervisor_pid, signal.SIGKILL)
-                await self._supervisor_gone(GUARD_PERIOD_S)  # its port is free only then
             if SUPERVISOR not in names or silent:
+                await self._supervisor_gone(GUARD_PERIOD_S)  # its port is free only then
                 self._bring_back(SUPERVISOR)
 
     async def _supervisor_gone(self, timeout_s: float) -> None:

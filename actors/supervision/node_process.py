@@ -62,7 +62,7 @@ def node_main(
     exit_with_launcher(
         lifeline, (lambda: kill_leftovers(launcher)) if SUPERVISOR in names else None)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is the launcher's to handle
-    signal.signal(signal.SIGUSR2, _wedge)
+    signal.signal(signal.SIGUSR2, wedge)
     try:
         asyncio.run(_live(layout, names, incarnation, shared))
     except BusError as error:
@@ -95,7 +95,8 @@ async def _live(
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _wedge(_signal: int, _frame: Any) -> None:
+def wedge(_signal: int, _frame: Any) -> None:
+    """Handle SIGUSR2: turn no more, and live on."""
     while True:
         time.sleep(3600)
 

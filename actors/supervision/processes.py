@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 from actors.messages import AdaptedSystem
-from actors.supervision.process_title import find_processes, is_stopped, process_state
+from actors.supervision.process_title import find_processes, is_stopped
 from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
 __all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerUnavailableError"]
@@ -102,7 +102,9 @@ class _OsHandle:
                 signal.pidfd_send_signal(self.pidfd, number)
 
     def gone(self) -> bool:
-        return process_state(self._pid) in "XZ"
+        # Not the state in /proc: that is the main thread's, which may be a zombie while another
+        # thread still ends and holds the ports. A pidfd is readable when the last one has ended.
+        return self.pidfd < 0 or bool(select.select([self.pidfd], [], [], 0)[0])
 
     def stopped(self) -> bool:
         return is_stopped(self._pid)

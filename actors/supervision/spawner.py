@@ -26,7 +26,7 @@ import msgspec
 
 from actors.messages import AdaptedSystem
 from actors.supervision.lifeline import kill_leftovers
-from actors.supervision.node_process import node_main
+from actors.supervision.node_process import node_main, wedge
 from actors.supervision.process_title import set_title
 from actors.supervision.run_plan import (
     Layout,
@@ -118,6 +118,7 @@ class Spawner:
         """Serve until the launcher ends."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGUSR2, wedge)
         self._reap_on_child_end()
         self._selector.register(self._lifeline, selectors.EVENT_READ, self._launcher_gone)
         while True:

@@ -49,6 +49,9 @@ STOP_GRACE_S = 0.5
 START_TIMEOUT_S = 3.0
 """Wall seconds in which a new process must have sent its first heartbeat."""
 
+_CHECK_S = 0.1
+"""Simulated seconds between two looks at who is silent."""
+
 _RETRY_S = 0.05
 _DEAD = (NodeState.CRASHED, NodeState.GIVEN_UP)
 
@@ -90,6 +93,7 @@ class Supervisor(Actor):
             self._machine.adapt(adapted)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
         self._loop = asyncio.get_running_loop()
+        self._checked_s = self._loop.time()
 
     @classmethod
     def names(
@@ -186,10 +190,11 @@ class Supervisor(Actor):
 
     # -- watching -------------------------------------------------------------------------------
 
-    @every(0.1)
+    @every(_CHECK_S)
     def check(self) -> None:
         """Look for processes whose loops are silent."""
         now = self._loop.time()
+        self._discount_own_stall(now)
         for process in self._processes.values():
             if process.state is NodeState.STARTING:
                 if now - process.started_s > START_TIMEOUT_S:
@@ -204,6 +209,17 @@ class Supervisor(Actor):
     def repeat(self) -> None:
         """Repeat the node table for whoever joined late."""
         self._publish_table()
+
+    def _discount_own_stall(self, now: float) -> None:
+        # Who was stopped, starved or waiting for a hung spawner has heard nobody meanwhile. What
+        # was said is still on its way here, and silence counts only while this loop turned.
+        period_s = _CHECK_S / self._plan.rate
+        stall_s = now - self._checked_s - period_s
+        self._checked_s = now
+        if stall_s > period_s:
+            for process in self._processes.values():
+                process.started_s = min(now, process.started_s + stall_s)
+                process.heard_s = {n: min(now, at + stall_s) for n, at in process.heard_s.items()}
 
     def _silent(self, process: _Process, nodes: list[str]) -> None:
         stopped = process.handle is not None and process.handle.stopped()

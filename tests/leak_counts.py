@@ -1,0 +1,99 @@
+"""What a run holds of the machine, counted from outside, and whether it grows with its deaths.
+
+Those that outlive all deaths are looked at: the launcher, the supervisor and the spawners, and the
+world, which stands for any node that loses its partners and finds them again. Counts are compared
+when nothing is under way. What may become more:
+
+* Descriptors of who has a Zenoh session, by one connection for each partner. Zenoh dials a partner
+  that it has lost while that dials it; one of the two connections then idles until either ends.
+* Memory, by the record of the run in the launcher and by what allocators and Zenoh keep.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+from real_run import RealRun
+
+from actors.supervision.process_title import find_processes
+
+LAUNCHER = "launch.py"
+MAX_GROWTH_MB = 15.0
+NO_SESSION = "spawner_"
+"""How the names of those begin that have none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What was there at one moment; the first two by name of a process that survives.
+
+    `listening` are the run's TCP ports that somebody listens on, `half_closed` its connections
+    that the other end has left and this one keeps.
+    """
+
+    descriptors: dict[str, int]
+    memory_mb: dict[str, float]
+    processes: int
+    zombies: int
+    listening: int
+    half_closed: int
+    shared_memory: frozenset[str]
+
+    def __str__(self) -> str:
+        each = "  ".join(
+            f"{name} {self.descriptors[name]} fd {memory:.1f} MB"
+            for name, memory in self.memory_mb.items())
+        return (f"{each}  | {self.processes} processes, {self.zombies} zombies, "
+                f"{self.listening} ports, {self.half_closed} half closed, "
+                f"{len(self.shared_memory)} in shared memory")
+
+
+def count(run: RealRun, survivors: tuple[str, ...]) -> Counts:
+    """Count what a run holds now; `survivors` are looked at one by one, and the launcher."""
+    running = find_processes(run.port)
+    pids = {LAUNCHER: run.process.pid}
+    pids |= {name: p.pid for name in survivors for p in running if name in p.names}
+    one_by_one = {name: psutil.Process(pid) for name, pid in pids.items()}
+    family = {run.process.pid, *(p.pid for p in running)}
+    ports = range(run.port, run.port + len(run.info.nodes))
+    sockets = [c for c in psutil.net_connections("tcp") if c.laddr.port in ports]
+    return Counts(
+        {name: p.num_fds() for name, p in one_by_one.items()},
+        {name: p.memory_info().rss / 1e6 for name, p in one_by_one.items()},
+        len(running),
+        sum(p.info["status"] == psutil.STATUS_ZOMBIE and p.info["ppid"] in family
+            for p in psutil.process_iter(["status", "ppid"])),
+        len({c.laddr.port for c in sockets if c.status == psutil.CONN_LISTEN}),
+        sum(c.status == psutil.CONN_CLOSE_WAIT for c in sockets),
+        shared_memory())
+
+
+def shared_memory() -> frozenset[str]:
+    """Return the names of the machine's shared memory segments.
+
+    Those of joblib are left out: they come and go with a campaign that runs beside.
+    """
+    return frozenset(entry.name for entry in Path("/dev/shm").iterdir()
+                     if not entry.name.startswith("joblib_"))
+
+
+def leaks(before: Counts, after: Counts) -> list[str]:
+    """Return what has become more, one line each; empty if nothing has leaked."""
+    found = [
+        f"{name}: descriptors {old} -> {after.descriptors[name]}"
+        for name, old in before.descriptors.items()
+        if after.descriptors[name] > old + before.processes * (not name.startswith(NO_SESSION))]
+    found += [
+        f"{name}: memory {mb:.1f} -> {after.memory_mb[name]:.1f} MB"
+        for name, mb in before.memory_mb.items() if after.memory_mb[name] > mb + MAX_GROWTH_MB]
+    found += [
+        f"{what}: {old} -> {new}"
+        for what, old, new in (("processes", before.processes, after.processes),
+                               ("ports", before.listening, after.listening),
+                               ("zombies", before.zombies, after.zombies),
+                               ("half closed", before.half_closed, after.half_closed))
+        if new > old]
+    return found + [f"shared memory: {name}"
+                    for name in sorted(after.shared_memory - before.shared_memory)]
