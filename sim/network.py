@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from actors.runtime.virtual_bus import Link
-from sim.timing import Timing, drawer, measured
+from sim.timing import Stock, Timing, drawer, measured
 
 __all__ = ["NETWORKS", "NetworkModel", "SeededNetwork", "find_network"]
 
@@ -85,7 +85,9 @@ class SeededNetwork:
         self.model = model
         self.lost = self.duplicated = self.overtaken = 0
         self._rng = random.Random(f"network {seed}")  # noqa: S311 no secret
-        self._delay_s = drawer((timing or measured()).message_ms, self._rng)
+        delays_ms = (timing or measured()).message_ms
+        self._delay_s = drawer(delays_ms, self._rng)
+        self._stock = Stock(delays_ms, self._rng)
         self._local = frozenset(local)
         self._links: dict[tuple[str, str], Link] = {}
 
@@ -104,12 +106,14 @@ class SeededNetwork:
 
     def _in_order(self) -> Link:
         """Return a link that delays messages and does no more: most runs have only these."""
-        delay_s, last_s = self._delay_s, 0.0
+        fill, delays_s, last_s = self._stock.fill, self._stock.draws_s, 0.0
 
         def arrivals(now_s: float) -> Sequence[float]:
             nonlocal last_s
-            at_s = now_s + delay_s()
-            last_s = max(last_s, at_s)
+            if not delays_s:
+                fill()
+            at_s = now_s + delays_s.pop()
+            last_s = at_s if at_s > last_s else last_s
             return (last_s,)
 
         return arrivals

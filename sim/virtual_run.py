@@ -20,10 +20,9 @@ import msgspec
 
 from actors.messages import NodeTable
 from actors.runtime.actor import Actor, Context, Header
-from actors.runtime.clock import Clock
 from actors.runtime.topic import Topic
 from actors.runtime.virtual_bus import Hub, VirtualBus
-from actors.runtime.virtual_loop import VirtualLoop
+from actors.runtime.virtual_loop import VirtualClock, VirtualLoop
 from actors.supervision.run_plan import OBSERVER, Layout, RunPlan, load_shared
 from manager.schema import SystemSpec
 from sim.injector import INJECTOR, Injector, can_be_hit
@@ -148,7 +147,9 @@ class VirtualRun:
     async def _run(self) -> VirtualResult:
         begun_s = time.perf_counter()
         loop = asyncio.get_running_loop()
-        clock = Clock(loop.time() + LEAD_S, source=loop.time)
+        if not isinstance(loop, VirtualLoop):
+            raise TypeError(f"{loop!r}: a virtual run needs a virtual loop")
+        clock = VirtualClock(loop, loop.time() + LEAD_S)
         hub = Hub(SeededNetwork(self._network, self.plan.seed, local=(OBSERVER, INJECTOR)))
         trace = Trace()
         hub.taps.append(trace)

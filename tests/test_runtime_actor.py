@@ -224,7 +224,7 @@ async def test_an_injected_fault_changes_what_is_published(make_bus, mode, expec
             for x in (1.0, 2.0, 3.0):
                 talker.publish(topics.POSE, m.Pose(x, 0.0, 0.0), stamp=x)
                 await asyncio.sleep(0.05)
-            talker._faults.expire("i1")
+            talker._injections.gate.expire("i1")
             talker.publish(topics.POSE, m.Pose(7.0, 0.0, 0.0), stamp=4.0)
             await eventually(lambda: listener.heard[-1][0].x_m == 7.0)
             assert [(b.x_m, h.stamp) for b, h in listener.heard[1:-1]] == expected

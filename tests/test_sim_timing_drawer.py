@@ -5,7 +5,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.timing import draw, drawer
+from sim.timing import Stock, draw, drawer
 
 
 @given(st.lists(st.floats(0, 1e4), min_size=2, max_size=40).map(sorted), st.integers())
@@ -13,3 +13,19 @@ def test_a_drawer_gives_bit_by_bit_what_draw_gives(quantiles, seed):
     one, other = random.Random(seed), random.Random(seed)
     next_s = drawer(tuple(quantiles), one)
     assert [next_s() for _ in range(20)] == [draw(tuple(quantiles), other) for _ in range(20)]
+
+
+@given(st.lists(st.floats(0, 1e4), min_size=2, max_size=40).map(sorted), st.integers(),
+       st.integers(0, 5))
+def test_a_stock_gives_bit_by_bit_what_draw_gives_from_one_block_to_the_next(
+        quantiles, seed, used):
+    one, other = random.Random(seed), random.Random(seed)
+    for rng in (one, other):
+        for _ in range(used):
+            rng.random()
+    stock, drawn = Stock(tuple(quantiles), one), []
+    for _ in range(stock.BLOCK + 20):
+        if not stock.draws_s:
+            stock.fill()
+        drawn.append(stock.draws_s.pop())
+    assert drawn == [draw(tuple(quantiles), other) for _ in range(stock.BLOCK + 20)]

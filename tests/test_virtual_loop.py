@@ -9,7 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.runtime.virtual_loop import VirtualLoop
+from actors import topics
+from actors.runtime.clock import Clock
+from actors.runtime.virtual_bus import Hub, VirtualBus
+from actors.runtime.virtual_loop import VirtualClock, VirtualLoop
 
 
 def run(scenario):
@@ -113,3 +116,130 @@ def test_the_context_of_a_task_stays_its_own():
         return await asyncio.gather(one("a"), one("b")), variable.get()
 
     assert run(scenario) == (["a", "b"], "-")
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from([0.0, 0.5, 1.0, 2.0]), st.booleans()), max_size=30))
+def test_posted_calls_and_timers_share_one_order(calls):
+    async def scenario():
+        loop, seen = asyncio.get_running_loop(), []
+
+        def note(when, i):
+            seen.append((when, i))
+
+        for i, (when, posted) in enumerate(calls):
+            (loop.post_at if posted else loop.call_at)(when, note, when, i)
+        await asyncio.sleep(3)
+        return seen
+
+    assert run(scenario) == sorted((when, i) for i, (when, _) in enumerate(calls))
+
+
+def test_what_a_call_posts_for_now_waits_for_those_that_are_ready():
+    async def scenario():
+        loop, seen = asyncio.get_running_loop(), []
+
+        def first(what, _):
+            seen.append(what)
+            loop.post_at(loop.time(), note, "posted", None)
+            loop.call_soon(seen.append, "soon")
+
+        def note(what, _):
+            seen.append(what)
+
+        loop.post_at(1.0, first, "first", None)
+        loop.post_at(1.0, note, "second", None)
+        await asyncio.sleep(2)
+        return seen
+
+    assert run(scenario) == ["first", "second", "soon", "posted"]
+
+
+def test_a_posted_call_that_raises_is_reported_and_those_due_with_it_are_made():
+    async def scenario():
+        loop, seen, errors = asyncio.get_running_loop(), [], []
+        loop.set_exception_handler(lambda _loop, context: errors.append(context["exception"]))
+        loop.post_at(1.0, lambda one, zero: one / zero, 1, 0)
+        loop.post_at(1.0, lambda what, _: seen.append(what), "after", None)
+        await asyncio.sleep(2)
+        return seen, [type(error) for error in errors]
+
+    assert run(scenario) == (["after"], [ZeroDivisionError])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from([1.0, 1.5, 2.0]), st.booleans()), max_size=30))
+def test_what_was_withdrawn_is_not_called_and_the_rest_keeps_its_order(calls):
+    async def scenario():
+        loop, seen = asyncio.get_running_loop(), []
+
+        def stays(when, i):
+            seen.append((when, i))
+
+        def goes(when, i):
+            seen.append("what was withdrawn")
+
+        loop.post_at(0.5, lambda _one, _two: loop.withdraw([goes]), None, None)
+        for i, (when, kept) in enumerate(calls):
+            loop.post_at(when, stays if kept else goes, when, i)
+        loop.call_at(1.0, stays, 1.0, len(calls))
+        await asyncio.sleep(3)
+        return seen
+
+    kept = [(when, i) for i, (when, kept) in enumerate(calls) if kept]
+    assert run(scenario) == sorted([*kept, (1.0, len(calls))])
+
+
+class _Slow:
+    """A network on which everything takes a second."""
+
+    def link(self, source, reader):
+        return lambda now_s: (now_s + 1.0,)
+
+
+def test_what_is_on_its_way_to_a_node_that_is_killed_does_not_arrive():
+    async def scenario():
+        hub, seen = Hub(_Slow()), []
+        buses = {name: VirtualBus(hub, name) for name in ("talker", "killed", "other")}
+        for name, bus in buses.items():
+            await bus.open()
+            if name != "talker":
+                bus.subscribe(topics.POSE, topics.POSE.at(),
+                              lambda _key, payload, name=name: seen.append((name, payload)))
+        buses["talker"].publish(topics.POSE, topics.POSE.at(), b"first")
+        await asyncio.sleep(1.5)
+        buses["talker"].publish(topics.POSE, topics.POSE.at(), b"second")
+        await asyncio.sleep(0.5)
+        buses["killed"].cut()
+        buses["talker"].publish(topics.POSE, topics.POSE.at(), b"third")
+        await asyncio.sleep(2)
+        return seen
+
+    assert run(scenario) == [("killed", b"first"), ("other", b"first"),
+                             ("other", b"second"), ("other", b"third")]
+
+
+def test_a_virtual_clock_shows_what_a_clock_of_the_same_loop_shows():
+    async def scenario():
+        loop = asyncio.get_running_loop()
+        await asyncio.sleep(0.3)
+        lean, plain = VirtualClock(loop, 1.7), Clock(1.7, source=loop.time)
+        await asyncio.sleep(12.345)
+        assert (lean.now(), lean.rate) == (plain.now(), plain.rate)
+        assert lean.source_time(5.1) == plain.source_time(5.1)
+
+    run(scenario)
+
+
+def test_a_call_from_another_thread_wakes_a_loop_that_has_nothing_to_do():
+    async def scenario():
+        return await asyncio.to_thread(lambda: "from the thread"), asyncio.get_running_loop().time()
+
+    assert run(scenario) == ("from the thread", 0.0)
+
+
+def test_a_loop_that_was_told_to_stop_does_not_wait():
+    loop = VirtualLoop()
+    loop.stop()
+    loop.run_forever()
+    loop.close()

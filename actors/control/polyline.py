@@ -58,10 +58,10 @@ class Hull:
         Args:
             points: shape (..., 2).
         """
-        beyond = np.abs(points) - (self.half_length_m, self.half_width_m)
-        outside = np.hypot(np.maximum(beyond[..., 0], 0.0), np.maximum(beyond[..., 1], 0.0))
-        inside = np.minimum(np.max(beyond, axis=-1), 0.0)
-        return np.asarray(outside + inside)
+        beyond = np.abs(points)
+        ahead, aside = beyond[..., 0] - self.half_length_m, beyond[..., 1] - self.half_width_m
+        outside = np.hypot(np.maximum(ahead, 0.0), np.maximum(aside, 0.0))
+        return np.asarray(outside + np.minimum(np.maximum(ahead, aside), 0.0))
 
 
 @lru_cache(maxsize=4)
@@ -201,17 +201,23 @@ class Polyline:
         if not len(points):
             return NO_POINTS
         low, high = self._stretch(s_from_m, s_to_m)
-        along = self._directions[low:high]
-        relative = points[:, None, :] - self._starts[None, low:high, :]
-        ahead = np.einsum("ksi,si->ks", relative, along)
-        left = along[None, :, 0] * relative[:, :, 1] - along[None, :, 1] * relative[:, :, 0]
-        foot = np.clip(ahead, 0.0, self._lengths[None, low:high])
+        along_x, along_y = self._directions[low:high].T
+        x, y = (points[:, None, :] - self._starts[low:high]).transpose(2, 0, 1)
+        ahead = along_x * x + along_y * y
+        left = along_x * y - along_y * x
+        foot = np.minimum(np.maximum(ahead, 0.0), self._lengths[low:high])
         distance = np.hypot(ahead - foot, left)
+        found = np.empty((len(points), 2))
+        if high - low == 1:
+            found[:, 0] = self._arc[low] + foot[:, 0]
+            found[:, 1] = np.where(left[:, 0] < 0.0, -distance[:, 0], distance[:, 0])
+            return found
         best = np.argmin(distance, axis=1)
         row = np.arange(len(points))
-        s = self._arc[low + best] + foot[row, best]
-        n = np.where(left[row, best] < 0.0, -1.0, 1.0) * distance[row, best]
-        return np.asarray(np.column_stack((s, n)))
+        off = distance[row, best]
+        found[:, 0] = self._arc[low + best] + foot[row, best]
+        found[:, 1] = np.where(left[row, best] < 0.0, -off, off)
+        return found
 
     def project(self, x_m: float, y_m: float, near_s_m: float | None = None) -> Projection:
         """Return the foot of a point.

@@ -58,6 +58,8 @@ def repulsion(points: Array, hull: Hull, gains: FieldGains) -> tuple[float, floa
     One echo per obstacle: else the push would depend on the laser's resolution.
     """
     push_x = push_y = 0.0
+    if not len(points) or float(hull.distance(points).min()) >= gains.influence_m:
+        return push_x, push_y  # as nearly always
     for cluster in clusters(points):
         distances = hull.distance(cluster)
         nearest = int(np.argmin(distances))

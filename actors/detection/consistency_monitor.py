@@ -85,6 +85,7 @@ class ConsistencyMonitor:
         self._odometer_m = 0.0
         self._pose: tuple[float, float] | None = None
         self._progress: tuple[tuple[str, int, float], float] = (("", 0, 0.0), 0.0)
+        self._found: list[Finding] = []
         self.reason = ""
         self.nodes: tuple[str, ...] = ()
 
@@ -101,10 +102,11 @@ class ConsistencyMonitor:
     @property
     def due_s(self) -> float:
         """When time alone may change the finding."""
-        due_s = [self._since_s[name] + lasts_s for name, _, _, lasts_s in self._findings()]
-        due_s += [said.stamp_s + self._limits.silence_s for said in self._said.values()]
-        due_s += [self._known_after_s]
-        return min((t for t in due_s if t > self._now_s), default=math.inf)
+        now_s, silence_s = self._now_s, self._limits.silence_s
+        due_s = [self._since_s[name] + lasts_s for name, _, _, lasts_s in self._found]
+        due_s += [said.stamp_s + silence_s for said in self._said.values()]
+        due_s.append(self._known_after_s)
+        return min([t for t in due_s if t > now_s], default=math.inf)
 
     def expire(self, now_s: float) -> None:
         """Conclude from the time that has passed."""
@@ -145,7 +147,12 @@ class ConsistencyMonitor:
 
     def _judge(self, now_s: float) -> None:
         self._now_s = now_s
-        findings = list(self._findings())
+        self._found = findings = list(self._findings())
+        if not findings:  # nearly always
+            if self._since_s:
+                self._since_s = {}
+            self.nodes, self.reason = (), ""
+            return
         names = {name for name, *_ in findings}
         self._since_s = {
             name: self._since_s.get(name, now_s) for name in sorted(names)}
@@ -160,9 +167,9 @@ class ConsistencyMonitor:
     def _findings(self) -> Iterator[Finding]:
         """Yield what contradicts now, the first in the chain first."""
         yield from self._silences()
-        status, goal, route, control = (
-            self._said.get(kind.__name__)
-            for kind in (MissionStatus, GoalOrder, Route, ControlStatus))
+        said = self._said
+        status, goal = said.get("MissionStatus"), said.get("GoalOrder")
+        route, control = said.get("Route"), said.get("ControlStatus")
         patience_s = self._limits.patience_s
         if status is None or goal is None:
             return
@@ -181,9 +188,11 @@ class ConsistencyMonitor:
             yield from self._against_the_world(status, goal.body, control)
 
     def _silences(self) -> Iterator[Finding]:
-        for kind, said in sorted(self._said.items()):
-            if self._now_s >= said.stamp_s + self._limits.silence_s - 1e-9:
-                yield (f"silent {kind}", said, f"its {_WORDS[kind]} is not updated", 0.0)
+        now_s, silence_s = self._now_s, self._limits.silence_s
+        silent = [(kind, said) for kind, said in self._said.items()
+                  if now_s >= said.stamp_s + silence_s - 1e-9]
+        for kind, said in sorted(silent) if silent else ():
+            yield (f"silent {kind}", said, f"its {_WORDS[kind]} is not updated", 0.0)
 
     def _against_the_world(
         self, status: _Said, goal: GoalOrder, control: _Said

@@ -132,16 +132,19 @@ class PilotOutputMonitor:
         if (linear_mps, angular_radps) == (0.0, 0.0):
             return ""
         limits = self.limits
-        shown = f"the base got {linear_mps:.2f} m/s {angular_radps:.2f} rad/s"
         has_said = sent_s - self._said_s > limits.status_s
         if self._says_stop and has_said:
-            return f"{shown} while the safety pilot says that it stops"
-        recent = [c for c in self._asked if sent_s - c[0] <= limits.recent_s]
+            return f"{_shown(linear_mps, angular_radps)} while the safety pilot says that it stops"
         exactly = self._says_unchanged and has_said
-        for index, value in ((1, linear_mps), (2, angular_radps)):
-            if not any(self._explains(c[index], value, exactly=exactly) for c in recent):
-                return f"{shown}, which nobody has asked for"
-        return ""
+        moves = turns = False
+        for asked_s, linear_asked, angular_asked in reversed(self._asked):
+            if sent_s - asked_s > limits.recent_s:
+                break
+            moves = moves or self._explains(linear_asked, linear_mps, exactly=exactly)
+            turns = turns or self._explains(angular_asked, angular_radps, exactly=exactly)
+            if moves and turns:
+                return ""
+        return f"{_shown(linear_mps, angular_radps)}, which nobody has asked for"
 
     def _explains(self, asked: float, got: float, *, exactly: bool) -> bool:
         slack = self.limits.rounding * (1.0 + abs(asked))
@@ -162,3 +165,7 @@ class PilotOutputMonitor:
         """Accuse the next life as well, if that is wrong for long enough too."""
         if wrong and now_s - self._wrong_since_s >= self.limits.wrong_s - 1e-9:
             self._accuse(wrong)
+
+
+def _shown(linear_mps: float, angular_radps: float) -> str:
+    return f"the base got {linear_mps:.2f} m/s {angular_radps:.2f} rad/s"

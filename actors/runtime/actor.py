@@ -25,10 +25,10 @@ import msgspec
 from actors.runtime.bus import Bus
 from actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
 from actors.runtime.clock import Clock
-from actors.runtime.envelope import ArrivalGuard, Header, RejectedError, pack
-from actors.runtime.injection import FaultGate, News
+from actors.runtime.envelope import ArrivalGuard, Envelope, Header, pack
+from actors.runtime.injection_desk import InjectionDesk
 from actors.runtime.mailbox import Mailbox
-from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection, InjectionReport
+from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection
 from actors.runtime.timer import Timer
 from actors.runtime.topic import Qos, Topic
 from actors.runtime.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
@@ -47,6 +47,14 @@ _REPEATED_SOON_HZ = 10.0
 """A state that is repeated this often anyway is not repeated for a newcomer."""
 
 _DIAGNOSTIC_PERIOD_S = 1.0
+
+# What an actor is doing. Numbers, because they are compared and set for each message.
+_RESTING = 0
+"""Nothing, and what comes goes through the mailbox."""
+_IDLE = 1
+"""Nothing, and what comes may be handled without a stay in the mailbox."""
+_AWAKE = 2
+"""It handles an item, is about to, or has not started yet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,16 +137,16 @@ class Actor:
         self.parameters = context.parameters
         self._bus = context.bus
         self._guard = ArrivalGuard()
-        self._faults = FaultGate()
+        self._injections = InjectionDesk(self)
+        self._in_force = self._injections.gate.in_force
+        self._last_sent = self._injections.gate.last
         self._keeper = Keeper(
             context.checkpoints, lambda line: self.report_diagnostic("checkpoint", line, self.name),
             context.clock.now, expected=context.incarnation > 1)
-        self._injection_ends: dict[str, Timer] = {}
         self._mailbox = Mailbox(on_overflow=self._overflowed, on_item=self._wake)
         self._waiting = self._mailbox.waiting
         self._ended: asyncio.Future[None] | None = None
-        self._awake = False
-        self._idle = False
+        self._stance = _RESTING
         self._on_hold = False
         self._pace_s = 0.0
         self._sequence = 0
@@ -151,7 +159,7 @@ class Actor:
         self._tickers: list[_Ticker] = []
         self._diagnostics: dict[str, tuple[float, int]] = {}
         self._states: dict[str, tuple[Topic[Any], msgspec.Struct, float]] = {}
-        self._outlets: dict[tuple[str, str | None], tuple[str, bool]] = {}
+        self._outlets: dict[str | tuple[str, str], tuple[str, bool]] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
 
     # -- what a subclass may override -----------------------------------------------------------
@@ -209,15 +217,16 @@ class Actor:
         Raises:
             ValueError: the topic is not declared in `outputs`.
         """
-        key, is_kept = self._outlets.get((topic.key, name)) or self._outlet(topic, name)
+        key, is_kept = self._outlets.get(
+            topic.key if name is None else (topic.key, name)) or self._outlet(topic, name)
         if stamp is None:
             stamp = self.clock.now()
         if is_kept:
             self._states[key] = (topic, body, stamp)
-        if self._faults.in_force:
-            self._disturb_and_send(topic, key, body, stamp)
+        if self._in_force:
+            self._injections.send(topic, key, body, stamp)
         else:
-            self._send(topic, key, body, stamp)
+            self.send(topic, key, body, stamp)
 
     def _outlet(self, topic: Topic[Any], name: str | None) -> tuple[str, bool]:
         """Return the key of a topic, and whether its last message is kept for newcomers."""
@@ -226,12 +235,12 @@ class Actor:
                              "which its outputs do not declare")
         outlet = (topic.at(name or self.name) if topic.is_family else topic.at(),
                   topic.qos is Qos.STATE and topic.rate_hz < _REPEATED_SOON_HZ)
-        self._outlets[topic.key, name] = outlet
+        self._outlets[topic.key if name is None else (topic.key, name)] = outlet
         return outlet
 
     def has_readers(self, topic: Topic[Any]) -> bool:
         """Whether somebody may be listening to one of its topics, as far as the bus can know."""
-        key, _ = self._outlets.get((topic.key, None)) or self._outlet(topic, None)
+        key, _ = self._outlets.get(topic.key) or self._outlet(topic, None)
         return self._bus.has_readers(key)
 
     def call_later(self, delay_s: float, call: Callable[[], None]) -> Timer:
@@ -283,13 +292,15 @@ class Actor:
     def hold(self, held: bool) -> None:
         """Handle nothing while held: in virtual time what SIGSTOP and a wedged loop do."""
         self._on_hold = held
-        self._idle = False
+        if self._stance == _IDLE:
+            self._stance = _RESTING
         self._wake()
 
     def slow_down(self, pace_s: float) -> None:
         """Take so many virtual seconds for each item, as on a machine that is overloaded."""
         self._pace_s = pace_s
-        self._idle = False
+        if self._stance == _IDLE:
+            self._stance = _RESTING
 
     # -- the three phases -----------------------------------------------------------------------
 
@@ -302,10 +313,10 @@ class Actor:
         """
         await self._bus.open()
         self._ended = asyncio.get_running_loop().create_future()
-        self._awake = True  # nothing is handled before `on_start`
+        self._stance = _AWAKE  # nothing is handled before `on_start`
         try:
             self._set_up()
-            self._awake = False
+            self._stance = _RESTING
             self._wake()
             await self._ended
         except asyncio.CancelledError:
@@ -321,8 +332,8 @@ class Actor:
 
         Not at once if messages arrive in bursts: what is overtaken within one need not be handled.
         """
-        if not self._awake and self._ended is not None:
-            self._awake = True
+        if self._stance != _AWAKE and self._ended is not None:
+            self._stance = _AWAKE
             if self._bus.bursts:
                 self._ended.get_loop().call_soon(self._work)
             else:
@@ -330,25 +341,28 @@ class Actor:
 
     def _rest(self) -> None:
         """The mailbox is empty. Whether the next item may be handled without a stay in it?"""
-        self._awake = False
-        self._idle = not (self._bus.bursts or self._on_hold or self._pace_s
-                          or self._ended is None or self._ended.done())
+        self._stance = _RESTING if (
+            self._bus.bursts or self._on_hold or self._pace_s
+            or self._ended is None or self._ended.done()) else _IDLE
 
-    def _handle(self, item: Callable[..., None], *what: Any) -> None:
-        """Handle an item at once, if idle, and then what it has put into the mailbox."""
-        self._awake, self._idle = True, False
+    def _handle(self, item: Callable[[], None]) -> None:
+        """Handle an item at once, being idle, and then what it has put into the mailbox."""
+        self._stance = _AWAKE
         try:
-            item(*what)
-            self._progress += 1
+            item()
         except Exception as error:
-            if self._ended is not None:
-                self._ended.set_exception(error)
-            self._rest()
+            self._broken(error)
             return
+        self._progress += 1
         if self._waiting:
             self._work()
         else:
-            self._awake, self._idle = False, True
+            self._stance = _IDLE
+
+    def _broken(self, error: Exception) -> None:
+        if self._ended is not None:
+            self._ended.set_exception(error)
+        self._rest()
 
     def _work(self) -> None:
         mailbox, ended = self._mailbox, self._ended
@@ -415,26 +429,32 @@ class Actor:
     def _receiver(
         self, topic: Topic[Any], handler: Callable[[Any, Header], None]
     ) -> Callable[[str, bytes], None]:
-        def deliver(key: str, payload: bytes) -> None:
-            try:
-                message = admit(key, payload)
-            except RejectedError as reason:
-                self._rejected += 1
-                self.report_diagnostic("payload rejected", str(reason), key)
-                return
-            if message is None:
-                return
-            if self._idle:
-                handle(handler, message.body, message)
+        command, name, waiting = topic.qos is Qos.COMMAND, handler.__name__, self._waiting
+
+        def take(key: str, message: Envelope[Any]) -> None:
+            if self._stance == _IDLE:  # as `_handle`, once more because it is run so often
+                self._stance = _AWAKE
+                try:
+                    handler(message.body, message)
+                except Exception as error:
+                    self._broken(error)
+                    return
+                self._progress += 1
+                if waiting:
+                    self._work()
+                else:
+                    self._stance = _IDLE
             elif command:
                 self._mailbox.put(lambda: handler(message.body, message))
             else:
                 self._mailbox.put_latest(
                     f"{key} {name}", lambda: handler(message.body, message))
 
-        admit, handle = self._guard.admission(topic), self._handle
-        command, name = topic.qos is Qos.COMMAND, handler.__name__
-        return deliver
+        return self._guard.receiver(topic, take, self._reject)
+
+    def _reject(self, key: str, reason: str) -> None:
+        self._rejected += 1
+        self.report_diagnostic("payload rejected", reason, key)
 
     def _peer_changed(self, node: str, incarnation: int, alive: bool) -> None:
         self._mailbox.put_latest(
@@ -443,24 +463,12 @@ class Actor:
     def _overflowed(self, _item: Any) -> None:
         self.report_diagnostic("mailbox full", "a command was refused", self.name)
 
-    def _disturb_and_send(
-        self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float
-    ) -> None:
-        faults = self._faults
-        out = faults.apply(key, body, stamp, self.clock.now())
-        if out is not None and out.delay_s > 0:
-            self.call_later(
-                out.delay_s, lambda: self._send(topic, key, out.body, out.stamp, out.copies))
-        elif out is not None:
-            self._send(topic, key, out.body, out.stamp, out.copies)
-        for news in faults.take_news():
-            self._tell_injection(news)
-
-    def _send(
+    def send(
         self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float, copies: int = 1
     ) -> None:
+        """Send a message as it is, past all fault injections; `publish` is what actors call."""
         self._sequence = sequence = self._sequence + 1
-        self._faults.last[key] = (body, stamp)
+        self._last_sent[key] = (body, stamp)
         payload = pack((self.name, self._incarnation, sequence, stamp, body))
         for _ in range(copies):
             self._bus.publish(topic, key, payload)
@@ -485,7 +493,7 @@ class Actor:
         ticker.arm(self.clock.now() + period_s)
 
     def _tick(self, slot: str, call: Callable[[], None]) -> None:
-        if self._idle:
+        if self._stance == _IDLE:
             self._handle(call)
         else:
             self._mailbox.put_latest(slot, call)
@@ -501,49 +509,18 @@ class Actor:
         if header.source == self.name:
             return
         for key, (topic, body, stamp) in list(self._states.items()):
-            if self._faults.in_force:
-                self._disturb_and_send(topic, key, body, stamp)
+            if self._in_force:
+                self._injections.send(topic, key, body, stamp)
             else:
-                self._send(topic, key, body, stamp)
+                self.send(topic, key, body, stamp)
 
     # -- fault injection ------------------------------------------------------------------------
 
     def _on_injection(self, order: Injection, _header: Header) -> None:
-        topic = self._published(order.topic)
-        if topic is None:
-            return
-        reason = self._faults.order(order, self.clock.now(), topic.type)
-        self.publish(INJECTION_REPORT, InjectionReport(
-            order.injection, self.name, 0, bool(reason), reason))
-        if reason:
-            return
-        self._forget_injection_end(order.injection)  # of an earlier order with the same id
-        if order.duration_s <= 0:
-            self._injection_over(order.injection)
-        elif order.duration_s < math.inf:
-            self._injection_ends[order.injection] = self.call_later(
-                order.duration_s, lambda: self._injection_over(order.injection))
+        self._injections.order(order)
 
-    def _injection_over(self, injection: str) -> None:
-        self._forget_injection_end(injection)
-        affected = self._faults.expire(injection)
-        self.publish(INJECTION_REPORT, InjectionReport(
-            injection, self.name, affected, True, ""))
-
-    def _tell_injection(self, news: News) -> None:
-        """Report the first effect of an injection, or that it ended early and why."""
-        if news.finished:
-            self._forget_injection_end(news.injection)
-            self.report_diagnostic("fault injection", news.reason, news.topic)
-        self.publish(INJECTION_REPORT, InjectionReport(
-            news.injection, self.name, news.affected, news.finished, news.reason))
-
-    def _forget_injection_end(self, injection: str) -> None:
-        timer = self._injection_ends.pop(injection, None)
-        if timer is not None:
-            timer.cancel()
-
-    def _published(self, key: str) -> Topic[Any] | None:
+    def published(self, key: str) -> Topic[Any] | None:
+        """Return the topic of a key below `rampart/`, if this actor publishes it."""
         for topic in (*self.outputs, *BASE_OUTPUTS):
             if not topic.is_family and topic.key == key:
                 return topic
@@ -577,17 +554,20 @@ class _Ticker:
     def arm(self, due_s: float) -> None:
         """Tick next at a simulated time."""
         self._due_s = due_s
-        self._post_at(self._clock.source_time(due_s), self._fire)
+        self._post_at(self._clock.source_time(due_s), _Ticker._fire, self, None)
 
     def cancel(self) -> None:
         """Tick no more."""
         self._cancelled = True
 
-    def _fire(self) -> None:
+    def _fire(self, _nothing: None) -> None:
         if self._cancelled:
             return
         clock, actor = self._clock, self._actor
         now_s, next_s = clock.now(), self._due_s + self._period_s
         self._due_s = due_s = next_s if next_s > now_s else now_s + self._period_s
-        self._post_at(clock.source_time(due_s), self._fire)
-        actor._tick(self._slot, self._call)
+        self._post_at(clock.source_time(due_s), _Ticker._fire, self, None)
+        if actor._stance == _IDLE:
+            actor._handle(self._call)
+        else:
+            actor._mailbox.put_latest(self._slot, self._call)

@@ -17,7 +17,6 @@ from actors.runtime.topic import Qos, Topic
 B = TypeVar("B")
 
 _REMEMBERED_COMMANDS = 64
-_COMMAND = Qos.COMMAND
 
 
 class Header(msgspec.Struct, frozen=True, gc=False):
@@ -67,67 +66,63 @@ def _decoder(kind: type[Any]) -> Callable[[bytes], Envelope[Any]]:
     return decoder.decode
 
 
-class RejectedError(Exception):
-    """A payload that must not reach the actor; the text is the reason."""
+Life = tuple[int, dict[str, int], dict[str, deque[int]]]
+"""What was heard from a node in its present life: incarnation; newest sequence number by key of
+the topics of which only the newest counts; of commands, by key, the last numbers."""
 
 
 class ArrivalGuard:
     """Decides for each arriving payload whether the actor may see it."""
 
     def __init__(self) -> None:
-        self._incarnations: dict[str, int] = {}
-        self._last: dict[tuple[str, str], int] = {}
-        self._recent: dict[tuple[str, str], deque[int]] = {}
+        self._lives: dict[str, Life] = {}
 
-    def admission(self, topic: Topic[Any]) -> Callable[[str, bytes], Envelope[Any] | None]:
-        """Return the check for one topic: of key and payload, as it is made of every message.
+    def receiver(
+        self, topic: Topic[Any], take: Callable[[str, Envelope[Any]], None],
+        refuse: Callable[[str, str], None],
+    ) -> Callable[[str, bytes], None]:
+        """Return what is to be called with key and payload of each message of a topic.
 
-        It returns the message, or None for a duplicate or an overtaken sample.
-
-        Raises:
-            RejectedError: it does not decode, or comes from a superseded incarnation.
+        Args:
+            topic: Which.
+            take: Called with the key and the message, unless it is a duplicate or was overtaken.
+            refuse: Called with the key and the reason, if it does not decode or comes from a
+                superseded incarnation.
         """
         unpack, kind = _decoders.get(topic.type) or _decoder(topic.type), topic.type.__name__
-        incarnations, newest = self._incarnations, self._last
-        is_fresh = self._is_fresh_command if topic.qos is _COMMAND else None
+        lives, meet, is_command = self._lives, self._meet, topic.qos is Qos.COMMAND
 
-        def admit(key: str, payload: bytes) -> Envelope[Any] | None:
+        def receive(key: str, payload: bytes) -> None:  # made of every message
             try:
                 message = unpack(payload)
             except (msgspec.MsgspecError, RecursionError) as error:
-                raise RejectedError(f"not a {kind}: {error}") from None
-            source, sequence = message.source, message.sequence
-            if message.incarnation != incarnations.get(source, -1):
-                self._meet(source, message.incarnation)
-            channel = (source, key)
-            if is_fresh is not None:
-                return message if is_fresh(channel, sequence) else None
-            if sequence <= newest.get(channel, -1):
-                return None
-            newest[channel] = sequence
-            return message
+                refuse(key, f"not a {kind}: {error}")
+                return
+            life = lives.get(message.source)
+            if life is None or life[0] != message.incarnation:
+                if life is not None and message.incarnation < life[0]:
+                    refuse(key, f"incarnation {message.incarnation} of {message.source} "
+                                f"was superseded by {life[0]}")
+                    return
+                life = meet(message.source, message.incarnation)
+            sequence = message.sequence
+            if is_command:
+                recent = life[2].get(key)
+                if recent is None:
+                    recent = life[2][key] = deque(maxlen=_REMEMBERED_COMMANDS)
+                if sequence in recent:
+                    return
+                recent.append(sequence)
+            else:
+                newest = life[1]
+                if sequence <= newest.get(key, -1):
+                    return
+                newest[key] = sequence
+            take(key, message)
 
-        return admit
+        return receive
 
-    def _is_fresh_command(self, channel: tuple[str, str], sequence: int) -> bool:
-        recent = self._recent.get(channel)
-        if recent is None:
-            recent = self._recent[channel] = deque(maxlen=_REMEMBERED_COMMANDS)
-        if sequence in recent:
-            return False
-        recent.append(sequence)
-        return True
-
-    def _meet(self, source: str, incarnation: int) -> None:
-        """Take another incarnation than before for the valid one, unless it is an older one."""
-        newest = self._incarnations.get(source, -1)
-        if incarnation < newest:
-            raise RejectedError(
-                f"incarnation {incarnation} of {source} was superseded by {newest}")
-        self._forget(source)
-        self._incarnations[source] = incarnation
-
-    def _forget(self, source: str) -> None:
-        for table in (self._last, self._recent):
-            for channel in [c for c in table if c[0] == source]:
-                del table[channel]
+    def _meet(self, source: str, incarnation: int) -> Life:
+        life: Life = (incarnation, {}, {})
+        self._lives[source] = life
+        return life

@@ -1,7 +1,7 @@
 """A bus inside one process, for virtual time and tests: no sockets, no threads.
 
-What lies between two nodes is up to a `Network`: it says when each copy of a message arrives.
-Without one everything arrives at once.
+What lies between two nodes is up to a `Network`: it says when each copy of a message arrives,
+which takes a virtual loop. Without one everything arrives at once, on any loop.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from actors.runtime.bus import Deliver, PeerChange
 from actors.runtime.topic import Topic
+from actors.runtime.virtual_loop import VirtualLoop
 
 Tap = Callable[[float, str, str, bytes], None]
 """Sees each message as it is sent: when by the loop's clock, source, key, payload."""
@@ -28,8 +29,8 @@ class Network(Protocol):
         """Return the one link between two nodes; None if everything arrives at once."""
 
 
-Route = tuple[Link | None, Callable[[Deliver, str, bytes], None], Deliver]
-"""The way to a reader, its bus's `arrive`, and who there takes the message."""
+Route = tuple[Link | None, Deliver, Callable[[Deliver, str, bytes], None]]
+"""The way to a reader, who there takes the message, and its bus's `arrive` if there is no way."""
 
 
 class Hub:
@@ -67,7 +68,7 @@ class Hub:
         """Return the ways from a node to all who hear a key, in the order of subscription."""
         link = self.network.link if self.network else _at_once
         found = self.routes_from(source)[key] = [
-            (link(source, bus.node), bus.arrive, deliver)
+            (link(source, bus.node), deliver, bus.arrive)
             for pattern, deliver, bus in self._subscriptions if pattern.fullmatch(key)]
         return found
 
@@ -102,12 +103,14 @@ class VirtualBus:
         self._routes = hub.routes_from(node)
         self._incarnation = incarnation
         self._open = False
+        self._readers: list[Deliver] = []
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._virtual: VirtualLoop | None = None
 
     async def open(self) -> None:
         """Join the hub."""
         self._loop = loop = asyncio.get_running_loop()
-        self._post_at = getattr(loop, "post_at", loop.call_at)  # cheaper, on a virtual loop
+        self._virtual = loop if isinstance(loop, VirtualLoop) else None
         self._open = True
         self._hub.announce(self.node, self._incarnation, alive=True)
 
@@ -117,27 +120,30 @@ class VirtualBus:
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:  # noqa: ARG002
         """Send to all present subscribers of the key."""
-        loop, hub = self._loop, self._hub
+        loop, virtual, hub = self._loop, self._virtual, self._hub
         if not self._open or loop is None:
             return
-        now_s = loop.time()
+        now_s = loop.time() if virtual is None else virtual.now_s
         for tap in hub.taps:
             tap(now_s, self.node, key, payload)
         routes = self._routes.get(key)
         if routes is None:
             routes = hub.route(self.node, key)
-        for link, arrive, deliver in routes:
-            if link is None:
+        for link, deliver, arrive in routes:
+            if link is None or virtual is None:
                 loop.call_soon(arrive, deliver, key, payload)
                 continue
             for at_s in link(now_s):
                 if at_s > now_s:
-                    self._post_at(at_s, arrive, deliver, key, payload)
+                    virtual.post_at(at_s, deliver, key, payload)
                 else:
                     loop.call_soon(arrive, deliver, key, payload)
 
     def arrive(self, deliver: Deliver, key: str, payload: bytes) -> None:
-        """Hand a message over, if somebody is still there to take it."""
+        """Hand a message over, if somebody is still there to take it.
+
+        What takes time is handed over without asking: `cut` takes it back.
+        """
         if self._open:
             deliver(key, payload)
 
@@ -147,7 +153,8 @@ class VirtualBus:
         return bool(self._hub.route(self.node, key) if routes is None else routes)
 
     def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:  # noqa: ARG002
-        """Have `deliver` called for each message on keys that match."""
+        """Have `deliver` called for each message on keys that match; no other bus may have it."""
+        self._readers.append(deliver)
         self._hub.subscribe(key_expression, deliver, self)
 
     def watch(self, node: str, changed: PeerChange) -> None:
@@ -160,6 +167,9 @@ class VirtualBus:
         """Send and receive nothing any more, as when the process is killed; nobody is told yet."""
         self._open = False
         self._hub.remove(self)
+        if self._virtual is not None:
+            self._virtual.withdraw(self._readers)
+        self._readers = []
 
     async def close(self) -> None:
         """Leave the hub."""

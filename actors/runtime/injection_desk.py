@@ -1,0 +1,83 @@
+"""What an actor does about fault injections: takes orders, ends them in time, tells what became.
+
+`actors.runtime.injection` decides what happens to a message; here are the timers and the reports.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from actors.runtime.injection import FaultGate, News
+from actors.runtime.messages import Injection, InjectionReport
+from actors.runtime.timer import Timer
+from actors.runtime.topic import Topic
+from actors.runtime.topics import INJECTION_REPORT
+
+if TYPE_CHECKING:
+    from actors.runtime.actor import Actor
+
+
+class InjectionDesk:
+    """The injections of one actor.
+
+    Attributes:
+        gate: Those in force, and what was sent last.
+    """
+
+    def __init__(self, actor: Actor) -> None:
+        self.gate = FaultGate()
+        self._actor = actor
+        self._ends: dict[str, Timer] = {}
+
+    def order(self, order: Injection) -> None:
+        """Put an injection in force, if it concerns a topic that the actor publishes."""
+        actor = self._actor
+        topic = actor.published(order.topic)
+        if topic is None:
+            return
+        reason = self.gate.order(order, actor.clock.now(), topic.type)
+        actor.publish(INJECTION_REPORT, InjectionReport(
+            order.injection, actor.name, 0, bool(reason), reason))
+        if reason:
+            return
+        self._forget_end(order.injection)  # of an earlier order with the same id
+        if order.duration_s <= 0:
+            self._over(order.injection)
+        elif order.duration_s < math.inf:
+            self._ends[order.injection] = actor.call_later(
+                order.duration_s, lambda: self._over(order.injection))
+
+    def send(self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float) -> None:
+        """Send what the injections in force leave of a message, when they let it go."""
+        actor = self._actor
+        out = self.gate.apply(key, body, stamp, actor.clock.now())
+        if out is not None and out.delay_s > 0:
+            actor.call_later(
+                out.delay_s, lambda: actor.send(topic, key, out.body, out.stamp, out.copies))
+        elif out is not None:
+            actor.send(topic, key, out.body, out.stamp, out.copies)
+        for news in self.gate.take_news():
+            self._tell(news)
+
+    def _over(self, injection: str) -> None:
+        self._forget_end(injection)
+        affected = self.gate.expire(injection)
+        self._actor.publish(INJECTION_REPORT, InjectionReport(
+            injection, self._actor.name, affected, True, ""))
+
+    def _tell(self, news: News) -> None:
+        """Report the first effect of an injection, or that it ended early and why."""
+        actor = self._actor
+        if news.finished:
+            self._forget_end(news.injection)
+            actor.report_diagnostic("fault injection", news.reason, news.topic)
+        actor.publish(INJECTION_REPORT, InjectionReport(
+            news.injection, actor.name, news.affected, news.finished, news.reason))
+
+    def _forget_end(self, injection: str) -> None:
+        timer = self._ends.pop(injection, None)
+        if timer is not None:
+            timer.cancel()
