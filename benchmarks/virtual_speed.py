@@ -1,8 +1,8 @@
 """How fast is the whole controller in virtual time? `python -m benchmarks.virtual_speed [RUNS]`.
 
-Mission A on the shipped airport with seed 1, again and again in one process; prints, for each run,
-processor time, simulated seconds per second of it, messages and trace. A first run, which also
-imports and loads, is left out.
+Mission A on the shipped airport with seed 1, again and again in one process, of the paper's system
+and of the full one in turn; prints, for each run, processor time, simulated seconds per second of
+it, messages and trace. A first run of each, which also imports and loads, is left out.
 """
 
 from __future__ import annotations
@@ -14,22 +14,26 @@ import time
 from sim.campaign.job import Job, run_virtually
 
 RUNS = 4
+SYSTEMS = ("paper", "osmosis")
 
 
 def main() -> None:
     """Measure and print."""
     runs = int(sys.argv[1]) if len(sys.argv) > 1 else RUNS
-    job = Job(row="none", system="osmosis", mission="A", seed=1)
-    run_virtually(job)  # imports, compiles, loads the map
-    speeds = []
+    jobs = {name: Job(row="none", system=name, mission="A", seed=1) for name in SYSTEMS}
+    speeds: dict[str, list[float]] = {name: [] for name in SYSTEMS}
+    for job in jobs.values():
+        run_virtually(job)  # imports, compiles, loads the map
     for _ in range(runs):
-        begun_s = time.process_time()
-        result = run_virtually(job)
-        took_s = time.process_time() - begun_s
-        speeds.append(result.record.duration_s / took_s)
-        print(f"{took_s:.2f} s, {speeds[-1]:.1f} times real time, {result.messages} messages, "
-              f"trace {result.trace[:12]}", flush=True)
-    print(f"median {statistics.median(speeds):.1f}, {min(speeds):.1f} to {max(speeds):.1f}")
+        for name, job in jobs.items():
+            begun_s = time.process_time()
+            result = run_virtually(job)
+            took_s = time.process_time() - begun_s
+            speeds[name].append(result.record.duration_s / took_s)
+            print(f"{name}: {took_s:.2f} s, {speeds[name][-1]:.1f} times real time, "
+                  f"{result.messages} messages, trace {result.trace[:12]}", flush=True)
+    for name, seen in speeds.items():
+        print(f"{name}: median {statistics.median(seen):.1f}, {min(seen):.1f} to {max(seen):.1f}")
 
 
 if __name__ == "__main__":
