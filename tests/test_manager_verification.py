@@ -363,7 +363,7 @@ def test_the_command_refuses_nonsense_in_one_line(capsys, monkeypatch):
 
 
 def test_the_command_prints_json_of_the_promised_shape(capsys):
-    assert main(["verify", "--system", "paper", "--strategy", "safety-first", "--json"]) == 0
+    assert main(["verify", "paper", "--strategy", "safety-first", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert {"states", "permissiveness", "properties"} <= told.keys()
     assert told["permissiveness"] == {"safety-first": 90}
@@ -376,11 +376,11 @@ def test_the_command_prints_json_of_the_promised_shape(capsys):
 
 @pytest.mark.parametrize(("strategy", "code"), [("safety-first", 1), ("guarded-repair", 0)])
 def test_strict_the_exit_code_tells_whether_all_holds(capsys, strategy, code):
-    assert main(["verify", "--system", "paper", "--strategy", strategy, "--strict"]) == code
+    assert main(["verify", "paper", "--strategy", strategy, "--strict"]) == code
 
 
 def test_the_command_prints_a_table_the_states_and_the_traces(capsys):
-    assert main(["verify", "--system", "paper", "--strategy", "safety-first"]) == 0
+    assert main(["verify", "paper", "--strategy", "safety-first"]) == 0
     told = capsys.readouterr().out
     assert "127 active sets, " in told
     assert "FAILS in 32" in told
