@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from checkpoint_runs import write_short_mission
 from real_run import RealRun
 from stub_actors import ROOT
 
@@ -49,10 +50,11 @@ def test_the_same_seed_gives_the_same_run_to_the_byte_and_another_seed_another(n
 @pytest.mark.parametrize(("system", "code"), [("paper", 1), ("osmosis", 0)])
 def test_the_trace_does_not_depend_on_the_process_it_is_made_in(tmp_path, system, code):
     traces = set()
+    mission = write_short_mission(tmp_path)
     for seed in ("0", "4711"):
         done = subprocess.run(
-            [sys.executable, "launch.py", "--virtual", "--system", system, "--mission", "A",
-             "--seed", "5", "--fault", "kill:mission_manager@6", "--fault", "wedge:DM2@3",
+            [sys.executable, "launch.py", "--virtual", "--system", system,
+             "--mission", str(mission), "--seed", "5", "--fault", "kill:mission_manager@6", "--fault", "wedge:DM2@3",
              "--json", "--report", str(tmp_path / seed)],
             cwd=ROOT, env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True,
             check=False)
