@@ -54,8 +54,8 @@ def test_the_trace_does_not_depend_on_the_process_it_is_made_in(tmp_path, system
     for seed in ("0", "4711"):
         done = subprocess.run(
             [sys.executable, "launch.py", "--virtual", "--system", system,
-             "--mission", str(mission), "--seed", "5", "--fault", "kill:mission_manager@6", "--fault", "wedge:DM2@3",
-             "--json", "--report", str(tmp_path / seed)],
+             "--mission", str(mission), "--seed", "5", "--fault", "kill:mission_manager@6",
+             "--fault", "wedge:DM2@3", "--json", "--report", str(tmp_path / seed)],
             cwd=ROOT, env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True,
             check=False)
         assert done.returncode == code, done.stderr
