@@ -55,6 +55,8 @@ class Browser:
                         deviceScaleFactor=1, mobile=False)
         await self.call("Emulation.setEmulatedMedia",
                         features=[{"name": "prefers-color-scheme", "value": scheme}])
+        await self.call("Page.bringToFront")  # keys go to a tab only while it has the focus
+        await self.call("Emulation.setFocusEmulationEnabled", enabled=True)
         await self.call("Page.enable")
         await self.call("Runtime.enable")
         await self.call("Log.enable")

@@ -75,6 +75,13 @@ def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():
     assert 0.9 < guarded.detected_after_s < 1.1
 
 
+@pytest.mark.parametrize("fault", [
+    "command-out-of-bounds@9+60", "localization-not-updated@9+60", "prohibited-area@9+60",
+    "wrong-graph@3+60"])
+def test_without_fault_tolerance_the_papers_faults_are_unsafe(fault):
+    assert not run_job(job(fault, ftm=False, patience_s=35.0)).safe
+
+
 def test_a_killed_process_is_detected_respawned_and_the_mission_goes_on():
     result = run_job(job("kill:osmosis_control@20"))
     assert (result.success, result.safe) == (True, True)
