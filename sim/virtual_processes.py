@@ -280,7 +280,8 @@ class VirtualMachine:
             try:
                 actor = member.actor(Context(
                     name, process.incarnation, self._clock, bus, member.parameters, self._shared,
-                    process.pid, self._store(name, process.incarnation)))
+                    process.pid, self._store(name, process.incarnation),
+                    self._layout.spec.timing.heartbeat_period_s))
             except Exception as error:
                 self._failed(process, name, error)
                 return

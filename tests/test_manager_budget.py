@@ -151,7 +151,7 @@ def test_a_budget_explains_itself():
 
 
 def test_all_timeouts_are_guarded_against_false_alarms():
-    for field, least in {"heartbeat_timeout_s": 0.3, "command_timeout_s": 0.15,
+    for field, least in {"heartbeat_timeout_s": 0.42, "command_timeout_s": 0.15,
                          "localization_timeout_s": 0.15, "scan_timeout_s": 0.15,
                          "dead_man_timeout_s": 0.15,
                          "manager_timeout_s": 0.3, "detection_silence_timeout_s": 0.6}.items():

@@ -104,8 +104,8 @@ REFUSED = {
     "missing field": ([("width_m = 0.614\n", "")],
                       ["$.robot: required field 'width_m' is missing"]),
     "missing table": ([("[robot]", "[layerz]")], ["$.layerz", "unknown field"]),
-    "negative time": ([("heartbeat_period_s = 0.1", "heartbeat_period_s = -0.1")],
-                      ["$.timing.heartbeat_period_s = -0.1: Expected float > 0"]),
+    "negative time": ([("heartbeat_period_s = 0.14", "heartbeat_period_s = -0.14")],
+                      ["$.timing.heartbeat_period_s = -0.14: Expected float > 0"]),
     "zero timeout": ([("arbitration_s = 0.05 ", "command_timeout_s = 0\narbitration_s = 0.05 ")],
                      ["$.timing.command_timeout_s = 0", "> 0"]),
     "time that is not finite": ([("respawn_s = 0.4", "respawn_s = inf")],
@@ -257,7 +257,7 @@ REFUSED = {
                                               "raise false alarms"]),
     "a heartbeat timeout that trips": (
         [("arbitration_s = 0.05 ", "heartbeat_timeout_s = 0.2\narbitration_s = 0.05 ")],
-        ["$.timing.heartbeat_timeout_s = 0.2: would raise false alarms; at least 0.300 s"]),
+        ["$.timing.heartbeat_timeout_s = 0.2: would raise false alarms; at least 0.420 s"]),
     "a respawn that is too slow": ([("respawn_s = 0.4", "respawn_s = 0.6")],
                                    ["$.timing.heartbeat_timeout_s", "would raise false alarms"]),
     "a robot that is too fast": (

@@ -31,6 +31,7 @@ from actors.operator.hmi_submission import (
     system_is_up,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.topic import Topic
 from airport.drawing import draw
 from airport.model import Airport, Mission
 
@@ -61,6 +62,10 @@ class Hmi(Actor):
         self._port: int = self.parameters.get("port", shared.get("hmi_port")) or 0
         self._server: PageServer | None = None
         self._starting: asyncio.Task[None] | None = None
+
+    def listens(self, topic: Topic[Any]) -> bool:
+        """Without a page, hear only what missions and orders depend on."""
+        return bool(self._port) or topic not in _SHOWN
 
     @property
     def page_port(self) -> int | None:
@@ -214,6 +219,12 @@ class Hmi(Actor):
     @on(topics.LIGHT_MEASURED)
     def _light(self, message: m.LightMeasurement, _header: Header) -> None:
         self._state.light(message)
+
+
+_SHOWN = (
+    topics.POSE, topics.ROUTE, topics.CONTROL_STATUS, topics.PILOT_STATUS, topics.OBSTACLES,
+    topics.PROCESS_EVENT, topics.ERROR_REPORT, topics.LIGHT_MEASURED)
+"""What is heard for the page alone."""
 
 
 def _goals(mission: Mission) -> tuple[m.Goal, ...]:

@@ -43,7 +43,7 @@ BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, HELLO, DIAGNOSTIC, INJECTION_
 BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT, HELLO)
 """What every actor hears besides its own inputs: injections from tools, hellos from partners."""
 
-_REPEATED_SOON_HZ = 10.0
+_REPEATED_SOON_HZ = 7.0
 """A state that is repeated this often anyway is not repeated for a newcomer."""
 
 _DIAGNOSTIC_PERIOD_S = 1.0
@@ -70,6 +70,7 @@ class Context:
         shared: read-only objects loaded once for the whole run ("system", "airport", ...).
         pid: number of the process that it lives in.
         checkpoints: where this node's state is kept.
+        heartbeat_period_s: simulated seconds between two heartbeats.
     """
 
     name: str
@@ -80,6 +81,7 @@ class Context:
     shared: Mapping[str, Any] = field(default_factory=dict)
     pid: int = field(default_factory=os.getpid)
     checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
+    heartbeat_period_s: float = 0.1
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:
@@ -107,11 +109,9 @@ class Actor:
 
     Class attributes:
         outputs: topics it publishes; publishing another one raises.
-        heartbeat_period_s: simulated seconds between heartbeats.
     """
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = ()
-    heartbeat_period_s: float = 0.1
     _handlers: ClassVar[tuple[tuple[Topic[Any], str], ...]] = ()
     _periodic: ClassVar[tuple[tuple[float, str], ...]] = ()
 
@@ -187,6 +187,10 @@ class Actor:
     def inputs(cls) -> tuple[Topic[Any], ...]:
         """Topics it has handlers for, those of every actor included."""
         return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
+
+    def listens(self, topic: Topic[Any]) -> bool:  # noqa: ARG002
+        """Whether this life of the node, as it was started, has any use for one of its inputs."""
+        return True
 
     def on_start(self) -> None:
         """Runs on the loop when the bus is open, before the first message. A raise ends it."""
@@ -384,6 +388,8 @@ class Actor:
 
     def _set_up(self) -> None:
         for topic, method in self._handlers:
+            if not self.listens(topic):
+                continue
             handler = getattr(self, method)
             names = self.names(topic, self.name, self.parameters) if topic.is_family else None
             keys = [topic.at(n) for n in names] if names is not None else [topic.pattern]
@@ -394,7 +400,7 @@ class Actor:
         self.on_start()
         self.publish(HELLO, Hello())
         self._beat()
-        self._start_timer(self.heartbeat_period_s, "_beat")
+        self._start_timer(self.context.heartbeat_period_s, "_beat")
         for period_s, method in self._periodic:
             self._start_timer(period_s, method)
 
@@ -499,8 +505,9 @@ class Actor:
             self._mailbox.put_latest(slot, call)
 
     def _beat(self) -> None:
+        context = self.context
         self.publish(HEARTBEAT, Heartbeat(
-            self.context.pid, self._progress, self.heartbeat_period_s, self._rejected,
+            context.pid, self._progress, context.heartbeat_period_s, self._rejected,
             self._mailbox.overflowed))
 
     # -- newcomers ------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection, InjectionReport
 from actors.runtime.topic import Qos, Topic
 
-HEARTBEAT = Topic("heartbeat/{name}", Heartbeat, Qos.STATE, 10, "",
+HEARTBEAT = Topic("heartbeat/{name}", Heartbeat, Qos.STATE, 7, "",
                   "Proof that the event loop of node {name} turns.")
 HELLO = Topic("hello/{name}", Hello, Qos.COMMAND, 0, "",
               "Node {name} has started; its partners repeat their states for it.")

@@ -130,19 +130,18 @@ class VirtualBus:
         if routes is None:
             routes = hub.route(self.node, key)
         for link, deliver, arrive in routes:
-            if link is None or virtual is None:
+            if virtual is None:
                 loop.call_soon(arrive, deliver, key, payload)
-                continue
-            for at_s in link(now_s):
-                if at_s > now_s:
+            elif link is None:
+                virtual.post_at(now_s, deliver, key, payload)
+            else:
+                for at_s in link(now_s):
                     virtual.post_at(at_s, deliver, key, payload)
-                else:
-                    loop.call_soon(arrive, deliver, key, payload)
 
     def arrive(self, deliver: Deliver, key: str, payload: bytes) -> None:
         """Hand a message over, if somebody is still there to take it.
 
-        What takes time is handed over without asking: `cut` takes it back.
+        On a virtual loop nobody asks: `cut` takes back what is posted.
         """
         if self._open:
             deliver(key, payload)

@@ -39,8 +39,10 @@ def make_actor(
     member = layout.members[name]
     clock = Clock(layout.plan.origin_s, layout.plan.rate, loop.time)
     bus = ZenohBus(name, incarnation, layout.listen(name), layout.dial(name))
-    return member.actor(Context(name, incarnation, clock, bus, member.parameters, shared,
-                                checkpoints=make_store(layout, name, incarnation)))
+    return member.actor(Context(
+        name, incarnation, clock, bus, member.parameters, shared,
+        checkpoints=make_store(layout, name, incarnation),
+        heartbeat_period_s=layout.spec.timing.heartbeat_period_s))
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
