@@ -7,14 +7,20 @@ import argparse
 import asyncio
 import contextlib
 import json
+import os
 import signal
+import socket
 import sys
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import msgspec
 
+from actors.recording.bag_writer import BagError, check_target
+from actors.recording.process import Order, RecorderProcess
+from actors.recording.virtual import VirtualRecording
+from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
 from actors.supervision.launcher import Launcher, LaunchError
 from actors.supervision.run_plan import DEFAULT_PORT, RunPlan, load_system
 from airport.formats import load_airport, load_mission
@@ -24,6 +30,7 @@ from sim.console import Console
 from sim.injector import can_be_hit
 from sim.mission_run import MissionRun, summary
 from sim.network import NETWORKS, find_network
+from sim.offered_faults import offered_faults
 from sim.process_run import ProcessRun
 from sim.report import write_report
 from sim.report_record import RunRecord
@@ -40,7 +47,10 @@ examples:
   python launch.py                                  mission AB on the shipped airport
   python launch.py --mission A --obstacles 2        two obstacles on the way
   python launch.py --rate 4 --no-hmi --json         four times real time, result as JSON
+  python launch.py --hmi-host 0.0.0.0               the page for other machines too, with a token
+  python launch.py --record run.mcap                keep everything that is said; `rampart replay`
   python launch.py --no-ftm                         the paper's baseline, without fault tolerance
+  python launch.py --joystick                       drive by hand: hold the left shoulder button
   python launch.py --virtual --seed 7               in seconds, and every time the same
   python launch.py --virtual --fault kill:osmosis_control@30 --fault gps-bias@goal2+5
   python launch.py --system paper                   the paper's mechanisms and no more
@@ -61,6 +71,8 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--mission", metavar="NAME|FILE", help="mission of the airport, or a file with "
                    "lines x=…,y=…,taxi=… (default: the system's)")
+    p.add_argument("--wait", action="store_true",
+                   help="let the operator start the mission from the page")
     p.add_argument("--airport", metavar="NAME|FILE", help="shipped airport, a .toml, or a .graph "
                    "with its image beside it (default: the system's)")
     p.add_argument("--system", metavar="FILE", default=str(ROOT / "systems" / "osmosis.toml"),
@@ -81,15 +93,28 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", metavar="N", type=int, default=1, help="for sensor noise (default: 1)")
     p.add_argument("--no-hmi", action="store_true", help="no operator's page (its node still runs)")
     p.add_argument("--hmi-port", metavar="PORT", type=int, default=8080,
-                   help="port of the operator's page on loopback (default: 8080)")
+                   help="port of the operator's page (default: 8080)")
+    p.add_argument("--hmi-host", metavar="HOST", default="127.0.0.1",
+                   help="address of the operator's page (default: 127.0.0.1, this machine only). "
+                   "Any other makes it need a token, which is printed with the page's address "
+                   "when the run starts")
+    p.add_argument("--hmi-token", metavar="TOKEN", default="",
+                   help="that token, 16 characters or more, to keep it over several runs "
+                   "(default: a random one; on this machine none is needed)")
     p.add_argument("--port", metavar="PORT", type=int, default=DEFAULT_PORT,
                    help=f"first of the run's Zenoh ports on loopback (default: {DEFAULT_PORT})")
+    p.add_argument("--joystick", metavar="DEVICE", nargs="?", const="auto", default="",
+                   help="drive with a joystick or gamepad of this machine, e.g. /dev/input/js0 "
+                   "(without DEVICE: the first one); hold its left shoulder button to drive")
     p.add_argument("--patience", metavar="S", type=float, default=60.0,
                    help="simulated seconds without progress after which the mission counts as "
                    "failed (default: 60)")
     p.add_argument("--duration", metavar="S", type=float,
                    help="simulated seconds after which a system without a mission ends (default: "
                    "when it is interrupted)")
+    p.add_argument("--record", metavar="FILE", help="keep everything that is sent in an MCAP file, "
+                   "for `rampart bag info`, `rampart replay` and Foxglove-compatible viewers")
+    p.add_argument("--overwrite", action="store_true", help="--record may replace an existing file")
     p.add_argument("--report", metavar="DIR", help="where the report goes (default: "
                    "reports/TIME-MISSION)")
     p.add_argument("--virtual", action="store_true",
@@ -154,17 +179,27 @@ class Run:
     async def _on_processes(self) -> int:
         title = f"{self._mission.mission.name} on {self._mission.airport.name}"
         run = ProcessRun(Launcher(self._plan, title), self._spec, self._mission, self._scenario)
-        _interruptible(run)
-        return self._conclude(await run.run())
+        with _recorded(self._options):
+            _interruptible(run)
+            record = await run.run()
+        return self._conclude(record)
 
     def in_virtual_time(self) -> int:
         """Run the mission in virtual time and return the exit code."""
+        recording = None
+        if self._options.record:
+            title = f"{self._mission.mission.name} on {self._mission.airport.name}"
+            recording = VirtualRecording(Path(self._options.record), self._plan.description, title,
+                                         overwrite=self._options.overwrite)
         run = VirtualRun(self._plan, self._spec, self._mission, scenario=self._scenario,
-                         network=find_network(self._options.network))
+                         network=find_network(self._options.network),
+                         taps=[recording.take] if recording else [])
         self._console.virtual_banner(self._mission.airport.name, self._mission.mission,
                                      self._plan, self._spec.strategy)
         result = run.run()
         self._console.close()
+        if recording is not None:
+            print(f"launch.py: {recording.close()}", file=sys.stderr)
         self._console.speed(result.speed, result.messages, result.trace)
         for name, error in result.failures:
             print(f"launch.py: {name} failed: {error}", file=sys.stderr)
@@ -183,6 +218,21 @@ class Run:
         if record.safety != "safe":
             return EXIT_UNSAFE
         return EXIT_SUCCESS if record.mission == "success" else EXIT_FAILED
+
+
+@contextlib.contextmanager
+def _recorded(options: argparse.Namespace) -> Iterator[None]:
+    """Have what runs meanwhile recorded, if that is asked for, by a process of its own."""
+    recorder = None
+    if options.record:
+        recorder = RecorderProcess(Order(options.port, str(Path(options.record).resolve()),
+                                         os.getpid(), options.overwrite))
+        recorder.start()
+    try:
+        yield
+    finally:
+        if recorder is not None:
+            recorder.end()
 
 
 def _interruptible(run: ProcessRun | WatchedRun) -> None:
@@ -211,7 +261,9 @@ def _plan(options: argparse.Namespace) -> tuple[RunPlan, SystemSpec]:
         run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
         airport="", mission="", obstacles=options.obstacles, ftm=not options.no_ftm,
-        hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow)
+        hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
+        joystick=_joystick(options), hmi_host=options.hmi_host, hmi_token=_token(options),
+        faults=() if options.no_hmi else offered_faults(), waits=options.wait)
     return plan, load_system(plan)
 
 
@@ -226,8 +278,9 @@ async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -
     directory.mkdir(parents=True, exist_ok=True)
     run = WatchedRun(plan, spec, options.duration, directory, sys.stderr)
 
-    _interruptible(run)
-    await run.run()
+    with _recorded(options):
+        _interruptible(run)
+        await run.run()
     if options.json:
         print(json.dumps(run.summary()), flush=True)
     return EXIT_SUCCESS
@@ -242,6 +295,10 @@ def _check(options: argparse.Namespace) -> None:
         raise UsageError(f"--duration {options.duration:g}: must be above 0")
     if not options.patience > 0:
         raise UsageError(f"--patience {options.patience:g}: must be above 0")
+    if options.record:
+        check_target(Path(options.record), overwrite=options.overwrite)
+    elif options.overwrite:
+        raise UsageError("--overwrite: only with --record FILE")
     for name, port in (("--port", options.port), ("--hmi-port", options.hmi_port)):
         if not 1024 <= port <= LAST_PORT:
             raise UsageError(f"{name} {port}: must be between 1024 and {LAST_PORT}, below the "
@@ -254,6 +311,48 @@ def _check(options: argparse.Namespace) -> None:
     for option, name in (("--strategy", options.strategy), ("--shadow", options.shadow)):
         if name and name not in STRATEGIES:
             raise UsageError(f"{option} {name}: unknown strategy; known: {', '.join(STRATEGIES)}")
+
+
+def _token(options: argparse.Namespace) -> str:
+    """Return what the operator's page asks for: the token given, or a new one where it needs it."""
+    host: str = options.hmi_host
+    token: str = options.hmi_token
+    if options.no_hmi or options.virtual:
+        if options.wait:
+            raise UsageError("--wait: the mission is started from the operator's page, which there "
+                             f"is not with --{'no-hmi' if options.no_hmi else 'virtual'}")
+        return ""
+    if not token and not is_loopback(host):
+        token = new_token()
+    try:
+        Access(host, options.hmi_port, token)
+    except AccessError as error:
+        raise UsageError(f"--hmi-token: {error}") from None
+    try:
+        family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, number) as probe:
+            probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or str(error)
+        raise UsageError(f"--hmi-host {host}: no address of this machine ({why}); 0.0.0.0 stands "
+                         "for all it has") from None
+    return token
+
+
+def _joystick(options: argparse.Namespace) -> str:
+    """Return the joystick to use; one that is not plugged in yet is waited for."""
+    name: str = options.joystick
+    if name and options.virtual:
+        raise UsageError(f"--joystick {name}: not with --virtual, nobody can drive that fast")
+    if name in {"", "auto"}:
+        return name
+    device = Path(name)
+    if device.is_file() or device.is_dir():
+        raise UsageError(f"--joystick {name}: neither a device nor a FIFO; joysticks are "
+                         "/dev/input/js0, /dev/input/js1 …")
+    if not device.exists():
+        print(f"launch.py: --joystick {name}: not there yet, waiting for it", file=sys.stderr)
+    return str(device.resolve())
 
 
 def _existing_path(name: str) -> str:
@@ -271,7 +370,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return asyncio.run(_watch(options, plan, spec))
         run = Run(options, plan, spec)
         return run.in_virtual_time() if options.virtual else run.on_processes()
-    except (UsageError, LaunchError, ValueError, OSError) as error:
+    except (UsageError, LaunchError, BagError, ValueError, OSError) as error:
         print("launch.py: " + " ".join(str(error).split()), file=sys.stderr)
         return EXIT_USAGE
     except KeyboardInterrupt:

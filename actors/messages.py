@@ -333,7 +333,8 @@ class PilotOrder(Message, frozen=True):
 class PilotStatus(Message, frozen=True):
     """What the Safety Pilot does and why: `reason` is empty while commands pass unchanged.
 
-    `top_speed_mps` is the lowest bound that was ordered, 0 for none.
+    `top_speed_mps` is the lowest bound that was ordered, 0 for none. `forbids` says why nobody may
+    drive now, not even by the joystick; "" if somebody may.
     """
 
     mode: PilotMode
@@ -341,6 +342,7 @@ class PilotStatus(Message, frozen=True):
     reason: str
     refused_commands: int
     top_speed_mps: float = 0.0
+    forbids: str = ""
 
 
 class DetectionState(StrEnum):
@@ -583,6 +585,21 @@ class ActuatorFault(Message, frozen=True):
     wheel: str
     strength: float
     duration_s: float
+
+
+class NamedFault(Message, frozen=True):
+    """A fault that can be ordered by its name: what the launcher offers to the operator's page.
+
+    `duration_s` is how long it lasts unless told otherwise, simulated seconds. The ids of the
+    orders are filled in when it is ordered.
+    """
+
+    name: str
+    title: str
+    group: str
+    duration_s: float
+    injections: tuple[Injection, ...] = ()
+    actuator_faults: tuple[ActuatorFault, ...] = ()
 
 
 class ObstacleList(Message, frozen=True):

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from actors import messages as m
 from actors.runtime.topic import Qos, Topic
-from actors.runtime.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT  # noqa: F401
+from actors.runtime.topics import (  # noqa: F401
+    DIAGNOSTIC,
+    HEARTBEAT,
+    HELLO,
+    INJECT,
+    INJECTION_REPORT,
+    INJECTION_REQUEST,
+    INJECTION_RESULT,
+)
 
 # Summit XL layer: a real robot's driver stands behind these keys just as well.
 ABSOLUTE_POSE = Topic("summit_xl/absolute_pose", m.Pose, Qos.SENSOR, 20, "map",

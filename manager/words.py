@@ -14,9 +14,13 @@ _BLOCKS = {
 
 
 def decision_in_words(
-    active: Sequence[str], rule: int, recoveries: Sequence[str], strategy: str = "safety-first"
+    active: Sequence[str], rule: int, recoveries: Sequence[str], strategy: str = "safety-first",
+    because: str = "",
 ) -> str:
-    """Return one sentence: what is active, what is done about it, and by which rule."""
+    """Return one sentence: what is active, what is done about it, and by which rule.
+
+    `because` says the rule of a strategy other than safety-first in words, where they are known.
+    """
     if not active and recoveries:
         return (f"No mechanism is active any more; {listing(recoveries)} "
                 f"{'stays' if len(recoveries) == 1 else 'stay'} in force until reset.")
@@ -27,6 +31,8 @@ def decision_in_words(
     sentence = f"{listing(active)} {verb} active: {taken}"
     if strategy == "safety-first" and rule in _BLOCKS:
         return f"{sentence}, because {_BLOCKS[rule]} (block {rule})."
+    if because:
+        return f"{sentence}, because {because} ({strategy}, rule {rule})."
     return f"{sentence} (strategy {strategy}, rule {rule})."
 
 

@@ -51,7 +51,7 @@ class Console:
         self._print(f"Rampart: mission {mission.name} ({len(mission.goals)} goals) on {airport}, "
                     f"{mode}, rate {plan.rate:g}")
         if plan.hmi_port:
-            self._print(f"Operator's page: http://127.0.0.1:{plan.hmi_port}/")
+            self._print(f"Operator's page: {plan.hmi_page}")
         self._print("Try from another shell: kill-node osmosis_control")
 
     def virtual_banner(

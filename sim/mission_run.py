@@ -47,7 +47,7 @@ class MissionRun:
         self.judge = Judge(mission.goals)
         self.console = console
         self.strategy = strategy if plan.ftm else ""
-        self._end = RunEnd(patience_s)
+        self._end = RunEnd(patience_s, plan.waits)
         self._recorder = RunRecorder(
             plan.run_id, airport, mission, seed=plan.seed, rate=plan.rate, strategy=self.strategy)
         self._brought_back = 0

@@ -10,6 +10,7 @@ from actors.messages import NodeTable
 from actors.runtime.actor import Actor, Context, Header
 from actors.runtime.clock import Clock
 from actors.runtime.shared_bus import SharedBus
+from actors.runtime.tap import Tap
 from actors.runtime.topic import Topic
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher
@@ -70,7 +71,7 @@ class ProcessRun:
         ports = dict(launcher.ports)
         own = ports.pop(OBSERVER)
         others = [endpoint(port) for port in ports.values()]
-        bus = ZenohBus(OBSERVER, 1, endpoint(own), others)
+        bus = ZenohBus(OBSERVER, 1, endpoint(own), others, Tap(plan.base_port))
         sinks: list[Sink] = [to_launcher, *mission.sinks(clock)]
         actors: list[Actor] = [Observer(Context(OBSERVER, 1, clock, bus, {}, {"sinks": sinks}))]
         injector = None

@@ -28,9 +28,11 @@ class RunEnd:
     Args:
         patience_s: longest time without progress: no new step, no light measured, not half
             a metre nearer to the goal, and no way round something that is on the way.
+        waits: whether the mission comes when the operator wants it, however late.
     """
 
     patience_s: float
+    waits: bool = False
     _mission_id: str = ""
     _progress: tuple[int, int] = (-1, -1)
     _nearest_m: float = float("inf")
@@ -82,8 +84,9 @@ class RunEnd:
             return "the world is gone: no ground truth from the simulator"
         if self._lost_at_s is not None and now_s - self._lost_at_s > LOST_AFTER_S:
             return "mission lost: the Mission Manager came back without it"
-        if not self._mission_id and now_s > ACCEPT_WITHIN_S:
+        begun = bool(self._mission_id) or not self.waits
+        if begun and not self._mission_id and now_s > ACCEPT_WITHIN_S:
             return f"no mission was accepted within {ACCEPT_WITHIN_S:.0f} s"
-        if self._over_at_s is None and now_s - self._progress_at_s > self.patience_s:
+        if begun and self._over_at_s is None and now_s - self._progress_at_s > self.patience_s:
             return f"no progress for {self.patience_s:.0f} s"
         return None

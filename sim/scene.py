@@ -8,6 +8,7 @@ below the ground, collides with nothing and is in a group that no ray sees.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,9 +57,12 @@ class Scene:
 
     Args:
         airport: buildings, obstacle presets and the start pose are taken from it.
+        dress: adds to the model what is only to be seen (`sim.camera`), before it is compiled.
     """
 
-    def __init__(self, airport: Airport) -> None:
+    def __init__(
+        self, airport: Airport, dress: Callable[[Any], None] = lambda _spec: None
+    ) -> None:
         spec = mujoco.MjSpec.from_file(str(MODEL_FILE))
         for building in airport.buildings:
             half_yaw = building.yaw_rad / 2
@@ -86,6 +90,7 @@ class Scene:
                 conaffinity=0,
                 group=ABSENT_GROUP,
             )
+        dress(spec)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self._slots = {name: i for i, name in enumerate(self._presets)}

@@ -12,7 +12,7 @@ import gc
 import hashlib
 import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ import msgspec
 from actors.messages import NodeTable
 from actors.runtime.actor import Actor, Context, Header
 from actors.runtime.topic import Topic
-from actors.runtime.virtual_bus import Hub, VirtualBus
+from actors.runtime.virtual_bus import Hub, Tap, VirtualBus
 from actors.runtime.virtual_loop import VirtualClock, VirtualLoop
 from actors.supervision.run_plan import OBSERVER, Layout, RunPlan, load_shared
 from manager.schema import SystemSpec
@@ -99,6 +99,10 @@ class Trace:
         return self._hash.hexdigest()
 
 
+def _tap(take: Callable[[float, str, bytes], None], zero_s: float) -> Tap:
+    return lambda now_s, _source, key, payload: take(now_s - zero_s, key, payload)
+
+
 class VirtualRun:
     """One mission in virtual time. Use: `run`, once.
 
@@ -109,6 +113,7 @@ class VirtualRun:
         network: What lies between the nodes; as measured if None.
         scenario: What goes wrong, and when.
         nodes: That faults may name, whether they run or not; those of the spec if None.
+        taps: Hear each message as it is sent: simulated time, key, payload.
         shared: What actors share, as `run_plan.load_shared` gives it, perhaps for another seed or
             number of obstacles; loaded if None.
     """
@@ -116,6 +121,7 @@ class VirtualRun:
     def __init__(self, plan: RunPlan, spec: SystemSpec, mission: MissionRun,
                  *, network: NetworkModel | None = None, scenario: Sequence[PlannedFault] = (),
                  nodes: Sequence[str] | None = None,
+                 taps: Sequence[Callable[[float, str, bytes], None]] = (),
                  shared: Mapping[str, Any] | None = None) -> None:
         # Nothing that differs from run to run may get into a message.
         self.plan = msgspec.structs.replace(
@@ -124,11 +130,13 @@ class VirtualRun:
         self._spec = spec
         self._network = network or NETWORKS["measured"]
         self._scenario = tuple(scenario)
+        self._taps = tuple(taps)
         self._nodes = can_be_hit(spec) if nodes is None else tuple(nodes)
         loaded = shared if shared is not None else load_shared(self.plan, spec)
         self._shared = {
             **loaded, "system": spec, "plan": self.plan, "run_id": self.plan.run_id,
-            "seed": plan.seed, "obstacles": plan.obstacles, "hmi_port": 0}
+            "seed": plan.seed, "obstacles": plan.obstacles, "hmi_port": 0,
+            "joystick": None}
 
     def run(self) -> VirtualResult:
         """Run to the end, on a loop of its own."""
@@ -153,6 +161,7 @@ class VirtualRun:
         hub = Hub(SeededNetwork(self._network, self.plan.seed, local=(OBSERVER, INJECTOR)))
         trace = Trace()
         hub.taps.append(trace)
+        hub.taps += [_tap(take, loop.time() + LEAD_S) for take in self._taps]
         layout = Layout(self.plan, self._spec)
         machine = VirtualMachine(layout, self._shared, hub, clock, seed=self.plan.seed)
         machine.on_restart = lambda name: self.mission.brought_back(name, clock.now())

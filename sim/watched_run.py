@@ -16,6 +16,7 @@ from actors import topics
 from actors.messages import DecisionRecord, NodeTable, ProcessEvent
 from actors.runtime.actor import Context, Header
 from actors.runtime.clock import Clock
+from actors.runtime.tap import Tap
 from actors.runtime.topic import Topic
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher
@@ -76,7 +77,8 @@ class WatchedRun:
         self.launcher.on_restart = lambda name: self._console.line(
             clock.now(), f"{name} brought back")
         ports = dict(self.launcher.ports)
-        bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()))
+        bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()),
+                       Tap(plan.base_port))
         observer = Observer(Context(
             OBSERVER, 1, clock, bus, {}, {"sinks": [self._take, self._console.take]}))
         task = asyncio.create_task(observer.run())

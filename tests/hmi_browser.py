@@ -21,13 +21,14 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 
 class Browser:
-    """One tab. `errors` collects what the page complained about."""
+    """One tab. `errors` collects what the page complained about, `requests` what it asked for."""
 
     def __init__(self, connection: Any) -> None:
         self._connection = connection
         self._ids = itertools.count(1)
         self._answers: dict[int, asyncio.Future[Any]] = {}
         self.errors: list[str] = []
+        self.requests: list[str] = []
         self._reader = asyncio.ensure_future(self._read())
 
     async def _read(self) -> None:
@@ -37,6 +38,10 @@ class Browser:
                 self._answers.pop(message["id"]).set_result(message)
             elif message["method"] == "Runtime.exceptionThrown":
                 self.errors.append(json.dumps(message["params"]["exceptionDetails"])[:500])
+            elif message["method"] == "Network.requestWillBeSent":
+                self.requests.append(message["params"]["request"]["url"])
+            elif message["method"] == "Network.webSocketCreated":
+                self.requests.append(message["params"]["url"])
             elif message["method"] == "Log.entryAdded":
                 self.errors.append(message["params"]["entry"]["text"])
 
@@ -50,16 +55,18 @@ class Browser:
         return answer["result"]
 
     async def show(self, url: str, width: int = 1500, height: int = 1060,
-                   scheme: str = "light") -> None:
+                   scheme: str = "light", motion: str = "no-preference") -> None:
         await self.call("Emulation.setDeviceMetricsOverride", width=width, height=height,
-                        deviceScaleFactor=1, mobile=False)
-        await self.call("Emulation.setEmulatedMedia",
-                        features=[{"name": "prefers-color-scheme", "value": scheme}])
+                        deviceScaleFactor=1, mobile=width < 500)
+        await self.call("Emulation.setEmulatedMedia", features=[
+            {"name": "prefers-color-scheme", "value": scheme},
+            {"name": "prefers-reduced-motion", "value": motion}])
         await self.call("Page.bringToFront")  # keys go to a tab only while it has the focus
         await self.call("Emulation.setFocusEmulationEnabled", enabled=True)
         await self.call("Page.enable")
         await self.call("Runtime.enable")
         await self.call("Log.enable")
+        await self.call("Network.enable")
         await self.call("Page.navigate", url=url)
 
     async def value(self, expression: str) -> Any:

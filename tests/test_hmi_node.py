@@ -5,97 +5,26 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
-from contextlib import asynccontextmanager
 
 import httpx
 import pytest
 import websockets
 from hmi_browser import CHROMIUM, browser
+from hmi_world import (
+    AIRPORT,
+    RATE,
+    World,
+    eventually,
+    free_port,
+    hear,
+    repeated,
+    served,
+)
 
 from actors import messages as m
 from actors import topics
-from actors.operator.hmi import Hmi
-from actors.operator.hmi_server import MAX_MESSAGE_BYTES, OrderWish, own_origin
-from actors.runtime.actor import Actor, Context, Header, on
-from actors.runtime.clock import Clock
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from airport.formats import load_airport
-
-AIRPORT = load_airport("vallombre")
-RATE = 20.0
-
-
-class Others(Actor):
-    """Stands for the rest of the system."""
-
-    outputs = (topics.MISSION_STATUS, topics.MANAGER_STATUS, topics.POSE, topics.DETECTION,
-               topics.MISSION_ORDER_ANSWER)
-
-    def __init__(self, context: Context) -> None:
-        super().__init__(context)
-        self.requests: list[m.MissionRequest] = []
-        self.resets: list[m.Reset] = []
-        self.orders: list[m.MissionOrder] = []
-        self.diagnostics: list[m.Diagnostic] = []
-
-    @on(topics.MISSION_REQUEST)
-    def request(self, message: m.MissionRequest, _header: Header) -> None:
-        self.requests.append(message)
-
-    @on(topics.RESET)
-    def reset(self, message: m.Reset, _header: Header) -> None:
-        self.resets.append(message)
-
-    @on(topics.MISSION_ORDER)
-    def order(self, message: m.MissionOrder, _header: Header) -> None:
-        self.orders.append(message)
-
-    @on(topics.DIAGNOSTIC)
-    def diagnostic(self, message: m.Diagnostic, _header: Header) -> None:
-        self.diagnostics.append(message)
-
-
-class World:
-    """A hub with `Others` on it; HMIs join and leave."""
-
-    def __init__(self) -> None:
-        loop = asyncio.get_running_loop()
-        self.hub = Hub()
-        self.clock = Clock(loop.time(), RATE, loop.time)
-        self.others = Others(self.context("others", 1))
-
-    def context(self, name: str, incarnation: int, **shared: object) -> Context:
-        return Context(name, incarnation, self.clock, VirtualBus(self.hub, name, incarnation),
-                       {}, {"airport": AIRPORT, "run_id": "r1", **shared})
-
-    @asynccontextmanager
-    async def running(self, actor: Actor):
-        task = asyncio.create_task(actor.run())
-        for _ in range(20):
-            await asyncio.sleep(0)
-        try:
-            yield actor
-        finally:
-            actor.stop()
-            await asyncio.wait_for(task, 5)
-
-    @asynccontextmanager
-    async def hmi(self, incarnation: int = 1, **shared: object):
-        async with self.running(Hmi(self.context("hmi", incarnation, **shared))) as hmi:
-            yield hmi
-
-    def say_running(self, request: m.MissionRequest) -> None:
-        self.others.publish(topics.MISSION_STATUS, m.MissionStatus(
-            request.mission_id, request.name, m.MissionPhase.RUNNING, 0, request.goals, (), (), ""))
-
-    def say(self, phase: m.MissionPhase, *possible: m.MissionAction) -> None:
-        goals = tuple(m.Goal(g.x_m, g.y_m, m.Mode(g.mode)) for g in AIRPORT.mission("A").goals)
-        self.others.publish(topics.MISSION_STATUS, m.MissionStatus(
-            "r1/first", "A", phase, 0, goals, (), (), "", orders=possible))
-
-    def say_latched(self, *names: str) -> None:
-        self.others.publish(topics.MANAGER_STATUS, m.ManagerStatus(
-            (), (), names, names, "safety-first", 1))
+from actors.operator.hmi_server import MAX_MESSAGE_BYTES, Visitor
+from actors.operator.hmi_wishes import OrderWish
 
 
 @pytest.fixture
@@ -103,47 +32,6 @@ async def world():
     made = World()
     async with made.running(made.others):
         yield made
-
-
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
-
-
-async def eventually(condition, timeout_s: float = 5.0) -> None:
-    deadline = asyncio.get_running_loop().time() + timeout_s
-    while not condition():
-        assert asyncio.get_running_loop().time() < deadline, "it did not happen in time"
-        await asyncio.sleep(0.005)
-
-
-@asynccontextmanager
-async def repeated(say, period_s: float = 0.02):
-    """Have something said again and again, as living nodes do."""
-    async def again() -> None:
-        while True:
-            say()
-            await asyncio.sleep(period_s)
-
-    task = asyncio.create_task(again())
-    try:
-        yield
-    finally:
-        task.cancel()
-
-
-async def served(hmi: Hmi) -> str:
-    await eventually(lambda: hmi._starting is not None and hmi._starting.done())
-    return f"127.0.0.1:{hmi.page_port}"
-
-
-async def hear(page, kind: str) -> dict:
-    async with asyncio.timeout(5):
-        while True:
-            message = json.loads(await page.recv())
-            if message["type"] == kind:
-                return message
 
 
 async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world):
@@ -172,7 +60,7 @@ async def test_a_page_gets_the_map_once_and_then_states(world):
         at = await served(hmi)
         world.others.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
         async with websockets.connect(f"ws://{at}/ws", origin=f"http://{at}") as page:
-            hello = json.loads(await page.recv())
+            hello = await hear(page, "hello")
             assert hello["map"]["name"] == AIRPORT.name
             assert hello["missions"] == ["A", "B", "AB"]
             state = await hear(page, "state")
@@ -234,7 +122,8 @@ async def test_a_malformed_message_is_answered_with_an_error_and_ignored(world, 
         async with websockets.connect(f"ws://{at}/ws") as page:
             await page.send(text)
             assert "not understood" in (await hear(page, "error"))["text"]
-            await hear(page, "state")
+            world.others.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
+            assert (await hear(page, "state"))["pose"]
     assert (world.others.resets, world.others.orders) == ([], [])
 
 
@@ -268,7 +157,7 @@ async def test_an_order_without_an_answer_is_repeated_to_a_mission_manager_that_
     async with world.hmi() as hmi:
         world.say(m.MissionPhase.RUNNING, *m.MissionAction)
         await eventually(lambda: hmi._orders._status is not None)
-        hmi._fulfil(OrderWish(m.MissionAction.HOME))
+        hmi._fulfil(OrderWish(m.MissionAction.HOME), Visitor(1, "127.0.0.1"))
         sent = []
         hmi.publish = lambda topic, body, *_: topic is topics.MISSION_ORDER and sent.append(body)
         await eventually(lambda: len(sent) >= 2)
@@ -298,16 +187,6 @@ async def test_a_foreign_origin_and_a_foreign_host_are_refused(world):
             rebound = await client.get(f"http://{at}/", headers={"host": "evil.example"})
             assert rebound.status_code == 400
             assert (await client.get(f"http://{at}/../hmi.py")).status_code == 404
-
-
-@pytest.mark.parametrize(("origin", "own"), [
-    (None, True), ("http://127.0.0.1:8080", True), ("http://localhost:8080", True),
-    ("http://127.0.0.1:8081", False), ("https://127.0.0.1:8080", False), ("null", False),
-    ("http://127.0.0.1.evil.example:8080", False), ("http://evil.example", False),
-    ("http://127.0.0.1:99999999", False), ("", False),
-])
-def test_only_the_page_itself_is_its_own_origin(origin, own):
-    assert own_origin(origin, 8080) is own
 
 
 async def test_without_a_free_port_the_hmi_works_without_a_page_and_says_why(world):

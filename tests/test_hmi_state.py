@@ -33,7 +33,7 @@ def test_a_state_not_heard_for_a_while_is_stale():
 def test_the_track_has_a_point_where_the_robot_has_moved_and_a_limit():
     state = HmiState()
     for i in range(3 * TRACK_POINTS):
-        state.pose(m.Pose(i * 0.1, 0.0, 0.0), 0.05 * i)
+        state.pose(m.Pose(i * 0.1, 0.0, 0.0), 0.05 * i, 0.05 * i)
     assert len(state.track) == TRACK_POINTS
     gaps = [b[0] - a[0] for a, b in zip(state.track, list(state.track)[1:], strict=False)]
     assert min(gaps) > 0.24
@@ -41,7 +41,7 @@ def test_the_track_has_a_point_where_the_robot_has_moved_and_a_limit():
 
 def test_a_corrupt_pose_neither_breaks_the_track_nor_the_json():
     state = HmiState()
-    state.pose(m.Pose(math.nan, math.inf, 0.0), 1.0)
+    state.pose(m.Pose(math.nan, math.inf, 0.0), 1.0, 1.0)
     assert not state.track
     assert shown(state, 1.0)["pose"]["value"]["x_m"] is None
 

@@ -16,15 +16,18 @@ ALLOWED: dict[str, set[str]] = {
     "actors": {"actors.runtime"},  # messages.py and topics.py, the robot's contract
     "manager.actor": {"actors.runtime", "actors", "manager"},
     "actors.control": {"actors.runtime", "actors", "airport", "manager"},
-    "actors.operator": {"actors.runtime", "actors", "airport", "manager"},
+    # The page shows the processes that supervision looks after.
+    "actors.operator": {"actors.runtime", "actors", "actors.supervision", "airport", "manager"},
     "actors.detection": {"actors.runtime", "actors", "airport", "manager"},
     "actors.recovery": {"actors.runtime", "actors", "airport", "manager"},
+    "actors.recording": {"actors.runtime", "actors", "actors.supervision", "airport", "manager"},
     "actors.stub": {"actors.runtime", "actors", "actors.detection", "actors.recovery"},
     "actors.supervision": {"actors.runtime", "actors", "airport", "manager"},
     "sim": {"actors.runtime", "actors", "actors.supervision", "airport", "manager", "systems"},
-    "toolbox": {"actors.runtime", "actors", "actors.supervision", "actors.operator", "airport",
-                "manager", "sim", "systems"},
-    "launch": {"actors.runtime", "actors", "actors.supervision", "airport", "manager", "sim"},
+    "toolbox": {"actors.runtime", "actors", "actors.supervision", "actors.operator",
+                "actors.recording", "airport", "manager", "sim", "systems"},
+    "launch": {"actors.runtime", "actors", "actors.supervision", "actors.recording", "airport",
+               "manager", "sim"},
 }
 """What each room may import, besides itself and third parties."""
 

@@ -47,6 +47,14 @@ def test_patience_counts_from_the_last_progress_and_driving_in_circles_is_none()
     assert end.ended(25.0) is None
 
 
+def test_a_run_whose_mission_the_operator_starts_waits_for_it_and_then_is_like_any_other():
+    end = RunEnd(10.0, waits=True)
+    assert end.ended(10_000.0) is None
+    end.mission(mission(MissionPhase.RUNNING), 10_000.0)
+    assert end.ended(10_009.9) is None
+    assert end.ended(10_010.1) == "no progress for 10 s"
+
+
 def test_a_mission_nobody_takes_and_a_world_that_is_gone_end_the_run():
     assert RunEnd(100.0).ended(ACCEPT_WITHIN_S) is None
     assert "no mission was accepted" in (RunEnd(100.0).ended(ACCEPT_WITHIN_S + 0.1) or "")

@@ -18,12 +18,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from manager.diagram import Box, Diagram, clean, covers
+from manager.layered import arrange_in_layers, crossings
 from manager.order import PartialOrder
+from manager.placing import _isotonic, place
 from toolbox import systems
-from toolbox.diagram import Box, Diagram, clean, covers
-from toolbox.layered import arrange_in_layers, crossings
 from toolbox.main import main
-from toolbox.placing import _isotonic, place
 from toolbox.tree_dot import quote, to_dot
 from toolbox.tree_svg import to_svg
 from toolbox.tree_text import to_text

@@ -13,13 +13,19 @@ from collections.abc import Sequence
 
 from toolbox import (
     adapt_verb,
+    bag_verbs,
     campaign_verb,
     cut_set_verbs,
     decide_verbs,
     inject_verbs,
+    joystick_verb,
+    live_verb,
+    metrics_verb,
     mission_verb,
     node_verbs,
     operator_verbs,
+    record_verbs,
+    top_verb,
     topic_verbs,
     tree_verbs,
     verify_verb,
@@ -28,12 +34,16 @@ from toolbox.output import NoEffectError, UsageError, warn
 
 _EPILOG = """examples:
   rampart status                                 the run at a glance
+  rampart top                                    the run in the terminal, live
   rampart node list                              processes, states, restarts
   rampart topic echo localization/pose           see messages go by
   rampart inject command-not-updated             break something
   rampart reset RM1                              release the emergency stop
   rampart mission pause                          give the mission an order
+  rampart joystick                               drive from the keyboard
   rampart adapt set strategy guarded-repair      change mechanisms while it runs
+  rampart live foxglove                          see it in another viewer
+  rampart record run.mcap                        keep all that is said; `rampart replay` it
   rampart table                                  what the manager would decide
   rampart tree                                   see fault tree, FTMTree and orders
   rampart campaign --paper                       break it a hundred times, and count
@@ -52,11 +62,17 @@ def build_parser() -> argparse.ArgumentParser:
                         help="base port of the run, if there are several on this machine")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     node_verbs.add(verbs, formatter, common)
+    top_verb.add(verbs, formatter, common)
     topic_verbs.add(verbs, formatter, common)
     inject_verbs.add(verbs, formatter, common)
     operator_verbs.add(verbs, formatter, common)
     mission_verb.add(verbs, formatter, common)
+    joystick_verb.add(verbs, formatter, common)
+    live_verb.add(verbs, formatter, common)
+    metrics_verb.add(verbs, formatter)
     adapt_verb.add(verbs, formatter, common)
+    record_verbs.add(verbs, formatter, common)
+    bag_verbs.add(verbs, formatter)
     campaign_verb.add(verbs, formatter)
     cut_set_verbs.add(verbs, formatter, common)
     decide_verbs.add(verbs, formatter)

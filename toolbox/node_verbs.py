@@ -86,7 +86,7 @@ async def status(options: argparse.Namespace) -> int:
 def _print_run(session: Session, time_s: float) -> None:
     run = session.run
     say(f"run       {run.title} (port {run.base_port}, pid {run.pid})")
-    page = f", page http://127.0.0.1:{run.hmi_port}/" if run.hmi_port else ""
+    page = f", page {run.page}" if run.page else ""
     say(f"time      {time_s:.1f} s at rate {run.rate:g}{page}")
 
 

@@ -18,6 +18,7 @@ import msgspec
 from actors.runtime.bus import Bus, BusError
 from actors.runtime.clock import Clock
 from actors.runtime.envelope import Header, decode, encode
+from actors.runtime.tap import Tap
 from actors.runtime.topic import ROOT, Topic
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.run_info import NoRunError, RunInfo, find_run
@@ -76,6 +77,14 @@ class Session:
 
         self._bus.subscribe(topic, key, deliver)
 
+    def overhear(self, topic: Topic[Any], arrived: Callable[[str, bytes], None]) -> None:
+        """Have `arrived` called with key (below the root) and payload, undecoded, of each message.
+
+        For whoever counts messages: decoding costs most of hearing one.
+        """
+        start = len(f"{ROOT}/")
+        self._bus.subscribe(topic, topic.pattern, lambda key, load: arrived(key[start:], load))
+
     async def latest(
         self, topics: tuple[Topic[Any], ...], timeout_s: float
     ) -> dict[str, Any]:
@@ -96,11 +105,24 @@ class Session:
             await asyncio.wait_for(complete.wait(), timeout_s)
         return found
 
+    def publish(self, topic: Topic[Any], body: msgspec.Struct) -> None:
+        """Send a message once, stamped now; for what is repeated anyway."""
+        self._sequence += 1
+        self._bus.publish(topic, topic.at(), encode(
+            Header(self.name, 1, self._sequence, self.clock.now()), body))
+
     async def command(
         self, topic: Topic[Any], body: msgspec.Struct, effect: Callable[[], bool],
         timeout_s: float,
     ) -> bool:
-        """Send a command until `effect` holds; return False if it did not within real seconds."""
+        """Send a command until `effect` holds; return False if it did not within real seconds.
+
+        Raises:
+            UsageError: the run is a replay, where nobody obeys.
+        """
+        if self.run.replay_of:
+            raise UsageError(f"port {self.run.base_port} is a replay of {self.run.replay_of}: "
+                             "nobody is there to obey")
         self._sequence += 1
         payload = encode(Header(self.name, 1, self._sequence, self.clock.now()), body)
         loop = asyncio.get_running_loop()
@@ -128,7 +150,8 @@ async def connect(port: int | None = None) -> AsyncIterator[Session]:
         run = find_run(port)
     except NoRunError as error:
         raise UsageError(str(error)) from None
-    bus = ZenohBus("", 0, None, [endpoint(p) for p in run.nodes.values()])
+    ports = dict.fromkeys(run.nodes.values())  # a replay plays all nodes on one
+    bus = ZenohBus("", 0, None, map(endpoint, ports), Tap(run.base_port))
     try:
         await bus.open()
     except BusError as error:

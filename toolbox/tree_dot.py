@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from toolbox.diagram import Box, Diagram
+from manager.diagram import Box, Diagram
 
 LIT = "#d9480f"
 DECIDED = "#2b8a3e"

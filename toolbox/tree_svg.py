@@ -13,8 +13,8 @@ from xml.sax.saxutils import escape
 
 import msgspec
 
-from toolbox.diagram import Box, Diagram, clean
-from toolbox.placing import Place, Placing, place
+from manager.diagram import Box, Diagram, clean
+from manager.placing import Place, Placing, place
 
 MARGIN = 24.0
 FONT = 12.0

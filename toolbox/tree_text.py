@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from toolbox.diagram import Box, Diagram
+from manager.diagram import Box, Diagram
 
 ACTIVE = "●"
 DECIDED = "◀ decided"

@@ -10,11 +10,11 @@ from typing import Any
 
 import msgspec
 
+from manager.diagram import WHATS, Diagram, Situation, clean, draw
 from manager.order import CycleError, UnknownElementError
 from manager.schema import SystemSpec
 from manager.strategies import UnknownStrategyError, decide
 from toolbox import systems
-from toolbox.diagram import WHATS, Diagram, Situation, clean, draw
 from toolbox.output import UsageError, say, unknown
 from toolbox.tree_dot import to_dot
 from toolbox.tree_svg import to_svg

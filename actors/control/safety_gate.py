@@ -259,6 +259,10 @@ class SafetyGate:
             reason = "obstacle: stopped" if linear == 0.0 else "obstacle: slowed down"
         return GateOutput(linear, angular, mode, stopped, reason)
 
+    def forbidden(self, now: float) -> str:
+        """Return why nobody may drive now, not even by the joystick, or ""."""
+        return self._forbidden(self.mode, now)
+
     @property
     def top_speed_mps(self) -> float:
         """The lowest speed that an order in force allows at most; 0 if none bounds it."""

@@ -120,7 +120,8 @@ class SafetyPilot(Actor):
     def _tell(self) -> None:
         last = self._last
         self.publish(topics.PILOT_STATUS, PilotStatus(
-            last.mode, last.stopped, last.reason, self._gate.refused, self._gate.top_speed_mps))
+            last.mode, last.stopped, last.reason, self._gate.refused, self._gate.top_speed_mps,
+            self._gate.forbidden(self.clock.now())))
 
     def _note(self, refused: str, header: Header) -> None:
         if refused:

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
+
+import msgspec
 
 from actors import messages as m
 from actors import topics
+from actors.operator.camera_eye import CameraEye, renderer
+from actors.operator.hmi_feed import Feed
+from actors.operator.hmi_operating import OUTPUTS, SHOWN, Operating
 from actors.operator.hmi_orders import NoSenseError, Orders
-from actors.operator.hmi_server import (
-    MissionWish,
-    OrderWish,
-    PageServer,
-    PortError,
-    RefusedError,
-    Wish,
-)
+from actors.operator.hmi_processes import ProcessObserver
+from actors.operator.hmi_server import LOOPBACK, Handlers, PageServer, PortError, Visitor
 from actors.operator.hmi_state import HmiState
 from actors.operator.hmi_submission import (
     REPEAT_S,
@@ -30,10 +30,20 @@ from actors.operator.hmi_submission import (
     first_request,
     system_is_up,
 )
+from actors.operator.hmi_system import draw_system
+from actors.operator.hmi_wishes import (
+    MissionWish,
+    OrderWish,
+    RefusedError,
+    ResetWish,
+    Wish,
+)
 from actors.runtime.actor import Actor, Context, Header, every, on
 from actors.runtime.topic import Topic
-from airport.drawing import draw
+from actors.supervision.run_plan import RunPlan
+from airport.drawing import AirportDrawing, draw
 from airport.model import Airport, Mission
+from manager.specification import SystemSpec, check_document
 
 __all__ = ["Hmi"]
 
@@ -42,11 +52,14 @@ class Hmi(Actor):
     """The operator's node.
 
     Shared objects: "run_id" (text, required for a mission), "mission" (the mission the run starts
-    with, or None), "airport" (for the map and its missions), "hmi_port" (0 or None: no page; the
-    parameter `port` has precedence).
+    with, or None), "waits" (True: that mission alone, and not before the operator wants it),
+    "airport" (for the map and its missions), "hmi_port" (0 or None: no page; the parameter `port`
+    has precedence), "hmi_host" and "hmi_token" (see `PageServer`), and those of
+    `Operating`.
+    Parameters: `camera`, the module that renders the picture of the robot (`sim.camera`), if any.
     """
 
-    outputs = (topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.RESET)
+    outputs = (topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.RESET, *OUTPUTS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -54,14 +67,27 @@ class Hmi(Actor):
         self._airport: Airport | None = shared.get("airport")
         mission: Mission | None = shared.get("mission")
         run_id = str(shared.get("run_id", "run"))
-        first = first_request(run_id, mission.name, _goals(mission)) if mission else None
+        waits = bool(shared.get("waits"))
+        first = (first_request(run_id, mission.name, _goals(mission))
+                 if mission and not waits else None)
+        self._missions: Mapping[str, Mission] = (
+            {mission.name: mission} if mission and waits
+            else self._airport.missions if self._airport else {})
         self._submission = Submission(run_id, context.incarnation, self.clock.now(), first)
         self._orders = Orders(f"{run_id}/{context.name}.{context.incarnation}", "operator")
         self._state = HmiState()
+        self._operating = Operating(self, self._state)
         self._table: m.NodeTable | None = None
         self._port: int = self.parameters.get("port", shared.get("hmi_port")) or 0
         self._server: PageServer | None = None
         self._starting: asyncio.Task[None] | None = None
+        plan: RunPlan | None = shared.get("plan")
+        self._camera = self._make_camera()
+        self._observer = ProcessObserver(
+            plan.base_port if plan else 0, plan.launcher_pid if plan else 0)
+        self._version = -1
+        adapted: m.AdaptedSystem | None = shared.get("adapted")
+        self._show_system(shared.get("system"), adapted.version if adapted else 0)
 
     def listens(self, topic: Topic[Any]) -> bool:
         """Without a page, hear only what missions and orders depend on."""
@@ -77,10 +103,14 @@ class Hmi(Actor):
         self._submit()
         if not self._port:
             return
+        shared = self.context.shared
         try:
             self._server = PageServer(
-                self._port, self._hello, lambda: self._state.snapshot(self.clock.now()),
-                self._fulfil)
+                self._port, Feed(self._state, self.clock.now, self._hello, self._look),
+                Handlers(lambda page: self._operating.introduction(page.number), self._fulfil,
+                         lambda page: self._operating.left(page.number)),
+                shared.get("hmi_host") or LOOPBACK, shared.get("hmi_token") or "",
+                camera=self._camera)
         except PortError as error:
             self.report_diagnostic("operator's page", str(error), f"port {self._port}")
             return
@@ -89,6 +119,9 @@ class Hmi(Actor):
 
     def on_stop(self) -> None:
         """Close the page."""
+        self._operating.stop()
+        if self._camera is not None:
+            self._camera.close()
         if self._starting is not None:
             self._starting.cancel()
         if self._server is not None:
@@ -114,17 +147,25 @@ class Hmi(Actor):
         self._tell(self._orders.expire(now))
         if self._orders.pending is not None:
             self.publish(topics.MISSION_ORDER, self._orders.pending)
+        self._operating.repeat()
 
     def _tell(self, outcome: str) -> None:
         """Say what became of an order, if there is anything to say."""
         if outcome:
             self._state.order(outcome, self.clock.now())
 
-    def _fulfil(self, wish: Wish) -> str:
-        if isinstance(wish, MissionWish):
-            return self._start(wish.name)
-        if isinstance(wish, OrderWish):
-            return self._order(wish)
+    def _fulfil(self, wish: Wish, visitor: Visitor) -> str | dict[str, Any]:
+        match wish:
+            case MissionWish():
+                return self._start(wish.name)
+            case OrderWish():
+                return self._order(wish)
+            case ResetWish():
+                return self._reset(wish)
+            case _:
+                return self._operating.fulfil(wish, visitor.number)
+
+    def _reset(self, wish: ResetWish) -> str:
         if wish.recovery not in self._state.latched:
             waiting = ", ".join(self._state.latched) or "none"
             raise RefusedError(f"{wish.recovery[:40]!r} does not wait for a reset; "
@@ -133,12 +174,11 @@ class Hmi(Actor):
         return f"reset of {wish.recovery} asked for"
 
     def _start(self, name: str) -> str:
-        missions: Mapping[str, Mission] = self._airport.missions if self._airport else {}
-        if name not in missions:
+        if name not in self._missions:
             raise RefusedError(f"no mission {name[:40]!r}; there are: "
-                               f"{', '.join(missions) or 'none'}")
+                               f"{', '.join(self._missions) or 'none'}")
         try:
-            request = self._submission.ask(name, _goals(missions[name]), self.clock.now())
+            request = self._submission.ask(name, _goals(self._missions[name]), self.clock.now())
         except BusyError as error:
             raise RefusedError(str(error)) from None
         self.publish(topics.MISSION_REQUEST, request)
@@ -153,17 +193,55 @@ class Hmi(Actor):
         return f"{wish.action.value} asked for"
 
     def _hello(self) -> dict[str, Any]:
-        airport = self._airport
         return {
             "type": "hello",
             "run_id": str(self.context.shared.get("run_id", "run")),
             "rate": self.clock.rate,
-            "map": draw(airport) if airport else None,
-            "missions": list(airport.missions) if airport else [],
+            "map": self._map,
+            "footprint_m": self._footprint_m,
+            "camera": self._camera is not None,
+            "missions": list(self._missions),
             "track": list(self._state.track),
         }
 
+    def _make_camera(self) -> CameraEye | None:
+        module = str(self.parameters.get("camera", ""))
+        if not (module and self._port and self._airport and self._airport.source):
+            return None
+        return CameraEye(renderer(module), {"airport": self._airport.source}, self._camera_view)
+
+    def _camera_view(self) -> dict[str, Any] | None:
+        heard = self._state.picture.value("pose")
+        if heard is None:
+            return None
+        return {**msgspec.structs.asdict(heard.value), "obstacles": [
+            (o.name, o.x_m, o.y_m, o.radius_m) for o in self._state.picture.value("obstacles")]}
+
+    @property
+    def _footprint_m(self) -> tuple[float, float] | None:
+        system: SystemSpec | None = self.context.shared.get("system")
+        robot = system.mobile if system else None
+        return (robot.length_m, robot.width_m) if robot else None
+
+    @cached_property
+    def _map(self) -> AirportDrawing | None:
+        return draw(self._airport) if self._airport else None
+
+    def _look(self) -> None:
+        self._state.usage(self._observer.look(self._table))
+
+    def _show_system(self, system: SystemSpec | None, version: int) -> None:
+        if self._port and system is not None and version > self._version:
+            self._version = version
+            self._state.system(draw_system(system))
+
     # -- hearing --------------------------------------------------------------------------------
+
+    @on(topics.ADAPTED_SYSTEM)
+    def _adapted(self, message: m.AdaptedSystem, _header: Header) -> None:
+        if message.version > self._version:
+            document = msgspec.json.decode(message.document)
+            self._show_system(check_document(document, "changed system"), message.version)
 
     @on(topics.MISSION_STATUS)
     def _mission_status(self, message: m.MissionStatus, _header: Header) -> None:
@@ -177,11 +255,19 @@ class Hmi(Actor):
 
     @on(topics.POSE)
     def _pose(self, message: m.Pose, header: Header) -> None:
-        self._state.pose(message, header.stamp)
+        self._state.pose(message, header.stamp, self.clock.now())
+
+    @on(topics.SCAN)
+    def _scan(self, message: m.LaserScan, _header: Header) -> None:
+        self._state.laser("laser", message, self.clock.now())
+
+    @on(topics.UPPER_SCAN)
+    def _upper_scan(self, message: m.LaserScan, _header: Header) -> None:
+        self._state.laser("upper_laser", message, self.clock.now())
 
     @on(topics.ROUTE)
     def _route(self, message: m.Route, _header: Header) -> None:
-        self._state.keep("route", message, self.clock.now())
+        self._state.route(message)
 
     @on(topics.CONTROL_STATUS)
     def _control(self, message: m.ControlStatus, _header: Header) -> None:
@@ -189,20 +275,23 @@ class Hmi(Actor):
 
     @on(topics.PILOT_STATUS)
     def _pilot(self, message: m.PilotStatus, _header: Header) -> None:
+        self._operating.pilot(message)
         self._state.keep("pilot", message, self.clock.now())
 
     @on(topics.MANAGER_STATUS)
     def _manager(self, message: m.ManagerStatus, _header: Header) -> None:
+        self._operating.manager(message)
         self._state.manager(message, self.clock.now())
 
     @on(topics.NODES)
     def _nodes(self, message: m.NodeTable, _header: Header) -> None:
+        self._operating.nodes(message)
         self._table = message
         self._state.keep("nodes", message, self.clock.now())
 
     @on(topics.OBSTACLES)
     def _obstacles(self, message: m.ObstacleList, _header: Header) -> None:
-        self._state.keep("obstacles", message, self.clock.now())
+        self._state.obstacles(message)
 
     @on(topics.DECISION)
     def _decision(self, message: m.DecisionRecord, header: Header) -> None:
@@ -215,6 +304,19 @@ class Hmi(Actor):
     @on(topics.ERROR_REPORT)
     def _diagnostic(self, message: m.Diagnostic, header: Header) -> None:
         self._state.diagnostic(message, header.stamp)
+        self._operating.diagnostic(message)
+
+    @on(topics.ADAPTATION)
+    def _adaptation(self, message: m.AdaptationAnswer, _header: Header) -> None:
+        self._operating.answered(message)
+
+    @on(topics.INJECTION_RESULT)
+    def _injection(self, message: m.InjectionReport, _header: Header) -> None:
+        self._operating.injected(message)
+
+    @on(topics.BASE_STATUS)
+    def _base(self, message: m.BaseStatus, _header: Header) -> None:
+        self._operating.base(message)
 
     @on(topics.LIGHT_MEASURED)
     def _light(self, message: m.LightMeasurement, _header: Header) -> None:
@@ -222,8 +324,9 @@ class Hmi(Actor):
 
 
 _SHOWN = (
-    topics.POSE, topics.ROUTE, topics.CONTROL_STATUS, topics.PILOT_STATUS, topics.OBSTACLES,
-    topics.PROCESS_EVENT, topics.ERROR_REPORT, topics.LIGHT_MEASURED)
+    topics.POSE, topics.SCAN, topics.UPPER_SCAN, topics.ROUTE, topics.CONTROL_STATUS,
+    topics.PILOT_STATUS, topics.OBSTACLES, topics.ADAPTED_SYSTEM,
+    topics.PROCESS_EVENT, topics.ERROR_REPORT, topics.LIGHT_MEASURED, *SHOWN)
 """What is heard for the page alone."""
 
 

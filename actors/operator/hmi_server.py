@@ -1,12 +1,12 @@
-"""The web side of the HMI: four static files and a WebSocket, on loopback only.
+"""The web side of the HMI: static files and a WebSocket, on loopback unless asked otherwise.
 
 It runs on the actor's own event loop and costs nothing while no page is open: uvicorn is used
 for its protocols, without its main loop (ten wake-ups a second) and without its signal handlers
 (a node's signals are its process's business).
 
-Whoever can reach the port can reset an emergency stop or send the robot home, so other people's
-web pages must not: the `Host` header must name loopback (against DNS rebinding) and a WebSocket's
-`Origin` must be this page's own. Programs that are no browsers send no Origin and are let in.
+Who is let in is decided in `actors.runtime.web_access`, how much one may say in `hmi_limits`, and
+what may be said in `hmi_wishes`. The files are the same for everybody; everything else needs the
+token where there is one.
 """
 
 from __future__ import annotations
@@ -15,38 +15,51 @@ import asyncio
 import contextlib
 import socket
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-from urllib.parse import urlsplit
+from typing import Any
 
 import msgspec
 import uvicorn
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.middleware.trustedhost import TrustedHostMiddleware
-from starlette.requests import Request
-from starlette.responses import Response
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from actors.messages import MissionAction
+from actors.operator.camera_eye import CameraError, CameraEye
+from actors.operator.hmi_feed import SEND_TIMEOUT_S, Feed, PageFeed
+from actors.operator.hmi_limits import MessageBudget, Verdict
+from actors.operator.hmi_wishes import RefusedError, Wish, WishError, read_wish
+from actors.runtime.web_access import SUBPROTOCOL, Access, AccessError, shown_token
 
-HOST = "127.0.0.1"
-PUSH_PERIOD_S = 0.2
-"""Real seconds between two states pushed to a page."""
+LOOPBACK = "127.0.0.1"
+NO_TOKEN = 4401
+"""Close code of a WebSocket without the token; its page asks for it."""
 
-MAX_PAGES = 8
+MAX_PAGES = 16
 MAX_MESSAGE_BYTES = 4096
-SEND_TIMEOUT_S = 5.0
-"""A page that does not take a state for so long is disconnected (it may be suspended)."""
 
 _PAGE = Path(__file__).with_name("page")
 _FILES = {
     "/": ("index.html", "text/html"),
     "/style.css": ("style.css", "text/css"),
     "/map.js": ("map.js", "text/javascript"),
+    "/tree.js": ("tree.js", "text/javascript"),
+    "/nodes.js": ("nodes.js", "text/javascript"),
+    "/log.js": ("log.js", "text/javascript"),
+    "/camera.js": ("camera.js", "text/javascript"),
+    "/dom.js": ("dom.js", "text/javascript"),
+    "/drive.js": ("drive.js", "text/javascript"),
+    "/faults.js": ("faults.js", "text/javascript"),
+    "/access.js": ("access.js", "text/javascript"),
+    "/operate.js": ("operate.js", "text/javascript"),
+    "/operate.css": ("operate.css", "text/css"),
     "/app.js": ("app.js", "text/javascript"),
 }
+_CAMERA = "/camera.jpg"
 _HEADERS = {
     "cache-control": "no-cache",
     "content-security-policy": (
@@ -54,59 +67,64 @@ _HEADERS = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
 }
-_LOOPBACK = ("127.0.0.1", "localhost")
-
-
-class ResetWish(msgspec.Struct, tag="reset", forbid_unknown_fields=True):
-    """The operator wants a latched recovery released."""
-
-    recovery: str
-
-
-class MissionWish(msgspec.Struct, tag="mission", forbid_unknown_fields=True):
-    """The operator wants a mission of the airport started."""
-
-    name: str
-
-
-class OrderWish(msgspec.Struct, tag="order", forbid_unknown_fields=True):
-    """The operator wants something of the mission under way."""
-
-    action: MissionAction
-    reason: Annotated[str, msgspec.Meta(max_length=200)] = ""
-
-
-Wish = ResetWish | MissionWish | OrderWish
-_wishes = msgspec.json.Decoder(Wish)
-
-
-class RefusedError(ValueError):
-    """A wish that cannot be fulfilled; the text is shown on the page."""
-
 
 class PortError(OSError):
     """The page's port cannot be bound."""
+
+
+@dataclass(frozen=True, slots=True)
+class Visitor:
+    """An open page: its number in this life of the HMI, and from where it comes."""
+
+    number: int
+    address: str
+
+
+@dataclass(frozen=True, slots=True)
+class Handlers:
+    """Who deals with the pages.
+
+    Attributes:
+        came: returns what a new page is told first.
+        fulfil: acts on a page's wish and returns what to tell it; raises RefusedError.
+        left: hears of a page that was closed.
+    """
+
+    came: Callable[[Visitor], dict[str, Any]]
+    fulfil: Callable[[Wish, Visitor], str | dict[str, Any]]
+    left: Callable[[Visitor], None]
 
 
 class PageServer:
     """Serves the operator's page.
 
     Args:
-        port: TCP port on loopback; 0 lets the system choose one.
-        hello: returns what a page gets once: the map, the track so far.
-        state: returns what a page gets five times a second.
-        fulfil: acts on a wish and returns what to tell the operator; raises RefusedError.
+        port: TCP port; 0 lets the system choose one.
+        feed: what pages are shown.
+        handlers: who deals with the pages.
+        host: address to bind to.
+        token: what everybody has to show; "" for nothing, on loopback only.
+        camera: where pictures come from, or None.
+
+    Raises:
+        PortError: the address cannot be bound, or must not without a token.
     """
 
     def __init__(
-        self, port: int, hello: Callable[[], Any], state: Callable[[], Any],
-        fulfil: Callable[[Wish], str],
+        self, port: int, feed: Feed, handlers: Handlers, host: str = LOOPBACK, token: str = "",
+        *, camera: CameraEye | None = None,
     ) -> None:
-        self._hello = hello
-        self._state = state
-        self._fulfil = fulfil
-        self._socket = _listen(port)
+        self._feed = feed
+        self._camera = camera
+        self._handlers = handlers
+        self._visitors = 0
+        try:
+            Access(host, port, token)  # refused before anything is bound
+        except AccessError as error:
+            raise PortError(str(error)) from None
+        self._socket = _listen(host, port)
         self.port: int = self._socket.getsockname()[1]
+        self._access = Access(host, self.port, token, (socket.gethostname(),))
         self.pages = 0
         self._server: uvicorn.Server | None = None
 
@@ -119,10 +137,9 @@ class PageServer:
             return Response(files[path], media_type=_FILES[path][1], headers=_HEADERS)
 
         app = Starlette(
-            routes=[*(Route(path, file) for path in _FILES),
+            routes=[*(Route(path, file) for path in _FILES), Route(_CAMERA, self._picture),
                     WebSocketRoute("/ws", self._page)],
-            middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(_LOOPBACK),
-                                   www_redirect=False)],
+            middleware=[Middleware(_Door, access=self._access)],
         )
         config = uvicorn.Config(
             app, log_config=None, log_level="critical", access_log=False, lifespan="off",
@@ -145,58 +162,108 @@ class PageServer:
         for connection in list(self._server.server_state.connections):
             connection.shutdown()
 
+    async def _picture(self, request: Request) -> Response:
+        if request.headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
+            return PlainTextResponse("only for this page", 403)
+        try:
+            if self._camera is None:
+                raise CameraError("this system has no camera")
+            return Response(await self._camera.picture(), media_type="image/jpeg",
+                            headers={"cache-control": "no-store"})
+        except CameraError as error:
+            return PlainTextResponse(str(error), 503)
+
     async def _page(self, socket_: WebSocket) -> None:
-        if not own_origin(socket_.headers.get("origin"), self.port):
-            await socket_.close(1008, "foreign origin")
+        offered = socket_.scope.get("subprotocols", ())
+        await socket_.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
+        if not _has_token(socket_, self._access):
+            await socket_.close(NO_TOKEN, "the token is missing or wrong")
             return
-        await socket_.accept()
         if self.pages >= MAX_PAGES:
             await socket_.close(1013, f"more than {MAX_PAGES} pages")
             return
         self.pages += 1
-        push = asyncio.ensure_future(self._push(socket_))
+        self._visitors += 1
+        visitor = Visitor(self._visitors, socket_.client.host if socket_.client else "?")
         try:
-            while True:
-                message = await socket_.receive()
-                if message["type"] == "websocket.disconnect":
-                    return
-                await _send(socket_, self._answer(message.get("text") or message.get("bytes")))
+            with self._feed.page() as page:
+                await _send(socket_, self._handlers.came(visitor))
+                push = asyncio.ensure_future(self._push(socket_, page))
+                try:
+                    await self._talk(socket_, page, visitor)
+                finally:
+                    push.cancel()
+                    with contextlib.suppress(asyncio.CancelledError):
+                        await push
         except (WebSocketDisconnect, RuntimeError, TimeoutError):
             return  # the page has gone while it was being answered
         finally:
             self.pages -= 1
-            push.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await push
+            self._handlers.left(visitor)
 
-    async def _push(self, socket_: WebSocket) -> None:
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
-            await _send(socket_, self._hello())
-            while True:
-                await _send(socket_, self._state())
-                await asyncio.sleep(PUSH_PERIOD_S)
+    async def _talk(self, socket_: WebSocket, page: PageFeed, visitor: Visitor) -> None:
+        loop = asyncio.get_running_loop()
+        budget = MessageBudget(loop.time())
+        while True:
+            message = await socket_.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            verdict = budget.spend(loop.time())
+            text = message.get("text") or message.get("bytes")
+            if verdict is Verdict.READ:
+                if not self._feed.heard(page, text):
+                    await _send(socket_, self._answer(text, visitor))
+            elif verdict is Verdict.TELL:
+                await _send(socket_, {"type": "error", "text": "too many messages from this page; "
+                                      "those beyond the limit are not read"})
+            elif verdict is Verdict.CLOSE:
+                await socket_.close(1008, "flooding: far too many messages")
+                return
 
-    def _answer(self, text: str | bytes | None) -> dict[str, str]:
+    async def _push(self, socket_: WebSocket, page: PageFeed) -> None:
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            try:
+                await self._feed.push(page, socket_.send_text)
+            except TimeoutError:
+                await socket_.close(1013, "this page does not keep up")
+
+    def _answer(self, text: str | bytes | None, visitor: Visitor) -> dict[str, Any]:
         try:
-            wish = _wishes.decode(text or b"")
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            return {"type": "error", "text": f"message not understood: {error}"}
-        try:
-            return {"type": "done", "text": self._fulfil(wish)}
-        except RefusedError as error:
+            told = self._handlers.fulfil(read_wish(text), visitor)
+        except (WishError, RefusedError) as error:
             return {"type": "error", "text": str(error)}
+        return {"type": "done", "text": told} if isinstance(told, str) else told
 
 
-def own_origin(origin: str | None, port: int) -> bool:
-    """Tell whether a WebSocket with this Origin header may talk to the page's port."""
-    if origin is None:
-        return True
-    try:
-        parts = urlsplit(origin)
-        return (parts.scheme == "http" and parts.hostname in _LOOPBACK
-                and (parts.port or 80) == port)
-    except ValueError:
-        return False
+class _Door:
+    """Turns away whoever is not meant, before anything else is done."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app = app
+        self._access = access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        connection = HTTPConnection(scope)
+        hosts = connection.headers.getlist("host")
+        known = len(hosts) == 1 and self._access.own_host(hosts[0])
+        if scope["type"] == "websocket":
+            origin = connection.headers.get("origin")
+            if not (known and self._access.own_origin(origin)):
+                await send({"type": "websocket.close", "code": 1008})  # before it was accepted: 403
+                return
+        elif not known:
+            await PlainTextResponse("Invalid host header", 400)(scope, receive, send)
+            return
+        elif scope["path"] not in _FILES and not _has_token(connection, self._access):
+            await PlainTextResponse("The token is missing or wrong", 401)(scope, receive, send)
+            return
+        await self._app(scope, receive, send)
+
+
+def _has_token(connection: HTTPConnection, access: Access) -> bool:
+    return access.permits(shown_token(
+        connection.headers.get("authorization"), connection.query_params.get("token"),
+        connection.scope.get("subprotocols", ())))
 
 
 async def _send(socket_: WebSocket, data: Any) -> None:
@@ -204,17 +271,21 @@ async def _send(socket_: WebSocket, data: Any) -> None:
     await asyncio.wait_for(socket_.send_text(text), SEND_TIMEOUT_S)
 
 
-def _listen(port: int) -> socket.socket:
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+def _listen(host: str, port: int) -> socket.socket:
+    listener: socket.socket | None = None
     try:
+        family, kind, number, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, kind, number)
         # A respawned HMI takes its predecessor's port although old connections linger.
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((HOST, port))
+        listener.bind(address)
         listener.listen(16)
         listener.setblocking(False)
-    except (OSError, OverflowError) as error:
-        listener.close()
+    except (OSError, OverflowError, UnicodeError) as error:
+        if listener is not None:
+            listener.close()
         reason = getattr(error, "strerror", None) or str(error)
-        raise PortError(f"cannot serve the page on {HOST}:{port}: {reason}; "
+        raise PortError(f"cannot serve the page on {host}:{port}: {reason}; "
                         "choose another hmi_port") from None
     return listener

@@ -1,77 +1,129 @@
-"""What the operator's page shows: the latest of everything, and a few short logs. Pure.
+"""What the HMI has heard, as pages are to see it: fills the picture. Pure.
 
-Keeping is cheap, because it happens for every message; the JSON-like snapshot is only built
-while somebody looks.
+Keeping is cheap, because it happens for every message: a state that says the same again changes
+nothing, and nothing is turned into JSON unless somebody looks (`hmi_picture`).
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from typing import Any
 
+import msgspec
+
 from actors import messages as m
+from actors.operator.hmi_laser import thin
+from actors.operator.hmi_picture import Picture
+from manager.strategies import STRATEGIES
 from manager.words import decision_in_words
 
 TRACK_STEP_M = 0.25
 """A track point is kept when the robot has moved this far."""
 
 TRACK_POINTS = 4000
-LOG_LINES = 60
 STALE_S = 1.5
 """A state that was not heard for so long is shown as stale (simulated seconds)."""
+
+_AGED = ("pose", "mission", "control", "pilot", "manager", "nodes", "laser", "upper_laser")
+"""Sections that are stale if nothing has been heard for a while."""
 
 _ROUTINE = ("started", "running")
 _GOOD_NEWS = ("respawned", "resumed", "adopted")
 
 
+class _Heard(msgspec.Struct):
+    """A message, and whether the next one is overdue; pages see {"value", "stale"}."""
+
+    value: Any
+    stale: bool = False
+    t: float = 0.0
+    """When the content was true; only where a page needs it."""
+
+
 class HmiState:
-    """The operator's picture of the system, as far as the HMI has heard of it."""
+    """The operator's picture of the system, as far as the HMI has heard of it.
+
+    Attributes:
+        picture: what pages are shown.
+        track: where the robot was, (x, y) in `map`.
+    """
 
     def __init__(self) -> None:
         self.track: deque[tuple[float, float]] = deque(maxlen=TRACK_POINTS)
-        self._latest: dict[str, tuple[Any, float]] = {}
+        self.picture = picture = Picture()
+        self._heard_s: dict[str, float] = {}
         self._detections: dict[str, m.DetectionView] = {}
-        self._lights: dict[str, m.LightMeasurement] = {}
-        self._log: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
-        self._decisions: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
         self._mission_id = ""
         self._outcomes = 0
-        self._outcome = ""
+        picture.section("system")
+        picture.section("pose", show=_with_time)
+        for name in ("laser", "upper_laser"):
+            picture.section(name, show=_sweep)
+        picture.section("mission", show=_mission)
+        picture.section("order", {"number": 0, "text": ""})
+        picture.section("route", ())
+        for name in ("control", "pilot", "manager", "nodes"):
+            picture.section(name, show=_aged)
+        picture.section("detections", [])
+        picture.section("lights", {}, _lights)
+        picture.section("obstacles", ())
+        picture.section("usage", {})
+        picture.journal("decisions")
+        picture.journal("events")
 
     # -- hearing --------------------------------------------------------------------------------
 
     def keep(self, what: str, message: Any, now_s: float) -> None:
-        """Keep the latest message of a kind ("pose", "route", "pilot", ...)."""
-        self._latest[what] = (message, now_s)
+        """Keep the latest message of a kind: control, pilot, nodes."""
+        self._heard_s[what] = now_s
+        self.picture.put(what, _Heard(message))
 
-    def pose(self, pose: m.Pose, now_s: float) -> None:
+    def pose(self, pose: m.Pose, stamp_s: float, now_s: float) -> None:
         """Keep the pose, and a point of the track if the robot has moved."""
-        self._latest["pose"] = (pose, now_s)
+        self._heard_s["pose"] = now_s
+        self.picture.put("pose", _Heard(pose, False, stamp_s))
         at = (pose.x_m, pose.y_m)
         if not all(map(math.isfinite, at)):
             return
         if not self.track or math.dist(self.track[-1], at) >= TRACK_STEP_M:
             self.track.append((round(pose.x_m, 2), round(pose.y_m, 2)))
 
+    def laser(self, which: str, scan: m.LaserScan, now_s: float) -> None:
+        """Keep a sweep of "laser" or "upper_laser"; it may wait for the next pose."""
+        self._heard_s[which] = now_s
+        self.picture.put(which, _Heard(scan), urgent=False)
+
+    def route(self, route: m.Route) -> None:
+        """Keep the way to the goal; none while there is no goal."""
+        self.picture.put("route", route.waypoints if route.active else ())
+
+    def obstacles(self, obstacles: m.ObstacleList) -> None:
+        """Keep the obstacles that are there."""
+        self.picture.put("obstacles", tuple(o for o in obstacles.obstacles if o.present))
+
     def mission(self, status: m.MissionStatus, now_s: float) -> None:
         """Keep the mission's state; a new mission starts with unmeasured lights."""
+        lights = dict(self.picture.value("lights"))
         if status.mission_id and status.mission_id != self._mission_id:
             self._mission_id = status.mission_id
-            self._lights.clear()
-        self._latest["mission"] = (status, now_s)
-        for light in status.lights:
-            self._lights[light.light] = light
+            lights.clear()
+        self._heard_s["mission"] = now_s
+        self.picture.put("mission", _Heard(status))
+        self.picture.put("lights", lights | {light.light: light for light in status.lights})
 
     def light(self, measured: m.LightMeasurement) -> None:
         """Keep the measurement of a light."""
-        self._lights[measured.light] = measured
+        self.picture.put("lights", self.picture.value("lights") | {measured.light: measured})
 
     def manager(self, status: m.ManagerStatus, now_s: float) -> None:
         """Keep the manager's view, and log which detections have come and gone."""
         before = self._detections
         self._detections = {view.name: view for view in status.detections}
-        self._latest["manager"] = (status, now_s)
+        self._heard_s["manager"] = now_s
+        self.picture.put("manager", _Heard(status))
+        self._show_detections(False)
         for name, view in self._detections.items():
             if view.active != (name in before and before[name].active):
                 text = f"{name} detects: {view.reason}" if view.active else f"{name} is idle again"
@@ -79,14 +131,19 @@ class HmiState:
 
     def decision(self, record: m.DecisionRecord, now_s: float) -> None:
         """Add a decision of the manager to the decision log."""
-        self._decisions.append({
+        strategy = STRATEGIES.get(record.strategy)
+        rules = strategy.rules if strategy else {}
+        self.picture.add("decisions", {
             "t": round(now_s, 2),
             "number": record.decision,
             "active": record.active,
             "block": record.rule,
+            "strategy": record.strategy,
             "recoveries": record.recoveries,
             "words": decision_in_words(
-                record.active, record.rule, record.recoveries, record.strategy),
+                record.active, record.rule, record.recoveries, record.strategy,
+                rules.get(record.rule, "")),
+            "rule": f"{record.rule} of {record.strategy}",
             "path": record.path,
             "rejected": [f"{name}: {why}" for name, why in record.rejected],
         })
@@ -103,8 +160,14 @@ class HmiState:
     def order(self, outcome: str, now_s: float) -> None:
         """Log what became of an order of the operator, and keep it to be shown."""
         self._outcomes += 1
-        self._outcome = outcome
+        self.picture.put("order", {"number": self._outcomes, "text": outcome})
         self.log(now_s, "note", f"order to the mission: {outcome}")
+
+    def announce(self, text: str, now_s: float) -> None:
+        """Log what became of something the operator asked for, and keep it to be shown."""
+        self._outcomes += 1
+        self.picture.put("order", {"number": self._outcomes, "text": text})
+        self.log(now_s, "note", text)
 
     def diagnostic(self, report: m.Diagnostic, now_s: float) -> None:
         """Log an error report of a node."""
@@ -114,69 +177,70 @@ class HmiState:
 
     def log(self, now_s: float, kind: str, text: str) -> None:
         """Add a line to the event log; `kind` is fault, clear or note."""
-        self._log.append({"t": round(now_s, 2), "kind": kind, "text": text})
+        self.picture.add("events", {"t": round(now_s, 2), "kind": kind, "text": text})
+
+    def system(self, drawing: Mapping[str, Any] | None) -> None:
+        """Keep the drawing of the system's fault tree and order (`hmi_system`)."""
+        self.picture.put("system", drawing)
+
+    def usage(self, usage: Mapping[str, Any]) -> None:
+        """Keep what the processes use."""
+        self.picture.put("usage", usage, urgent=False)
 
     # -- showing --------------------------------------------------------------------------------
 
     @property
     def latched(self) -> tuple[str, ...]:
         """Recoveries that wait for the operator's reset, as the manager last said."""
-        manager = self._latest.get("manager")
-        return manager[0].latched if manager else ()
+        manager = self.picture.value("manager")
+        return manager.value.latched if manager else ()
+
+    def grow_old(self, now_s: float) -> None:
+        """Mark as stale what was not heard for a while; to be called before showing."""
+        for name in _AGED:
+            heard = self.picture.value(name)
+            if heard is None or heard.stale or now_s - self._heard_s[name] <= STALE_S:
+                continue
+            self.picture.put(name, msgspec.structs.replace(heard, stale=True))
+            if name == "manager":
+                self._show_detections(True)
 
     def snapshot(self, now_s: float) -> dict[str, Any]:
         """Return everything the page shows, ready for JSON; times in simulated seconds."""
-        manager = self._aged("manager", now_s)
-        return {
-            "type": "state",
-            "time_s": round(now_s, 2),
-            "pose": self._aged("pose", now_s),
-            "mission": self._mission(now_s),
-            "order": {"number": self._outcomes, "text": self._outcome},
-            "route": self._route(),
-            "control": self._aged("control", now_s),
-            "pilot": self._aged("pilot", now_s),
-            "manager": manager,
-            "nodes": self._aged("nodes", now_s),
-            "detections": [
-                {"name": name, "active": view.active, "reason": view.reason, "nodes": view.nodes,
-                 "stale": manager is None or manager["stale"]}
-                for name, view in sorted(self._detections.items())
-            ],
-            "lights": {
-                name: {"verdict": light.verdict, "ratio": round(light.ratio, 3),
-                       "intensity_cd": round(light.intensity_cd, 1)}
-                for name, light in self._lights.items()
-            },
-            "obstacles": [
-                o for o in self._value("obstacles", m.ObstacleList(())).obstacles if o.present
-            ],
-            "decisions": list(self._decisions),
-            "events": list(self._log),
-        }
+        self.grow_old(now_s)
+        return {"type": "state", "time_s": round(now_s, 2), **self.picture.all()}
 
-    def _value(self, what: str, default: Any) -> Any:
-        found = self._latest.get(what)
-        return found[0] if found else default
+    def _show_detections(self, stale: bool) -> None:
+        self.picture.put("detections", [
+            {"name": name, "active": view.active, "reason": view.reason, "nodes": view.nodes,
+             "stale": stale}
+            for name, view in self._detections.items()])
 
-    def _aged(self, what: str, now_s: float) -> dict[str, Any] | None:
-        found = self._latest.get(what)
-        if found is None:
-            return None
-        message, at_s = found
-        return {"value": message, "stale": now_s - at_s > STALE_S}
 
-    def _mission(self, now_s: float) -> dict[str, Any] | None:
-        found = self._latest.get("mission")
-        if found is None:
-            return None
-        status, at_s = found
-        return {
-            "name": status.name, "phase": status.phase, "step": status.step,
-            "goals": status.goals, "times_s": status.step_times_s, "reason": status.reason,
-            "stale": now_s - at_s > STALE_S, "orders": status.orders, "skipped": status.skipped,
-        }
+def _aged(heard: _Heard | None) -> dict[str, Any] | None:
+    return None if heard is None else {"value": heard.value, "stale": heard.stale}
 
-    def _route(self) -> tuple[tuple[float, float], ...]:
-        route = self._value("route", None)
-        return route.waypoints if route is not None and route.active else ()
+
+def _with_time(heard: _Heard | None) -> dict[str, Any] | None:
+    return None if heard is None else {**(_aged(heard) or {}), "t": round(heard.t, 4)}
+
+
+def _sweep(heard: _Heard | None) -> dict[str, Any] | None:
+    return None if heard is None or heard.stale else thin(heard.value)
+
+
+def _lights(lights: Mapping[str, m.LightMeasurement]) -> dict[str, Any]:
+    return {name: {"verdict": light.verdict, "ratio": round(light.ratio, 3),
+                   "intensity_cd": round(light.intensity_cd, 1)}
+            for name, light in lights.items()}
+
+
+def _mission(heard: _Heard | None) -> dict[str, Any] | None:
+    if heard is None:
+        return None
+    status: m.MissionStatus = heard.value
+    return {
+        "name": status.name, "phase": status.phase, "step": status.step,
+        "goals": status.goals, "times_s": status.step_times_s, "reason": status.reason,
+        "stale": heard.stale, "orders": status.orders, "skipped": status.skipped,
+    }

@@ -20,11 +20,16 @@ from typing import Any
 from actors.runtime.corruption import InjectionError, check_fields, corrupt
 from actors.runtime.messages import Injection
 from actors.runtime.topic import ROOT
-from actors.runtime.topics import INJECT, INJECTION_REPORT
+from actors.runtime.topics import (
+    INJECT,
+    INJECTION_REPORT,
+    INJECTION_REQUEST,
+    INJECTION_RESULT,
+)
 
 MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "corrupt")
 
-UNTOUCHED = (INJECT.key, INJECTION_REPORT.key)
+UNTOUCHED = (INJECT.key, INJECTION_REPORT.key, INJECTION_REQUEST.key, INJECTION_RESULT.key)
 """Keys that carry injections and their results, and therefore cannot be disturbed."""
 
 

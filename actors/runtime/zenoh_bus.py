@@ -20,6 +20,7 @@ from typing import Any
 import zenoh
 
 from actors.runtime.bus import BusError, Deliver, PeerChange
+from actors.runtime.tap import Tap
 from actors.runtime.topic import ROOT, Qos, Topic
 
 LEASE_MS = 2000
@@ -67,17 +68,20 @@ class ZenohBus:
         incarnation: life of the node.
         listen: endpoint to listen on, or None.
         dial: endpoints of the partners.
+        tap: for a recorder of the run; None for none.
     """
 
     bursts = True
 
     def __init__(
-        self, node: str, incarnation: int, listen: str | None, dial: Iterable[str]
+        self, node: str, incarnation: int, listen: str | None, dial: Iterable[str],
+        tap: Tap | None = None,
     ) -> None:
         self._node = node
         self._incarnation = incarnation
         self._listen = listen
         self._dial = tuple(dial)
+        self._tap = tap
         self._session: zenoh.Session | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._arrived: deque[Callable[[], None]] = deque()
@@ -117,6 +121,8 @@ class ZenohBus:
                 else zenoh.CongestionControl.DROP,
             )
         publisher.put(payload)
+        if self._tap is not None:
+            self._tap.take(key, payload)
 
     def has_readers(self, key: str) -> bool:  # noqa: ARG002
         """Not asked of the network: somebody may be listening."""
@@ -149,6 +155,8 @@ class ZenohBus:
         self._held.clear()
         self._publishers.clear()
         self._arrived.clear()
+        if self._tap is not None:
+            self._tap.close()
         if session is not None:
             await asyncio.to_thread(session.close)
 

@@ -35,15 +35,36 @@ A plain `kill -9 PID` or `pkill -9 -f osmosis_control` does the same.
 """
 
 
-class _Refusal(Exception):  # noqa: N818 it ends the command, it is no fault of the program
-    """One line for the user."""
+class SignalError(Exception):
+    """A node cannot be signalled; one line for the user."""
+
+
+def signal_node(node: str, name: str, port: int | None = None) -> RunProcess:
+    """Send a signal of `SIGNALS` to the newest process of a node and return which it was.
+
+    Args:
+        node: its name, as in the process's title.
+        name: of the signal, e.g. "KILL".
+        port: base port of the run; None if there is but one.
+
+    Raises:
+        SignalError: there is no such node or signal, or it may not be sent.
+    """
+    if name not in SIGNALS:
+        raise SignalError(f"unknown signal {name!r}; known: {', '.join(SIGNALS)}")
+    victim = _find(find_processes(port), node, port)
+    try:
+        os.kill(victim.pid, SIGNALS[name])
+    except OSError as error:
+        raise SignalError(f"{node} (pid {victim.pid}): {error.strerror}") from None
+    return victim
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code: 0 signalled, 2 bad usage or no such node."""
     try:
         _run(_parser().parse_args(arguments))
-    except _Refusal as refusal:
+    except SignalError as refusal:
         print(f"kill-node: {refusal}", file=sys.stderr)
         return 2
     return 0
@@ -63,19 +84,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> None:
-    processes = find_processes(options.port)
     if options.list:
-        _print_list(processes, as_json=options.json)
+        _print_list(find_processes(options.port), as_json=options.json)
         return
     if options.node is None:
-        raise _Refusal("no node given; --list shows what there is")
+        raise SignalError("no node given; --list shows what there is")
     if options.signal not in SIGNALS:
-        raise _Refusal(f"--signal {options.signal}: unknown signal; known: {', '.join(SIGNALS)}")
-    victim = _find(processes, options.node, options.port)
-    try:
-        os.kill(victim.pid, SIGNALS[options.signal])
-    except OSError as error:
-        raise _Refusal(f"{options.node} (pid {victim.pid}): {error.strerror}") from None
+        raise SignalError(f"--signal {options.signal}: unknown signal; known: {', '.join(SIGNALS)}")
+    victim = signal_node(options.node, options.signal, options.port)
     if options.json:
         print(json.dumps({"node": options.node, "pid": victim.pid, "signal": options.signal,
                           "incarnation": victim.incarnation}))
@@ -87,14 +103,14 @@ def _run(options: argparse.Namespace) -> None:
 def _find(processes: list[RunProcess], node: str, port: int | None) -> RunProcess:
     where = f" on port {port}" if port is not None else ""
     if not processes:
-        raise _Refusal(f"no run found{where}; start one with `python launch.py`")
+        raise SignalError(f"no run found{where}; start one with `python launch.py`")
     matches = [p for p in processes if node in p.names]
     if not matches:
         known = ", ".join(sorted({n for p in processes for n in p.names}))
-        raise _Refusal(f"unknown node {node!r}{where}; known: {known}")
+        raise SignalError(f"unknown node {node!r}{where}; known: {known}")
     if len({p.port for p in matches}) > 1:
         ports = ", ".join(str(p.port) for p in matches)
-        raise _Refusal(f"{node}: in several runs; choose one with --port: {ports}")
+        raise SignalError(f"{node}: in several runs; choose one with --port: {ports}")
     return max(matches, key=lambda p: p.incarnation)
 
 

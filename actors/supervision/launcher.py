@@ -264,7 +264,8 @@ class Launcher:
         """Return what tools need to know of this run."""
         return run_info.RunInfo(
             os.getpid(), self.plan.base_port, self.plan.rate, self.plan.origin_s,
-            self.plan.system_file, self.ports, self.plan.run_id, self.plan.hmi_port, self._title)
+            self.plan.system_file, self.ports, self.plan.run_id, self.plan.hmi_port, self._title,
+            self.plan.hmi_page, self.plan.description)
 
     # -- end ------------------------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ from actors.runtime.bus import BusError
 from actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from actors.runtime.checkpoint_store import SqliteCheckpoints
 from actors.runtime.clock import Clock
+from actors.runtime.tap import Tap
 from actors.runtime.zenoh_bus import ZenohBus
 from actors.supervision.lifeline import exit_with_launcher, kill_leftovers
 from actors.supervision.process_title import set_title
@@ -38,7 +39,8 @@ def make_actor(
     """Build one actor of the system with its bus, not yet running."""
     member = layout.members[name]
     clock = Clock(layout.plan.origin_s, layout.plan.rate, loop.time)
-    bus = ZenohBus(name, incarnation, layout.listen(name), layout.dial(name))
+    bus = ZenohBus(name, incarnation, layout.listen(name), layout.dial(name),
+                   Tap(layout.plan.base_port))
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, shared,
         checkpoints=make_store(layout, name, incarnation),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import socket
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -20,7 +21,8 @@ class RunInfo(msgspec.Struct, frozen=True):
     """One run: where it is, what it runs, and when its simulated time began.
 
     `nodes` maps node names to their Zenoh ports; `origin_s` is a reading of the machine's
-    monotonic clock.
+    monotonic clock. `page` is where an operator opens the page, its token included. `plan` is
+    what a recording keeps of the run's plan. `replay_of` names the file of a replay.
     """
 
     pid: int
@@ -32,6 +34,9 @@ class RunInfo(msgspec.Struct, frozen=True):
     run_id: str
     hmi_port: int
     title: str
+    page: str = ""
+    plan: dict[str, Any] = {}
+    replay_of: str = ""
 
 
 class NoRunError(Exception):
@@ -50,11 +55,13 @@ def find_runs() -> list[RunInfo]:
     except OSError:
         return []
     ports = {int(m[1]) for line in table.splitlines() if (m := _NAME.search(line))}
-    return [info for port in sorted(ports) if (info := _ask(port)) is not None]
+    return [info for port in sorted(ports) if (info := ask(port)) is not None]
 
 
 def find_run(port: int | None = None) -> RunInfo:
     """Return the one run there is, or the one on a base port.
+
+    A replay counts only where there is no run: whoever says nothing means the robot.
 
     Raises:
         NoRunError: there is none, or there are several and no port was given.
@@ -68,13 +75,15 @@ def find_run(port: int | None = None) -> RunInfo:
         raise NoRunError(f"--port {port}: no run there; runs found: {known}")
     if not runs:
         raise NoRunError("no run found; start one with `python launch.py`")
+    runs = [run for run in runs if not run.replay_of] or runs
     if len(runs) > 1:
         listed = ", ".join(f"{r.base_port} ({r.title})" for r in runs)
         raise NoRunError(f"several runs, choose one with --port: {listed}")
     return runs[0]
 
 
-def _ask(port: int) -> RunInfo | None:
+def ask(port: int) -> RunInfo | None:
+    """Return what the launcher of the run on a base port tells; None if there is none."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(_TIMEOUT_S)
         try:

@@ -7,14 +7,17 @@ data (JSON), so that any process can be given it.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from actors.messages import AdaptedSystem
+from actors.messages import AdaptedSystem, NamedFault
+from actors.runtime.web_access import page_url
 from actors.runtime.wiring import Member, load_class, partners
 from actors.runtime.zenoh_bus import endpoint
+from actors.supervision.kill_node import signal_node
 from manager.specification import (
     Kind,
     Layers,
@@ -52,6 +55,11 @@ class RunPlan(msgspec.Struct, frozen=True):
         error_log: file that collects tracebacks of failed nodes; "" for none.
         origin_s: reading of the monotonic clock at simulated time 0; set when all is loaded.
         checkpoints: directory for the nodes' checkpoints; "" keeps none, whatever the spec says.
+        hmi_host: address at which the operator's page is served.
+        hmi_token: what everybody has to show there; "" for nothing, on loopback.
+        faults: what the page offers to inject by name.
+        waits: True has the mission wait until the operator starts it from the page.
+        joystick: device to drive with, "auto" for the first; "" for what the spec says.
     """
 
     run_id: str
@@ -70,6 +78,22 @@ class RunPlan(msgspec.Struct, frozen=True):
     error_log: str = ""
     origin_s: float = 0.0
     checkpoints: str = ""
+    joystick: str = ""
+    hmi_host: str = "127.0.0.1"
+    hmi_token: str = ""
+    faults: tuple[NamedFault, ...] = ()
+    waits: bool = False
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """What a recording keeps of it: no secrets, and nothing that is true of one run only."""
+        return {name: getattr(self, name) for name in (
+            "system_file", "airport", "mission", "strategy", "shadow", "seed", "obstacles", "ftm")}
+
+    @property
+    def hmi_page(self) -> str:
+        """Where an operator opens the page, "" if there is none; its token stays in the browser."""
+        return page_url(self.hmi_host, self.hmi_port, self.hmi_token) if self.hmi_port else ""
 
 
 class Unit(msgspec.Struct, frozen=True):
@@ -206,5 +230,11 @@ def load_shared(plan: RunPlan, spec: SystemSpec) -> Mapping[str, Any]:
         "seed": plan.seed,
         "obstacles": plan.obstacles,
         "hmi_port": plan.hmi_port,
+        "hmi_host": plan.hmi_host,
+        "hmi_token": plan.hmi_token,
+        "faults": plan.faults,
+        "waits": plan.waits,
+        "signal_node": partial(signal_node, port=plan.base_port),
+        "joystick": plan.joystick,
         "plan": plan,
     }

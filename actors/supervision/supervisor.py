@@ -24,6 +24,8 @@ from actors.messages import (
     AdaptedSystem,
     Diagnostic,
     Heartbeat,
+    Injection,
+    InjectionReport,
     NodeInfo,
     NodeState,
     NodeTable,
@@ -74,7 +76,8 @@ class _Process:
 class Supervisor(Actor):
     """Keeps the processes of the run alive. Parameters: `nodes`, the names it watches."""
 
-    outputs = (topics.NODES, topics.PROCESS_EVENT, topics.ERROR_REPORT)
+    outputs = (topics.NODES, topics.PROCESS_EVENT, topics.ERROR_REPORT, topics.INJECT,
+               topics.INJECTION_RESULT)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -148,6 +151,16 @@ class Supervisor(Actor):
     def diagnostic(self, message: Diagnostic, _header: Header) -> None:
         """Pass a node's error report on to whoever shows it."""
         self.publish(topics.ERROR_REPORT, message)
+
+    @on(topics.INJECTION_REQUEST)
+    def inject(self, message: Injection, _header: Header) -> None:
+        """Order a fault for the operator's page; whoever publishes the topic hears it."""
+        self.publish(topics.INJECT, message)
+
+    @on(topics.INJECTION_REPORT)
+    def injected(self, message: InjectionReport, _header: Header) -> None:
+        """Pass on what came of a fault."""
+        self.publish(topics.INJECTION_RESULT, message)
 
     @on(topics.ADAPTED_SYSTEM)
     def adapted(self, message: AdaptedSystem, header: Header) -> None:

@@ -1,10 +1,30 @@
-// The operator's page: shows the states that the HMI pushes, asks for resets, missions, orders.
+// The operator's page: shows the picture that the HMI pushes, asks for resets, missions, orders.
 
+import { $, Memory, clock, element, pill, say } from "./dom.js";
+import { NO_TOKEN, protocols } from "./access.js";
+import { Camera } from "./camera.js";
+import { DecisionLog, EventLog } from "./log.js";
 import { AirportMap } from "./map.js";
+import { ProcessTable } from "./nodes.js";
+import { Operating } from "./operate.js";
+import { FaultTree, Order } from "./tree.js";
 
-const $ = (id) => document.getElementById(id);
+const LOGS = ["decisions", "events"];
 const map = new AirportMap($("map"));
-const shown = {};
+const tree = new FaultTree($("tree"));
+const order = new Order($("order"));
+const processes = new ProcessTable($("nodes"));
+const logs = {
+  decisions: new DecisionLog($("decisions"), "Nothing to decide so far."),
+  events: new EventLog($("events"), "Nothing happened so far."),
+};
+const operating = new Operating((wish) => send(wish));
+const camera = new Camera();
+const memory = new Memory();
+let picture = {};            // all that was heard, by section
+let fresh = { decisions: [], events: [] };  // lines of the logs that are not shown yet
+const changed = new Set();   // sections that are not shown yet
+let frame = 0;
 let socket = null;
 let retryMs = 500;
 let lastHeard = 0;
@@ -13,11 +33,13 @@ let toastTimer = 0;
 // ---- connection: reconnects by itself, and notices a server that only hangs -------------------
 
 function connect() {
-  socket = new WebSocket(`ws://${location.host}/ws`);
+  socket = new WebSocket(`ws://${location.host}/ws`, protocols());
   socket.onopen = () => { retryMs = 500; lastHeard = Date.now(); };
   socket.onmessage = (event) => { lastHeard = Date.now(); receive(JSON.parse(event.data)); };
-  socket.onclose = () => {
-    link("bad", "HMI not reachable, reconnecting");
+  socket.onclose = (event) => {
+    operating.offline();
+    link("bad", event.code === NO_TOKEN ? "token missing: open the address that the run has printed"
+      : "HMI not reachable, reconnecting");
     setTimeout(connect, retryMs);
     retryMs = Math.min(retryMs * 1.5, 4000);
   };
@@ -40,9 +62,39 @@ function send(wish) {
 
 function receive(message) {
   if (message.type === "hello") hello(message);
-  else if (message.type === "state") state(message);
-  else toast(message.text);
+  else if (message.type === "state") take(message);
+  else if (operating.receive(message)) return;
+  else if (message.text) toast(message.text);
 }
+
+// ---- the picture: sections arrive when they changed, and are drawn with the next frame ----------
+
+function take(message) {
+  for (const [name, value] of Object.entries(message)) {
+    if (LOGS.includes(name)) fresh[name].push(...value);
+    else picture[name] = value;
+    changed.add(name);
+  }
+  if (document.hidden) seen();
+  else if (!frame) frame = requestAnimationFrame(draw);
+}
+
+function draw() {
+  frame = 0;
+  show(picture);
+  changed.clear();
+  seen();
+}
+
+/** Tell the HMI what was drawn: it sends the newest then, and never a backlog. */
+function seen() {
+  if (socket.readyState === WebSocket.OPEN) socket.send(`{"type":"seen","version":${picture.version}}`);
+}
+
+document.addEventListener("visibilitychange", () => {
+  if (document.hidden) seen();
+  else if (!frame) frame = requestAnimationFrame(draw);
+});
 
 function toast(text) {
   $("toast").textContent = text;
@@ -53,35 +105,15 @@ function toast(text) {
 
 // ---- showing ----------------------------------------------------------------------------------
 
-function element(tag, className, text) {
-  const made = document.createElement(tag);
-  if (className) made.className = className;
-  if (text !== undefined) made.textContent = text;
-  return made;
-}
-
-/** Rebuild a part of the page only if its data changed, so that it can be read and selected. */
-function once(name, value, build) {
-  const text = JSON.stringify(value);
-  if (shown[name] === text) return;
-  shown[name] = text;
-  build();
-}
-
-function clock(seconds) {
-  if (!Number.isFinite(seconds)) return "–";
-  const minutes = Math.floor(seconds / 60);
-  return `${minutes}:${(seconds - 60 * minutes).toFixed(1).padStart(4, "0")}`;
-}
-
-function pill(id, kind, text) {
-  $(id).className = `pill ${kind}`;
-  $(id).textContent = text;
-}
-
 function hello(message) {
-  for (const key of Object.keys(shown)) delete shown[key];
-  map.begin(message.map, message.track);
+  picture = {};
+  fresh = { decisions: [], events: [] };
+  changed.clear();
+  memory.forget();
+  for (const log of Object.values(logs)) log.begin();
+  map.begin(message.map, message.track, message.footprint_m);
+  camera.begin(message.camera);
+  system(null);
   $("airport").textContent = message.map ? message.map.name : "";
   $("rate").textContent = message.rate === 1 ? "" : `× ${message.rate}`;
   $("mission-name").replaceChildren(...message.missions.map((name) => {
@@ -89,22 +121,51 @@ function hello(message) {
     option.value = name;
     return option;
   }));
-  document.title = message.map ? `Rampart · ${message.map.name}` : "Rampart";
 }
 
-function state(s) {
+/** Show what changed; each part names the sections that it is made of. */
+function show(s) {
+  const any = (...names) => names.some((name) => changed.has(name));
   link("good", "live");
-  $("clock").textContent = clock(s.time_s);
-  map.show(s);
-  once("mission", [s.mission, s.control && s.control.value.phase], () => mission(s));
-  orders(s.mission);
-  if (shown.order !== undefined && shown.order !== s.order.number) toast(s.order.text);
-  shown.order = s.order.number;
-  once("lights", s.lights, () => lights(s.lights));
-  once("safety", [s.pilot, s.manager, s.detections], () => safety(s));
-  once("nodes", s.nodes, () => nodes(s.nodes));
-  once("decisions", s.decisions, () => decisions(s.decisions));
-  once("events", s.events, () => events(s.events));
+  if (any("operating") && s.operating) operating.show(s.operating);
+  say($("clock"), clock(s.time_s));
+  map.show(s, changed);
+  if (any("pose")) where(s.pose);
+  if (any("mission", "control")) mission(s);
+  if (any("mission")) orders(s.mission);
+  if (any("order")) told(s.order);
+  if (any("lights")) lights(s.lights);
+  if (any("pilot", "manager", "detections")) safety(s);
+  if (any("system")) system(s.system);
+  if (any("system", "manager", "detections")) {
+    say($("tree-words"), tree.show(s.manager, s.detections));
+    order.show(s.manager);
+  }
+  if (any("nodes", "usage")) processes.show(s.nodes, s.usage);
+  for (const name of LOGS) logs[name].add(fresh[name].splice(0));
+}
+
+function where(pose) {
+  const { x_m: x, y_m: y, yaw_rad: yaw } = pose ? pose.value : {};
+  const heading = (90 - yaw * 180 / Math.PI + 360) % 360;
+  say($("where"), [x, y, yaw].every(Number.isFinite)
+    ? `Robot at ${x.toFixed(1)} m east, ${y.toFixed(1)} m north, heading ${heading.toFixed(0).padStart(3, "0")}°${pose.stale ? " (not heard any more)" : ""}`
+    : "The robot's pose is not known.");
+}
+
+function told(outcome) {
+  if (memory.shown.order !== undefined && memory.shown.order !== outcome.number) toast(outcome.text);
+  memory.shown.order = outcome.number;
+}
+
+function system(drawn) {
+  $("tree-panel").hidden = !drawn || !(drawn.tree || drawn.note);
+  $("order-panel").hidden = !drawn || !drawn.order;
+  tree.begin(drawn && drawn.tree);
+  order.begin(drawn && drawn.order);
+  if (!drawn) return;
+  say($("tree-title"), `Fault tree: ${drawn.title}`);
+  say($("order-words"), `By ${drawn.criteria.join(", then ")}: what is above is preferred in doubt. ${drawn.note}`);
 }
 
 const PHASES = { running: "good", paused: "warn", "returning home": "warn", succeeded: "good", failed: "bad", cancelled: "bad", idle: "" };
@@ -117,6 +178,7 @@ function mission(s) {
     pill("mission-phase", "warn", "Mission Manager not heard");
     $("mission-reason").textContent = "";
     $("steps").replaceChildren();
+    $("mission-progress").hidden = true;
     return;
   }
   pill("mission-phase", m.stale ? "warn" : PHASES[m.phase], m.stale ? `${m.phase} (stale)` : m.phase);
@@ -124,7 +186,10 @@ function mission(s) {
   const name = m.name ? `Mission ${m.name}` : "No mission";
   $("mission-reason").textContent = [name, m.reason, waiting ? "waiting: obstacle ahead" : ""]
     .filter(Boolean).join(" · ");
-  $("steps").replaceChildren(...m.goals.map((goal, i) => step(m, goal, i)));
+  memory.once("steps", m, () => $("steps").replaceChildren(...m.goals.map((goal, i) => step(m, goal, i))));
+  $("mission-progress").hidden = !m.goals.length;
+  $("mission-progress").max = Math.max(m.goals.length, 1);
+  $("mission-progress").value = m.phase === "succeeded" ? m.goals.length : m.step;
 }
 
 function step(m, goal, i) {
@@ -132,7 +197,8 @@ function step(m, goal, i) {
   const done = !skipped && (i < m.step || m.phase === "succeeded");
   const now = i === m.step && !done;
   const lost = now && (m.phase === "failed" || m.phase === "cancelled");
-  const line = element("li", done ? "done" : lost ? "failed": now && m.phase !== "idle" ? "now" : "");
+  const line = element("li", done ? "done" : lost ? "failed" : now && m.phase !== "idle" ? "now" : "");
+  if (line.className === "now") line.setAttribute("aria-current", "step");
   line.append(element("span", "n", done ? "✓" : lost ? "✕" : i + 1),
     element("span", "", `${goal.mode} to (${goal.x_m.toFixed(1)}, ${goal.y_m.toFixed(1)})${skipped ? ", skipped" : ""}`),
     element("span", "time", done && m.times_s[i] !== undefined ? clock(m.times_s[i]) : ""));
@@ -187,9 +253,10 @@ function safety(s) {
   $("pilot-reason").textContent = pilot ? pilot.reason || "Commands pass unchanged." : "";
   manager(s.manager);
   $("detections").replaceChildren(...s.detections.map((d) => {
-    const chip = element("li", d.active ? "active" : d.stale ? "stale" : "", d.name);
+    const chip = element("li", d.active ? "active" : d.stale ? "stale" : "", d.active ? `▲ ${d.name}` : d.name);
     const nodes = d.nodes.length ? ` (${d.nodes.join(", ")})` : "";
     chip.title = d.active ? `${d.reason}${nodes}` : d.stale ? "silent" : "idle";
+    chip.append(element("span", "unseen", `: ${chip.title}`));
     return chip;
   }));
 }
@@ -207,59 +274,16 @@ function manager(heard) {
   const acting = m ? m.active.length + m.activated.length : 0;
   $("alarm").hidden = !latched.length && !acting;
   $("alarm").classList.toggle("mild", !latched.length);
-  $("alarm-title").textContent = latched.length
-    ? `${latched.join(", ")} latched: waits for your reset.` : "A recovery is under way.";
-  $("alarm-text").textContent = m && m.active.length ? `Active: ${m.active.join(", ")}.` : "";
-  once("latched", latched, () => $("resets").replaceChildren(...latched.map((name) => {
+  say($("alarm-title"), latched.length
+    ? `${latched.join(", ")} latched: waits for your reset.` : acting
+      ? m.activated.length ? `Recovery under way: ${m.activated.join(", ")}.` : "A fault is detected." : "");
+  say($("alarm-text"), m && m.active.length ? `Active: ${m.active.join(", ")}.` : "");
+  document.title = `${latched.length ? "⚠ stopped · " : acting ? "▲ recovery · " : ""}Rampart`;
+  memory.once("latched", latched, () => $("resets").replaceChildren(...latched.map((name) => {
     const button = element("button", "", name === "RM1" ? "Reset emergency stop (RM1)" : `Reset ${name}`);
     button.onclick = () => send({ type: "reset", recovery: name });
     return button;
   })));
-}
-
-const STATES = { running: "good", starting: "warn", stopped: "bad", wedged: "bad", crashed: "bad", "given up": "bad" };
-
-function nodes(heard) {
-  const troubled = (n) => (n.state === "running" ? 1 : 0);
-  const rows = heard ? heard.value.nodes.slice().sort((a, b) => troubled(a) - troubled(b)) : [];
-  const up = rows.filter((n) => n.state === "running").length;
-  $("nodes-count").textContent = heard ? `${up} of ${rows.length} running${heard.stale ? " · supervisor silent" : ""}` : "supervisor not heard";
-  $("nodes").replaceChildren(...rows.map((n) => {
-    const row = element("tr");
-    row.title = `${n.kind}, incarnation ${n.incarnation}`;
-    const stateCell = element("td");
-    stateCell.append(element("span", `dot ${STATES[n.state] || ""}`), n.state);
-    row.append(element("td", "", n.name), element("td", "quiet", n.kind), stateCell,
-      element("td", "num", n.pid || "–"), element("td", "num", n.restarts));
-    return row;
-  }));
-}
-
-function logLine(seconds, kind, text) {
-  const line = element("li");
-  line.append(element("time", "", clock(seconds)), element("p", kind, text));
-  return line;
-}
-
-function decisions(list) {
-  $("decisions").replaceChildren(...list.slice().reverse().map((d) => {
-    const line = logLine(d.t, "", d.words);
-    const why = [...d.path.map((p) => `path: ${p}`), ...d.rejected.map((r) => `rejected: ${r}`)];
-    if (why.length) {
-      const details = element("details");
-      const items = element("ul");
-      items.append(...why.map((text) => element("li", "", text)));
-      details.append(element("summary", "", `certificate of decision ${d.number}`), items);
-      line.append(details);
-    }
-    return line;
-  }));
-  if (!list.length) $("decisions").append(element("li", "empty", "Nothing to decide so far."));
-}
-
-function events(list) {
-  $("events").replaceChildren(...list.slice().reverse().map((e) => logLine(e.t, e.kind, e.text)));
-  if (!list.length) $("events").append(element("li", "empty", "Nothing happened so far."));
 }
 
 for (const button of $("orders").children) button.addEventListener("click", () => ask(button));
@@ -267,6 +291,12 @@ for (const button of $("orders").children) button.addEventListener("click", () =
 $("start").addEventListener("submit", (event) => {
   event.preventDefault();
   send({ type: "mission", name: $("mission-name").value });
+});
+
+$("follow").addEventListener("click", () => {
+  const on = $("follow").getAttribute("aria-pressed") !== "true";
+  $("follow").setAttribute("aria-pressed", on);
+  map.follow(on);
 });
 
 connect();

@@ -1,14 +1,9 @@
 // The airport's map as SVG: metres, y turned over so that north is up.
 
-const NS = "http://www.w3.org/2000/svg";
+import { Memory, svg as make } from "./dom.js";
 
-function make(tag, attributes, parent, text) {
-  const element = document.createElementNS(NS, tag);
-  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-  if (text !== undefined) element.textContent = text;
-  if (parent) parent.append(element);
-  return element;
-}
+const FOLLOW_M = 22;  // what is shown round the robot when the map follows it
+const TRACK_STEP_M = .25;
 
 function points(list) {
   return list.map(([x, y]) => `${x},${-y}`).join(" ");
@@ -21,16 +16,20 @@ export class AirportMap {
     this.svg = svg;
     this.lights = new Map();
     this.track = [];
-    this.drawn = {};
+    this.memory = new Memory();
+    this.at = null;
+    this.following = false;
   }
 
-  /** Draw what does not move; `map` is an AirportDrawing or null, `track` the way driven so far. */
-  begin(map, track) {
+  /** Draw what does not move; `map` is an AirportDrawing or null, `track` the way driven so far,
+   * `footprint` the robot's length and width or null. */
+  begin(map, track, footprint) {
     this.svg.replaceChildren();
     this.lights.clear();
-    this.drawn = {};
-    const [x0, y0, x1, y1] = map ? map.bounds_m : [-50, -50, 50, 50];
-    this.svg.setAttribute("viewBox", `${x0} ${-y1} ${x1 - x0} ${y1 - y0}`);
+    this.memory.forget();
+    this.at = null;
+    this.bounds = map ? map.bounds_m : [-50, -50, 50, 50];
+    this.look();
     const hatch = make("pattern", { id: "hatch", width: 1, height: 1,
       patternUnits: "userSpaceOnUse", patternTransform: "rotate(45)" }, make("defs", {}, this.svg));
     make("rect", { class: "hatch-ground", width: 1, height: 1 }, hatch);
@@ -51,8 +50,12 @@ export class AirportMap {
     for (const light of map ? map.lights : []) this.addLight(light);
     this.obstacles = make("g", {}, this.svg);
     this.robot = make("g", { class: "robot", visibility: "hidden" }, this.svg);
+    this.sweeps = { laser: this.addSweep("lower"), upper_laser: this.addSweep("upper") };
     make("circle", { class: "robot-ring", r: 1.7 }, this.robot);
-    make("path", { class: "robot-body", d: "M1.1 0L-.75 .75L-.4 0L-.75 -.75Z" }, this.robot);
+    make("path", { class: "robot-heading", d: "M1.7 0L2.7 0M2.35 -.3L2.75 0L2.35 .3" }, this.robot);
+    const [length, width] = footprint || [.72, .614];
+    make("rect", { class: "robot-body", x: -length / 2, y: -width / 2, width: length, height: width, rx: .1 }, this.robot);
+    make("path", { class: "robot-front", d: `M${length / 2 - .2} ${-width / 2 + .1}L${length / 2 - .05} 0L${length / 2 - .2} ${width / 2 - .1}Z` }, this.robot);
     this.track = track.filter((p) => p.every(Number.isFinite));
     this.trackLine.setAttribute("points", points(this.track));
   }
@@ -74,33 +77,75 @@ export class AirportMap {
     this.lights.set(light.name, { dot, cross, title, verdict: "none" });
   }
 
-  /** Show a state as the HMI pushed it. */
-  show(state) {
-    this.showRobot(state.pose, state.pilot);
-    this.showLights(state.lights);
-    this.once("route", state.route, () => this.route.setAttribute("points", points(state.route)));
-    this.once("obstacles", state.obstacles, () => this.showObstacles(state.obstacles));
-    const goals = state.mission ? state.mission.goals : [];
-    this.once("goals", [goals, state.mission && state.mission.step], () => this.showGoals(goals, state.mission));
+  addSweep(which) {
+    const group = make("g", { class: `sweep ${which}` }, this.robot);
+    return { area: make("path", { class: "sweep-area" }, group), echoes: make("path", { class: "sweep-echoes" }, group) };
   }
 
-  /** Redraw only what changed: most states bring a new pose and nothing else. */
-  once(name, value, draw) {
-    const text = JSON.stringify(value);
-    if (this.drawn[name] === text) return;
-    this.drawn[name] = text;
-    draw();
+  /** Show the whole airport, or what is round the robot. */
+  look() {
+    const [x0, y0, x1, y1] = this.bounds;
+    if (!this.following || !this.at) {
+      this.svg.setAttribute("viewBox", `${x0} ${-y1} ${x1 - x0} ${y1 - y0}`);
+      return;
+    }
+    const height = FOLLOW_M * Math.min(1, (y1 - y0) / (x1 - x0));
+    this.svg.setAttribute("viewBox", `${this.at[0] - FOLLOW_M / 2} ${-this.at[1] - height / 2} ${FOLLOW_M} ${height}`);
+  }
+
+  follow(on) {
+    this.following = on;
+    this.look();
+  }
+
+  /** Show what changed of a picture; `changed` is the set of the names of its sections. */
+  show(picture, changed) {
+    if (changed.has("pose") || changed.has("pilot")) this.showRobot(picture.pose, picture.pilot);
+    for (const which of ["laser", "upper_laser"]) {
+      if (changed.has(which)) this.showSweep(this.sweeps[which], picture[which]);
+    }
+    if (changed.has("lights")) this.showLights(picture.lights);
+    if (changed.has("route")) this.route.setAttribute("points", points(picture.route));
+    if (changed.has("obstacles")) this.showObstacles(picture.obstacles);
+    if (changed.has("mission")) {
+      const goals = picture.mission ? picture.mission.goals : [];
+      const key = [goals, picture.mission && [picture.mission.step, picture.mission.phase]];
+      this.memory.once("goals", key, () => this.showGoals(goals, picture.mission));
+    }
+  }
+
+  /** Draw a sweep in the robot's frame, so that it moves with the robot between two sweeps. */
+  showSweep(drawn, sweep) {
+    if (!sweep) {
+      drawn.area.removeAttribute("d");
+      drawn.echoes.removeAttribute("d");
+      return;
+    }
+    let [area, echoes] = ["M0 0", ""];
+    sweep.cm.forEach((cm, i) => {
+      const range = cm < 0 ? sweep.max_m : cm / 100;
+      const angle = sweep.from_rad + i * sweep.step_rad;
+      const at = `${(range * Math.cos(angle)).toFixed(2)} ${(-range * Math.sin(angle)).toFixed(2)}`;
+      area += `L${at}`;
+      if (cm >= 0) echoes += `M${at}h0`;
+    });
+    drawn.area.setAttribute("d", `${area}Z`);
+    drawn.echoes.setAttribute("d", echoes || "M0 0");
+    drawn.echoes.setAttribute("visibility", echoes ? "inherit" : "hidden");
   }
 
   showRobot(pose, pilot) {
     if (!pose || !finite(pose.value)) return;
     const { x_m: x, y_m: y, yaw_rad: yaw } = pose.value;
+    this.at = [x, y];
+    if (this.following) this.look();
+    this.svg.dataset.t = pose.t;  // which moment is shown
     this.robot.setAttribute("visibility", "visible");
     this.robot.setAttribute("transform", `translate(${x} ${-y}) rotate(${-yaw * 180 / Math.PI})`);
     this.robot.classList.toggle("stale", pose.stale);
     this.robot.classList.toggle("stopped", Boolean(pilot && pilot.value.stopped));
     const last = this.track[this.track.length - 1];
-    if (!last || Math.hypot(last[0] - x, last[1] - y) > .25) {
+    if (!last || Math.hypot(last[0] - x, last[1] - y) > TRACK_STEP_M) {
       this.track.push([x, y]);
       if (this.track.length > 6000) this.track.splice(0, 1000);
       this.trackLine.setAttribute("points", points(this.track));
@@ -133,8 +178,10 @@ export class AirportMap {
     this.goals.replaceChildren();
     goals.forEach((goal, i) => {
       const done = i < mission.step || mission.phase === "succeeded";
+      const now = i === mission.step && ["running", "paused"].includes(mission.phase);
+      if (now) make("circle", { class: "goal now", cx: goal.x_m, cy: -goal.y_m, r: .45 }, this.goals);
       make("circle", { class: `goal ${done ? "done" : ""}`, cx: goal.x_m, cy: -goal.y_m, r: 1.1 }, this.goals);
-      make("text", { x: goal.x_m, y: -goal.y_m - 1.5, "font-size": 1.7, "text-anchor": "middle" }, this.goals, i + 1);
+      make("text", { x: goal.x_m, y: -goal.y_m - 1.5, "font-size": 1.7, "text-anchor": "middle" }, this.goals, done ? `${i + 1} ✓` : i + 1);
     });
   }
 }

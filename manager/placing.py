@@ -19,7 +19,7 @@ from itertools import pairwise
 
 import msgspec
 
-from toolbox.layered import Layering, arrange_in_layers
+from manager.layered import Layering, arrange_in_layers
 
 SWEEPS = 24
 GAP = 22.0

@@ -6,7 +6,7 @@ there, and the vertices of a layer are sorted by the mean position of their neig
 (barycentre), downwards and upwards, as long as that takes crossings away. A tree starts without a
 crossing and stays as it was declared. The same graph always gives the same picture.
 
-`toolbox.placing` turns the sequence into coordinates.
+`manager.placing` turns the sequence into coordinates.
 """
 
 from __future__ import annotations

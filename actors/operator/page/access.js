@@ -1,0 +1,23 @@
+// The token of a page that other machines can reach: taken from the address once, kept by this tab.
+
+const KEY = "rampart-token";
+
+function fromAddress() {
+  const found = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (!found) return;
+  sessionStorage.setItem(KEY, found);
+  history.replaceState(null, "", location.pathname + location.search);  // not to be read over a shoulder
+}
+
+fromAddress();
+addEventListener("hashchange", () => { fromAddress(); location.reload(); });
+
+export const token = () => sessionStorage.getItem(KEY) || "";
+
+/** Subprotocols of the WebSocket: a browser sends no header of ours, but these. */
+export const protocols = () => (token() ? ["rampart", `token.${token()}`] : ["rampart"]);
+
+/** Address of anything on the HMI that is not one of its files. */
+export const withToken = (path) => (token() ? `${path}?token=${encodeURIComponent(token())}` : path);
+
+export const NO_TOKEN = 4401;

@@ -1,0 +1,51 @@
+// Small helpers for all panels.
+
+export const $ = (id) => document.getElementById(id);
+
+export function element(tag, className, text) {
+  const made = document.createElement(tag);
+  if (className) made.className = className;
+  if (text !== undefined) made.textContent = text;
+  return made;
+}
+
+const SVG = "http://www.w3.org/2000/svg";
+
+export function svg(tag, attributes, parent, text) {
+  const made = document.createElementNS(SVG, tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  if (text !== undefined) made.textContent = text;
+  if (parent) parent.append(made);
+  return made;
+}
+
+/** Set a text only if it differs, so that a selection survives and screen readers stay quiet. */
+export function say(node, text) {
+  if (node.textContent !== text) node.textContent = text;
+}
+
+export function pill(id, kind, text) {
+  if ($(id).className !== `pill ${kind}`) $(id).className = `pill ${kind}`;
+  say($(id), text);
+}
+
+export function clock(seconds) {
+  if (!Number.isFinite(seconds)) return "–";
+  const tenths = Math.round(Math.max(seconds, 0) * 10);
+  const minutes = Math.floor(tenths / 600);
+  return `${minutes}:${((tenths - 600 * minutes) / 10).toFixed(1).padStart(4, "0")}`;
+}
+
+/** Remembers what was shown, so that a part is rebuilt only if its data changed. */
+export class Memory {
+  constructor() { this.shown = {}; }
+
+  once(name, value, build) {
+    const text = JSON.stringify(value);
+    if (this.shown[name] === text) return;
+    this.shown[name] = text;
+    build();
+  }
+
+  forget() { this.shown = {}; }
+}

@@ -1,0 +1,145 @@
+// Breaking things on purpose: signals to processes, and faults injected into what nodes publish.
+
+import { $, element, say } from "./dom.js";
+
+const SIGNALS = {
+  KILL: "the process is gone at once",
+  STOP: "the process stands still; CONT lets it go on",
+  CONT: "a stopped process goes on",
+  TERM: "the process ends in order; its supervisor takes that for a crash",
+  SEGV: "as if it had touched memory that is not there",
+  WEDGE: "the process lives, its event loop turns no more",
+};
+const GROUPS = { paper: "The paper's", sensor: "Sensors", actuator: "Actuators" };
+const WAYS = {
+  drop: "nothing arrives", freeze: "the last message again and again, old stamp included",
+  stuck: "the last content with fresh stamps", delay: "every message late",
+  duplicate: "every message twice",
+};
+
+/** A button in a node's row; a click on it opens the dialog of its signals. */
+export function signalButton(node) {
+  const button = element("button", "small signal", "⋯");
+  button.type = "button";
+  button.dataset.signal = node;
+  button.setAttribute("aria-label", `Signals to ${node}`);
+  button.setAttribute("aria-haspopup", "dialog");
+  return button;
+}
+
+export class Faults {
+  constructor(send) {
+    this.send = send;
+    this.known = new Map();
+    this.node = "";
+    this.signal = "";
+    this.ownDuration = 10;
+    this.shown = "";
+    document.addEventListener("click", (event) => {
+      const button = event.target.closest?.("button[data-signal]");
+      if (button) this.open(button.dataset.signal);
+    });
+    $("signal-confirm").addEventListener("click", () => {
+      this.send({ type: "signal", node: this.node, signal: this.signal });
+      $("signal-dialog").close();
+    });
+    $("signal-cancel").addEventListener("click", () => $("signal-dialog").close());
+    $("fault").addEventListener("change", () => this.describe());
+    $("fault-permanent").addEventListener("change", () => this.describe());
+    $("inject").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.inject();
+    });
+  }
+
+  introduced(message) {
+    this.signals = message.signals;
+    this.ownDuration = message.duration_s;
+    this.known = new Map(message.faults.map((fault) => [fault.name, fault]));
+    const groups = new Map();
+    for (const fault of message.faults) {
+      if (!groups.has(fault.group)) groups.set(fault.group, []);
+      groups.get(fault.group).push([fault.name, fault.name]);
+    }
+    const choices = [...groups].map(([group, options]) => this.group(GROUPS[group] || group, options));
+    choices.push(this.group("Any topic", message.modes.map((mode) => [`${mode}:`, `${mode} a topic`])));
+    const before = $("fault").value;
+    $("fault").replaceChildren(...choices);
+    if (before) $("fault").value = before;
+    $("fault-topic").replaceChildren(...message.topics.map((key) => new Option(key, key)));
+    this.describe();
+  }
+
+  group(label, options) {
+    const made = element("optgroup");
+    made.label = label;
+    made.append(...options.map(([value, text]) => new Option(text, value)));
+    return made;
+  }
+
+  describe() {
+    const chosen = $("fault").value;
+    const mode = chosen.endsWith(":") ? chosen.slice(0, -1) : "";
+    const fault = this.known.get(chosen);
+    $("fault-topic").parentElement.hidden = !mode;
+    $("fault-duration").placeholder = fault ? fault.duration_s : this.ownDuration;
+    $("fault-duration").disabled = $("fault-permanent").checked;
+    say($("fault-title"), fault ? fault.title : WAYS[mode] || "");
+  }
+
+  inject() {
+    const chosen = $("fault").value;
+    const wish = { type: "inject", fault: chosen.endsWith(":") ? chosen + $("fault-topic").value : chosen };
+    const delay = $("fault-delay").valueAsNumber;
+    const duration = $("fault-duration").valueAsNumber;
+    if (Number.isFinite(delay)) wish.delay_s = delay;
+    if ($("fault-permanent").checked) wish.permanent = true;
+    else if (Number.isFinite(duration)) wish.duration_s = duration;
+    this.send(wish);
+  }
+
+  open(node) {
+    this.node = node;
+    this.choose("");
+    say($("signal-node"), node);
+    $("signals").replaceChildren(...(this.signals || []).map((name) => {
+      const button = element("button", "", name);
+      button.type = "button";
+      button.title = SIGNALS[name] || "";
+      button.addEventListener("click", () => this.choose(name));
+      return button;
+    }));
+    $("signal-dialog").showModal();
+  }
+
+  /** A signal cannot be taken back, so it is chosen first and sent by a second button. */
+  choose(name) {
+    this.signal = name;
+    for (const button of $("signals").children) {
+      button.setAttribute("aria-pressed", String(button.textContent === name));
+    }
+    say($("signal-what"), name ? SIGNALS[name] || "" : "Choose a signal.");
+    $("signal-confirm").hidden = !name;
+    $("signal-confirm").textContent = `Send ${name} to ${this.node}`;
+    if (name) $("signal-confirm").focus();
+  }
+
+  show(operating) {
+    const text = JSON.stringify(operating.faults);
+    if (text === this.shown) return;
+    this.shown = text;
+    $("faults").replaceChildren(...operating.faults.map((fault) => {
+      const line = element("li");
+      const kind = fault.ended && !fault.effective ? "fault" : "";
+      line.append(element("p", kind, `${fault.fault}: ${fault.state}`));
+      if (!fault.ended) {
+        const button = element("button", "small", "End");
+        button.type = "button";
+        button.setAttribute("aria-label", `End ${fault.fault}`);
+        button.addEventListener("click", () => this.send({ type: "end-fault", injection: fault.injection }));
+        line.append(button);
+      }
+      return line;
+    }));
+  }
+}

@@ -1,0 +1,169 @@
+// The fault tree with its mechanisms as barriers, and the order of the recoveries. The layout comes
+// from the HMI; here it is drawn once, and lit as detections come and go. Nothing is said by colour
+// alone: what is lit is also framed and has a word beside it.
+
+import { svg, say } from "./dom.js";
+
+const LINE = 14;
+const STEM = 78;  // as in hmi_system.py: the line on which a barrier stands
+const PAD = 10;
+const path = (points) => `M${points.map(([x, y]) => `${x} ${y}`).join("L")}`;
+
+function box(shape, parent, className) {
+  const group = svg("g", { class: className }, parent);
+  svg("rect", { class: "box", x: shape.x, y: shape.y, width: shape.width, height: shape.height, rx: 4 }, group);
+  const first = shape.y + shape.height / 2 - LINE * shape.lines.length / 2 + 11;
+  shape.lines.forEach((line, i) => svg("text", { x: shape.x + shape.width / 2, y: first + LINE * i }, group, line));
+  return group;
+}
+
+function begin(canvas, drawing) {
+  canvas.replaceChildren();
+  const [width, height] = [drawing.width + 2 * PAD, drawing.height + 2 * PAD];
+  canvas.setAttribute("viewBox", `${-PAD} ${-PAD} ${width} ${height}`);
+  canvas.style.setProperty("--natural", `${Math.round(width)}px`);
+  svg("title", {}, canvas, drawing.title);
+  svg("desc", {}, canvas, drawing.words);
+}
+
+export class FaultTree {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.events = new Map();
+    this.lines = [];
+    this.lit = new Set();
+  }
+
+  begin(drawing) {
+    this.events.clear();
+    this.lines = [];
+    this.canvas.replaceChildren();
+    if (!drawing) return;
+    begin(this.canvas, drawing);
+    const under = svg("g", {}, this.canvas);
+    const arriving = new Map();
+    for (const line of drawing.lines) {
+      this.lines.push({ ...line, drawn: svg("path", { class: "line", d: path(line.points) }, under) });
+      const end = line.points[line.points.length - 1];
+      arriving.set(line.lower, [...(arriving.get(line.lower) || []), end]);
+    }
+    for (const ends of arriving.values()) {  // all inputs of the same box
+      if (ends.length > 1) svg("path", { class: "line", d: path(ends) }, under);
+    }
+    for (const shape of drawing.boxes) this.addEvent(shape, arriving.has(shape.name));
+  }
+
+  addEvent(shape, below) {
+    const group = svg("g", { class: "event" }, this.canvas);
+    const middle = shape.y + shape.height / 2;
+    const right = shape.x + shape.width;
+    if (below || shape.mechanism) svg("path", { class: "line stem", d: `M${shape.x - (shape.mechanism ? STEM : below ? STEM : 0)} ${middle}H${shape.x}` }, group);
+    box(shape, group, shape.gate ? "" : "basic");
+    if (shape.gate) this.addGate(shape.gate, right, middle, group);
+    else svg("circle", { class: "gate", cx: right, cy: middle, r: 5 }, group);
+    const title = svg("title", {}, group);
+    const tag = svg("text", { class: "tag", x: shape.x + shape.width / 2, y: shape.y - 3 }, group);
+    let barrier = null;
+    if (shape.mechanism) {
+      const x = shape.x - STEM / 2;
+      barrier = svg("g", { class: "barrier" }, group);
+      svg("path", { class: "bar", d: `M${x - 4} ${middle - 11}v22M${x + 4} ${middle - 11}v22` }, barrier);
+      svg("text", { class: "ftm", x, y: middle - 15 }, barrier, shape.mechanism);
+      const short = `${shape.detect} → ${shape.recover}`;
+      svg("text", { class: "modules", x, y: middle + 22 }, barrier, short.length > 14 ? `${short.slice(0, 13)}…` : short);
+    }
+    this.events.set(shape.name, { shape, group, title, tag, barrier });
+  }
+
+  addGate(qualifier, x, y, group) {
+    const left = x + 6;
+    svg("path", { class: "line", d: `M${x} ${y}h6M${left + 20} ${y}h8` }, group);
+    const d = qualifier === "&"
+      ? `M${left + 22} ${y - 11}H${left + 11}A11 11 0 0 0 ${left + 11} ${y + 11}H${left + 22}Z`
+      : `M${left + 24} ${y - 11}Q${left + 8} ${y - 11} ${left} ${y}Q${left + 8} ${y + 11} ${left + 24} ${y + 11}Q${left + 18} ${y} ${left + 24} ${y - 11}Z`;
+    svg("path", { class: "gate", d }, group);
+    svg("text", { class: "qualifier", x: left + 13, y: y + 3.5 }, group, qualifier);
+  }
+
+  /** Where the tree is wider than its room, bring what has just been lit into view. */
+  reveal(shape) {
+    const room = this.canvas.parentElement;
+    const scale = this.canvas.clientWidth / this.canvas.viewBox.baseVal.width;
+    const [left, right] = [(shape.x - STEM) * scale, (shape.x + shape.width) * scale];
+    if (left < room.scrollLeft || right > room.scrollLeft + room.clientWidth) {
+      room.scrollLeft = right - room.clientWidth + PAD;
+    }
+  }
+
+  /** Light what is detected, how it would go on, and the barrier that stands in its way. */
+  show(manager, detections) {
+    const status = manager ? manager.value : { active: [], activated: [], latched: [], silent: [] };
+    const stale = !manager || manager.stale;
+    const reasons = new Map((detections || []).map((d) => [d.name, d]));
+    const occurred = new Set();
+    const led = new Set();
+    const words = [];
+    for (const { shape } of this.events.values()) {
+      if (!status.active.includes(shape.mechanism)) continue;
+      occurred.add(shape.name);
+      for (const upper of shape.way) led.add(upper);
+    }
+    for (const { shape, group, title, tag, barrier } of this.events.values()) {
+      const lit = occurred.has(shape.name);
+      const ahead = led.has(shape.name) && !lit;
+      const silent = shape.detections.some((name) => status.silent.includes(name));
+      const running = shape.recoveries.filter((name) => status.activated.includes(name));
+      const detected = shape.detections.filter((name) => reasons.get(name)?.active);
+      group.setAttribute("class", ["event", lit && "active", ahead && "ahead", silent && "silent",
+        lit && running.length && "acting"].filter(Boolean).join(" "));
+      say(tag, lit ? (running.length ? `detected · ${running.join(" + ")} runs` : "detected")
+        : silent ? "module silent" : ahead && shape.mechanism ? "next barrier" : "");
+      const why = detected.map((name) => `${name}: ${reasons.get(name).reason}`).join("; ");
+      say(title, [shape.title, barrier && `${shape.mechanism}(${shape.detect}, ${shape.recover})`, tag.textContent, why]
+        .filter(Boolean).join(" – "));
+      if (lit && !this.lit.has(shape.name)) this.reveal(shape);
+      if (lit) words.push(`${shape.mechanism}, ${shape.title}: ${tag.textContent}${why ? ` (${why})` : ""}`);
+    }
+    this.lit = occurred;
+    for (const line of this.lines) {
+      const on = led.has(line.upper) && (occurred.has(line.lower) || (led.has(line.lower) && !this.events.get(line.lower).shape.mechanism));
+      line.drawn.classList.toggle("lit", on);
+    }
+    this.canvas.classList.toggle("stale", stale);
+    return stale ? "The manager is not heard: what is lit may be old."
+      : words.length ? `Detected: ${words.join(". ")}.` : "Nothing is detected.";
+  }
+}
+
+export class Order {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.recoveries = new Map();
+  }
+
+  begin(drawing) {
+    this.recoveries.clear();
+    this.canvas.replaceChildren();
+    if (!drawing) return;
+    begin(this.canvas, drawing);
+    for (const line of drawing.lines) svg("path", { class: "line", d: path(line.points) }, this.canvas);
+    for (const shape of drawing.boxes) {
+      const group = box(shape, this.canvas, "recovery");
+      const title = svg("title", {}, group);
+      const tag = svg("text", { class: "tag", x: shape.x + shape.width - 6, y: shape.y + 11 }, group);
+      this.recoveries.set(shape.name, { shape, group, title, tag });
+    }
+  }
+
+  show(manager) {
+    const status = manager ? manager.value : { activated: [], latched: [] };
+    for (const [name, { shape, group, title, tag }] of this.recoveries) {
+      const latched = status.latched.includes(name);
+      const running = status.activated.includes(name);
+      group.setAttribute("class", `recovery ${latched ? "latched" : running ? "running" : ""}`);
+      say(tag, latched ? "latched" : running ? "active" : "");
+      say(title, `${name}, ${shape.title}${tag.textContent ? `: ${tag.textContent}` : ""}`);
+    }
+    this.canvas.classList.toggle("stale", !manager || manager.stale);
+  }
+}

@@ -1,0 +1,223 @@
+"""Writes a recording: MCAP, one channel per key, and one per view (see `views`).
+
+`log_time` is the simulated time of sending, in nanoseconds from `time_zero_s`, which is in the
+metadata: 0 or, if the recording began before simulated time 0, a whole negative number of seconds.
+`publish_time` is the message's stamp on the same scale, or `log_time` if the stamp is none.
+
+What was written before the last `flush` survives this process's SIGKILL: chunks are closed and
+handed to the kernel. A file without its end is still a recording, for `bag_reader` and for other
+readers of MCAP alike.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mcap.writer import CompressionType, Writer
+
+from actors.recording import foxglove as fg
+from actors.recording.json_schema import plain_schema
+from actors.recording.message_form import MessageForm, Recorded, form_of
+from actors.recording.run_documents import Documents
+from actors.recording.sequence_gaps import SequenceGaps
+from actors.recording.views import CHANNELS, View, Views, encode
+from actors.runtime.topic import ROOT
+
+PROFILE = "rampart"
+RUN = "rampart.run"
+END = "rampart.end"
+"""Names of the metadata records: what was run, and what came of the recording."""
+
+KEY = "key"
+"""Channel metadata that only channels of the bus have: the full key."""
+
+_MAX_NS = (1 << 64) - 1
+_Entry = tuple[int, MessageForm]
+
+
+class BagError(Exception):
+    """A recording cannot be written or read; the text is one line for the user."""
+
+
+def check_target(path: Path, *, overwrite: bool) -> None:
+    """Make sure, before anything is started, that a recording can be made at a path.
+
+    Raises:
+        BagError: it exists, or there is no place for it.
+    """
+    open_target(path, overwrite=overwrite, probe=True).close()
+
+
+def open_target(path: Path, *, overwrite: bool, probe: bool = False) -> BinaryIO:
+    """Open the file of a new recording; one that is only probed for is not left behind.
+
+    Raises:
+        BagError: it exists, or cannot be made.
+    """
+    existed = path.exists()
+    if existed and not overwrite:
+        raise BagError(f"{path}: exists already; choose another name, or --overwrite")
+    try:
+        file = path.open("ab" if probe else "wb" if overwrite else "xb")
+        if probe and not existed:
+            path.unlink()
+    except OSError as error:
+        raise BagError(f"{path}: cannot be written: {_why(error)}") from None
+    return file
+
+
+class BagWriter:
+    """One recording, from the first message to the last.
+
+    Args:
+        file: where it goes; closed at the end.
+        documents: what was run.
+        time_zero_s: simulated time at `log_time` 0.
+        begin_s: simulated time at which the recording begins; that of `time_zero_s` if None.
+        views: translation for viewers; None writes none.
+        wants: says of a full key whether it is recorded.
+        from_start: whether it begins with the first message of every node, so that a missing one
+            can be told.
+    """
+
+    def __init__(
+        self, file: BinaryIO, documents: Documents, *, time_zero_s: float = 0.0,
+        begin_s: float | None = None, views: Views | None = None,
+        wants: Callable[[str], bool] = lambda _key: True,
+        from_start: bool = False,
+    ) -> None:
+        self.messages = 0
+        self.garbage = 0
+        self.untranslated = 0
+        self.gaps = SequenceGaps(from_start=from_start)
+        self._file = file
+        self._zero_s = time_zero_s
+        self._views = views
+        self._wants = wants
+        self._last_ns = 0
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, _Entry | None] = {}
+        self._view_channels: dict[str, int] = {}
+        self._writer = Writer(file, compression=CompressionType.LZ4)
+        self._writer.start(PROFILE, f"rampart {documents.version}")
+        self._describe(documents)
+        if views is not None:
+            begin_ns = 0 if begin_s is None else self._ns(begin_s)
+            self._show(views.start(begin_ns), begin_ns)
+        self.flush()
+
+    def take(self, at_s: float, key: str, payload: bytes) -> None:
+        """Add a message.
+
+        Args:
+            at_s: simulated time of sending.
+            key: full key.
+            payload: as it was sent.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        channel = self._channels.get(key, ...)
+        if channel is ...:
+            channel = self._channels[key] = self._channel(key) if self._wants(key) else None
+        form = form_of(key) if channel is None else channel[1]
+        text, header, body = form.recorded(payload)
+        if header is not None:
+            self.gaps.hear(header)
+        if channel is None:
+            return
+        log_ns = self._ns(at_s)
+        self._last_ns = max(self._last_ns, log_ns)
+        if header is None:
+            self.garbage += 1
+            self._writer.add_message(channel[0], log_ns, text, log_ns)
+        else:
+            stamp_ns = self._ns(header.stamp) if math.isfinite(header.stamp) else log_ns
+            self._writer.add_message(
+                channel[0], log_ns, text, stamp_ns, header.sequence & 0xFFFFFFFF)
+        self.messages += 1
+        if self._views is None or header is None or form.topic is None:
+            return
+        try:
+            self._show(self._views.of(form.topic, key, header, body, log_ns), log_ns)
+        except (ValueError, TypeError, OverflowError):  # the message itself is recorded
+            self.untranslated += 1
+
+    def flush(self) -> None:
+        """Close the chunk and hand everything to the kernel, which keeps it if this process dies.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self._writer.flush()
+
+    def close(self, end: Mapping[str, str] | None = None) -> None:
+        """Write the end, with what came of the recording, and close the file.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self._writer.add_metadata(END, {
+            "messages": str(self.messages), "garbage": str(self.garbage),
+            "lost": json.dumps(self.gaps.lost(), sort_keys=True),
+            "untranslated": str(self.untranslated), **(end or {})})
+        self._writer.finish()
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is, after an error."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+
+    # -- channels -------------------------------------------------------------------------------
+
+    def _channel(self, key: str) -> _Entry:
+        form = form_of(key)
+        topic = form.topic
+        described = {KEY: key}
+        schema = 0
+        if topic is not None:
+            name = topic.type.__name__
+            schema = self._schema(f"rampart.{name}", Recorded[topic.type])  # type: ignore[name-defined]
+            described |= {"qos": topic.qos.value, "rate_hz": f"{topic.rate_hz:g}",
+                          "frame": topic.frame, "about": topic.doc}
+        number = self._writer.register_channel(
+            key.removeprefix(f"{ROOT}/"), "json", schema, described)
+        return number, form
+
+    def _schema(self, name: str, kind: Any) -> int:
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(
+                name, "jsonschema", plain_schema(kind))
+        return self._schemas[name]
+
+    def _show(self, views: list[View], log_ns: int) -> None:
+        for name, view in views:
+            number = self._view_channels.get(name)
+            if number is None:
+                kind = CHANNELS[name]
+                number = self._view_channels[name] = self._writer.register_channel(
+                    name, "json", self._schema(fg.schema_name(kind), kind))
+            self._writer.add_message(number, log_ns, encode(view), log_ns)
+
+    def _describe(self, documents: Documents) -> None:
+        self._writer.add_metadata(
+            RUN, {**documents.metadata(), "time_zero_s": f"{self._zero_s:g}"})
+        for name, media_type, data in documents.files:
+            self._writer.add_attachment(0, 0, name, media_type, data)
+
+    def _ns(self, at_s: float) -> int:
+        seconds = (at_s - self._zero_s) if math.isfinite(at_s) else 0.0
+        return min(max(0, round(seconds * 1e9)), _MAX_NS)
+
+
+def _why(error: OSError) -> str:
+    if error.errno == errno.ENOENT:
+        return "there is no such directory"
+    return error.strerror or str(error)

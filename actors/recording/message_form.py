@@ -1,0 +1,174 @@
+"""A message as a recording holds it: JSON for people and viewers, and the payload back, exactly.
+
+JSON has no NaN and no infinity, and garbage that was injected is no message at all. So whatever
+does not come back from its JSON byte for byte has its payload beside it, in base64. Whether it does
+is not guessed: it is tried, unless the message is of a kind that cannot go wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, Generic, TypeVar
+
+import msgspec
+
+from actors import topics
+from actors.runtime.envelope import Envelope, Header, decode, pack
+from actors.runtime.topic import ROOT, Topic
+
+B = TypeVar("B")
+
+FAMILY = "{name}"
+
+
+class Recorded(msgspec.Struct, Generic[B], frozen=True, omit_defaults=True):
+    """One message of a recording.
+
+    Attributes:
+        source: node that sent it; empty for garbage.
+        incarnation: life of the node, counted from 1; 0 for garbage.
+        sequence: how many-th message of that life, over all keys; 0 for garbage.
+        stamp: simulated seconds at which the content was true; null if that is no finite number.
+        body: the message; numbers that are not finite are null here. None for garbage.
+        raw: the payload as it was sent, if it cannot be made anew from the rest.
+        error: why it is no message, of garbage.
+    """
+
+    source: str
+    incarnation: int
+    sequence: int
+    stamp: float | None
+    body: B | msgspec.UnsetType = msgspec.UNSET
+    raw: bytes | msgspec.UnsetType = msgspec.UNSET
+    error: str = ""
+
+
+_encode = msgspec.json.Encoder().encode
+_raw_only = msgspec.json.Decoder(Recorded[msgspec.Raw])
+
+
+class MessageForm:
+    """The form of one topic's messages; None stands for keys that no topic has.
+
+    Args:
+        topic: the contract of the key.
+    """
+
+    def __init__(self, topic: Topic[Any] | None) -> None:
+        kind: Any = topic.type if topic else Any
+        self.topic = topic
+        self._decode = _decoder(kind)
+        self._is_plain = topic is not None and _is_plain(topic.type)
+
+    def recorded(self, payload: bytes) -> tuple[bytes, Header | None, Any]:
+        """Return JSON, header and body of a payload; for garbage the latter are None."""
+        if self.topic is None:
+            return _garbage(payload, "no topic has this key"), None, None
+        try:
+            header, body = decode(self.topic, payload)
+        except (msgspec.MsgspecError, RecursionError) as error:
+            return _garbage(payload, f"not a {self.topic.type.__name__}: {error}"), None, None
+        parts = (header.source, header.incarnation, header.sequence, header.stamp)
+        try:
+            text = _encode(Recorded(*parts, body))
+            if self._is_exact(text, parts, body, payload):
+                return text, header, body
+            return _encode(Recorded(*parts, body, payload)), header, body
+        except (TypeError, ValueError, RecursionError, OverflowError):
+            # What msgpack can say and JSON cannot, in a field that takes anything.
+            return _encode(Recorded(*parts, raw=payload)), header, body
+
+    def payload(self, text: bytes) -> bytes:
+        """Return the payload that was sent.
+
+        Raises:
+            ValueError: it is no message of a recording, or of another version of this topic.
+        """
+        if b'"raw":' in text:
+            with_raw = _raw_only.decode(text)
+            if with_raw.raw is not msgspec.UNSET:
+                return with_raw.raw
+        found = self._decode(text)
+        if found.body is msgspec.UNSET or found.stamp is None:
+            raise ValueError("neither body nor payload")
+        return pack((found.source, found.incarnation, found.sequence, found.stamp, found.body))
+
+    def _is_exact(
+        self, text: bytes, parts: tuple[str, int, int, float], body: Any, payload: bytes
+    ) -> bool:
+        """Whether the JSON gives the payload again."""
+        if self._is_plain:  # nothing but null for a number that is not finite can go wrong in JSON
+            return b"null" not in text and pack((*parts, body)) == payload
+        try:
+            return self.payload(text) == payload
+        except (ValueError, TypeError, RecursionError):
+            return False
+
+
+def renumbered(payload: bytes, lives: int, later_s: float) -> bytes:
+    """Return a payload as of a later life of its node, stamped later; garbage stays as it is.
+
+    Args:
+        payload: as it was sent.
+        lives: how many lives later.
+        later_s: simulated seconds later.
+    """
+    try:
+        message = _any_message.decode(payload)
+    except (msgspec.MsgspecError, RecursionError):
+        return payload
+    head = (message.source, message.incarnation + lives, message.sequence,
+            message.stamp + later_s)
+    return _encode_msgpack((*head, message.body))
+
+
+def header_of(payload: bytes) -> Header | None:
+    """Return the header of a payload, or None for garbage."""
+    try:
+        return _any_message.decode(payload)
+    except (msgspec.MsgspecError, RecursionError):
+        return None
+
+
+_any_message = msgspec.msgpack.Decoder(Envelope[msgspec.Raw])
+_encode_msgpack = msgspec.msgpack.Encoder().encode
+
+
+@cache
+def form_of(key: str) -> MessageForm:
+    """Return the form of the messages on a full key."""
+    return MessageForm(topic_of(key))
+
+
+def topic_of(key: str) -> Topic[Any] | None:
+    """Return the topic that a full key belongs to, or None."""
+    short = key.removeprefix(f"{ROOT}/")
+    for topic in topics.ALL:
+        if not topic.is_family:
+            if topic.key == short:
+                return topic
+            continue
+        head, tail = topic.key.split(FAMILY)
+        member = short[len(head):len(short) - len(tail)]
+        if member and "/" not in member and short == f"{head}{member}{tail}":
+            return topic
+    return None
+
+
+@cache
+def _decoder(kind: Any) -> Callable[[bytes], Recorded[Any]]:
+    return msgspec.json.Decoder(Recorded[kind]).decode
+
+
+def _garbage(payload: bytes, reason: str) -> bytes:
+    return _encode(Recorded("", 0, 0, None, raw=payload, error=reason))
+
+
+def _is_plain(kind: Any) -> bool:
+    """Whether a type leaves no choice of what may stand in a field."""
+    if kind is Any:
+        return False
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return all(_is_plain(f.type) for f in msgspec.structs.fields(kind))
+    return all(_is_plain(part) for part in getattr(kind, "__args__", ()) if part is not Ellipsis)

@@ -1,0 +1,136 @@
+"""The recorder as a process of its own: `python -m actors.recording.process ORDER`.
+
+ORDER is a JSON object (`Order`). It says "ready" on stdout when taps can find it, or "error: …" and
+ends; on stderr it says what came of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import setproctitle
+
+from actors.recording.bag_writer import BagError
+from actors.recording.recorder import Recorder
+
+_ROOT = Path(__file__).resolve().parents[2]
+_READY = "ready"
+_PR_SET_PDEATHSIG = 1
+_START_S, _END_S = 30.0, 10.0
+
+
+class Order(msgspec.Struct, frozen=True):
+    """What to record where; `launcher` is the pid of the run's launcher."""
+
+    port: int
+    path: str
+    launcher: int
+    overwrite: bool = False
+
+
+class RecorderProcess:
+    """A launcher's hold on its recorder. Use: `start`, and `end` when the run is over.
+
+    Args:
+        order: what it is told.
+    """
+
+    def __init__(self, order: Order) -> None:
+        self._order = order
+        self._process: subprocess.Popen[str] | None = None
+
+    def start(self) -> None:
+        """Start it and wait until nodes can find it.
+
+        Raises:
+            BagError: it cannot begin.
+        """
+        environment = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
+        environment["PYTHONPATH"] = os.pathsep.join(
+            [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+        self._process = subprocess.Popen(  # noqa: S603 our own interpreter and module
+            [sys.executable, "-m", "actors.recording.process",
+             msgspec.json.encode(self._order).decode()],
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, env=environment)
+        assert self._process.stdout is not None  # noqa: S101 for the type checker
+        with self._process.stdout as answers:
+            answer = answers.readline().strip()
+        if answer != _READY:
+            self._process.wait(_END_S)
+            raise BagError(answer.removeprefix("error: ") or "the recorder ended as it started")
+
+    def end(self) -> None:
+        """Have it write the end of the file. Harmless when it has ended already."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        for number in (signal.SIGCONT, signal.SIGTERM):
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(number)
+        try:
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def stop_pipe() -> int:
+    """Have SIGTERM and SIGINT readable from a file descriptor, and return it."""
+    read_end, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: None)
+    signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+    return read_end
+
+
+def record(order: Order) -> int:
+    """Record to the end of the run, and return the exit code."""
+    # Should it be stopped when the launcher dies, it must go on to see that and end.
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT, 0, 0, 0)
+    path = Path(order.path)
+    setproctitle.setproctitle(f"rampart-recorder[{order.port}/{order.launcher}] {path}")
+    stop = stop_pipe()
+    for number in (signal.SIGINT, signal.SIGHUP):  # the launcher's to handle; we see its end
+        signal.signal(number, signal.SIG_IGN)
+    recorder = Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher)
+    try:
+        recorder.open()
+    except BagError as error:
+        print(f"error: {error}", flush=True)
+        return 1
+    print(_READY, flush=True)
+    try:
+        recorder.run(stop)
+    except (BagError, ValueError, OSError) as error:
+        _say(str(error))
+        return 1
+    if recorder.writer is not None:
+        _say(told(recorder))
+    return 0
+
+
+def told(recorder: Recorder) -> str:
+    """Return one line on what came of a recording."""
+    writer = recorder.writer
+    if writer is None:
+        return f"{recorder.path}: nothing was recorded"
+    lost = sum(writer.gaps.lost().values())
+    parts = [f"{writer.messages} messages in {recorder.path}",
+             *([f"{writer.garbage} of them garbage"] if writer.garbage else []),
+             f"{lost} lost" if lost else "none lost"]
+    return "recorded " + ", ".join(parts)
+
+
+def _say(text: str) -> None:
+    print("rampart: " + " ".join(text.split()), file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(record(msgspec.json.decode(sys.argv[1], type=Order)))

@@ -1,0 +1,274 @@
+"""The recorder: takes what the taps hand over, and writes it down.
+
+It is a process of its own, and neither a node nor on the bus: whatever becomes of it, nobody waits
+for it, and the robot drives on. It sleeps most of the time: some twenty times a second it empties
+all sockets at once, puts what it found into order by time of sending, and writes; every 0.8 s it
+hands the file to the kernel. It ends when it is told to, or when the launcher of the run has ended,
+however that ended; then it takes what is still in the sockets and closes the file in order.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import math
+import os
+import select
+import selectors
+import socket
+import time
+from collections.abc import Callable, Iterable
+from operator import itemgetter
+from pathlib import Path
+
+from actors.recording.bag_writer import BagError, BagWriter, open_target
+from actors.recording.run_documents import Documents, collect, restore
+from actors.recording.views import Views
+from actors.runtime import tap
+from actors.supervision.run_info import RunInfo, ask
+from airport.formats import load_airport
+from airport.model import Airport
+
+PERIOD_S = 0.05
+"""Real seconds between two looks into the sockets."""
+
+FLUSH_S = 0.8
+"""Real seconds between two hand-overs of the file to the kernel: so much a crash may lose."""
+
+LAST_S = 2.0
+"""Real seconds that nodes have to end after their launcher, while their sockets are still read."""
+
+_ASK_S = 0.2
+_WAITING_FRAMES = 500_000
+
+Frame = tuple[float, str, bytes]
+
+
+class Recorder:
+    """One recording of one run. Use: `open`, then `run`, once.
+
+    Args:
+        port: base port of the run.
+        path: of the file, which must not exist.
+        overwrite: it may.
+        wants: says of a full key whether it is recorded.
+        launcher: pid of the run's launcher if it is about to start; None joins the run there is.
+    """
+
+    def __init__(self, port: int, path: Path, *, overwrite: bool = False,
+                 wants: Callable[[str], bool] = lambda _key: True,
+                 launcher: int | None = None) -> None:
+        self.path = path
+        self.writer: BagWriter | None = None
+        self._port = port
+        self._overwrite = overwrite
+        self._wants = wants
+        self._launcher = launcher
+        self._from_start = launcher is not None
+        self._listener: socket.socket | None = None
+        self._sockets = selectors.DefaultSelector()
+        self._buffer = bytearray(tap.MAX_FRAME_BYTES)
+        self._info: RunInfo | None = None
+        self._waiting: list[Frame] = []
+        self._next_ask_s = 0.0
+        self._next_flush_s = 0.0
+
+    def open(self) -> None:
+        """Take the place where taps look for a recorder.
+
+        Raises:
+            BagError: the run is being recorded already.
+        """
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        try:
+            listener.bind(tap.address(self._port))
+        except OSError:
+            listener.close()
+            raise BagError(f"the run on port {self._port} is being recorded already") from None
+        listener.listen(256)
+        self._listener = listener
+
+    def run(self, stop: int, duration_s: float | None = None) -> str:
+        """Record until a byte can be read from `stop`, or the run or its time is over; say why.
+
+        Args:
+            stop: file descriptor.
+            duration_s: real seconds.
+
+        Raises:
+            BagError: the file cannot be written (any more); what is in it stays.
+        """
+        poller = select.poll()
+        poller.register(stop, select.POLLIN)
+        pidfd = -1
+        begun_s = time.monotonic()
+        why = ""
+        try:
+            while not why:
+                if pidfd < 0 and self._launcher is not None:
+                    pidfd = _pidfd(self._launcher)
+                    if pidfd < 0:
+                        why = "the run has ended"
+                        break
+                    poller.register(pidfd, select.POLLIN)
+                ready = {fd for fd, _ in poller.poll(1000 * self._period_s())}
+                if pidfd in ready:
+                    why = "the run has ended"
+                elif stop in ready:
+                    why = "it was told to"
+                elif duration_s is not None and time.monotonic() - begun_s >= duration_s:
+                    why = f"its {duration_s:g} s are over"
+                self._turn()
+            self._finish(why, run_is_over=pidfd in ready)
+        finally:
+            if pidfd >= 0:
+                os.close(pidfd)
+            self.close()
+        return why
+
+    def close(self) -> None:
+        """Let go of all sockets, and of the file as it is."""
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+        for key in list(self._sockets.get_map().values()):
+            self._drop(key.fileobj)  # type: ignore[arg-type]
+        self._sockets.close()
+        if self.writer is not None:
+            self.writer.abandon()
+
+    # -- one turn -------------------------------------------------------------------------------
+
+    def _turn(self) -> None:
+        frames = self._gather()
+        if self.writer is None:
+            self._waiting += frames[:max(0, _WAITING_FRAMES - len(self._waiting))]
+            if not self._find_run():
+                return
+            frames, self._waiting = self._waiting, []
+        self._write(frames)
+
+    def _write(self, frames: Iterable[Frame]) -> None:
+        writer, info = self.writer, self._info
+        if writer is None or info is None:
+            return
+        try:
+            for at_s, key, payload in sorted(frames, key=itemgetter(0)):
+                writer.take((at_s - info.origin_s) * info.rate, key, payload)
+            now_s = time.monotonic()
+            if now_s >= self._next_flush_s:
+                self._next_flush_s = now_s + FLUSH_S
+                writer.flush()
+        except OSError as error:
+            self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        written = self.writer.messages if self.writer else 0
+        raise BagError(f"{self.path}: {error.strerror or error}: the recording ends after "
+                       f"{written} messages, the robot goes on") from None
+
+    def _finish(self, why: str, *, run_is_over: bool) -> None:
+        deadline = time.monotonic() + LAST_S
+        while run_is_over and self._sockets.get_map() and time.monotonic() < deadline:
+            time.sleep(self._period_s())
+            self._turn()
+        self._turn()
+        if self.writer is None:
+            return
+        try:
+            self.writer.close({"ended": why, "stopped": _wall()})
+        except OSError as error:
+            self._give_up(error)
+
+    def _period_s(self) -> float:
+        """Return how long to sleep: at a high rate the sockets fill sooner."""
+        return min(PERIOD_S, 0.4 / self._info.rate) if self._info else PERIOD_S
+
+    # -- the run --------------------------------------------------------------------------------
+
+    def _find_run(self) -> bool:
+        """Whether it is known what runs; then the file is begun."""
+        now_s = time.monotonic()
+        if now_s < self._next_ask_s:
+            return False
+        self._next_ask_s = now_s + _ASK_S
+        info = ask(self._port)
+        if info is None or self._launcher not in {None, info.pid}:
+            return False
+        self._info, self._launcher = info, info.pid
+        documents = describe(info)
+        begin_s = (min((f[0] for f in self._waiting), default=now_s) - info.origin_s) * info.rate
+        zero_s = min(0.0, float(math.floor(begin_s)))
+        file = open_target(self.path, overwrite=self._overwrite)
+        try:
+            self.writer = BagWriter(
+                file, documents, time_zero_s=zero_s, begin_s=begin_s,
+                views=Views(airport_of(documents)), wants=self._wants,
+                from_start=self._from_start)
+        except OSError as error:
+            self._give_up(error)
+        return True
+
+    # -- sockets --------------------------------------------------------------------------------
+
+    def _gather(self) -> list[Frame]:
+        """Return all that was handed over since the last time."""
+        self._accept()
+        frames: list[Frame] = []
+        for key, _ in self._sockets.select(0):
+            connection: socket.socket = key.fileobj  # type: ignore[assignment]
+            try:
+                while (size := connection.recv_into(self._buffer)) > 0:
+                    with contextlib.suppress(ValueError):  # not from a tap
+                        frames.append(tap.parse_frame(memoryview(self._buffer)[:size]))
+            except BlockingIOError:
+                continue
+            except OSError:
+                pass
+            self._drop(connection)
+        return frames
+
+    def _accept(self) -> None:
+        while self._listener is not None:
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            connection.setblocking(False)
+            if tap.is_same_user(connection):
+                self._sockets.register(connection, selectors.EVENT_READ)
+            else:
+                connection.close()
+
+    def _drop(self, connection: socket.socket) -> None:
+        self._sockets.unregister(connection)
+        connection.close()
+
+
+def describe(info: RunInfo) -> Documents:
+    """Return what a recording keeps of a run."""
+    return collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
+                   nodes=tuple(info.nodes), started=_wall())
+
+
+def airport_of(documents: Documents) -> Airport | None:
+    """Return the airport that was recorded, or None if there is none or it cannot be read."""
+    import tempfile  # noqa: PLC0415 once a recording
+
+    with tempfile.TemporaryDirectory() as directory:
+        path = restore(documents.files, Path(directory))
+        try:
+            return load_airport(path) if path else None
+        except (ValueError, OSError):
+            return None
+
+
+def _pidfd(pid: int) -> int:
+    try:
+        return os.pidfd_open(pid)
+    except OSError:
+        return -1
+
+
+def _wall() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")

@@ -1,0 +1,45 @@
+"""Counts what a recording has missed: each node numbers what it sends, without gaps. Pure."""
+
+from __future__ import annotations
+
+from actors.runtime.envelope import Header
+
+
+class SequenceGaps:
+    """Numbers heard, life by life.
+
+    Args:
+        from_start: whether every node is heard from its first message on; else only lives that
+            begin later are.
+    """
+
+    def __init__(self, *, from_start: bool = False) -> None:
+        self._from_start = from_start
+        self._first_life: dict[str, int] = {}
+        self._last: dict[tuple[str, int], int] = {}
+        self._lost: dict[str, int] = {}
+
+    def hear(self, header: Header) -> None:
+        """Note one message; copies have the same number."""
+        life = (header.source, header.incarnation)
+        last = self._last.get(life)
+        if last is None:
+            first_life = self._first_life.setdefault(header.source, header.incarnation)
+            new = self._from_start or header.incarnation > first_life
+            last = 0 if new else header.sequence - 1
+        if header.sequence > last + 1:
+            self._lost[header.source] = (
+                self._lost.get(header.source, 0) + header.sequence - last - 1)
+        self._last[life] = max(last, header.sequence)
+
+    def lost(self) -> dict[str, int]:
+        """Return source → messages that were sent and not recorded."""
+        return dict(self._lost)
+
+    @property
+    def heard(self) -> dict[str, int]:
+        """Source → messages that were numbered, over all lives heard."""
+        found: dict[str, int] = {}
+        for (source, _), last in self._last.items():
+            found[source] = found.get(source, 0) + last
+        return found

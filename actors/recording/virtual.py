@@ -1,0 +1,75 @@
+"""The recording of a run in virtual time, in the same process: the same run, the same file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from actors.recording.bag_writer import BagError, BagWriter, open_target
+from actors.recording.recorder import airport_of
+from actors.recording.run_documents import collect
+from actors.recording.views import Views
+
+FLUSH_S = 10.0
+"""Simulated seconds between two hand-overs of the file: some tenths of a real one."""
+
+LEAD_S = 1.0
+"""Simulated seconds before simulated time 0 in which a virtual run starts."""
+
+
+class VirtualRecording:
+    """One recording. Use: `take` for each message, then `close`.
+
+    When the file cannot be written any more, the recording ends and the run goes on.
+
+    Args:
+        path: of the file.
+        plan: what is run (`RunPlan.description`).
+        title: for people.
+        overwrite: the file may exist.
+
+    Raises:
+        BagError: the file cannot be made.
+    """
+
+    def __init__(self, path: Path, plan: Mapping[str, Any], title: str, *, overwrite: bool) -> None:
+        self._path = path
+        self._failed = ""
+        self._next_flush_s = 0.0
+        documents = collect(plan, run_id=f"virtual-{plan.get('seed')}", title=title, rate=1.0,
+                            nodes=(), started="")
+        file = open_target(path, overwrite=overwrite)
+        try:
+            self._writer = BagWriter(
+                file, documents, time_zero_s=-LEAD_S, views=Views(airport_of(documents)),
+                from_start=True)
+        except OSError as error:
+            file.close()
+            raise BagError(f"{path}: {error.strerror or error}") from None
+
+    def take(self, at_s: float, key: str, payload: bytes) -> None:
+        """Write a message down, sent at a simulated time."""
+        if self._failed:
+            return
+        try:
+            self._writer.take(at_s, key, payload)
+            if at_s >= self._next_flush_s:
+                self._next_flush_s = at_s + FLUSH_S
+                self._writer.flush()
+        except OSError as error:
+            self._fail(error)
+
+    def close(self) -> str:
+        """Write the end of the file, and return one line on what came of it."""
+        if not self._failed:
+            try:
+                self._writer.close({"ended": "the run has ended"})
+            except OSError as error:
+                self._fail(error)
+        return self._failed or f"recorded {self._writer.messages} messages in {self._path}"
+
+    def _fail(self, error: OSError) -> None:
+        self._writer.abandon()
+        self._failed = (f"{self._path}: {error.strerror or error}: the recording ends after "
+                        f"{self._writer.messages} messages")

@@ -1,0 +1,161 @@
+"""An HMI in a small world: a hub in this process, and `Others` that stands for the rest."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+from contextlib import asynccontextmanager
+
+from actors import messages as m
+from actors import topics
+from actors.operator.hmi import Hmi
+from actors.runtime.actor import Actor, Context, Header, on
+from actors.runtime.clock import Clock
+from actors.runtime.virtual_bus import Hub, VirtualBus
+from airport.formats import load_airport
+
+AIRPORT = load_airport("vallombre")
+RATE = 20.0
+
+
+class Others(Actor):
+    """Stands for the rest of the system."""
+
+    outputs = (topics.MISSION_STATUS, topics.MANAGER_STATUS, topics.POSE, topics.DETECTION,
+               topics.MISSION_ORDER_ANSWER, topics.PILOT_STATUS, topics.NODES,
+               topics.BASE_STATUS, topics.ADAPTATION, topics.INJECTION_RESULT)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.requests: list[m.MissionRequest] = []
+        self.resets: list[m.Reset] = []
+        self.orders: list[m.MissionOrder] = []
+        self.diagnostics: list[m.Diagnostic] = []
+        self.stick: list[m.Joystick] = []
+        self.adaptations: list[m.AdaptationRequest] = []
+        self.injections: list[m.Injection] = []
+        self.actuator_faults: list[m.ActuatorFault] = []
+
+    @on(topics.MISSION_REQUEST)
+    def request(self, message: m.MissionRequest, _header: Header) -> None:
+        self.requests.append(message)
+
+    @on(topics.RESET)
+    def reset(self, message: m.Reset, _header: Header) -> None:
+        self.resets.append(message)
+
+    @on(topics.MISSION_ORDER)
+    def order(self, message: m.MissionOrder, _header: Header) -> None:
+        self.orders.append(message)
+
+    @on(topics.JOYSTICK)
+    def joystick(self, message: m.Joystick, _header: Header) -> None:
+        self.stick.append(message)
+
+    @on(topics.ADAPT)
+    def adapt(self, message: m.AdaptationRequest, _header: Header) -> None:
+        self.adaptations.append(message)
+
+    @on(topics.INJECTION_REQUEST)
+    def injection(self, message: m.Injection, _header: Header) -> None:
+        self.injections.append(message)
+
+    @on(topics.ACTUATOR_FAULT)
+    def actuator_fault(self, message: m.ActuatorFault, _header: Header) -> None:
+        self.actuator_faults.append(message)
+
+    @on(topics.DIAGNOSTIC)
+    def diagnostic(self, message: m.Diagnostic, _header: Header) -> None:
+        self.diagnostics.append(message)
+
+
+class World:
+    """A hub with `Others` on it; HMIs join and leave."""
+
+    def __init__(self) -> None:
+        loop = asyncio.get_running_loop()
+        self.hub = Hub()
+        self.clock = Clock(loop.time(), RATE, loop.time)
+        self.others = Others(self.context("others", 1))
+
+    def context(self, name: str, incarnation: int, **shared: object) -> Context:
+        return Context(name, incarnation, self.clock, VirtualBus(self.hub, name, incarnation),
+                       {}, {"airport": AIRPORT, "run_id": "r1", **shared})
+
+    @asynccontextmanager
+    async def running(self, actor: Actor):
+        task = asyncio.create_task(actor.run())
+        for _ in range(20):
+            await asyncio.sleep(0)
+        try:
+            yield actor
+        finally:
+            actor.stop()
+            await asyncio.wait_for(task, 5)
+
+    @asynccontextmanager
+    async def hmi(self, incarnation: int = 1, **shared: object):
+        async with self.running(Hmi(self.context("hmi", incarnation, **shared))) as hmi:
+            yield hmi
+
+    def say_running(self, request: m.MissionRequest) -> None:
+        self.others.publish(topics.MISSION_STATUS, m.MissionStatus(
+            request.mission_id, request.name, m.MissionPhase.RUNNING, 0, request.goals, (), (), ""))
+
+    def say(self, phase: m.MissionPhase, *possible: m.MissionAction) -> None:
+        goals = tuple(m.Goal(g.x_m, g.y_m, m.Mode(g.mode)) for g in AIRPORT.mission("A").goals)
+        self.others.publish(topics.MISSION_STATUS, m.MissionStatus(
+            "r1/first", "A", phase, 0, goals, (), (), "", orders=possible))
+
+    def say_latched(self, *names: str) -> None:
+        self.others.publish(topics.MANAGER_STATUS, m.ManagerStatus(
+            (), (), names, names, "safety-first", 1))
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
+
+
+async def eventually(condition, timeout_s: float = 5.0) -> None:
+    deadline = asyncio.get_running_loop().time() + timeout_s
+    while not condition():
+        assert asyncio.get_running_loop().time() < deadline, "it did not happen in time"
+        await asyncio.sleep(0.005)
+
+
+@asynccontextmanager
+async def repeated(say, period_s: float = 0.02):
+    """Have something said again and again, as living nodes do."""
+    async def again() -> None:
+        while True:
+            say()
+            await asyncio.sleep(period_s)
+
+    task = asyncio.create_task(again())
+    try:
+        yield
+    finally:
+        task.cancel()
+
+
+async def served(hmi: Hmi) -> str:
+    await eventually(lambda: hmi._starting is not None and hmi._starting.done())
+    return f"127.0.0.1:{hmi.page_port}"
+
+
+async def hear(page, kind: str) -> dict:
+    """Return the next message of a kind; of a state, all that the page knows by then."""
+    async with asyncio.timeout(5):
+        while True:
+            message = json.loads(await page.recv())
+            if message["type"] == "state":
+                known = page.__dict__.setdefault("picture", {})
+                for log in ("decisions", "events"):
+                    message[log] = [*known.get(log, ()), *message.get(log, ())]
+                known |= message
+                message = dict(known)
+            if message["type"] == kind:
+                return message

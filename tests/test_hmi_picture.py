@@ -1,0 +1,290 @@
+"""The picture that pages are shown: what changed since a version, and the push that sends it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from actors import messages as m
+from actors.operator import hmi_feed
+from actors.operator.hmi_feed import Feed
+from actors.operator.hmi_laser import POINTS, thin
+from actors.operator.hmi_picture import JOURNAL_LINES, Picture
+from actors.operator.hmi_state import STALE_S, HmiState
+
+
+def as_json(value: object) -> dict:
+    return json.loads(msgspec.json.encode(value))
+
+
+class FakePage:
+    """Keeps a picture from frames, as the page's script does."""
+
+    def __init__(self) -> None:
+        self.known: dict = {}
+
+    def take(self, text: str) -> dict:
+        frame = json.loads(text)
+        for log in ("decisions", "events"):
+            if log in frame:
+                frame[log] = [*self.known.get(log, ()), *frame[log]][-JOURNAL_LINES:]
+        self.known |= frame
+        return self.known
+
+
+def test_only_what_changed_since_a_version_is_sent():
+    picture = Picture()
+    picture.section("pose")
+    picture.section("pilot")
+    picture.put("pilot", "auto")
+    seen = picture.version
+    assert picture.changes(seen) == {}
+    picture.put("pose", 1)
+    picture.put("pilot", "auto")
+    assert as_json(picture.changes(seen)) == {"pose": 1}
+    assert as_json(picture.changes(0)) == {"pose": 1, "pilot": "auto"}
+
+
+def test_the_same_again_is_no_change_and_tells_nobody():
+    picture = Picture()
+    picture.section("pilot")
+    told = []
+    picture.on_change = told.append
+    picture.put("pilot", m.PilotStatus(m.PilotMode.AUTO, False, "", 0))
+    picture.put("pilot", m.PilotStatus(m.PilotMode.AUTO, False, "", 0))
+    assert told == [True]
+
+
+def test_a_section_is_encoded_once_for_all_pages():
+    encoded = []
+    picture = Picture()
+    picture.section("laser", show=lambda v: encoded.append(v) or v)
+    picture.put("laser", 7)
+    for _ in range(10):
+        picture.changes(0)
+    assert encoded == [7]
+
+
+def test_of_a_journal_the_new_lines_are_sent_and_the_oldest_forgotten():
+    picture = Picture()
+    picture.journal("events")
+    for i in range(JOURNAL_LINES + 5):
+        picture.add("events", i)
+    assert as_json(picture.changes(0))["events"][0] == 5
+    seen = picture.version
+    picture.add("events", "new")
+    assert as_json(picture.changes(seen)) == {"events": ["new"]}
+
+
+@given(st.lists(st.one_of(
+    st.tuples(st.just("put"), st.sampled_from(("pose", "pilot")), st.integers(0, 3)),
+    st.tuples(st.just("log"), st.just("events"), st.integers(0, 3)),
+    st.tuples(st.just("frame"), st.just(""), st.just(0)))))
+def test_whatever_frames_a_page_missed_it_ends_up_with_the_whole_picture(steps):
+    picture, page, version = Picture(), FakePage(), 0
+    for name in ("pose", "pilot"):
+        picture.section(name)
+    picture.journal("events")
+    for what, name, value in (*steps, ("frame", "", 0)):
+        if what == "put":
+            picture.put(name, value)
+        elif what == "log":
+            picture.add(name, value)
+        else:
+            page.take(msgspec.json.encode(picture.changes(version)).decode())
+            version = picture.version
+    assert {"events": [], **page.known} == as_json(picture.all())
+
+
+def test_silence_is_shown_once_and_the_next_message_ends_it():
+    state = HmiState()
+    state.pose(m.Pose(1.0, 2.0, 0.0), 5.0, 5.0)
+    state.grow_old(5.0 + STALE_S + 0.1)
+    version = state.picture.version
+    assert state.snapshot(7.0)["pose"]["stale"] is True
+    state.grow_old(8.0)
+    assert state.picture.version == version
+    state.pose(m.Pose(1.0, 2.0, 0.0), 9.0, 9.0)
+    assert state.snapshot(9.0)["pose"]["stale"] is False
+
+
+# ---- the laser -----------------------------------------------------------------------------------
+
+
+def scan(ranges: list[float], **changed: float) -> m.LaserScan:
+    values = {"angle_min_rad": -1.0, "angle_increment_rad": 0.01, "range_max_m": 8.0} | changed
+    return m.LaserScan(**values, ranges_f32=np.array(ranges, dtype="<f4").tobytes())
+
+
+def test_an_obstacle_that_a_single_ray_has_hit_stays_in_the_thinned_sweep():
+    for hit in range(181):
+        ranges = [8.0] * 181
+        ranges[hit] = 2.5
+        thinned = thin(scan(ranges))
+        assert len(thinned["cm"]) <= POINTS
+        assert thinned["cm"].count(250) == 1
+        angle = thinned["from_rad"] + thinned["cm"].index(250) * thinned["step_rad"]
+        assert abs(angle - (-1.0 + 0.01 * hit)) < 0.0101
+
+
+def test_no_echo_is_none_of_the_ranges():
+    thinned = thin(scan([8.0, 8.0, 3.0, math.nan, -1.0, math.inf]))
+    assert thinned["cm"] == [-1, -1, 300, -1, -1, -1]
+
+
+@pytest.mark.parametrize("broken", [
+    None, scan([]), scan([1.0]), m.LaserScan(-1.0, 0.01, 8.0, b"12345"),
+    scan([1.0, 2.0], angle_min_rad=math.nan), scan([1.0, 2.0], range_max_m=0.0),
+])
+def test_a_sweep_that_makes_no_sense_is_not_drawn(broken):
+    assert thin(broken) is None
+
+
+# ---- the push ------------------------------------------------------------------------------------
+
+
+class Line:
+    """A connection to a page: what was sent, and whether it is taken."""
+
+    def __init__(self) -> None:
+        self.frames: list[dict] = []
+        self.taken = asyncio.Event()
+        self.taken.set()
+        self.arrived = asyncio.Condition()
+
+    async def send(self, text: str) -> None:
+        await self.taken.wait()
+        async with self.arrived:
+            self.frames.append(json.loads(text))
+            self.arrived.notify_all()
+
+    async def until(self, condition) -> None:
+        async with asyncio.timeout(5), self.arrived:
+            await self.arrived.wait_for(lambda: condition(self.frames))
+
+
+class Pushing:
+    """A feed with one page on it."""
+
+    def __init__(self) -> None:
+        self.state = HmiState()
+        self.looks = 0
+        self.feed = Feed(self.state, lambda: 1.0, lambda: {"type": "hello"}, self._look)
+        self.line = Line()
+
+    def _look(self) -> None:
+        self.looks += 1
+
+    async def __aenter__(self):
+        self._open = self.feed.page()
+        self.page = self._open.__enter__()
+        self.task = asyncio.create_task(self.feed.push(self.page, self.line.send))
+        return self
+
+    async def __aexit__(self, *_):
+        self.task.cancel()
+        await asyncio.wait([self.task])
+        self._open.__exit__(None, None, None)
+
+
+async def test_a_page_is_greeted_then_gets_everything_then_changes():
+    pushing = Pushing()
+    pushing.state.log(0.0, "note", "before")
+    async with pushing as p:
+        await p.line.until(lambda frames: len(frames) >= 2)
+        hello, whole = p.line.frames[:2]
+        assert hello == {"type": "hello"}
+        assert [e["text"] for e in whole["events"]] == ["before"]
+        assert set(p.state.picture.all()) <= set(whole)
+        p.state.keep("pilot", m.PilotStatus(m.PilotMode.STOP, True, "", 0), 1.0)
+        await p.line.until(lambda frames: frames[-1].get("pilot"))
+        assert set(p.line.frames[-1]) == {"type", "version", "time_s", "pilot"}
+
+
+async def test_a_page_that_answers_has_few_frames_on_the_way_and_then_the_newest():
+    async with Pushing() as p:
+        await p.line.until(lambda frames: len(frames) >= 2)
+        assert p.feed.heard(p.page, b'{"type":"seen","version":0}')
+        for i in range(30):
+            p.state.keep("pilot", m.PilotStatus(m.PilotMode.STOP, True, str(i), 0), 1.0)
+            await asyncio.sleep(hmi_feed.FRAME_GAP_S / 4)
+        on_the_way = len(p.line.frames) - 1
+        assert on_the_way <= hmi_feed.IN_FLIGHT + 1
+        version = p.line.frames[-1]["version"]
+        p.feed.heard(p.page, f'{{"type":"seen","version":{version}}}')
+        await p.line.until(lambda frames: frames[-1].get("pilot", {}).get(
+            "value", {}).get("reason") == "29")
+        assert len(p.line.frames) - 1 == on_the_way + 1
+
+
+async def test_an_answer_alone_brings_no_frame():
+    async with Pushing() as p:
+        await p.line.until(lambda frames: len(frames) >= 2)
+        await asyncio.sleep(hmi_feed.FRAME_GAP_S)
+        before = len(p.line.frames)
+        for _ in range(20):
+            p.feed.heard(p.page, f'{{"type":"seen","version":{p.state.picture.version}}}')
+            await asyncio.sleep(0)
+        assert len(p.line.frames) == before
+
+
+async def test_a_page_that_takes_nothing_is_given_up(monkeypatch):
+    monkeypatch.setattr(hmi_feed, "SEND_TIMEOUT_S", 0.05)
+    async with Pushing() as p:
+        await p.line.until(lambda frames: len(frames) >= 2)
+        p.line.taken.clear()
+        p.state.log(1.0, "note", "news")
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(asyncio.shield(p.task), 5)
+
+
+async def test_a_page_that_draws_nothing_is_given_up(monkeypatch):
+    monkeypatch.setattr(hmi_feed, "SEND_TIMEOUT_S", 0.3)
+    async with Pushing() as p:
+        await p.line.until(lambda frames: len(frames) >= 2)
+        p.feed.heard(p.page, b'{"type":"seen","version":0}')
+        for i in range(hmi_feed.IN_FLIGHT + 1):
+            p.state.log(1.0, "note", str(i))
+            await asyncio.sleep(2 * hmi_feed.FRAME_GAP_S)
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(asyncio.shield(p.task), 5)
+
+
+async def test_a_flood_of_changes_becomes_few_frames():
+    async with Pushing() as p:
+        await p.line.until(lambda frames: len(frames) >= 2)
+        loop = asyncio.get_running_loop()
+        start, before = loop.time(), len(p.line.frames)
+        for i in range(200):
+            p.state.pose(m.Pose(float(i), 0.0, 0.0), 1.0, 1.0)
+            await asyncio.sleep(0.001)
+        most = (loop.time() - start) / hmi_feed.FRAME_GAP_S + 2
+        assert 1 < len(p.line.frames) - before <= most
+
+
+async def test_with_no_page_nothing_is_looked_at_and_no_timer_is_left():
+    pushing = Pushing()
+    async with pushing as p:
+        await p.line.until(lambda frames: len(frames) >= 2)
+    looks = pushing.looks
+    pushing.state.log(1.0, "note", "nobody listens")
+    assert pushing.feed._timer is None
+    assert pushing.feed._looker is None
+    assert pushing.looks == looks == 1
+
+
+@pytest.mark.parametrize("text", [
+    b"", b'{"type":"seen"}', b'{"type":"seen","version":}', b'{"type":"seen","version":-1}',
+    b'{"type":"seen","version":1', b'{"type":"seen","version":' + 60 * b"1" + b"}", "\ud800", None,
+    b'{"type":"seen","version":1e9}', '{"type": "reset", "recovery": "RM1"}',
+])
+def test_what_is_no_answer_is_left_to_others(text):
+    feed = Feed(HmiState(), lambda: 0.0, dict)
+    assert feed.heard(hmi_feed.PageFeed(), text) is False

@@ -1,0 +1,116 @@
+"""The operator's page on a real run: processes, Zenoh, Chromium."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hmi_browser import CHROMIUM, browser
+from real_run import RealRun
+from stub_actors import ROOT, free_base_port
+
+
+def text(name: str) -> str:
+    return f"document.getElementById('{name}').textContent"
+
+
+ROW = "document.querySelector('tr[data-node=localization]')"
+STATE = f"(({ROW}) || document.createElement('p')).textContent"
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+async def test_a_mission_is_started_from_the_page_disturbed_from_it_and_followed_to_its_report(
+        tmp_path):
+    port = free_base_port()
+    short = tmp_path / "SHORT.miss"
+    short.write_text("x=-27,y=-8,taxi=1\n")
+    with RealRun(tmp_path, "--mission", str(short), "--rate", "1", "--hmi-port", str(port),
+                 "--wait", hmi=True) as run:
+        await asyncio.to_thread(run.sleep_until, 1.0)
+        async with browser() as tab:
+            await tab.show(f"http://127.0.0.1:{port}/")
+            await tab.until(f"{text('stick-state')} === 'free'", 60)
+            assert await tab.value(f"{text('mission-phase')}") == "idle"
+            await tab.until("document.getElementById('mission-name').value === 'SHORT'")
+            await tab.value("document.getElementById('start').requestSubmit()")
+            await tab.until(f"{text('mission-phase')} === 'running'")
+
+            await tab.value("document.getElementById('stick').focus()")
+            await key(tab, "ArrowUp", down=True)
+            await tab.until(f"{text('pilot-reason')}.includes('the joystick pre-empts')")
+            await key(tab, "ArrowUp", down=False)
+            await tab.until(f"!{text('pilot-reason')}.includes('the joystick pre-empts')")
+
+            before = run.pid("localization")
+            await kill(tab, "localization")
+            await tab.until(f"{text('events')}.includes('localization respawned by RM4')")
+            assert run.pid("localization") not in (None, before)
+            await tab.until(f"{STATE}.includes('running')")
+
+            await tab.value("document.getElementById('fault').value = 'duplicate:';"
+                            "document.getElementById('fault-topic').value = 'detection/DM1';"
+                            "document.getElementById('fault-duration').value = '1';"
+                            "document.getElementById('inject').requestSubmit()")
+            await tab.until(f"/duplicate:detection.DM1: over, \\d+ messages changed/.test("
+                            f"{text('faults')})")
+
+            await tab.value("document.getElementById('strategy-name').value = 'mission-first';"
+                            "document.getElementById('strategy-set').click()")
+            await tab.until(f"{text('strategy-now')} === 'in force: mission-first'")
+
+            before = run.pid("hmi")
+            await kill(tab, "hmi")  # the page's own
+            await asyncio.to_thread(
+                run.wait_until, lambda: run.pid("hmi") not in (None, before), 20, "no other HMI")
+            await tab.until(f"{text('link')} === 'live' && {text('stick-state')} === 'free'")
+            assert await tab.value(text("strategy-now")) == "in force: mission-first"
+            await tab.until(f"{text('mission-phase')} === 'succeeded'", 120)
+        code, result = await asyncio.to_thread(run.result)
+    assert (code, result["mission"], result["safety"]) == (0, "success", "safe")
+    assert result["restarts"].keys() >= {"localization", "hmi"}
+    assert Path(result["report"]).is_file()
+
+
+async def kill(tab, node: str) -> None:
+    await tab.value(f"document.querySelector('tr[data-node={node}] button').click();"
+                    "[...document.querySelectorAll('#signals button')]"
+                    ".find((b) => b.textContent === 'KILL').click();"
+                    "document.getElementById('signal-confirm').click()")
+
+
+async def key(tab, name: str, *, down: bool) -> None:
+    await tab.call("Input.dispatchKeyEvent", type="rawKeyDown" if down else "keyUp", key=name,
+                   code=name)
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["--hmi-host", "192.0.2.1"], "--hmi-host 192.0.2.1: no address of this machine"),
+    (["--hmi-host", "0.0.0.0", "--hmi-token", "short"], "--hmi-token: token of 5 characters"),
+    (["--hmi-host", "no such host"], "--hmi-host no such host: no address of this machine"),
+])
+def test_an_address_that_cannot_be_served_is_one_clear_line(tmp_path, arguments, words):
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "launch.py"), "--report", str(tmp_path), *arguments],
+        check=False, capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "short" not in done.stderr.replace("shorter", "")
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_page_for_the_network_prints_its_token_once_and_tools_know_the_address(tmp_path):
+    port = free_base_port()
+    with RealRun(tmp_path, "--mission", "A", "--hmi-port", str(port), "--hmi-host", "0.0.0.0",
+                 hmi=True) as run:
+        run.wait_for("#token=")
+        address = next(w for w in run.story.split() if "#token=" in w)
+        assert address.startswith(f"http://127.0.0.1:{port}/#token=")
+        assert run.info.page == address
+        token = address.partition("#token=")[2]
+        titles = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True)
+        assert token not in titles.stdout
+        assert json.dumps(token) not in run.story

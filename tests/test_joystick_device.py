@@ -1,0 +1,208 @@
+"""The joystick's decoder on records, its reader on a FIFO and a pseudo-terminal."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pty
+import tty
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from actors import messages as m
+from actors.operator.joystick_device import (
+    AXIS,
+    BUTTON,
+    EVENT,
+    INITIAL,
+    ForeignDeviceError,
+    JoystickDevice,
+    StickDecoder,
+    StickMapping,
+    device_path,
+    mapping_of,
+)
+
+PLAIN = StickMapping(dead_zone=0.0)
+RELEASED = m.Joystick(0.0, 0.0, False)
+
+
+def record(kind: int, number: int, value: int) -> bytes:
+    return EVENT.pack(7, value, kind, number)
+
+
+PRESS, LET_GO = record(BUTTON, 4, 1), record(BUTTON, 4, 0)
+
+
+def position(*records: bytes, mapping: StickMapping = PLAIN) -> m.Joystick:
+    decoder = StickDecoder(mapping)
+    for one in records:
+        decoder.feed(one)
+    return decoder.stick
+
+
+def test_a_stick_pushed_forward_and_left_is_forward_and_left():
+    assert position(PRESS, record(AXIS, 1, -32767), record(AXIS, 0, -32767)) == m.Joystick(
+        1.0, 1.0, True)
+    assert position(PRESS, record(AXIS, 1, 32767), record(AXIS, 0, 32767)) == m.Joystick(
+        -1.0, -1.0, True)
+
+
+def test_the_most_negative_value_is_no_more_than_full():
+    assert position(record(AXIS, 1, -32768)).forward == 1.0
+
+
+def test_other_axes_and_buttons_mean_nothing():
+    assert position(record(AXIS, 3, 9000), record(BUTTON, 0, 1)) == RELEASED
+
+
+def test_within_the_dead_zone_nothing_moves_and_beyond_it_begins_at_zero():
+    mapping = StickMapping(dead_zone=0.5)
+
+    def forward(value: int) -> float:
+        return position(record(AXIS, 1, value), mapping=mapping).forward
+
+    assert forward(-16000) == 0.0
+    assert 0.0 < forward(-16500) < 0.01
+    assert forward(-32767) == 1.0
+
+
+def test_a_button_that_is_down_at_the_opening_is_no_press_until_it_was_let_go():
+    down = record(BUTTON | INITIAL, 4, 1)
+    assert not position(down).dead_man
+    assert position(down, LET_GO, PRESS).dead_man
+
+
+def test_a_state_told_again_after_an_overflow_neither_presses_nor_releases():
+    again = record(BUTTON | INITIAL, 4, 1)
+    assert position(PRESS, again).dead_man
+    assert not position(PRESS, record(BUTTON | INITIAL, 4, 0)).dead_man
+
+
+def test_records_may_arrive_in_pieces():
+    stream = PRESS + record(AXIS, 1, -32767) + record(AXIS, 0, 32767)
+    assert position(*(stream[i:i + 1] for i in range(len(stream)))) == m.Joystick(1.0, -1.0, True)
+
+
+@pytest.mark.parametrize("kind", [0x00, 0x03, 0x80, 0xff])
+def test_a_device_that_is_no_joystick_is_refused(kind):
+    with pytest.raises(ForeignDeviceError, match="none of a joystick's"):
+        position(PRESS, record(kind, 4, 1))
+
+
+@given(st.lists(st.tuples(
+    st.sampled_from([BUTTON, AXIS, BUTTON | INITIAL, AXIS | INITIAL]), st.integers(0, 255),
+    st.integers(-32768, 32767)), max_size=40),
+    st.floats(0.0, 0.99), st.integers(1, 50))
+def test_no_stream_of_records_leaves_the_range(records, zone, piece):
+    decoder = StickDecoder(StickMapping(dead_zone=zone))
+    stream = b"".join(record(*one) for one in records)
+    for start in range(0, len(stream), piece):
+        decoder.feed(stream[start:start + piece])
+        assert -1.0 <= decoder.stick.forward <= 1.0
+        assert -1.0 <= decoder.stick.left <= 1.0
+    released = [value for kind, number, value in records if number == 4 and kind & BUTTON]
+    assert not (decoder.stick.dead_man and (not released or released[-1] == 0))
+
+
+@pytest.mark.parametrize(("parameters", "words"), [
+    ({"dead_zone": 1.0}, "dead_zone = 1.0: must be a number from 0 to below 1"),
+    ({"dead_zone": "a"}, "dead_zone = 'a'"),
+    ({"forward_sign": 2}, "forward_sign = 2: must be 1 or -1"),
+    ({"dead_man_button": -1}, "dead_man_button = -1: must be a whole number"),
+    ({"dead_man_button": True}, "dead_man_button = True"),
+    ({"left_axis": 1}, "left_axis = 1: is the forward axis already")])
+def test_a_mapping_without_sense_is_refused_by_name_and_value(parameters, words):
+    with pytest.raises(ValueError, match=words.replace(".", r"\.")):
+        mapping_of(parameters)
+
+
+def test_a_mapping_takes_what_is_given_and_leaves_the_rest():
+    assert mapping_of({"left_axis": 3, "linear_mps": 0.4}) == StickMapping(left_axis=3)
+
+
+def test_the_first_joystick_is_the_one_with_the_lowest_number(tmp_path):
+    assert device_path("auto", tmp_path) == ""
+    for name in ("js10", "js9", "event0", "jsx"):
+        (tmp_path / name).touch()
+    assert device_path("auto", tmp_path) == str(tmp_path / "js9")
+    assert device_path("/dev/input/js3", tmp_path) == "/dev/input/js3"
+
+
+class Hand:
+    """A device and what it has told, with a way to wait for it."""
+
+    def __init__(self, path: object) -> None:
+        self.gone: list[str] = []
+        self._changed = asyncio.Event()
+        self.device = JoystickDevice(str(path), PLAIN, self._changed.set, self._vanished)
+
+    def _vanished(self, why: str) -> None:
+        self.gone.append(why)
+        self._changed.set()
+
+    async def until(self, condition):
+        async with asyncio.timeout(10):
+            while not condition():
+                self._changed.clear()
+                await self._changed.wait()
+
+
+async def test_a_fifo_is_a_joystick_that_can_be_unplugged_and_plugged_in_again(tmp_path):
+    path = tmp_path / "stick"
+    os.mkfifo(path)
+    hand = Hand(path)
+    assert hand.device.open() == ""
+    writer = os.open(path, os.O_WRONLY)
+    os.write(writer, PRESS + record(AXIS, 1, -32767))
+    await hand.until(lambda: hand.device.stick == m.Joystick(1.0, 0.0, True))
+    os.close(writer)
+    await hand.until(lambda: hand.gone == ["ended"])
+    assert hand.device.stick == RELEASED
+    assert not hand.device.is_open
+
+    assert hand.device.open() == ""
+    writer = os.open(path, os.O_WRONLY)
+    os.write(writer, record(AXIS, 1, 32767))
+    await hand.until(lambda: hand.device.stick == m.Joystick(-1.0, 0.0, False))
+    hand.device.close()
+    os.close(writer)
+
+
+async def test_a_device_node_that_goes_away_lets_the_stick_go():
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    hand = Hand(os.ttyname(slave))
+    assert hand.device.open() == ""
+    os.write(master, PRESS)
+    await hand.until(lambda: hand.device.stick.dead_man)
+    os.close(slave)
+    os.close(master)
+    await hand.until(lambda: len(hand.gone) == 1)
+    assert hand.device.stick == RELEASED
+    assert hand.device.open() != ""
+
+
+async def test_a_foreign_stream_lets_the_stick_go(tmp_path):
+    path = tmp_path / "stick"
+    os.mkfifo(path)
+    hand = Hand(path)
+    assert hand.device.open() == ""
+    writer = os.open(path, os.O_WRONLY)
+    os.write(writer, PRESS)
+    await hand.until(lambda: hand.device.stick.dead_man)
+    os.write(writer, b"hello joystick, how are you?    ")
+    await hand.until(lambda: len(hand.gone) == 1)
+    assert "none of a joystick's" in hand.gone[0]
+    assert hand.device.stick == RELEASED
+    os.close(writer)
+
+
+async def test_what_cannot_be_a_joystick_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    for path, why in ((tmp_path / "file", "neither a device nor a FIFO"),
+                      (tmp_path / "none", "No such file"), ("/dev/zero", "is no joystick"),
+                      ("a\0b", "null")):
+        assert why in Hand(path).device.open()

@@ -1,0 +1,93 @@
+"""Driving by keys: what a terminal sends, and the dead man that lives on its repetition."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from toolbox.keyboard_stick import HOLD_S, KeyboardStick
+from toolbox.terminal import KeyDecoder
+
+
+def test_a_key_counts_for_a_moment_and_its_repetition_prolongs_it():
+    stick = KeyboardStick(0.5)
+    stick.press("up", 0.0)
+    assert stick.stick(HOLD_S - 0.01).dead_man
+    stick.press("up", HOLD_S - 0.01)
+    assert stick.stick(2 * HOLD_S - 0.02).dead_man
+    assert not stick.stick(2 * HOLD_S).dead_man
+
+
+def test_without_repetition_the_robot_stands_within_600_ms():
+    sending_s, repeating_s = 0.05, 0.03
+    assert HOLD_S + sending_s + repeating_s <= 0.6
+
+
+@pytest.mark.parametrize(("key", "forward", "left"), [
+    ("up", 1, 0), ("down", -1, 0), ("left", 0, 1), ("right", 0, -1),
+    ("u", 1, 1), ("i", 1, 0), ("o", 1, -1), ("j", 0, 1), ("l", 0, -1),
+    ("m", -1, -1), (",", -1, 0), (".", -1, 1)])
+def test_every_key_has_its_direction(key, forward, left):
+    stick = KeyboardStick(0.5)
+    assert stick.press(key, 0.0)
+    held = stick.stick(0.1)
+    assert (held.forward, held.left) == (0.5 * forward, 0.5 * left)
+
+
+@pytest.mark.parametrize("key", [" ", "k"])
+def test_letting_go_is_immediate(key):
+    stick = KeyboardStick()
+    stick.press("up", 0.0)
+    stick.press(key, 0.1)
+    assert not stick.stick(0.1).dead_man
+
+
+def test_the_speed_stays_between_a_tenth_and_all():
+    stick = KeyboardStick(0.9)
+    for _ in range(5):
+        stick.press("+", 0.0)
+    assert stick.speed == 1.0
+    for _ in range(50):
+        stick.press("-", 0.0)
+    assert stick.speed == 0.1
+    assert not stick.stick(0.0).dead_man
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 2.0), st.text(max_size=6)), max_size=30))
+def test_no_key_leaves_the_range_or_holds_longer_than_it_may(presses):
+    stick, now_s, last_s = KeyboardStick(), 0.0, -1.0
+    for pause_s, key in presses:
+        now_s += pause_s
+        if stick.press(key, now_s):
+            last_s = now_s
+        held = stick.stick(now_s)
+        assert abs(held.forward) <= 1.0 >= abs(held.left)
+        assert not held.dead_man or now_s - last_s < HOLD_S
+
+
+@pytest.mark.parametrize(("data", "keys"), [
+    (b"\x1b[A\x1b[B\x1b[C\x1b[D", ["up", "down", "right", "left"]),
+    (b"\x1bOA", ["up"]),  # application mode
+    (b"q", ["q"]),
+    (b"\x1b[1;5A", ["up"]),  # with Ctrl
+    (b"\x1b[15~x", ["x"]),  # F5
+    (b"\xff\xfe", ["\ufffd", "\ufffd"])])
+def test_a_terminals_bytes_are_keys(data, keys):
+    assert KeyDecoder().feed(data) == keys
+
+
+def test_a_key_may_arrive_in_pieces():
+    decoder = KeyDecoder()
+    assert [decoder.feed(bytes([b])) for b in b"\x1b[A"] == [[], [], ["up"]]
+
+
+def test_an_escape_alone_is_nothing_and_does_not_swallow_what_follows():
+    decoder = KeyDecoder()
+    assert decoder.feed(b"\x1b") == []
+    assert decoder.feed(b"q") == ["q"]
+
+
+@given(st.binary(max_size=60))
+def test_no_bytes_are_too_much(data):
+    KeyDecoder().feed(data)

@@ -1,0 +1,120 @@
+"""Metrics and live views: what they make of a run, and one clear line if a library is missing."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from test_top_view import busy
+
+from actors import messages as m
+from actors import topics
+from actors.recording.views import Views
+from actors.runtime.envelope import Header
+from actors.supervision.process_usage import ProcessCount
+from actors.supervision.run_info import RunInfo
+from airport.formats import load_airport
+from toolbox.live_verb import SHOWN
+from toolbox.main import main
+
+RUN = RunInfo(1, 7450, 1.0, 0.0, "paper.toml", {}, "run", 0, 'a "title"\\ and\nmore')
+
+
+@pytest.mark.parametrize(("module", "arguments", "extra"), [
+    ("prometheus_client.exposition", ["metrics"], "prometheus"),
+    ("foxglove", ["live", "foxglove"], "foxglove"), ("rerun", ["live", "rerun"], "rerun")])
+def test_a_missing_extra_is_one_line_that_says_what_to_install(
+        module, arguments, extra, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, module, None)
+    assert main(arguments) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1
+    assert f"pip install 'rampart[{extra}]'" in told[0]
+
+
+@pytest.mark.parametrize("arguments", [
+    ["metrics", "--port", "99999"], ["live", "foxglove", "--port", "-1"],
+    ["metrics", "--host", "nobody.invalid"]])
+def test_an_address_that_is_none_is_named(arguments, capsys):
+    pytest.importorskip("prometheus_client")
+    pytest.importorskip("foxglove")
+    assert main(arguments) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1
+    assert arguments[-1] in told[0]
+
+
+def test_what_is_listened_to_for_viewers_is_what_is_translated_for_them():
+    assert {t.key for t in SHOWN} == set(Views()._translators)
+
+
+def exposed(now):
+    exposition = pytest.importorskip("prometheus_client.exposition")
+    from toolbox.metrics_families import Collector
+
+    return exposition.generate_latest(Collector(lambda: now)).decode()
+
+
+def test_without_a_run_prometheus_is_told_so():
+    assert exposed(None).splitlines()[-1] == "rampart_up 0.0"
+
+
+def test_a_run_becomes_metrics_that_prometheus_reads_back():
+    parser = pytest.importorskip("prometheus_client.parser")
+    from toolbox.metrics_families import Exposition
+
+    text = exposed(Exposition(RUN, 10.5, busy(), {"hmi": ProcessCount(2.5, 4096, 1.0)}))
+    found = {s.name: s for f in parser.text_string_to_metric_families(text) for s in f.samples}
+    assert found["rampart_run_info"].labels["title"] == RUN.title
+    assert found["rampart_simulated_seconds"].value == 10.5
+    assert found["rampart_decisions_total"].labels == {"strategy": "safety-first"}
+    assert found["rampart_process_cpu_seconds_total"].value == 2.5
+    crashed = 'rampart_node_up{kind="control",node="localization"} 0.0'
+    assert crashed in text
+    assert 'rampart_node_restarts_total{node="localization"} 2.0' in text
+    assert 'rampart_detection_active{module="DM7"} 1.0' in text
+    assert 'rampart_detections_total{module="DM7"} 1.0' in text
+    assert 'rampart_mission_phase{rampart_mission_phase="running"} 1.0' in text
+
+
+def test_a_run_of_which_nothing_was_heard_yet_is_no_error():
+    from toolbox.run_picture import RunPicture
+
+    pytest.importorskip("prometheus_client")
+    from toolbox.metrics_families import Exposition
+
+    assert "rampart_up 1.0" in exposed(Exposition(RUN, 0.0, RunPicture()))
+
+
+@pytest.mark.parametrize(("option", "value"), [("--save", "/nowhere/run.rrd"), ("--connect", "http://x")])
+def test_a_place_for_rerun_that_is_none_is_named(option, value, capsys):
+    pytest.importorskip("rerun")
+    assert main(["live", "rerun", option, value]) == 2
+    assert f"{option} {value}: " in capsys.readouterr().err
+
+
+def test_rerun_writes_a_file_with_map_robot_laser_and_log(tmp_path):
+    pytest.importorskip("rerun")
+    from toolbox.live_rerun import RerunViewer
+
+    airport = load_airport("vallombre")
+    views = Views(airport)
+    file = tmp_path / "run.rrd"
+    viewer = RerunViewer(save=str(file))
+    viewer.begin(RUN)
+    header = Header("somebody", 1, 1, 1.0)
+    sweep = m.LaserScan(-1.0, 0.5, 10.0, b"\0\0\x80?" * 5)
+    found = [*views.start(0)]
+    for topic, body in (
+            (topics.POSE, m.Pose(1.0, 2.0, 0.5)), (topics.SCAN, sweep),
+            (topics.OBSTACLES, m.ObstacleList((m.ObstacleCommand("c", True, 1.0, 1.0, 0.4),))),
+            (topics.LIGHT_MEASURED, m.LightMeasurement(
+                airport.lights[0].name, 100.0, 0.4, m.LightVerdict.DIM)),
+            (topics.PROCESS_EVENT, m.ProcessEvent("hmi", "crashed", 1, 1, "", ""))):
+        found += views.of(topic, f"rampart/{topic.key}", header, body, 1_000_000_000)
+    for channel, record in found:
+        viewer.show(channel, record, 1_000_000_000)
+    viewer.close()
+    data = file.read_bytes()
+    assert data.startswith(b"RRF2")
+    assert len(data) > 10_000

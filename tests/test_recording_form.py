@@ -1,0 +1,146 @@
+"""What is recorded of a message gives its payload again, to the byte, whatever it is."""
+
+from __future__ import annotations
+
+import json
+import typing
+from enum import Enum
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from actors import messages as m
+from actors import topics
+from actors.recording.json_schema import plain_schema
+from actors.recording.message_form import (
+    MessageForm,
+    Recorded,
+    form_of,
+    header_of,
+    renumbered,
+    topic_of,
+)
+from actors.runtime.envelope import Header, encode, pack
+
+TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
+WHOLE = st.integers(-(2**63), 2**64 - 1)
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | WHOLE | st.floats() | TEXT | st.binary(max_size=4),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(TEXT | WHOLE, inner, max_size=3),
+    max_leaves=5)
+HEADS = st.builds(Header, TEXT, st.integers(0, 2**40), st.integers(0, 2**40), st.floats())
+
+
+def values(kind: typing.Any) -> st.SearchStrategy[typing.Any]:
+    """Anything that a field of a type may hold, numbers that are none included."""
+    simple = {float: st.floats(), int: WHOLE, str: TEXT, bytes: st.binary(max_size=12),
+              bool: st.booleans(), typing.Any: ANYTHING}
+    if kind in simple:
+        return simple[kind]
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return st.sampled_from(kind)
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return st.builds(kind, **{f.name: values(f.type) for f in msgspec.structs.fields(kind)})
+    parts = typing.get_args(kind)
+    if typing.get_origin(kind) is dict:
+        return st.dictionaries(values(parts[0]), values(parts[1]), max_size=3)
+    if typing.get_origin(kind) is tuple and parts[-1] is Ellipsis:
+        return st.lists(values(parts[0]), max_size=3).map(tuple)
+    return st.tuples(*map(values, parts))
+
+
+@pytest.mark.parametrize("topic", topics.ALL, ids=lambda t: t.key)
+def test_any_message_of_any_topic_comes_back_to_the_byte(topic):
+    form = MessageForm(topic)
+
+    @settings(max_examples=15, deadline=None, database=None)
+    @given(HEADS, values(topic.type))
+    def check(header, body):
+        payload = encode(header, body)
+        text, found, _ = form.recorded(payload)
+        assert found is not None
+        assert json.loads(text)["source"] == header.source
+        assert form.payload(text) == payload
+
+    check()
+
+
+@settings(max_examples=60, deadline=None, database=None)
+@given(st.binary(max_size=40) | ANYTHING.map(msgspec.msgpack.encode))
+def test_garbage_comes_back_to_the_byte_and_says_that_it_is_none(payload):
+    form = MessageForm(topics.COMMAND)
+    text, header, _ = form.recorded(payload)
+    assert form.payload(text) == payload
+    assert (header is None) == ("error" in json.loads(text))
+
+
+def test_a_message_that_json_can_hold_has_no_second_copy():
+    payload = encode(Header("localization", 1, 7, 3.25), m.Pose(1.5, -0.0, 1e-310))
+    text, _, _ = form_of(topics.POSE.at()).recorded(payload)
+    assert json.loads(text) == {
+        "source": "localization", "incarnation": 1, "sequence": 7, "stamp": 3.25,
+        "body": {"x_m": 1.5, "y_m": -0.0, "yaw_rad": 1e-310}}
+
+
+def test_a_message_with_nan_is_legible_and_has_its_payload_beside_it():
+    payload = encode(Header("localization", 1, 7, 3.25), m.Pose(1.5, 2.0, float("nan")))
+    shown = json.loads(form_of(topics.POSE.at()).recorded(payload)[0])
+    assert shown["body"] == {"x_m": 1.5, "y_m": 2.0, "yaw_rad": None}
+    assert shown["raw"]
+
+
+def test_a_sound_message_in_other_bytes_than_ours_keeps_them():
+    payload = pack(("x", 1, 1, 3, m.Pose(1, 2, 3)))  # integers where floats are due
+    form = form_of(topics.POSE.at())
+    text, header, body = form.recorded(payload)
+    assert (header.stamp, body.x_m) == (3.0, 1.0)
+    assert form.payload(text) == payload
+
+
+def test_the_text_raw_in_a_message_is_no_payload():
+    payload = encode(Header('"raw":', 1, 1, 0.0), m.Reset('"raw":"AAAA"', "raw"))
+    form = form_of(topics.RESET.at())
+    assert form.payload(form.recorded(payload)[0]) == payload
+
+
+@pytest.mark.parametrize("text", [
+    b"", b"{}", b"[]", b'{"source":"a","incarnation":1,"sequence":1,"stamp":1}',
+    b'{"source":"a","incarnation":1,"sequence":1,"stamp":1,"body":{"x_m":"far"}}',
+    b'{"source":"a","incarnation":1,"sequence":1,"stamp":1,"raw":"?"}'])
+def test_what_is_no_recorded_message_is_refused(text):
+    with pytest.raises(ValueError):  # noqa: PT011 msgspec's words
+        form_of(topics.POSE.at()).payload(text)
+
+
+def test_every_key_is_known_by_its_topic_and_strange_ones_are_not():
+    for topic in topics.ALL:
+        assert topic_of(topic.at("DM1") if topic.is_family else topic.at()) is topic
+    assert [topic_of(key) for key in (
+        "rampart/detection", "rampart/detection/", "rampart/detection/a/b", "x")] == [None] * 4
+
+
+def test_a_later_lap_is_a_later_life_and_nothing_else_of_the_message_changes():
+    payload = encode(Header("DM1", 2, 7, 3.0), m.Pose(1.0, 2.0, float("inf")))
+    assert renumbered(payload, 3, 10.0) == encode(
+        Header("DM1", 5, 7, 13.0), m.Pose(1.0, 2.0, float("inf")))
+    assert renumbered(b"\xc1", 3, 10.0) == b"\xc1"
+    assert header_of(b"\xc1") is None
+
+
+@pytest.mark.parametrize("topic", topics.ALL, ids=lambda t: t.key)
+def test_schemas_are_of_the_plain_kind_that_viewers_know(topic):
+    schema = json.loads(plain_schema(Recorded[topic.type]))
+    body = schema["properties"]["body"]
+    assert schema["type"] == body["type"] == "object"
+    assert set(body["properties"]) == {f.name for f in msgspec.structs.fields(topic.type)}
+
+    def check(node, name):
+        assert not {"$ref", "anyOf", "prefixItems"} & set(node), name
+        if node.get("type") == "array":
+            check(node["items"], name)
+        for key, part in node.get("properties", {}).items():
+            check(part, f"{name}.{key}")
+
+    check(schema, topic.key)

@@ -1,0 +1,169 @@
+"""`rampart top` without a terminal: what a picture of the run becomes on screens of any size."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.cells import cell_len
+
+from actors import messages as m
+from actors import topics
+from actors.runtime.envelope import Header
+from toolbox.run_picture import COUNTED, DECODED, RunPicture
+from toolbox.top_view import Frame, lines, picture_json
+
+MISSION = m.MissionStatus(
+    "id", "AB", m.MissionPhase.RUNNING, 1,
+    tuple(m.Goal(x, 0.0, m.Mode.TAXI) for x in (1.0, 2.0, 3.0)), (1.0,), (), "")
+CRASH = m.DecisionRecord(4, "safety-first", ("FTM4",), 1, ("RM3",), ("FTM4",), (), 1.0)
+NODES = m.NodeTable((
+    m.NodeInfo("mission_manager", "control", 11, m.NodeState.RUNNING, 1, 0),
+    m.NodeInfo("localization", "control", 12, m.NodeState.CRASHED, 3, 2),
+    m.NodeInfo("hmi", "operator", 13, m.NodeState.RUNNING, 1, 0)))
+MANAGER = m.ManagerStatus(("FTM4",), (), ("RM3",), ("RM1",), "safety-first", 4)
+TRUTH = m.GroundTruth(m.Pose(0, 0, 0), m.Twist(0, 0), 0, 0.0, 2.5, 1.25, 1.0)
+USAGE = {"mission_manager": {"cpu": 1.0, "mb": 60.0, "age_s": 75.0},
+         "localization": {"cpu": 2.0, "mb": 61.0, "age_s": 3700.0},
+         "hmi": {"cpu": 9.0, "mb": 62.0, "age_s": 4.0}}
+
+
+def told(picture: RunPicture, topic, body, source: str = "somebody", now_s: float = 10.0) -> None:
+    picture.heard(topic, Header(source, 1, 1, now_s), body, now_s)
+
+
+def busy() -> RunPicture:
+    picture = RunPicture()
+    told(picture, topics.MISSION_STATUS, MISSION)
+    told(picture, topics.POSE, m.Pose(1.5, -2.0, 1.5708))
+    told(picture, topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.STOP, True, "RM1: brake", 0))
+    told(picture, topics.MANAGER_STATUS, MANAGER)
+    told(picture, topics.NODES, NODES)
+    told(picture, topics.TRUTH, TRUTH)
+    told(picture, topics.DETECTION, m.DetectionReport(
+        m.DetectionState.ACTIVE, "localization crashed", ("localization",), 9.0), "DM7")
+    told(picture, topics.DETECTION, m.DetectionReport(m.DetectionState.IDLE, "", (), 0.0), "DM1")
+    told(picture, topics.DECISION, CRASH)
+    return picture
+
+
+def frame(picture: RunPicture, **changes) -> Frame:
+    return Frame(**{"title": "AB on Vallombre", "port": 7450, "rate": 1.0, "time_s": 10.5,
+                    "picture": picture, "usage": USAGE, **changes})
+
+
+def screen(picture: RunPicture, width: int = 80, height: int = 24, **changes) -> list[str]:
+    return [line.plain for line in lines(frame(picture, **changes), width, height)]
+
+
+def line_of(shown: list[str], label: str) -> str:
+    return next(line for line in shown if line.startswith(label))
+
+
+def test_a_screen_of_80_by_24_tells_what_matters():
+    shown = screen(busy())
+    assert len(shown) <= 24
+    assert "AB running, step 2 of 3" in line_of(shown, "mission")
+    assert "x 1.50 m  y -2.00 m  heading 90 deg" in line_of(shown, "robot")
+    assert "stop, STOPPED: RM1: brake" in line_of(shown, "pilot")
+    assert "safe so far; nearest obstacle 2.50 m" in line_of(shown, "safety")
+    manager = line_of(shown, "manager")
+    assert "ACTIVE FTM4; recovery RM3; latched RM1" in manager
+    assert "1 of 2: DM7 localization crashed" in line_of(shown, "detection")
+    assert "4: FTM4 is active: run RM3, because" in line_of(shown, "decisions")
+    assert "localization       crashed     3     2  1h01m   2%    61" in line_of(
+        shown, "localization")
+
+
+def test_a_process_in_trouble_comes_first_and_the_busiest_next_if_asked():
+    def order(**changes) -> list[str]:
+        return [line.split()[0] for line in screen(busy(), **changes)
+                if line.split()[:1] in [[n.name] for n in NODES.nodes]]
+
+    assert order() == ["localization", "mission_manager", "hmi"]
+    assert order(by_cpu=True) == ["localization", "hmi", "mission_manager"]
+    assert order(skip=99, height=13)[-1] == "hmi"
+
+
+def test_a_collision_is_told_in_words():
+    picture = busy()
+    told(picture, topics.TRUTH, msgspec.structs.replace(TRUTH, collisions=2, prohibited_s=1.5))
+    assert "UNSAFE: 2 collisions, 1.5 s in the prohibited area" in line_of(
+        screen(picture), "safety")
+
+
+def test_whoever_has_fallen_silent_is_named():
+    shown = screen(busy(), time_s=20.0)
+    assert "SILENT for 10 s; last: AB running" in line_of(shown, "mission")
+    assert "SILENT" in line_of(shown, "manager")
+
+
+def test_nothing_heard_is_no_reason_to_fail():
+    shown = screen(RunPicture(), usage={})
+    assert line_of(shown, "mission").endswith("silent")
+    assert any("the supervisor has not told yet" in line for line in shown)
+
+
+def test_words_of_a_node_do_not_move_the_cursor():
+    picture = busy()
+    told(picture, topics.PILOT_STATUS, m.PilotStatus(
+        m.PilotMode.AUTO, False, "a\x1b[2Jb\nc\rd", 0))
+    assert all(line.isprintable() for line in screen(picture))
+
+
+@given(st.integers(1, 250), st.integers(0, 80), st.integers(0, 99), st.text(max_size=30))
+@settings(max_examples=60, deadline=None)
+def test_every_screen_fits(width, height, skip, words):
+    picture = busy()
+    told(picture, topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.AUTO, False, words, 0))
+    for second in range(3):
+        for topic in COUNTED:
+            picture.count(topic)
+        picture.sample(float(second))
+    shown = screen(picture, width, height, skip=skip, note=words, title=words)
+    assert len(shown) <= height
+    assert all(cell_len(line) <= width for line in shown)
+    if height >= 12:
+        assert any("mission"[:width] in line for line in shown)
+
+
+def test_rates_are_in_messages_a_simulated_second():
+    picture = RunPicture()
+    for step in range(5):
+        picture.sample(step * 0.25)
+        for _ in range(5):
+            picture.count(topics.SCAN)
+    assert picture.rates() == {"summit_xl/scan": 20.0}
+
+
+def test_an_activity_is_counted_when_it_begins():
+    picture = RunPicture()
+    for state in ("active", "active", "idle", "active"):
+        told(picture, topics.DETECTION, m.DetectionReport(m.DetectionState(state), "", (), 0.0),
+             "DM1")
+    for state in ("idle", "activated", "activated"):
+        told(picture, topics.RECOVERY, m.RecoveryReport(
+            m.RecoveryState(state), m.RecoveryPhase.ACTING, 1, ""), "RM1")
+    assert (picture.detections_total["DM1"], picture.recoveries_total["RM1"]) == (2, 1)
+
+
+def test_every_topic_is_either_read_or_counted():
+    assert {t.key for t in (*DECODED, *COUNTED)} == {t.key for t in topics.ALL}
+    assert set(DECODED).isdisjoint(COUNTED)
+
+
+def test_the_same_can_be_had_as_data():
+    data = msgspec.json.decode(msgspec.json.encode(picture_json(frame(busy()))))
+    assert data["mission"]["step"] == 1
+    assert data["decisions"][0]["words"].startswith("FTM4 is active: run RM3")
+    assert data["processes"][0] == {
+        "name": "localization", "kind": "control", "pid": 12, "state": "crashed",
+        "incarnation": 3, "restarts": 2, "cpu": 2.0, "mb": 61.0, "age_s": 3700.0}
+
+
+@pytest.mark.parametrize("state", [s for s in m.NodeState if s is not m.NodeState.RUNNING])
+def test_no_state_is_told_by_colour_alone(state):
+    picture = busy()
+    told(picture, topics.NODES, m.NodeTable((m.NodeInfo("hmi", "operator", 13, state, 1, 0),)))
+    assert state.value in line_of(screen(picture), "hmi")

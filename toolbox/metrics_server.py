@@ -1,0 +1,120 @@
+"""The server of `rampart metrics`: follows runs, and answers each scrape with what there is then.
+
+All on one event loop, so that a scrape sees a picture that nobody is drawing at.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import socket
+from collections.abc import Iterator
+
+import uvicorn
+from prometheus_client.exposition import choose_encoder
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route
+
+from actors import topics
+from actors.operator.hmi_processes import ProcessObserver
+from actors.supervision.process_usage import read_count
+from toolbox.following import LOOK_S, draw, is_over, sessions, stopped_by_signals
+from toolbox.metrics_families import Collector, Exposition
+from toolbox.output import UsageError, say
+from toolbox.run_picture import RunPicture
+from toolbox.session import Session
+
+
+async def metrics(options: argparse.Namespace) -> int:
+    """Serve until interrupted."""
+    stop = asyncio.Event()
+    listening = listen(options.host, options.port)
+    exporter = Exporter()
+    server = _Server(uvicorn.Config(
+        _app(exporter), log_level="error", access_log=False, lifespan="off", ws="none"))
+    with stopped_by_signals(stop):
+        serving = asyncio.create_task(server.serve(sockets=[listening]))
+        host = f"[{options.host}]" if ":" in options.host else options.host
+        say(f"metrics at http://{host}:{listening.getsockname()[1]}/metrics")
+        try:
+            await exporter.follow(options.of, stop)
+        finally:
+            server.should_exit = True
+            await serving
+            listening.close()
+    return 0
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return a socket that listens on an address.
+
+    Raises:
+        UsageError: there is no such address, or it is taken.
+    """
+    if not 0 <= port <= 65535:
+        raise UsageError(f"--port {port}: must be between 0 and 65535")
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        raise UsageError(f"cannot serve on {host} port {port}: {error.strerror or error}; "
+                         "choose another --port or --host") from None
+
+
+class Exporter:
+    """Follows runs and says what there is now; a `look` for `metrics_families.Collector`."""
+
+    def __init__(self) -> None:
+        self._now: tuple[Session, RunPicture, ProcessObserver] | None = None
+
+    async def follow(self, port: int | None, stop: asyncio.Event) -> None:
+        """Follow one run after the other until `stop`."""
+        async with contextlib.aclosing(sessions(port, stop, follow=True, option="--run")) as found:
+            async for session in found:
+                picture = RunPicture()
+                draw(session, picture)
+                run = session.run
+                self._now = (session, picture, ProcessObserver(run.base_port, run.pid))
+                while not stop.is_set() and not is_over(run):
+                    picture.sample(session.clock.now())
+                    with contextlib.suppress(TimeoutError):
+                        await asyncio.wait_for(stop.wait(), LOOK_S)
+                self._now = None
+
+    def look(self) -> Exposition | None:
+        """Return the exposition of this moment, None without a run."""
+        if self._now is None:
+            return None
+        session, picture, observer = self._now
+        table = picture.latest(topics.NODES)
+        guards = observer.look(table)["guards"]
+        pids = {node.name: node.pid for node in (table.nodes if table else ())} | {
+            row["name"]: row["pid"] for row in guards}
+        return Exposition(
+            session.run, session.clock.now(), picture,
+            {name: count for name, pid in pids.items() if (count := read_count(pid)) is not None})
+
+
+class _Server(uvicorn.Server):
+    """Uvicorn without signal handlers: the verb has its own."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Do not."""
+        yield
+
+
+def _app(exporter: Exporter) -> Starlette:
+    collector = Collector(exporter.look)
+
+    async def figures(request: Request) -> Response:
+        encode, kind = choose_encoder(request.headers.get("accept", ""))
+        return Response(encode(collector), headers={"content-type": kind})
+
+    async def front(_request: Request) -> Response:
+        return PlainTextResponse("Rampart's figures for Prometheus are at /metrics\n")
+
+    return Starlette(routes=[Route("/metrics", figures), Route("/", front)])
