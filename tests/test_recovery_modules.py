@@ -488,6 +488,7 @@ def test_a_respawned_module_that_is_commanded_again_does_not_kill_who_is_well():
             boss.order("RM3", nodes=("a",))
             await asyncio.sleep(0.3)
             await system.kill("RM3")
+            await system.settle()
             boss.reports.clear()
             system.start("RM3", Respawn, nodes=["a", "b"])
             await system.settle()

@@ -10,6 +10,7 @@ import textwrap
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
+import msgspec
 import pytest
 
 from actors import messages as m
@@ -21,7 +22,14 @@ from actors.runtime.envelope import encode
 from actors.runtime.virtual_bus import Hub, VirtualBus
 from actors.runtime.wiring import load_class
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
-from actors.supervision.run_plan import OBSERVER_CLASS, SUPERVISOR_CLASS
+from actors.supervision.node_process import make_actor
+from actors.supervision.run_plan import (
+    OBSERVER_CLASS,
+    SUPERVISOR_CLASS,
+    Layout,
+    RunPlan,
+    load_system,
+)
 from toolbox import systems
 
 
@@ -249,6 +257,20 @@ async def test_a_newcomer_hears_the_states_of_its_partners_at_once(make_bus):
             assert newcomer.heard[0][1].stamp == 0.125
 
 
+async def test_what_a_node_has_no_use_for_in_this_life_does_not_reach_it(make_bus):
+    class Deaf(Listener):
+        def listens(self, topic) -> bool:
+            return topic is not topics.POSE
+
+    async with running(Deaf, "listener", make_bus) as deaf:
+        async with running(Talker, "talker", make_bus) as talker:
+            await eventually(lambda: bool(deaf.peers))
+            talker.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
+            talker.publish(topics.RESET, m.Reset("RM1", "you"))
+            await eventually(lambda: bool(deaf.heard))
+            assert [message for message, _ in deaf.heard] == [m.Reset("RM1", "you")]
+
+
 def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
     """Python would let it happen in silence: a node's `_held` once stopped the node's mailbox."""
 
@@ -267,3 +289,28 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
                              and not name.startswith("__")}
     taken = {cls.__name__: names for cls in classes if (names := assigned(cls) & own)}
     assert taken == {}
+
+
+async def test_the_heart_beats_at_the_period_that_the_system_states():
+    hub, beats = Hub(), []
+    hub.taps.append(lambda at_s, _source, key, _payload: key == topics.HEARTBEAT.at("talker")
+                    and beats.append(at_s))
+    clock = Clock(asyncio.get_running_loop().time(), 100.0)
+    node = Talker(Context("talker", 1, clock, VirtualBus(hub, "talker"), heartbeat_period_s=3.0))
+    task = asyncio.create_task(node.run())
+    await eventually(lambda: len(beats) >= 4)
+    node.stop()
+    await task
+    assert (beats[-1] - beats[0]) * 100.0 / (len(beats) - 1) == pytest.approx(3.0, rel=0.5)
+
+
+def test_a_process_is_given_the_heartbeat_period_of_the_spec():
+    plan = RunPlan("run", 7450, 1.0, 1, str(systems.SHIPPED / "paper.toml"), "", "vallombre", "A",
+                   0, ftm=True, hmi_port=0)
+    spec = load_system(plan)
+    timing = msgspec.structs.replace(spec.timing, heartbeat_period_s=0.123)
+    layout = Layout(plan, msgspec.structs.replace(spec, timing=timing))
+    loop = asyncio.new_event_loop()
+    node = make_actor(layout, "DM2", 1, {"system": layout.spec}, loop)
+    loop.close()
+    assert node.context.heartbeat_period_s == 0.123

@@ -10,10 +10,10 @@ from __future__ import annotations
 from actors import topics
 from actors.control.dead_reckoning import DeadReckoning
 from actors.control.osmosis_control import OsmosisControl
-from actors.control.parameters import amount
 from actors.control.standby_control import StandbyControl
 from actors.messages import Odometry, Pose
 from actors.runtime.actor import Context, Header, on
+from actors.runtime.parameters import amount
 
 
 class BridgedControl(OsmosisControl):

@@ -10,11 +10,11 @@ import math
 from dataclasses import replace
 
 from actors import topics
-from actors.control.parameters import amount
 from actors.control.pose_filter import PoseFilter
 from actors.control.position_source import FilterLimits
 from actors.messages import GpsFix, Imu, LocalizationStatus, Odometry, Pose
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.parameters import amount
 
 _PERIOD_S = 0.05
 

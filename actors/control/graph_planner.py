@@ -8,11 +8,11 @@ import msgspec
 
 from actors import topics
 from actors.control.closures import Closures, without
-from actors.control.parameters import amount
 from actors.control.route_search import PlannedRoute, plan_route
 from actors.messages import Blockage, ControlStatus, GoalOrder, Mode, Pose, Route
 from actors.runtime.actor import Actor, Context, Header, every, on
 from actors.runtime.checkpoint import StateFormat
+from actors.runtime.parameters import amount
 from airport.model import Airport
 
 

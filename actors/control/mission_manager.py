@@ -8,7 +8,6 @@ from actors import topics
 from actors.control import mission_state
 from actors.control.mission_checkpoint import MISSION_STATE, catch_up
 from actors.control.mission_state import MissionState
-from actors.control.parameters import names
 from actors.messages import (
     ControlStatus,
     Goal,
@@ -19,6 +18,7 @@ from actors.messages import (
     Route,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.parameters import names
 
 UNCERTAIN_S = 1.0
 """A Mission Manager that comes back waits so long for word of the step that others are at. They

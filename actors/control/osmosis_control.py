@@ -20,7 +20,6 @@ from actors.control.light_inspection import LightInspection, RowLight
 from actors.control.light_ledger import LightLedger
 from actors.control.light_row import LightRow, RowLimits
 from actors.control.motion_loop import MotionLoop
-from actors.control.parameters import amount, switch
 from actors.control.path_follower import Motion, PathFollower
 from actors.control.polyline import Array, Polyline
 from actors.control.settings import hull_of, motion_of
@@ -40,6 +39,7 @@ from actors.messages import (
     Twist,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.parameters import amount, switch
 from actors.runtime.topic import Topic
 from airport.model import Airport
 from airport.route_check import RouteCheck

@@ -7,8 +7,9 @@ import math
 from actors import messages as m
 from actors import topics
 from actors.detection.actuator_failure_monitor import ActuatorMonitor, MotionLimits
-from actors.detection.module import DetectionModule, number
+from actors.detection.module import DetectionModule
 from actors.runtime.actor import Context, Header, on
+from actors.runtime.parameters import amount
 from manager.schema import SystemSpec
 
 _FIRST_STATUS_S = 0.3
@@ -29,8 +30,8 @@ class ActuatorFailure(DetectionModule):
         usual = MotionLimits()
         self.monitor = ActuatorMonitor(
             MotionLimits(
-                wheel_radius_m=number(self.parameters, "wheel_radius_m", usual.wheel_radius_m),
-                hold_s=number(self.parameters, "hold_s", usual.hold_s),
+                wheel_radius_m=amount(self.parameters, "wheel_radius_m", usual.wheel_radius_m),
+                hold_s=amount(self.parameters, "hold_s", usual.hold_s),
                 braking_mps2=system.robot.braking_mps2),
             -math.inf if self.first_life else self.clock.now() + _FIRST_STATUS_S)
 

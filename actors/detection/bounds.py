@@ -9,8 +9,9 @@ from typing import Any
 from actors import messages as m
 from actors import topics
 from actors.detection.bounds_check import BoundsCheck
-from actors.detection.module import DetectionModule, number
+from actors.detection.module import DetectionModule
 from actors.runtime.actor import Context, Header, on
+from actors.runtime.parameters import amount
 from manager.schema import SystemSpec
 
 _FIRST_COMMAND_S = 0.2
@@ -34,7 +35,7 @@ class Bounds(DetectionModule):
         self._suspects = suspects_of(self.parameters)
         self.monitor = BoundsCheck(
             system.robot.top_speed_mps, system.robot.top_turn_rate_radps,
-            number(self.parameters, "hold_s", 0.5),
+            amount(self.parameters, "hold_s", 0.5),
             -math.inf if self.first_life else self.clock.now() + _FIRST_COMMAND_S)
 
     def on_start(self) -> None:

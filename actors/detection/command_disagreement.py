@@ -7,8 +7,9 @@ import math
 from actors import messages as m
 from actors import topics
 from actors.detection.command_comparison import CommandComparison, ComparisonLimits
-from actors.detection.module import DetectionModule, number
+from actors.detection.module import DetectionModule
 from actors.runtime.actor import Context, Header, on
+from actors.runtime.parameters import amount
 
 _FIRST_PAIR_S = 0.3
 """A respawned module waits this long for two commands before it says idle."""
@@ -37,7 +38,7 @@ class CommandDisagreement(DetectionModule):
         self.monitor = CommandComparison(
             (first, second),
             ComparisonLimits(**{
-                name: number(self.parameters, name, getattr(usual, name))
+                name: amount(self.parameters, name, getattr(usual, name))
                 for name in ("linear_mps", "angular_radps", "linear_s", "angular_s", "hold_s")}),
             -math.inf if self.first_life else self.clock.now() + _FIRST_PAIR_S)
 

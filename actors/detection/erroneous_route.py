@@ -12,9 +12,10 @@ import math
 
 from actors import messages as m
 from actors import topics
-from actors.detection.module import DetectionModule, number
+from actors.detection.module import DetectionModule
 from actors.detection.route_monitor import RouteMonitor
 from actors.runtime.actor import Context, Header, on
+from actors.runtime.parameters import amount
 from airport.model import Airport
 from airport.route_check import RouteCheck
 
@@ -35,7 +36,7 @@ class ErroneousRoute(DetectionModule):
         check = RouteCheck(airport)
         self.monitor = RouteMonitor(
             lambda waypoints, goal: check.fault(waypoints, None, goal),
-            number(self.parameters, "hold_s", 0.5),
+            amount(self.parameters, "hold_s", 0.5),
             -math.inf if self.first_life else self.clock.now() + _FIRST_ROUTE_S)
 
     def on_start(self) -> None:

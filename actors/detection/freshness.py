@@ -5,8 +5,9 @@ from __future__ import annotations
 from actors import messages as m
 from actors import topics
 from actors.detection.freshness_monitor import FreshnessMonitor
-from actors.detection.module import DetectionModule, names_of, number
+from actors.detection.module import DetectionModule
 from actors.runtime.actor import Context, Header, on
+from actors.runtime.parameters import amount, names
 
 
 class Freshness(DetectionModule):
@@ -34,11 +35,11 @@ class Freshness(DetectionModule):
         if not self.subject:
             raise ValueError(f"{self.name}: actor Freshness hears no topic; name a subclass, "
                              "CommandFreshness or LocalizationFreshness")
-        timeout_s = number(self.parameters, "timeout_s", self.default_timeout_s)
+        timeout_s = amount(self.parameters, "timeout_s", self.default_timeout_s)
         self.monitor = FreshnessMonitor(
-            self.subject, timeout_s, number(self.parameters, "hold_s", 0.2), self.clock.now(),
+            self.subject, timeout_s, amount(self.parameters, "hold_s", 0.2), self.clock.now(),
             self.grace_s(timeout_s), known=self.first_life)
-        self._suspects = names_of(self.parameters, "suspects")
+        self._suspects = names(self.parameters, "suspects")
         self.monitor.nodes = self._suspects
 
     def on_start(self) -> None:

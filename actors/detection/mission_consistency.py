@@ -10,8 +10,9 @@ from __future__ import annotations
 from actors import messages as m
 from actors import topics
 from actors.detection.consistency_monitor import ConsistencyLimits, ConsistencyMonitor
-from actors.detection.module import DetectionModule, number
+from actors.detection.module import DetectionModule
 from actors.runtime.actor import Context, Header, on
+from actors.runtime.parameters import amount
 
 
 class MissionConsistency(DetectionModule):
@@ -26,8 +27,8 @@ class MissionConsistency(DetectionModule):
         super().__init__(context)
         limits = ConsistencyLimits()
         self.monitor = ConsistencyMonitor(
-            ConsistencyLimits(number(self.parameters, "patience_s", limits.patience_s),
-                              number(self.parameters, "silence_s", limits.silence_s)),
+            ConsistencyLimits(amount(self.parameters, "patience_s", limits.patience_s),
+                              amount(self.parameters, "silence_s", limits.silence_s)),
             self.clock.now(), known=self.first_life)
 
     def on_start(self) -> None:

@@ -22,6 +22,7 @@ from typing import Any, ClassVar, Protocol
 from actors import topics
 from actors.messages import DetectionReport, DetectionState
 from actors.runtime.actor import Actor, Context, every
+from actors.runtime.parameters import amount
 from actors.runtime.topic import Topic
 
 TRANSITIONS = {
@@ -102,7 +103,7 @@ class DetectionModule(Actor):
             return timeout_s
         system = self.context.shared.get("system")
         startup_s = DEFAULT_GRACE_S if system is None else system.timing.startup_grace_s
-        return max(timeout_s, number(self.parameters, "startup_grace_s", startup_s))
+        return max(timeout_s, amount(self.parameters, "startup_grace_s", startup_s))
 
     # -- the state machine ----------------------------------------------------------------------
 
@@ -181,28 +182,3 @@ class DetectionModule(Actor):
         if now_s - self._ran_s > ABSENCE_S and now_s > self._judges_from_s + NEXT_EXCUSE_S:
             self._judges_from_s = now_s + EXCUSE_S
         self._ran_s = now_s
-
-
-def number(parameters: Any, name: str, default: float) -> float:
-    """Return a non-negative finite number among a node's parameters.
-
-    Raises:
-        ValueError: it is none; the message names parameter and value.
-    """
-    value = parameters.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) \
-            or not (math.isfinite(value) and value >= 0):
-        raise ValueError(f"parameters.{name} = {value!r}: must be a number, 0 or more")
-    return float(value)
-
-
-def names_of(parameters: Any, name: str) -> tuple[str, ...]:
-    """Return a list of names among a node's parameters; none by default.
-
-    Raises:
-        ValueError: it is no list of names; the message names parameter and value.
-    """
-    value = parameters.get(name, ())
-    if isinstance(value, str) or not all(isinstance(one, str) and one for one in value):
-        raise ValueError(f"parameters.{name} = {value!r}: must be a list of node names")
-    return tuple(value)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from actors import messages as m
 from actors import topics
-from actors.detection.module import DetectionModule, number
+from actors.detection.module import DetectionModule
 from actors.detection.pilot_output_monitor import PilotLimits, PilotOutputMonitor
 from actors.runtime.actor import Context, Header, on
+from actors.runtime.parameters import amount
 
 
 class PilotOutput(DetectionModule):
@@ -26,9 +27,9 @@ class PilotOutput(DetectionModule):
         super().__init__(context)
         usual = PilotLimits()
         limits = PilotLimits(
-            timeout_s=number(self.parameters, "timeout_s", usual.timeout_s),
-            wrong_s=number(self.parameters, "wrong_s", usual.wrong_s),
-            hold_s=number(self.parameters, "hold_s", usual.hold_s))
+            timeout_s=amount(self.parameters, "timeout_s", usual.timeout_s),
+            wrong_s=amount(self.parameters, "wrong_s", usual.wrong_s),
+            hold_s=amount(self.parameters, "hold_s", usual.hold_s))
         self.monitor = PilotOutputMonitor(
             str(self.parameters.get("pilot", "safety_pilot")), self.clock.now(),
             self.grace_s(limits.timeout_s), limits, known=self.first_life)

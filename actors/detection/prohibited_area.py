@@ -13,8 +13,9 @@ from actors import topics
 from actors.detection.fence_monitor import FenceMonitor
 from actors.detection.freshness_monitor import FreshnessMonitor
 from actors.detection.geofence import FenceLimits, Fix
-from actors.detection.module import DetectionModule, number
+from actors.detection.module import DetectionModule
 from actors.runtime.actor import Context, Header, on
+from actors.runtime.parameters import amount
 from airport.model import Airport
 from manager.budget import time_to_intrusion_s
 from manager.schema import Robot, SystemSpec
@@ -36,20 +37,20 @@ class ProhibitedArea(DetectionModule):
         super().__init__(context)
         system: SystemSpec = context.shared["system"]
         airport: Airport = context.shared["airport"]
-        timeout_s = number(self.parameters, "gps_timeout_s", 5 * GPS_PERIOD_S)
+        timeout_s = amount(self.parameters, "gps_timeout_s", 5 * GPS_PERIOD_S)
         self.monitor = FenceMonitor(
             airport.prohibited_distance_m,
             FenceLimits(half_diagonal_m(system.robot), self._reaction_s(system),
                         system.robot.braking_mps2),
             FreshnessMonitor("GPS", timeout_s, 2 * GPS_PERIOD_S, self.clock.now(),
                              self.grace_s(timeout_s), known=self.first_life),
-            number(self.parameters, "hold_s", 0.5))
+            amount(self.parameters, "hold_s", 0.5))
 
     def _reaction_s(self, system: SystemSpec) -> float:
         needed_s = GPS_PERIOD_S + system.timing.arbitration_s + system.timing.actuation_s
         if "margin_m" not in self.parameters:
             return needed_s
-        margin_m = number(self.parameters, "margin_m", 0.0)
+        margin_m = amount(self.parameters, "margin_m", 0.0)
         return max(needed_s, time_to_intrusion_s(system.robot, margin_m))
 
     def on_start(self) -> None:

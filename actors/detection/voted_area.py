@@ -16,10 +16,11 @@ from actors import topics
 from actors.detection.fence_monitor import FenceMonitor
 from actors.detection.freshness_monitor import FreshnessMonitor
 from actors.detection.geofence import FenceLimits, Fix
-from actors.detection.module import DetectionModule, number
+from actors.detection.module import DetectionModule
 from actors.detection.position_vote import GPS, PositionVote
 from actors.detection.prohibited_area import GPS_PERIOD_S, half_diagonal_m
 from actors.runtime.actor import Context, Header, on
+from actors.runtime.parameters import amount
 from airport.model import Airport
 from manager.budget import time_to_intrusion_s
 from manager.schema import Robot, SystemSpec
@@ -94,24 +95,24 @@ class VotedArea(DetectionModule):
         system: SystemSpec = context.shared["system"]
         airport: Airport = context.shared["airport"]
         robot = system.robot
-        timeout_s = number(self.parameters, "unknown_s", 5 * GPS_PERIOD_S)
+        timeout_s = amount(self.parameters, "unknown_s", 5 * GPS_PERIOD_S)
         self._looked_s = -math.inf
         self._where = VotedPosition(robot.gps_accuracy_m,
-                                    number(self.parameters, "blind_s", 10.0),
-                                    number(self.parameters, "blind_m", 5.0))
+                                    amount(self.parameters, "blind_s", 10.0),
+                                    amount(self.parameters, "blind_m", 5.0))
         self.monitor = FenceMonitor(
             airport.prohibited_distance_m,
             FenceLimits(half_diagonal_m(robot), self._reaction_s(system, robot),
                         robot.braking_mps2),
             FreshnessMonitor("position that two sources agree on", timeout_s, 2 * GPS_PERIOD_S,
                              self.clock.now(), self.grace_s(timeout_s), known=self.first_life),
-            number(self.parameters, "hold_s", 0.5))
+            amount(self.parameters, "hold_s", 0.5))
 
     def _reaction_s(self, system: SystemSpec, robot: Robot) -> float:
         needed_s = GPS_PERIOD_S + system.timing.arbitration_s + system.timing.actuation_s
         if "margin_m" not in self.parameters:
             return needed_s
-        return max(needed_s, time_to_intrusion_s(robot, number(self.parameters, "margin_m", 0.0)))
+        return max(needed_s, time_to_intrusion_s(robot, amount(self.parameters, "margin_m", 0.0)))
 
     def on_start(self) -> None:
         """Start waiting for the first position."""

@@ -7,9 +7,10 @@ from typing import Any
 
 from actors import messages as m
 from actors import topics
-from actors.detection.module import DetectionModule, number
+from actors.detection.module import DetectionModule
 from actors.detection.watchdog_core import WatchdogCore
 from actors.runtime.actor import Context, Header, on
+from actors.runtime.parameters import amount
 from actors.runtime.topic import Topic
 
 
@@ -26,7 +27,7 @@ class Watchdog(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        timeout_s = number(self.parameters, "timeout_s", 0.5)
+        timeout_s = amount(self.parameters, "timeout_s", 0.5)
         self.monitor = WatchdogCore(
             watched_nodes(self.parameters), timeout_s, self.clock.now(),
             self.grace_s(timeout_s), known=self.first_life)

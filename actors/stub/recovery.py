@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from actors.detection.module import number
 from actors.messages import RecoveryCommand, RecoveryPhase
 from actors.recovery.module import RecoveryModule
 from actors.runtime.actor import Context
+from actors.runtime.parameters import amount
 from actors.runtime.timer import Timer
 
 
@@ -19,7 +19,7 @@ class StubRecovery(RecoveryModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._takes_s = number(self.parameters, "takes_s", 0.1)
+        self._takes_s = amount(self.parameters, "takes_s", 0.1)
         self._ends = RecoveryPhase(self.parameters.get("ends", RecoveryPhase.DEGRADED))
         self._timer: Timer | None = None
 
