@@ -25,7 +25,7 @@ MOST_BYTES = 250_000
 LIVE = "document.getElementById('link').textContent === 'live'"
 RATE = 1.0
 FAULT_S = 76.0
-WIDE = (1500, 1180)
+WIDE = (1500, 1290)
 
 
 async def shoot(tab: Browser, file: Path, *, whole: bool = False) -> None:
