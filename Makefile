@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test lint campaign bench bench-respawn chaos setup clean requirements
+.PHONY: run test test-slow lint campaign bench bench-respawn chaos setup clean requirements
 
 run: setup
 	$(BIN)/python launch.py
@@ -11,6 +11,10 @@ test: setup
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
 	$(BIN)/python -m pytest
+
+# Long missions on real processes that the suite has shorter relatives of; three minutes.
+test-slow: setup
+	$(BIN)/python -m pytest -m slow
 
 lint: setup
 	$(BIN)/python -m ruff check .

@@ -348,6 +348,7 @@ def test_an_emergency_stop_outlives_recovery_module_and_manager(short):
 # -- real processes ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.processes
 @pytest.mark.timeout(180)
 def test_real_control_nodes_are_killed_and_nothing_is_lost_or_doubled(tmp_path):

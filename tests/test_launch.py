@@ -31,6 +31,7 @@ def test_the_world_of_the_tests_is_the_one_they_think():
     assert {n for n, f in truth.items() if n.startswith("A") and f < 0.5} == set(BROKEN_A)
 
 
+@pytest.mark.slow
 def test_mission_a_succeeds_although_every_other_node_is_killed_once(tmp_path):
     with RealRun(tmp_path, "--mission", "A", "--rate", "3") as run:
         run.wait_for("goal 1/3")
@@ -122,6 +123,7 @@ def test_without_ftm_the_same_fault_is_unsafe(tmp_path, fault):
     assert result["decisions"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("node", ["localization", "osmosis_control"])
 def test_without_ftm_a_killed_node_stays_dead_and_the_run_is_unsafe(tmp_path, node):
     with RealRun(tmp_path, "--mission", "A", "--rate", "3", "--patience", "35",
@@ -260,6 +262,7 @@ def test_two_runs_side_by_side_do_not_know_of_each_other(tmp_path):
         assert len(find_processes(one.port)) == 24
 
 
+@pytest.mark.slow
 def test_the_paper_s_strategy_leaves_a_dead_node_dead_where_repair_under_guard_respawns_it(
         tmp_path):
     """The trap that `rampart verify` finds, on real processes: FTM2 and FTM4 active together."""
