@@ -12,7 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from manager_bench import OSMOSIS, osmosis
 from test_manager_actor import Whole
-from virtual_loop import run
+from virtual_loop import run, turns
 
 from actors import messages as m
 from actors import topics
@@ -195,8 +195,7 @@ class Engineer(Actor):
     async def ask(self, action: str, name: str, values: str = "{}") -> m.AdaptationAnswer:
         count = len(self.answers)
         self.publish(topics.ADAPT, m.AdaptationRequest("r", action, name, values, "test"))
-        for _ in range(50):
-            await asyncio.sleep(0)
+        await turns()
         assert len(self.answers) == count + 1
         return self.answers[-1]
 

@@ -20,7 +20,7 @@ from actors.recording.bag_repair import repair
 from actors.recording.bag_writer import BagError, BagWriter, check_target, open_target
 from actors.recording.json_schema import plain_schema
 from actors.recording.message_form import form_of
-from actors.recording.run_documents import AIRPORT, restore
+from actors.recording.run_documents import AIRPORT, footprint_m, restore
 from actors.recording.sequence_gaps import SequenceGaps
 from actors.recording.views import CHANNELS, Views
 from actors.recording.virtual import VirtualRecording
@@ -171,6 +171,16 @@ def test_the_scene_shows_map_lights_by_verdict_and_obstacles_while_they_are_ther
     for present, count in (((crate,), 1), ((), 0)):
         [(_, update)] = views.of(topics.OBSTACLES, "k", header, m.ObstacleList(present), 0)
         assert len(update.entities[0].cylinders) == count
+
+
+@pytest.mark.parametrize(("text", "size"), [
+    (b"[robot]\nlength_m = 1.5\nwidth_m = 0.9\n", (1.5, 0.9)), (b"[robot]\nlength_m = 1.5\n", None),
+    (b"not = [toml", None), (b"\xff", None), (b"robot = 3\n", None)])
+def test_the_robot_is_as_large_as_the_system_says(text, size):
+    footprint = footprint_m([("system.toml", "application/toml", text)])
+    assert footprint == size
+    shown = dict(Views(None, footprint).start(0))["view/robot"].entities[0].cubes[0].size
+    assert (shown.x, shown.y) == (size or (0.72, 0.614))
 
 
 def test_the_log_tells_decisions_detections_and_processes_once_each():

@@ -69,12 +69,17 @@ class System:
     async def settle(self) -> None:
         """Let everything happen that needs no time."""
         before = self.clock.now()
-        loop = asyncio.get_running_loop()
-        for _ in range(60):
-            turn = loop.create_future()
-            loop.call_at(loop.time(), turn.set_result, None)  # messages are posted for now, too
-            await turn
+        await turns()
         assert self.clock.now() == before, "time has passed"
+
+
+async def turns(count: int = 60) -> None:
+    """Let the loop turn without time passing; messages, posted for now, are handed over too."""
+    loop = asyncio.get_running_loop()
+    for _ in range(count):
+        turn = loop.create_future()
+        loop.call_at(loop.time(), turn.set_result, None)
+        await turn
 
 
 async def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:

@@ -30,8 +30,9 @@ from actors.runtime.bus import BusError
 from actors.runtime.clock import Clock
 from actors.runtime.messages import Message
 from actors.runtime.shared_bus import SharedBus
-from actors.runtime.tap import Tap, is_same_user
+from actors.runtime.tap import Tap
 from actors.runtime.topic import Qos, Topic
+from actors.runtime.unix_peer import is_same_user
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision import run_info
 from actors.supervision.launcher import LaunchError, check_ports

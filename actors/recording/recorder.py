@@ -22,9 +22,10 @@ from operator import itemgetter
 from pathlib import Path
 
 from actors.recording.bag_writer import BagError, BagWriter, open_target
-from actors.recording.run_documents import Documents, collect, restore
+from actors.recording.run_documents import Documents, collect, footprint_m, restore
 from actors.recording.views import Views
 from actors.runtime import tap
+from actors.runtime.unix_peer import is_same_user
 from actors.supervision.run_info import RunInfo, ask
 from airport.formats import load_airport
 from airport.model import Airport
@@ -203,7 +204,7 @@ class Recorder:
         try:
             self.writer = BagWriter(
                 file, documents, time_zero_s=zero_s, begin_s=begin_s,
-                views=Views(airport_of(documents)), wants=self._wants,
+                views=views_of(documents), wants=self._wants,
                 from_start=self._from_start)
         except OSError as error:
             self._give_up(error)
@@ -235,7 +236,7 @@ class Recorder:
             except OSError:
                 return
             connection.setblocking(False)
-            if tap.is_same_user(connection):
+            if is_same_user(connection):
                 self._sockets.register(connection, selectors.EVENT_READ)
             else:
                 connection.close()
@@ -251,8 +252,12 @@ def describe(info: RunInfo) -> Documents:
                    nodes=tuple(info.nodes), started=_wall())
 
 
-def airport_of(documents: Documents) -> Airport | None:
-    """Return the airport that was recorded, or None if there is none or it cannot be read."""
+def views_of(documents: Documents) -> Views:
+    """Return what viewers get to see of a run: its airport, if it can be read, and its robot."""
+    return Views(_airport_of(documents), footprint_m(documents.files))
+
+
+def _airport_of(documents: Documents) -> Airport | None:
     import tempfile  # noqa: PLC0415 once a recording
 
     with tempfile.TemporaryDirectory() as directory:

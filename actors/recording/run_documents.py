@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
@@ -87,6 +88,18 @@ def own_version() -> str:
         return version("rampart")
     except PackageNotFoundError:
         return "unknown"
+
+
+def footprint_m(files: Sequence[File]) -> tuple[float, float] | None:
+    """Return length and width of the robot that the system's file states, None if it does not."""
+    for name, _media, data in files:
+        if name == SYSTEM:
+            try:
+                robot = tomllib.loads(data.decode())["robot"]
+                return float(robot["length_m"]), float(robot["width_m"])
+            except (ValueError, KeyError, TypeError):
+                return None
+    return None
 
 
 def restore(files: Sequence[File], directory: Path) -> Path | None:

@@ -31,8 +31,10 @@ _VERDICT = {
 _EVER = fg.Time(0, 0)
 _HERE = fg.pose_at(0.0, 0.0)
 
-ROBOT_SIZE_M = (0.72, 0.614, 0.4)
-"""Footprint and height of a Summit XL, if the system does not say otherwise."""
+FOOTPRINT_M = (0.72, 0.614)
+"""Length and width of a Summit XL, if the system does not say otherwise."""
+
+_HEIGHT_M = 0.4
 
 
 def map_scene(airport: Airport, at: fg.Time) -> fg.SceneUpdate:
@@ -94,13 +96,13 @@ def route_scene(route: m.Route, at: fg.Time) -> fg.SceneUpdate:
         fg.LineType.LINE_STRIP, _HERE, 3.0, True, points, _ROUTE),)))
 
 
-def robot_scene(size_m: tuple[float, float, float], at: fg.Time) -> fg.SceneUpdate:
+def robot_scene(footprint_m: tuple[float, float], at: fg.Time) -> fg.SceneUpdate:
     """Return the robot as a box with an arrow ahead; it moves with `base_link`."""
-    length_m, width_m, height_m = size_m
+    length_m, width_m = footprint_m
     arrow = fg.ArrowPrimitive(
-        fg.pose_at(0.0, 0.0, height_m + 0.1), 0.6 * length_m, 0.06, 0.3 * length_m, 0.18, _ROBOT)
+        fg.pose_at(0.0, 0.0, _HEIGHT_M + 0.1), 0.6 * length_m, 0.06, 0.3 * length_m, 0.18, _ROBOT)
     box = fg.CubePrimitive(
-        fg.pose_at(0.0, 0.0, height_m / 2), fg.Vector3(length_m, width_m, height_m), _ROBOT)
+        fg.pose_at(0.0, 0.0, _HEIGHT_M / 2), fg.Vector3(length_m, width_m, _HEIGHT_M), _ROBOT)
     return _scene(fg.SceneEntity(at, "base_link", "robot", _EVER, True, arrows=(arrow,),
                                  cubes=(box,)))
 

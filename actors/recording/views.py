@@ -42,13 +42,13 @@ class Views:
 
     Args:
         airport: for map and lights; None draws neither.
-        robot_size_m: length, width, height.
+        footprint_m: length and width of the robot; None for a Summit XL's.
     """
 
     def __init__(self, airport: Airport | None = None,
-                 robot_size_m: tuple[float, float, float] = scene.ROBOT_SIZE_M) -> None:
+                 footprint_m: tuple[float, float] | None = None) -> None:
         self._airport = airport
-        self._robot_size_m = robot_size_m
+        self._footprint_m = footprint_m or scene.FOOTPRINT_M
         self._odom = m.Pose(0.0, 0.0, 0.0)
         self._lights: dict[str, m.LightMeasurement] = {}
         self._seen: dict[str, Any] = {}
@@ -66,7 +66,7 @@ class Views:
     def start(self, at_ns: int) -> list[View]:
         """Return what does not depend on any message."""
         at = fg.time_of(at_ns)
-        views: list[View] = [("view/robot", scene.robot_scene(self._robot_size_m, at))]
+        views: list[View] = [("view/robot", scene.robot_scene(self._footprint_m, at))]
         if self._airport is not None:
             views += [("view/map", scene.map_scene(self._airport, at)),
                       ("view/lights", scene.lights_scene(self._airport, {}, at))]

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from actors.recording.bag_writer import BagError, BagWriter, open_target
-from actors.recording.recorder import airport_of
+from actors.recording.recorder import views_of
 from actors.recording.run_documents import collect
-from actors.recording.views import Views
 
 FLUSH_S = 10.0
 """Simulated seconds between two hand-overs of the file: some tenths of a real one."""
@@ -42,7 +41,7 @@ class VirtualRecording:
         file = open_target(path, overwrite=overwrite)
         try:
             self._writer = BagWriter(
-                file, documents, time_zero_s=-LEAD_S, views=Views(airport_of(documents)),
+                file, documents, time_zero_s=-LEAD_S, views=views_of(documents),
                 from_start=True)
         except OSError as error:
             file.close()

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import errno
 import math
-import os
 import socket
 import struct
 import time
 from collections.abc import Callable
+
+from actors.runtime.unix_peer import is_same_user
 
 RETRY_S = 1.0
 """Real seconds between two looks for a recorder."""
@@ -60,12 +61,6 @@ def parse_frame(data: bytes | memoryview) -> tuple[float, str, bytes]:
         return at_s, key.decode(), bytes(data[_HEAD.size + length:])
     except (struct.error, UnicodeDecodeError) as error:
         raise ValueError(f"{len(data)} bytes that are no frame: {error}") from None
-
-
-def is_same_user(connection: socket.socket) -> bool:
-    """Whether the process at the other end of a unix socket belongs to this user."""
-    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
-    return bool(struct.unpack("3i", credentials)[1] == os.getuid())
 
 
 class Tap:

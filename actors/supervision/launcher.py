@@ -22,11 +22,12 @@ from pathlib import Path
 import msgspec
 
 from actors.messages import NodeTable
+from actors.runtime.unix_peer import is_same_user
 from actors.supervision import run_info
 from actors.supervision.lifeline import kill_leftovers
 from actors.supervision.process_title import find_processes
 from actors.supervision.run_plan import SUPERVISOR, RunPlan
-from actors.supervision.spawner import NAMES, peer_is_same_user
+from actors.supervision.spawner import NAMES
 from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
 LOAD_TIMEOUT_S = 60.0
@@ -257,7 +258,7 @@ class Launcher:
         with contextlib.suppress(OSError):
             connection, _ = self._info.accept()
             with connection:
-                if peer_is_same_user(connection):
+                if is_same_user(connection):
                     connection.send(msgspec.json.encode(self.info()))
 
     def info(self) -> run_info.RunInfo:

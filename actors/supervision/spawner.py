@@ -17,7 +17,6 @@ import os
 import selectors
 import signal
 import socket
-import struct
 import sys
 from collections.abc import Mapping
 from typing import Any, NoReturn
@@ -25,6 +24,7 @@ from typing import Any, NoReturn
 import msgspec
 
 from actors.messages import AdaptedSystem
+from actors.runtime.unix_peer import is_same_user
 from actors.supervision.lifeline import kill_leftovers
 from actors.supervision.node_process import node_main, wedge
 from actors.supervision.process_title import set_title
@@ -85,13 +85,6 @@ def address(port: int, name: str) -> str:
     return f"\0rampart.{port}.spawner.{name}"
 
 
-def peer_is_same_user(connection: socket.socket) -> bool:
-    """Whether the process at the other end of a unix socket belongs to this user."""
-    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
-    _, uid, _ = struct.unpack("3i", credentials)
-    return bool(uid == os.getuid())
-
-
 class Spawner:
     """The fork server of one run."""
 
@@ -133,7 +126,7 @@ class Spawner:
 
     def _accept(self, listener: socket.socket) -> None:
         connection, _ = listener.accept()
-        if not peer_is_same_user(connection):
+        if not is_same_user(connection):
             connection.close()
             return
         self._selector.register(connection, selectors.EVENT_READ, self._serve_one)
@@ -244,6 +237,8 @@ def main() -> int:
         print(msgspec.json.encode(layout.port_of).decode(), flush=True)
         os.dup2(2, 1)  # nobody reads the pipe from here on
         spawner.serve()
+    except BrokenPipeError:  # the launcher ended while this was loading: nobody to tell
+        os._exit(2)
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             print(f"error: port in use: another run has base port {plan.base_port}", flush=True)

@@ -10,11 +10,11 @@ import contextlib
 import os
 import signal
 import socket
-import struct
 
 import msgspec
 
 from actors.messages import AdaptedSystem
+from actors.runtime.unix_peer import peer
 from actors.supervision.spawner import (
     MAX_DATAGRAM,
     NAMES,
@@ -121,7 +121,6 @@ class SpawnerClient:
 
 
 def _kill_peer(connection: socket.socket) -> None:
-    pid, _, _ = struct.unpack("3i", connection.getsockopt(
-        socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    pid, _ = peer(connection)
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, signal.SIGKILL)
