@@ -89,15 +89,6 @@ class BagReader:
             for record in self._raw(file):
                 if isinstance(record, Chunk):
                     yield from self._messages(record)
-                elif isinstance(record, Schema):
-                    self.schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    self.channels[record.id] = record
-                elif isinstance(record, Message):
-                    if record.channel_id in self.channels:
-                        yield record
-                    else:
-                        self._damaged("messages of a channel that was lost")
                 elif isinstance(record, Metadata):
                     self.metadata[record.name] = record.metadata
                     yield record
@@ -105,6 +96,8 @@ class BagReader:
                     yield record
                 elif isinstance(record, Header):
                     self.profile, self.library = record.profile, record.library
+                else:
+                    yield from self._content(record)
 
     def messages(self) -> Iterator[tuple[Channel, Message]]:
         """Return the messages with their channels, in the order of the file."""
@@ -151,15 +144,19 @@ class BagReader:
             self._damaged(f"a chunk ({type(error).__name__})")
             return
         for record in parts:
-            if isinstance(record, Schema):
-                self.schemas[record.id] = record
-            elif isinstance(record, Channel):
-                self.channels[record.id] = record
-            elif isinstance(record, Message):
-                if record.channel_id in self.channels:
-                    yield record
-                else:
-                    self._damaged("messages of a channel that was lost")
+            yield from self._content(record)
+
+    def _content(self, record: Any) -> Iterator[Message]:
+        """Note schemas and channels, return messages: what stands in a chunk, or without one."""
+        if isinstance(record, Schema):
+            self.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self.channels[record.id] = record
+        elif isinstance(record, Message):
+            if record.channel_id in self.channels:
+                yield record
+            else:
+                self._damaged("messages of a channel that was lost")
 
     def _damaged(self, what: str) -> None:
         if what not in self.damage:

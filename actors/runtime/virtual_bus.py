@@ -30,7 +30,7 @@ class Network(Protocol):
 
 
 Route = tuple[Link | None, Deliver, Callable[[Deliver, str, bytes], None]]
-"""The way to a reader, who there takes the message, and its bus's `arrive` if there is no way."""
+"""The way to a reader, who there takes the message, and its bus's `arrive`, for other loops."""
 
 
 class Hub:
