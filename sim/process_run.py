@@ -63,6 +63,8 @@ class ProcessRun:
         plan = launcher.plan
         clock = Clock(plan.origin_s, plan.rate)
         launcher.on_restart = lambda name: mission.brought_back(name, clock.now())
+        if console := mission.console:
+            launcher.on_trouble = lambda text: console.line(clock.now(), text)
 
         def to_launcher(_topic: Topic[Any], message: Any, _header: Header) -> None:
             if isinstance(message, NodeTable):

@@ -76,6 +76,7 @@ class WatchedRun:
         clock = Clock(plan.origin_s, plan.rate)
         self.launcher.on_restart = lambda name: self._console.line(
             clock.now(), f"{name} brought back")
+        self.launcher.on_trouble = lambda text: self._console.line(clock.now(), text)
         ports = dict(self.launcher.ports)
         bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()),
                        Tap(plan.base_port))

@@ -24,7 +24,8 @@ class Others(Actor):
 
     outputs = (topics.MISSION_STATUS, topics.MANAGER_STATUS, topics.POSE, topics.DETECTION,
                topics.MISSION_ORDER_ANSWER, topics.PILOT_STATUS, topics.NODES,
-               topics.BASE_STATUS, topics.ADAPTATION, topics.INJECTION_RESULT)
+               topics.BASE_STATUS, topics.ADAPTATION, topics.INJECTION_RESULT,
+               topics.ERROR_REPORT)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

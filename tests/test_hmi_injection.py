@@ -95,12 +95,24 @@ def test_a_planned_fault_waits_for_its_time_and_can_be_withdrawn():
     ordered = faults.order("gps-bias", 20.0, None, 5.0)
     assert faults.due(24.9) == []
     assert faults.view(10.0)[0]["state"] == "begins at 25 s"
+    withdrawn = faults.order("gps-bias", 20.0, None, 5.0)
+    assert faults.end(withdrawn.injection, 6.0)[0].duration_s == 0.0
+    with pytest.raises(FaultError, match=r"no fault .* is under way"):
+        faults.end(withdrawn.injection, 7.0)
     (order,) = faults.due(25.0)
     assert order.topic == "summit_xl/gps"
-    assert faults.end(ordered.injection, 6.0)[0].duration_s == 0.0
-    assert faults.due(30.0) == []
-    with pytest.raises(FaultError, match=r"no fault .* is under way"):
-        faults.end(ordered.injection, 7.0)
+    assert order.injection.startswith(ordered.injection)
+
+
+def test_a_fault_ended_before_its_first_report_is_over_only_when_its_publisher_says_so():
+    faults = injections()
+    ordered = faults.order("drop:localization/pose", 0.0, math.inf, 0.0)
+    (order,) = faults.due(0.0)
+    faults.end(ordered.injection, 1.0)
+    assert not faults.view(1.0)[0]["ended"]
+    (again,) = faults.due(1.5)
+    assert again.duration_s == 0.0
+    assert "over, 4 messages" in faults.hear(report(order, 4, finished=True))
 
 
 def test_a_permanent_fault_is_ended_on_request_and_the_order_repeated_until_that_is_reported():

@@ -23,6 +23,8 @@ from hmi_world import (
 
 from actors import messages as m
 from actors import topics
+from actors.operator import hmi_feed, hmi_server
+from actors.operator.hmi import Hmi
 from actors.operator.hmi_server import MAX_MESSAGE_BYTES, Visitor
 from actors.operator.hmi_wishes import OrderWish
 
@@ -157,7 +159,7 @@ async def test_an_order_without_an_answer_is_repeated_to_a_mission_manager_that_
     async with world.hmi() as hmi:
         world.say(m.MissionPhase.RUNNING, *m.MissionAction)
         await eventually(lambda: hmi._orders._status is not None)
-        hmi._fulfil(OrderWish(m.MissionAction.HOME), Visitor(1, "127.0.0.1"))
+        hmi._fulfil(OrderWish(m.MissionAction.HOME), Visitor(1))
         sent = []
         hmi.publish = lambda topic, body, *_: topic is topics.MISSION_ORDER and sent.append(body)
         await eventually(lambda: len(sent) >= 2)
@@ -175,6 +177,29 @@ async def test_a_huge_message_closes_that_page_only(world):
             with pytest.raises(websockets.ConnectionClosedError):
                 await hear(bad, "never")
             await hear(good, "state")
+
+
+async def test_a_page_that_takes_nothing_gives_its_place_back(world, monkeypatch):
+    monkeypatch.setattr(hmi_feed, "SEND_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(hmi_server, "CLOSE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(Hmi, "_hello", lambda _hmi: {"type": "hello", "much": "x" * (1 << 25)})
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        host, port = (await served(hmi)).split(":")
+        with socket.create_connection((host, int(port))) as mute:
+            mute.sendall(f"GET /ws HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\n"
+                         "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+                         "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode())
+            await eventually(lambda: hmi._server.pages == 1)
+            await eventually(lambda: hmi._server.pages == 0)
+
+
+async def test_on_loopback_the_name_of_the_machine_is_a_foreign_host(world, monkeypatch):
+    monkeypatch.setattr(socket, "gethostname", lambda: "robot.example")
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with httpx.AsyncClient() as client:
+            named = await client.get(f"http://{at}/", headers={"host": "robot.example"})
+            assert named.status_code == 400
 
 
 async def test_a_foreign_origin_and_a_foreign_host_are_refused(world):

@@ -88,7 +88,7 @@ async def test_a_page_drives_while_it_holds_the_stick_and_letting_go_stops(world
             await eventually(lambda: m.Joystick(0.25, -1.0, dead_man=True) in world.others.stick)
             assert (await ask(page, type="stick", held=False))["grip"] == "free"
             await eventually(lambda: world.others.stick[-1] == RELEASED)
-    assert world.others.stick.count(RELEASED) == 1
+    assert world.others.stick.count(RELEASED) == 2  # at the start of its life, and now
 
 
 @pytest.mark.usefixtures("patient")
@@ -333,7 +333,7 @@ async def test_with_a_token_the_files_are_open_and_everything_else_is_not(world,
             assert (await client.get(f"http://{at}/other?token={TOKEN}")).status_code == 404
         with pytest.raises(websockets.InvalidStatus, match="403"):
             await open_page(at, origin="http://evil.example", **options)
-    assert world.others.stick == []
+    assert set(world.others.stick) <= {RELEASED}
 
 
 async def test_a_page_for_everybody_without_a_token_is_not_served_and_the_reason_reported(world):

@@ -130,6 +130,10 @@ async def test_by_keyboard_the_focus_is_seen_and_the_first_stop_skips_to_the_map
         assert await tab.value("document.activeElement.className") == "skip"
         outline = "getComputedStyle(document.activeElement).outlineStyle"
         assert await tab.value(outline) != "none"
+        await tab.value("window.still = true; document.activeElement.click()")
+        await tab.until("location.hash === '#main'")
+        await tab.until("document.getElementById('link').textContent === 'live'")
+        assert await tab.value("window.still") is True  # and the connection was kept
 
 
 async def test_who_wants_no_motion_sees_none(world):

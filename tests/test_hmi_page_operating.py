@@ -50,10 +50,17 @@ def alive(world: World):
     return repeated(say)
 
 
-async def key(tab, name: str, *, down: bool, repeat: bool = False) -> None:
+CONTROL_HELD = 2
+
+
+async def key(tab, name: str, *, down: bool, repeat: bool = False, modifiers: int = 0) -> None:
     await tab.call("Input.dispatchKeyEvent", type="rawKeyDown" if down else "keyUp", key=name,
-                   code=name if name.startswith("Arrow") else f"Key{name.upper()}",
-                   autoRepeat=repeat)
+                   code=f"Key{name.upper()}" if len(name) == 1 else name,
+                   autoRepeat=repeat, modifiers=modifiers)
+
+
+def moved(world) -> bool:
+    return any(stick != RELEASED for stick in world.others.stick)
 
 
 async def mouse(tab, kind: str, x: float, y: float) -> None:
@@ -81,7 +88,8 @@ async def test_the_keyboard_drives_while_a_key_is_held_and_everything_else_stops
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until(FREE)
         await key(tab, "ArrowUp", down=True)
-        assert world.others.stick == []  # only with the focus on the stick
+        await asyncio.sleep(0.15)
+        assert not moved(world)  # only with the focus on the stick
         await key(tab, "ArrowUp", down=False)
 
         await tab.value(f"{PAD}.focus()")
@@ -108,6 +116,62 @@ async def test_the_keyboard_drives_while_a_key_is_held_and_everything_else_stops
             await stops(world)
             await key(tab, "ArrowDown", down=False)
         assert tab.errors == []
+
+
+@pytest.mark.usefixtures("patient")
+@pytest.mark.parametrize("name", ["Control", "Alt", "Meta"])
+async def test_a_key_that_is_let_go_under_another_one_is_let_go(world, name):
+    held = {"Alt": 1, "Control": CONTROL_HELD, "Meta": 4}[name]
+    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
+        await tab.show(f"http://{await served(hmi)}/")
+        await tab.until(FREE)
+        await tab.value(f"{PAD}.focus()")
+        await key(tab, "w", down=True)
+        await drives(tab, world, forward=0.5)
+        await key(tab, f"{name}Left", down=True, modifiers=held)
+        await stops(world)
+        await key(tab, "w", down=False, modifiers=held)
+        await key(tab, f"{name}Left", down=False)
+        await stops(world)
+        await tab.value(f"{PAD}.focus()")
+        await key(tab, "w", down=True)
+        await drives(tab, world, forward=0.5)
+        await key(tab, "w", down=False)
+        await stops(world)
+
+
+async def test_a_connection_that_is_too_slow_is_told_so_and_not_flooded(world, monkeypatch):
+    monkeypatch.setattr(hmi_stick, "TICKET_S", -1.0)  # every ticket comes too late
+    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
+        await tab.show(f"http://{await served(hmi)}/")
+        await tab.until(FREE)
+        await tab.value(
+            "window.sent = 0; const send = WebSocket.prototype.send; WebSocket.prototype.send = "
+            "function(text) { window.sent += text.includes('\"held\":true'); send.call(this, text); }")
+        await tab.value(f"{PAD}.focus()")
+        await key(tab, "w", down=True)
+        await tab.until(f"{WORDS}.includes('the connection is too slow to drive')")
+        assert await tab.value("window.sent") <= 1 + 1 + 21  # first, with a ticket, each 50 ms
+        await key(tab, "w", down=True, repeat=True)
+        await asyncio.sleep(0.15)
+        assert await tab.value("window.sent") <= 1 + 1 + 21
+        assert not moved(world)
+
+
+@pytest.mark.usefixtures("patient")
+async def test_the_page_says_why_teleoperation_does_not_follow_it(world):
+    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
+        await tab.show(f"http://{await served(hmi)}/")
+        await tab.until(FREE)
+        await tab.value(f"{PAD}.focus()")
+        await key(tab, "w", down=True)
+        await drives(tab, world, forward=0.5)
+        world.others.publish(topics.ERROR_REPORT, m.Diagnostic(
+            "teleoperation", "joystick", "not followed: /dev/input/js0 has the stick", "hmi", 1))
+        await tab.until("document.getElementById('stick-state').textContent === 'not followed'")
+        assert "/dev/input/js0 has the stick" in await tab.value(WORDS)
+        await key(tab, "w", down=False)
+        await stops(world)
 
 
 async def test_a_page_that_hangs_has_let_go_and_is_to_press_again(world):
@@ -147,6 +211,14 @@ async def test_an_hmi_that_comes_back_is_not_driven_by_a_key_that_is_still_held(
             await key(tab, "ArrowUp", down=False)
             await key(tab, "ArrowUp", down=True)
             await drives(tab, world, forward=0.5)
+        await key(tab, "ArrowUp", down=False)
+        await tab.until("document.body.classList.contains('offline')")
+        await key(tab, "ArrowUp", down=True)  # pressed while nobody listens
+        async with world.hmi(incarnation=3, hmi_port=port):
+            await tab.until(LIVE)
+            await key(tab, "ArrowUp", down=True, repeat=True)
+            await tab.until(f"{WORDS}.includes('let go first, then press again')")
+            await stops(world)
 
 
 @pytest.mark.usefixtures("patient")
@@ -173,6 +245,22 @@ async def test_the_stick_on_the_screen_and_a_gamepad_drive(world):
         await tab.value("window.pad.buttons[4].pressed = true")
         await drives(tab, world, left=-0.5)
         await tab.value("window.pad.buttons[4].pressed = false")
+        await stops(world)
+
+        await tab.value("window.pad.buttons[4].pressed = true")
+        await drives(tab, world, left=-0.5)
+        await tab.value("window.pad.connected = false; dispatchEvent(new Event('gamepaddisconnected'))")
+        await stops(world)
+        await tab.value("window.pad.connected = true; dispatchEvent(new Event('gamepadconnected'))")
+        await tab.until(f"{WORDS}.includes('let go first, then press again')")
+        await stops(world)  # plugging in moves nothing
+        await tab.value("window.pad.buttons[4].pressed = false")
+        await tab.until(f"!{WORDS}.includes('let go first')")
+        await tab.value("window.focusless = true; document.hasFocus = () => !window.focusless;"
+                        "window.pad.buttons[4].pressed = true")
+        await stops(world)  # meant for another window
+        await tab.value("window.focusless = false")
+        await tab.until(f"{WORDS}.includes('let go first, then press again')")
         await stops(world)
         assert tab.errors == []
 
@@ -292,5 +380,6 @@ async def test_the_token_of_the_address_is_kept_by_the_tab_and_hidden(world):
         await tab.call("Page.navigate", url=f"http://{at}/#token={TOKEN}")
         await tab.until(LIVE)
         assert await tab.value("location.hash") == ""
+        await tab.value("window.before = true")
         await tab.call("Page.reload")
-        await tab.until(f"{LIVE} && performance.now() < 15000")
+        await tab.until(f"{LIVE} && window.before === undefined")

@@ -47,6 +47,15 @@ def test_a_mission_once_taken_is_not_sent_again_when_the_mission_manager_forgets
     assert submission.expire(1000.0) is None
 
 
+def test_the_first_mission_is_settled_when_the_mission_manager_has_another_one():
+    submission = Submission("r7", 2, RESPAWN_WINDOW_S / 2, FIRST)
+    submission.hear(status(MissionRequest("r7/1.1", "B", GOALS), MissionPhase.CANCELLED))
+    assert submission.pending is None
+    assert submission.ask("A", GOALS, 10.0).name == "A"
+    submission.hear(status(FIRST, MissionPhase.CANCELLED))
+    assert submission.pending is not None  # what was asked for since is settled by its own id alone
+
+
 def test_the_first_life_sends_the_mission_however_late_it_begins():
     assert Submission("r7", 1, 60.0, FIRST).pending == FIRST
 

@@ -163,7 +163,7 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
         "    for t in topics.ALL:\n"
         "        for key in ([t.at(n) for n in names] if t.is_family else [t.at()]):\n"
         "            for junk in (b'', b'garbage', b'\\xff' * 300, b'\\x95\\xa1x\\x01\\x01\\xcb',\n"
-        "                         b'\\x91' * 5000):\n"
+        "                         b'\\x91' * 5000, b'\\x95\\xa1\\xff\\x01\\x01\\xcb' + bytes(9)):\n"
         "                s.put(key, junk)\n"
         "    time.sleep(0.2)\n"
         "s.close()\n")

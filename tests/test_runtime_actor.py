@@ -146,10 +146,12 @@ async def test_garbage_is_counted_and_reported_and_the_actor_goes_on(make_bus):
         async with running(Talker, "talker", make_bus) as talker:
             await eventually(lambda: bool(listener.peers))
             pose_then_text = encode(Header("talker", 1, 900, 0.0), m.Reset("RM1", "x"))
-            for garbage in (b"", b"\xff\x00 garbage", b"\x91" * 100_000, pose_then_text):
+            no_text = encode(Header("talker", 1, 901, 0.0), m.Pose(0.0, 0.0, 0.0)).replace(
+                b"talker", b"talk\xff\xff")
+            for garbage in (b"", b"\xff\x00 garbage", b"\x91" * 100_000, pose_then_text, no_text):
                 talker._bus.publish(topics.POSE, topics.POSE.at(), garbage)
-            await eventually(lambda: listener._rejected == 4)
             talker.publish(topics.POSE, m.Pose(1.0, 0.0, 0.0))
+            await eventually(lambda: listener._rejected == 5)
             await eventually(lambda: len(listener.heard) == 1)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import signal
 import socket
@@ -182,6 +183,50 @@ async def test_nodes_come_back_whatever_happens_to_the_spawners(tmp_path):
             await eventually(lambda i=incarnation: witness.state("DM1") == ("running", i + 1), 20)
             await eventually(lambda o=old: all(
                 process(port, v) not in {None, p} for v, p in o.items()), 20)
+
+
+async def test_the_launcher_turns_while_supervisor_and_both_spawners_are_dead(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        victims = ("supervisor", "spawner_a", "spawner_b")
+        old = {v: process(launcher.plan.base_port, v) for v in victims}
+        nodes = {r.name: r.pid for r in witness.table.nodes if r.name not in victims}
+        for pid in old.values():
+            os.kill(pid, signal.SIGKILL)
+        turns = rounds = 0
+        look_after = launcher._look_after_guards
+
+        async def counted() -> bool:
+            nonlocal rounds
+            rounds += 1
+            return await look_after()
+
+        launcher._look_after_guards = counted
+        while any(process(launcher.plan.base_port, v) in {None, p} for v, p in old.items()):
+            await asyncio.sleep(0.01)
+            turns += 1
+        assert turns > rounds  # it does nothing but look when nothing can be done
+        await eventually(lambda: witness.state("supervisor") == ("running", 2), 20)
+        assert {r.name: r.pid for r in witness.table.nodes if r.name not in victims} == nodes
+
+
+async def test_a_launcher_that_cannot_look_says_so_once_and_goes_on(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        told, failures = [], 0
+        launcher.on_trouble = told.append
+        look_after = launcher._look_after_guards
+
+        async def without_descriptors() -> bool:
+            nonlocal failures
+            if failures == 2:
+                return await look_after()
+            failures += 1
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+        launcher._look_after_guards = without_descriptors
+        await eventually(lambda: failures == 2)
+        os.kill(process(launcher.plan.base_port, "supervisor"), signal.SIGKILL)
+        await eventually(lambda: witness.state("supervisor")[1] == 2, 20)
+        assert told == ["cannot look after supervisor and spawners: Too many open files"]
 
 
 async def test_an_orderly_end_leaves_no_process(tmp_path):

@@ -168,6 +168,20 @@ async def test_echo_shows_garbage_as_such_with_the_reason(run, capsys):
     assert json.loads(out)["garbage"] == b"\xc1garbage".hex()
 
 
+async def test_a_name_that_is_no_text_is_garbage_too(run, capsys):
+    no_text = b"\x95\xa1\xff\x01\x01\xcb" + bytes(8) + b"\x90"
+
+    async def spoil() -> None:
+        while True:
+            run.bus.publish(topics.ROUTE, topics.ROUTE.at(), no_text)
+            await asyncio.sleep(0.02)
+
+    spoiler = asyncio.create_task(spoil())
+    _, out, _ = await run.call(capsys, "topic", "echo", "plan/route", "-n", "1")
+    spoiler.cancel()
+    assert out.startswith(f"garbage plan/route {len(no_text)} bytes, not a Route: ")
+
+
 async def test_a_silent_topic_is_said_to_be_silent(run, capsys):
     code, out, err = await run.call(capsys, "topic", "echo", "plan/route", "--duration", "0.2")
     assert (code, out) == (1, "")
@@ -295,6 +309,9 @@ async def test_obstacles_come_move_and_go(run, capsys):
     assert (await run.call(capsys, "obstacle", "add", "crate", "3", "2.5"))[0] == 0
     _, out, _ = await run.call(capsys, "obstacle", "list", "--json")
     assert json.loads(out) == [{"name": "crate", "x_m": 3.0, "y_m": 2.5, "radius_m": 0.4}]
+    wide = ("obstacle", "add", "crate", "3", "2.5", "--radius", "1")
+    assert (await run.call(capsys, *wide))[0] == 0
+    assert run.node.obstacles["crate"].radius_m == 1.0
     code, _, err = await run.call(capsys, "obstacle", "remove", "box")
     assert (code, err) == (2, "rampart: unknown obstacle 'box'; known: crate\n")
     assert (await run.call(capsys, "obstacle", "remove", "crate"))[0] == 0

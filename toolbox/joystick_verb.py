@@ -62,7 +62,7 @@ async def joystick(options: argparse.Namespace) -> int:
                          "a joystick is used with --device")
     stop = asyncio.Event()
     async with connect(options.port) as session:
-        drive = _Drive(session, KeyboardStick(options.speed), stop)
+        drive = _Drive(session, None if options.device else KeyboardStick(options.speed), stop)
         device = _open(options.device, session, drive) if options.device else None
         with stopped_by_signals(stop):
             say("hold a key to drive, q quits" if device is None
@@ -97,14 +97,22 @@ def _open(name: str, session: Session, drive: _Drive) -> JoystickDevice:
 
 
 class _Drive:
-    """A stick in the user's hand, and what is heard of it."""
+    """A stick in the user's hand, and what is heard of it.
 
-    def __init__(self, session: Session, stick: KeyboardStick, stop: asyncio.Event) -> None:
+    Args:
+        session: in the run.
+        keyboard: turns keys into positions; None if a device drives.
+        stop: set when the user has had enough.
+    """
+
+    def __init__(
+        self, session: Session, keyboard: KeyboardStick | None, stop: asyncio.Event
+    ) -> None:
         self.ended = ""
         self.answered = False
         self._session = session
-        self._keyboard = stick
-        self._device: m.Joystick | None = None
+        self._keyboard = keyboard
+        self._device = m.Joystick(0.0, 0.0, False)
         self._stop = stop
         self._loop = asyncio.get_running_loop()
         self._held_since_s: float | None = None
@@ -124,7 +132,7 @@ class _Drive:
         """Take a key."""
         if key in {"q", "Q", END}:
             self._stop.set()
-        elif self._device is None:
+        elif self._keyboard is not None:
             self._keyboard.press(key, self._loop.time())
             self._send()
 
@@ -161,7 +169,7 @@ class _Drive:
             await asyncio.sleep(_SHORTEST_S)
 
     def _stick(self) -> m.Joystick:
-        return self._device or self._keyboard.stick(self._loop.time())
+        return self._keyboard.stick(self._loop.time()) if self._keyboard else self._device
 
     def _send(self) -> None:
         stick = self._stick()
@@ -180,7 +188,7 @@ class _Drive:
         stick, pilot = self._stick(), self._pilot
         text = (f"forward {stick.forward:+.0%} left {stick.left:+.0%}" if stick.dead_man
                 else "let go")
-        if self._device is None:
+        if self._keyboard is not None:
             text += f"  speed {self._keyboard.speed:.0%}"
         if pilot is not None:
             text += f"  pilot {pilot.mode.value}, {'stopped' if pilot.stopped else 'driving'}"

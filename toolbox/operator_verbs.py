@@ -13,6 +13,7 @@ from actors import messages as m
 from actors import topics
 from actors.runtime.envelope import Header
 from toolbox import systems
+from toolbox.following import stopped_by_signals
 from toolbox.output import NoEffectError, UsageError, print_json, print_table, say, unknown
 from toolbox.session import Session, connect
 
@@ -124,7 +125,9 @@ async def trigger(options: argparse.Namespace) -> int:
         if not await bring(m.DetectionState.ACTIVE):
             raise NoEffectError(f"no effect: {options.module} does not answer")
         say(f"{options.module} detects")
-        await asyncio.sleep(options.duration / session.clock.rate)
+        stop = asyncio.Event()
+        with stopped_by_signals(stop), contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), options.duration / session.clock.rate)
         if not await bring(m.DetectionState.IDLE):
             raise NoEffectError(f"{options.module} did not become idle again")
     say(f"{options.module} is idle again")
@@ -156,8 +159,10 @@ async def obstacle_add(options: argparse.Namespace) -> int:
     order = m.ObstacleCommand(options.name, True, options.x, options.y, options.radius)
 
     def there(obstacle: m.ObstacleCommand | None) -> bool:
-        return obstacle is not None and math.dist(
-            (obstacle.x_m, obstacle.y_m), (order.x_m, order.y_m)) < 0.01
+        return obstacle is not None and all(
+            math.isclose(is_, wanted, abs_tol=1e-6) for is_, wanted in (
+                (obstacle.x_m, order.x_m), (obstacle.y_m, order.y_m),
+                (obstacle.radius_m, order.radius_m)))
 
     async with connect(options.port) as session:
         await _World(session).change(order, there)

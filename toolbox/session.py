@@ -17,7 +17,7 @@ import msgspec
 
 from actors.runtime.bus import Bus, BusError
 from actors.runtime.clock import Clock
-from actors.runtime.envelope import Header, decode, encode
+from actors.runtime.envelope import UNREADABLE, Header, decode, encode
 from actors.runtime.tap import Tap
 from actors.runtime.topic import ROOT, Topic
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
@@ -69,7 +69,7 @@ class Session:
             short = full_key.removeprefix(f"{ROOT}/")
             try:
                 header, body = decode(topic, payload)
-            except (msgspec.MsgspecError, RecursionError) as error:
+            except UNREADABLE as error:
                 if garbage is not None:
                     garbage(short, payload, str(error))
                 return

@@ -103,6 +103,7 @@ class Hmi(Actor):
         self._submit()
         if not self._port:
             return
+        self._operating.start()
         shared = self.context.shared
         try:
             self._server = PageServer(

@@ -55,6 +55,7 @@ class Ordered:
     affected: dict[str, dict[str, int]] = field(default_factory=dict)
     finished: set[str] = field(default_factory=set)
     reason: str = ""
+    sent: bool = False
     ending: bool = False
     outcome: str = ""
     effective: bool | None = None
@@ -147,7 +148,7 @@ class Injections:
         """
         for ordered in self._ordered:
             if ordered.injection == injection and not ordered.outcome:
-                if now_s < ordered.begins_s or not ordered.affected:
+                if not ordered.sent:
                     ordered.outcome = "withdrawn before it took hold"
                 ordered.ending = True
                 ordered.duration_s = max(now_s - ordered.begins_s, 0.0)
@@ -182,8 +183,10 @@ class Injections:
 
     def due(self, now_s: float) -> list[m.Injection | m.ActuatorFault]:
         """Return the orders to send now, first or again: those that nobody has answered."""
-        return [order for o in self._ordered if not o.outcome and now_s >= o.begins_s
-                for order in o.orders
+        begun = [o for o in self._ordered if not o.outcome and now_s >= o.begins_s]
+        for ordered in begun:
+            ordered.sent = True
+        return [order for o in begun for order in o.orders
                 if order.injection not in (o.finished if o.ending else o.affected)]
 
     def hear(self, report: m.InjectionReport) -> str:

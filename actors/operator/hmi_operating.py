@@ -88,6 +88,10 @@ class Operating:
         state.picture.section("operating")
         self.show()
 
+    def start(self) -> None:
+        """Let go of the stick in case a former life of the HMI died while a page held it."""
+        self._actor.publish(topics.JOYSTICK, m.Joystick(0.0, 0.0, dead_man=False))
+
     # -- wishes ---------------------------------------------------------------------------------
 
     def introduction(self, page: int) -> dict[str, Any]:

@@ -18,6 +18,7 @@ SEARCH_EVERY = 5
 """Looks between two searches of /proc for the guards: a search reads a file of every process."""
 
 GUARD_KIND = "supervision"
+LAUNCHER = "launch.py"
 _STATES = {"T": "stopped", "t": "stopped", "Z": "crashed", "X": "crashed"}
 
 
@@ -50,17 +51,17 @@ class ProcessObserver:
 
         Returns:
             `nodes`: usage by node name, of those whose process exists. `guards`: a row for each
-            process that is in no table: name, kind, pid, state, incarnation, restarts. The usage
-            of a guard is among the nodes'.
+            process that is in no table: name, kind, pid, state, incarnation, restarts, and
+            whether it can be sent signals by its name. The usage of a guard is among the nodes'.
         """
         nodes = table.nodes if table else ()
-        known = {name for node in nodes for name in node.name.split("+")}
+        known = {node.name for node in nodes}
         if self._port and self._looks % SEARCH_EVERY == 0:
             self._guards = {
                 "+".join(p.names): (p.pid, p.incarnation) for p in self._find(self._port)
                 if p.launcher == self._launcher and known.isdisjoint(p.names)
             } if nodes else {}
-            self._guards |= {"launch.py": (self._launcher, 1)} if self._launcher else {}
+            self._guards |= {LAUNCHER: (self._launcher, 1)} if self._launcher else {}
         # Until there is a table nobody knows who is a guard: search again at the next look.
         self._looks = self._looks + 1 if nodes else 0
         pids = {node.name: node.pid for node in nodes} | {
@@ -69,7 +70,8 @@ class ProcessObserver:
         return {"nodes": figures(pids, usage), "guards": [
             {"name": name, "kind": GUARD_KIND, "pid": pid,
              "state": _STATES.get(self._state(pid), "running"),
-             "incarnation": incarnation, "restarts": max(0, incarnation - 1)}
+             "incarnation": incarnation, "restarts": max(0, incarnation - 1),
+             "signals": name != LAUNCHER}
             for name, (pid, incarnation) in sorted(self._guards.items())]}
 
 

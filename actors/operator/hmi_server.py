@@ -14,7 +14,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from actors.operator.camera_eye import CameraError, CameraEye
 from actors.operator.hmi_feed import SEND_TIMEOUT_S, Feed, PageFeed
 from actors.operator.hmi_limits import MessageBudget, Verdict
 from actors.operator.hmi_wishes import RefusedError, Wish, WishError, read_wish
-from actors.runtime.web_access import SUBPROTOCOL, Access, AccessError, shown_token
+from actors.runtime.web_access import SUBPROTOCOL, Access, AccessError, is_loopback, shown_token
 
 LOOPBACK = "127.0.0.1"
 NO_TOKEN = 4401
@@ -41,6 +41,8 @@ NO_TOKEN = 4401
 
 MAX_PAGES = 16
 MAX_MESSAGE_BYTES = 4096
+CLOSE_TIMEOUT_S = 1.0
+"""Real seconds for a goodbye to get into the socket."""
 
 _PAGE = Path(__file__).with_name("page")
 _FILES = {
@@ -74,10 +76,9 @@ class PortError(OSError):
 
 @dataclass(frozen=True, slots=True)
 class Visitor:
-    """An open page: its number in this life of the HMI, and from where it comes."""
+    """An open page: its number in this life of the HMI."""
 
     number: int
-    address: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +125,8 @@ class PageServer:
             raise PortError(str(error)) from None
         self._socket = _listen(host, port)
         self.port: int = self._socket.getsockname()[1]
-        self._access = Access(host, self.port, token, (socket.gethostname(),))
+        names = () if is_loopback(host) else (socket.gethostname(),)
+        self._access = Access(host, self.port, token, names)
         self.pages = 0
         self._server: uvicorn.Server | None = None
 
@@ -184,17 +186,12 @@ class PageServer:
             return
         self.pages += 1
         self._visitors += 1
-        visitor = Visitor(self._visitors, socket_.client.host if socket_.client else "?")
+        visitor = Visitor(self._visitors)
         try:
             with self._feed.page() as page:
                 await _send(socket_, self._handlers.came(visitor))
-                push = asyncio.ensure_future(self._push(socket_, page))
-                try:
-                    await self._talk(socket_, page, visitor)
-                finally:
-                    push.cancel()
-                    with contextlib.suppress(asyncio.CancelledError):
-                        await push
+                await _until_one_ends(self._talk(socket_, page, visitor),
+                                      self._push(socket_, page))
         except (WebSocketDisconnect, RuntimeError, TimeoutError):
             return  # the page has gone while it was being answered
         finally:
@@ -217,7 +214,7 @@ class PageServer:
                 await _send(socket_, {"type": "error", "text": "too many messages from this page; "
                                       "those beyond the limit are not read"})
             elif verdict is Verdict.CLOSE:
-                await socket_.close(1008, "flooding: far too many messages")
+                await _close(socket_, 1008, "flooding: far too many messages")
                 return
 
     async def _push(self, socket_: WebSocket, page: PageFeed) -> None:
@@ -225,7 +222,7 @@ class PageServer:
             try:
                 await self._feed.push(page, socket_.send_text)
             except TimeoutError:
-                await socket_.close(1013, "this page does not keep up")
+                await _close(socket_, 1013, "this page does not keep up")
 
     def _answer(self, text: str | bytes | None, visitor: Visitor) -> dict[str, Any]:
         try:
@@ -264,6 +261,25 @@ def _has_token(connection: HTTPConnection, access: Access) -> bool:
     return access.permits(shown_token(
         connection.headers.get("authorization"), connection.query_params.get("token"),
         connection.scope.get("subprotocols", ())))
+
+
+async def _until_one_ends(*parts: Coroutine[Any, Any, None]) -> None:
+    """Run parts of a conversation side by side until one of them is over or raises."""
+    tasks = [asyncio.ensure_future(part) for part in parts]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _close(socket_: WebSocket, code: int, reason: str) -> None:
+    """Say goodbye; whoever takes nothing does not hear it."""
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(socket_.close(code, reason), CLOSE_TIMEOUT_S)
 
 
 async def _send(socket_: WebSocket, data: Any) -> None:

@@ -69,9 +69,14 @@ class Submission:
         return self._pending
 
     def hear(self, status: m.MissionStatus) -> None:
-        """Take note of the Mission Manager's status; a request it shows is settled."""
+        """Take note of the Mission Manager's status; a request it shows is settled.
+
+        So is the run's first mission by any other: whoever has one was not waiting for it.
+        """
         self._status = status
-        if self._pending is not None and status.mission_id == self._pending.mission_id:
+        if self._pending is not None and (
+                status.mission_id == self._pending.mission_id
+                or (self._give_up_s is None and status.mission_id)):
             self._pending = None
             self._give_up_s = None
 

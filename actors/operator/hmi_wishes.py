@@ -11,6 +11,7 @@ from typing import Annotated
 import msgspec
 
 from actors.messages import MissionAction
+from actors.runtime.envelope import UNREADABLE
 
 __all__ = ["AdaptWish", "EndFaultWish", "InjectWish", "MissionWish", "OrderWish", "RefusedError",
            "ResetWish", "SignalWish", "StickWish", "Wish", "WishError", "read_wish"]
@@ -107,6 +108,6 @@ def read_wish(text: str | bytes | None) -> Wish:
     """
     try:
         wish: Wish = _wishes.decode(text or b"")
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except UNREADABLE as error:
         raise WishError(f"message not understood: {error}") from None
     return wish

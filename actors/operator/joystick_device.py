@@ -82,7 +82,7 @@ def mapping_of(parameters: Mapping[str, Any]) -> StickMapping:
             right = "a number from 0 to below 1"
             sound = isinstance(value, (int, float)) and 0 <= value < 1
         elif name.endswith("_sign"):
-            right, sound = "1 or -1", value in {1, -1}
+            right, sound = "1 or -1", value in (1, -1)
         else:
             right, sound = "a whole number from 0 to 255", value in range(256)
         if not sound or isinstance(value, bool):

@@ -16,6 +16,10 @@ from actors.runtime.topic import Qos, Topic
 
 B = TypeVar("B")
 
+UNREADABLE = (ValueError, RecursionError)
+"""What decoding the bytes of a stranger raises: msgspec's errors are ValueErrors, and so is that of
+a text which is no UTF-8; nesting without end is the other."""
+
 _REMEMBERED_COMMANDS = 64
 
 
@@ -54,7 +58,7 @@ def decode(topic: Topic[Any], payload: bytes) -> tuple[Header, Any]:
     """Return header and body of a payload.
 
     Raises:
-        msgspec.MsgspecError: the payload is not a message of this topic's type.
+        ValueError, RecursionError: the payload is not a message of this topic's type.
     """
     envelope = (_decoders.get(topic.type) or _decoder(topic.type))(payload)
     return envelope, envelope.body
@@ -95,7 +99,7 @@ class ArrivalGuard:
         def receive(key: str, payload: bytes) -> None:  # made of every message
             try:
                 message = unpack(payload)
-            except (msgspec.MsgspecError, RecursionError) as error:
+            except UNREADABLE as error:
                 refuse(key, f"not a {kind}: {error}")
                 return
             life = lives.get(message.source)

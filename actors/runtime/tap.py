@@ -105,8 +105,11 @@ class Tap:
             self._socket = None
 
     def _look(self) -> None:
-        connection = socket.socket(
-            socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+        try:
+            connection = socket.socket(
+                socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+        except OSError:  # no descriptor left
+            return
         try:
             connection.connect(self._address)
             if not is_same_user(connection):

@@ -181,5 +181,11 @@ class ZenohBus:
                 call = self._arrived.popleft()
             except IndexError:
                 return
-            if self._session is not None:
+            if self._session is None:
+                continue
+            try:
                 call()
+            except Exception as error:  # what else has arrived is not to wait for the next message
+                asyncio.get_running_loop().call_exception_handler({
+                    "message": f"{self._node or 'tool'}: a message could not be handed over",
+                    "exception": error})

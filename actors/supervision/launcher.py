@@ -74,6 +74,7 @@ class Launcher:
         self.supervisor_incarnation = 0
         self.known_incarnations: dict[str, int] = {}
         self.on_restart: Callable[[str], None] = lambda _name: None
+        self.on_trouble: Callable[[str], None] = lambda _text: None
         self._title = title
         self._spawners = SpawnerClient(plan.base_port)
         self._lifeline: tuple[int, int] = (-1, -1)
@@ -81,6 +82,7 @@ class Launcher:
         self._begun_s = self._load_s = 0.0
         self._supervisor_pid = 0
         self._supervisor_heard_s = 0.0
+        self._trouble = ""
         self._info: socket.socket | None = None
         self._guard: asyncio.Task[None] | None = None
 
@@ -114,8 +116,9 @@ class Launcher:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[self._lifeline[0]],
             env=environment)
         assert self._first.stdin is not None  # noqa: S101 for the type checker
-        self._first.stdin.write(msgspec.json.encode(self.plan))
-        self._first.stdin.close()
+        with contextlib.suppress(BrokenPipeError):  # it has died: whoever waits for it will notice
+            self._first.stdin.write(msgspec.json.encode(self.plan))
+            self._first.stdin.close()
 
     async def load(self) -> None:
         """Wait until the first spawner has loaded the plan and check the ports.
@@ -159,9 +162,10 @@ class Launcher:
         self._guard = asyncio.create_task(self._keep_guards())
 
     def _start_supervisor(self) -> None:
-        self.supervisor_incarnation += 1
+        incarnation = self.supervisor_incarnation + 1
         self._supervisor_pid = self._spawners.fork(
-            (SUPERVISOR,), self.supervisor_incarnation, self.known_incarnations)
+            (SUPERVISOR,), incarnation, self.known_incarnations)
+        self.supervisor_incarnation = incarnation
         self._supervisor_heard_s = time.monotonic()
 
     # -- guard ----------------------------------------------------------------------------------
@@ -181,26 +185,51 @@ class Launcher:
             stall_s = time.monotonic() - begun_s - GUARD_PERIOD_S
             if stall_s > GUARD_PERIOD_S:  # silence counts only while this loop turned
                 self._supervisor_heard_s += stall_s
-            names = {n for p in find_processes(self.plan.base_port)
-                     if p.launcher == self.plan.launcher_pid for n in p.names}
-            for name in NAMES:
-                full = f"spawner_{name}"
-                if full not in names or not self._spawners.ping(name):
-                    self._bring_back(full)
-            patience_s = SUPERVISOR_PATIENCE_S / min(1.0, self.plan.rate)
-            silent = time.monotonic() - self._supervisor_heard_s > patience_s
-            if SUPERVISOR in names and silent:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(self._supervisor_pid, signal.SIGKILL)
-            if SUPERVISOR not in names or silent:
-                await self._supervisor_gone(GUARD_PERIOD_S)  # its port is free only then
-                self._bring_back(SUPERVISOR)
+            try:
+                all_there = await self._look_after_guards()
+                self._trouble = ""
+            except OSError as error:  # no descriptors or no memory left: perhaps later
+                all_there = False
+                self._report(f"cannot look after supervisor and spawners: {error.strerror}")
+            if not all_there:  # with no supervisor to wait for, the next round would come at once
+                await asyncio.sleep(GUARD_PERIOD_S)
+
+    async def _look_after_guards(self) -> bool:
+        """Bring back whichever guard is missing; False if that was not possible."""
+        living = {n: p for p in find_processes(self.plan.base_port)
+                  if p.launcher == self.plan.launcher_pid for n in p.names}
+        all_there = True
+        for name in NAMES:
+            full = f"spawner_{name}"
+            if full not in living or not self._spawners.ping(name):
+                all_there &= self._bring_back(full)
+        supervisor = living.get(SUPERVISOR)
+        if supervisor is not None:  # it may be a child of a spawner that died before it answered
+            self._supervisor_pid = supervisor.pid
+            self.supervisor_incarnation = max(self.supervisor_incarnation, supervisor.incarnation)
+        patience_s = SUPERVISOR_PATIENCE_S / min(1.0, self.plan.rate)
+        silent = time.monotonic() - self._supervisor_heard_s > patience_s
+        if supervisor is not None and silent:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._supervisor_pid, signal.SIGKILL)
+        if supervisor is None or silent:
+            await self._supervisor_gone(GUARD_PERIOD_S)  # its port is free only then
+            all_there &= self._bring_back(SUPERVISOR)
+        return all_there
+
+    def _report(self, trouble: str) -> None:
+        if trouble != self._trouble:
+            self._trouble = trouble
+            self.on_trouble(trouble)
 
     async def _supervisor_gone(self, timeout_s: float) -> None:
         loop = asyncio.get_running_loop()
         try:
             pidfd = os.pidfd_open(self._supervisor_pid)
-        except (ProcessLookupError, OSError):
+        except ProcessLookupError:
+            return
+        except OSError:  # no descriptor left
+            await asyncio.sleep(timeout_s)
             return
         gone = loop.create_future()
 
@@ -217,16 +246,17 @@ class Launcher:
             loop.remove_reader(pidfd)
             os.close(pidfd)
 
-    def _bring_back(self, name: str) -> None:
+    def _bring_back(self, name: str) -> bool:
         try:
             if name == SUPERVISOR:
                 self._start_supervisor()
-                self.on_restart(name)
             else:
                 self._spawners.fork((name,), 1)
-                self.on_restart(name)
         except SpawnerUnavailableError:
             self._restart_first_spawner()
+            return False
+        self.on_restart(name)
+        return True
 
     def _restart_first_spawner(self) -> None:
         """Both spawners are gone: load everything once more, which takes a second or two."""

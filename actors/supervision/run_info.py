@@ -13,6 +13,8 @@ from typing import Any
 
 import msgspec
 
+from actors.runtime.unix_peer import is_same_user
+
 _NAME = re.compile(r"@rampart\.(\d+)\.launcher$")
 _TIMEOUT_S = 1.0
 
@@ -51,7 +53,7 @@ def address(port: int) -> str:
 def find_runs() -> list[RunInfo]:
     """Return all runs of this machine whose launcher answers."""
     try:
-        table = Path("/proc/net/unix").read_text(encoding="utf-8")
+        table = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return []
     ports = {int(m[1]) for line in table.splitlines() if (m := _NAME.search(line))}
@@ -88,6 +90,8 @@ def ask(port: int) -> RunInfo | None:
         connection.settimeout(_TIMEOUT_S)
         try:
             connection.connect(address(port))
+            if not is_same_user(connection):
+                return None
             return msgspec.json.decode(connection.recv(65536), type=RunInfo)
-        except (OSError, msgspec.MsgspecError):
+        except (OSError, ValueError):
             return None

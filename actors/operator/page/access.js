@@ -1,16 +1,18 @@
 // The token of a page that other machines can reach: taken from the address once, kept by this tab.
+// Other fragments are places on the page.
 
 const KEY = "rampart-token";
 
 function fromAddress() {
   const found = new URLSearchParams(location.hash.slice(1)).get("token");
-  if (!found) return;
+  if (!found) return false;
   sessionStorage.setItem(KEY, found);
   history.replaceState(null, "", location.pathname + location.search);  // not to be read over a shoulder
+  return true;
 }
 
 fromAddress();
-addEventListener("hashchange", () => { fromAddress(); location.reload(); });
+addEventListener("hashchange", () => { if (fromAddress()) location.reload(); });
 
 export const token = () => sessionStorage.getItem(KEY) || "";
 

@@ -25,38 +25,53 @@ let picture = {};            // all that was heard, by section
 let fresh = { decisions: [], events: [] };  // lines of the logs that are not shown yet
 const changed = new Set();   // sections that are not shown yet
 let frame = 0;
-let socket = null;
+let socket = null;           // null between two attempts
 let retryMs = 500;
 let lastHeard = 0;
 let toastTimer = 0;
 
+const SILENT_MS = 4000;      // the HMI speaks once a second at least
+const OPENING_MS = 10000;
+const LOG_LINES = 60;
+
 // ---- connection: reconnects by itself, and notices a server that only hangs -------------------
 
 function connect() {
+  lastHeard = Date.now();
   socket = new WebSocket(`ws://${location.host}/ws`, protocols());
-  socket.onopen = () => { retryMs = 500; lastHeard = Date.now(); };
   socket.onmessage = (event) => { lastHeard = Date.now(); receive(JSON.parse(event.data)); };
-  socket.onclose = (event) => {
-    operating.offline();
-    link("bad", event.code === NO_TOKEN ? "token missing: open the address that the run has printed"
-      : "HMI not reachable, reconnecting");
-    setTimeout(connect, retryMs);
-    retryMs = Math.min(retryMs * 1.5, 4000);
-  };
+  socket.onclose = (event) => lost(
+    event.code === NO_TOKEN ? "token missing: open the address that the run has printed"
+      : event.reason ? `closed by the HMI: ${event.reason}; reconnecting`
+        : "HMI not reachable, reconnecting");
+}
+
+/** Take the connection for lost now: a browser waits a minute for a server that does not say goodbye. */
+function lost(why) {
+  socket.onclose = socket.onmessage = null;
+  socket.close();
+  socket = null;
+  operating.offline();
+  link("bad", why);
+  setTimeout(connect, retryMs);
+  retryMs = Math.min(retryMs * 1.5, 4000);
 }
 
 setInterval(() => {
-  if (socket && socket.readyState === WebSocket.OPEN && Date.now() - lastHeard > 4000) socket.close();
+  if (!socket) return;
+  const patience = socket.readyState === WebSocket.OPEN ? SILENT_MS : OPENING_MS;
+  if (Date.now() - lastHeard > patience) lost("HMI silent, reconnecting");
 }, 1000);
 
+const connected = () => socket !== null && socket.readyState === WebSocket.OPEN;
+
 function link(kind, text) {
-  $("link").className = `pill ${kind}`;
-  $("link").textContent = text;
+  pill("link", kind, text);
   document.body.classList.toggle("offline", kind === "bad");
 }
 
 function send(wish) {
-  if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(wish));
+  if (connected()) socket.send(JSON.stringify(wish));
   else toast("not connected");
 }
 
@@ -70,8 +85,9 @@ function receive(message) {
 // ---- the picture: sections arrive when they changed, and are drawn with the next frame ----------
 
 function take(message) {
+  link("good", "live");
   for (const [name, value] of Object.entries(message)) {
-    if (LOGS.includes(name)) fresh[name].push(...value);
+    if (LOGS.includes(name)) fresh[name] = [...fresh[name], ...value].slice(-LOG_LINES);
     else picture[name] = value;
     changed.add(name);
   }
@@ -81,6 +97,7 @@ function take(message) {
 
 function draw() {
   frame = 0;
+  if (!connected()) return;
   show(picture);
   changed.clear();
   seen();
@@ -88,7 +105,8 @@ function draw() {
 
 /** Tell the HMI what was drawn: it sends the newest then, and never a backlog. */
 function seen() {
-  if (socket.readyState === WebSocket.OPEN) socket.send(`{"type":"seen","version":${picture.version}}`);
+  if (!connected() || picture.version === undefined) return;
+  socket.send(`{"type":"seen","version":${picture.version}}`);
 }
 
 document.addEventListener("visibilitychange", () => {
@@ -106,6 +124,7 @@ function toast(text) {
 // ---- showing ----------------------------------------------------------------------------------
 
 function hello(message) {
+  retryMs = 500;
   picture = {};
   fresh = { decisions: [], events: [] };
   changed.clear();
@@ -123,26 +142,39 @@ function hello(message) {
   }));
 }
 
-/** Show what changed; each part names the sections that it is made of. */
-function show(s) {
-  const any = (...names) => names.some((name) => changed.has(name));
-  link("good", "live");
-  if (any("operating") && s.operating) operating.show(s.operating);
-  say($("clock"), clock(s.time_s));
-  map.show(s, changed);
-  if (any("pose")) where(s.pose);
-  if (any("mission", "control")) mission(s);
-  if (any("mission")) orders(s.mission);
-  if (any("order")) told(s.order);
-  if (any("lights")) lights(s.lights);
-  if (any("pilot", "manager", "detections")) safety(s);
-  if (any("system")) system(s.system);
-  if (any("system", "manager", "detections")) {
+/** Parts of the page, each with the sections that it is made of. */
+const PARTS = [
+  [["operating"], (s) => { if (s.operating) operating.show(s.operating); }],
+  [["pilot", "manager", "detections"], safety],
+  [["mission", "control"], mission],
+  [["mission"], (s) => orders(s.mission)],
+  [["order"], (s) => told(s.order)],
+  [["pose"], (s) => where(s.pose)],
+  [["lights"], (s) => lights(s.lights)],
+  [["system"], (s) => system(s.system)],
+  [["system", "manager", "detections"], (s) => {
     say($("tree-words"), tree.show(s.manager, s.detections));
     order.show(s.manager);
+  }],
+  [["nodes", "usage"], (s) => processes.show(s.nodes, s.usage)],
+];
+
+/** Show what changed. A part that fails, on values that nobody foresaw, does not take the others along. */
+function show(s) {
+  say($("clock"), clock(s.time_s));
+  guarded(() => map.show(s, changed));
+  for (const [sections, part] of PARTS) {
+    if (sections.some((name) => changed.has(name))) guarded(() => part(s));
   }
-  if (any("nodes", "usage")) processes.show(s.nodes, s.usage);
-  for (const name of LOGS) logs[name].add(fresh[name].splice(0));
+  for (const name of LOGS) guarded(() => logs[name].add(fresh[name].splice(0)));
+}
+
+function guarded(part) {
+  try {
+    part();
+  } catch (error) {
+    reportError(error);
+  }
 }
 
 function where(pose) {
@@ -197,10 +229,11 @@ function step(m, goal, i) {
   const done = !skipped && (i < m.step || m.phase === "succeeded");
   const now = i === m.step && !done;
   const lost = now && (m.phase === "failed" || m.phase === "cancelled");
+  const at = [goal.x_m, goal.y_m].map((m) => (Number.isFinite(m) ? m.toFixed(1) : "?")).join(", ");
   const line = element("li", done ? "done" : lost ? "failed" : now && m.phase !== "idle" ? "now" : "");
   if (line.className === "now") line.setAttribute("aria-current", "step");
   line.append(element("span", "n", done ? "✓" : lost ? "✕" : i + 1),
-    element("span", "", `${goal.mode} to (${goal.x_m.toFixed(1)}, ${goal.y_m.toFixed(1)})${skipped ? ", skipped" : ""}`),
+    element("span", "", `${goal.mode} to (${at})${skipped ? ", skipped" : ""}`),
     element("span", "time", done && m.times_s[i] !== undefined ? clock(m.times_s[i]) : ""));
   return line;
 }

@@ -2,11 +2,16 @@
 //
 // While something is held, the position is sent 20 times a second with the newest ticket of the
 // HMI; silence is letting go. Whatever ends the hold (key up, pointer up, focus lost, tab hidden,
-// page closed) says so at once. After a connection was lost everything must be let go first.
+// page closed) says so at once.
+//
+// *Barred* is what was held when it must not drive: before there was a connection, across the loss
+// of one, without focus, or so long that the connection must be stalled. It has to be let go first:
+// the robot moves because somebody presses, never because something recovers.
 
 import { $, pill, say } from "./dom.js";
 
 const PERIOD_MS = 50;
+const PATIENCE_MS = 1000;  // so long a press may wait until it drives; see `answered`
 const DEAD_ZONE = .12;
 const SHOULDERS = [4, 5];  // of a standard gamepad: either is the dead man
 const KEYS = {
@@ -22,7 +27,11 @@ export class Drive {
     this.keys = new Set();
     this.dragged = null;
     this.held = false;
+    this.heldSince = 0;
+    this.met = false;  // whether the present hold was answered
+    this.drove = false;  // whether it has driven
     this.barred = false;
+    this.focused = document.hasFocus();
     this.ticket = 0;
     this.page = null;
     this.grip = "free";
@@ -50,12 +59,19 @@ export class Drive {
     addEventListener("blur", () => this.letGo());
     addEventListener("pagehide", () => this.letGo());
     document.addEventListener("visibilitychange", () => { if (document.hidden) this.letGo(); });
-    addEventListener("gamepadconnected", () => this.pollGamepad());
+    addEventListener("gamepadconnected", () => {
+      if (this.pressed()) this.barred = true;  // plugging in moves nothing
+      this.pollGamepad();
+    });
     addEventListener("gamepaddisconnected", () => this.update());
   }
 
   key(event, down) {
-    if (!(event.code in KEYS) || event.ctrlKey || event.altKey || event.metaKey) return;
+    if (event.ctrlKey || event.altKey || event.metaKey) {
+      this.letGo();  // a browser need not tell which keys are let go under one of these
+      return;
+    }
+    if (!(event.code in KEYS)) return;
     event.preventDefault();  // do not scroll
     if (down && event.repeat && !this.keys.has(event.code)) return;  // held since before: press anew
     if (down) this.keys.add(event.code); else this.keys.delete(event.code);
@@ -83,8 +99,13 @@ export class Drive {
     }, PERIOD_MS);
   }
 
-  /** Position of the gamepad whose shoulder button is held, or null. */
+  /** Position of the gamepad whose shoulder button is held, or null: it drives a window with focus. */
   gamepad() {
+    return document.hasFocus() ? this.pressed() : null;
+  }
+
+  /** The same, whoever has the focus. */
+  pressed() {
     for (const pad of navigator.getGamepads ? navigator.getGamepads() : []) {
       if (!pad || !pad.connected || !SHOULDERS.some((i) => pad.buttons[i]?.pressed)) continue;
       const axis = (i) => (Math.abs(pad.axes[i] || 0) < DEAD_ZONE ? 0 : pad.axes[i]);
@@ -106,12 +127,19 @@ export class Drive {
 
   /** Something was pressed or let go. */
   update() {
+    const focused = document.hasFocus();
+    if (focused && !this.focused && this.pressed()) this.barred = true;  // meant for another window
+    this.focused = focused;
     const at = this.position();
     if (!at) {
       this.barred = false;
       this.release();
+    } else if (this.page === null) {
+      this.barred = true;
     } else if (!this.held && !this.barred) {
       this.held = true;
+      this.heldSince = performance.now();
+      this.met = this.drove = false;
       this.refusal = "";
       this.timer = setInterval(() => this.speak(), PERIOD_MS);
       this.speak();
@@ -123,7 +151,7 @@ export class Drive {
   letGo() {
     this.keys.clear();
     this.dragged = null;
-    this.barred = this.gamepad() !== null;  // it is pressed still
+    this.barred = this.pressed() !== null;  // it is still
     this.release();
     this.draw();
   }
@@ -146,6 +174,8 @@ export class Drive {
   introduced(page) {
     this.page = page;
     this.ticket = 0;
+    this.barred = this.position() !== null;
+    this.draw();
   }
 
   answered(message) {
@@ -153,8 +183,22 @@ export class Drive {
     this.grip = message.grip;
     if (message.text) this.refusal = message.text;
     else if (message.grip === "drives") this.refusal = "";
-    if (message.grip === "waits" && this.held) this.speak();  // now with a ticket
+    if (this.held && !this.drove && ["waits", "drives"].includes(message.grip)) this.begin(message.grip);
     this.draw();
+  }
+
+  /** The present hold was answered and has not driven yet: go on, unless it was pressed too long ago. */
+  begin(grip) {
+    if (performance.now() - this.heldSince > PATIENCE_MS) {
+      this.release();
+      this.barred = true;
+      this.refusal = "the connection is too slow to drive, or was stalled";
+    } else if (grip === "drives") {
+      this.drove = true;
+    } else if (!this.met) {
+      this.met = true;
+      this.speak();  // now with a ticket
+    }
   }
 
   offline() {
@@ -184,11 +228,12 @@ export class Drive {
     if (this.page === null || !status) pill("stick-state", "warn", "not connected");
     else if (other) pill("stick-state", "warn", `page ${status.holder} drives`);
     else if (!status.works) pill("stick-state", "warn", "no effect now");
+    else if (driving && status.note) pill("stick-state", "warn", "not followed");
     else if (driving) pill("stick-state", "good", "you drive");
     else pill("stick-state", "", "free");
     this.pad.classList.toggle("useless", Boolean(status && (other || !status.works)));
-    const texts = [this.barred ? "let go first, then press again" : this.refusal,
-      status ? status.text : "", status && !this.held ? status.note : ""];
+    const texts = [this.refusal, this.barred ? "let go first, then press again" : "",
+      status ? status.text : "", status ? status.note : ""];
     say($("stick-text"), texts.filter(Boolean).join(" · "));
   }
 }

@@ -34,7 +34,7 @@ export class Faults {
     this.node = "";
     this.signal = "";
     this.ownDuration = 10;
-    this.shown = "";
+    this.lines = new Map();
     document.addEventListener("click", (event) => {
       const button = event.target.closest?.("button[data-signal]");
       if (button) this.open(button.dataset.signal);
@@ -124,22 +124,28 @@ export class Faults {
     if (name) $("signal-confirm").focus();
   }
 
+  /** Lines stay and only their texts change, so that a button keeps its focus and its click. */
   show(operating) {
-    const text = JSON.stringify(operating.faults);
-    if (text === this.shown) return;
-    this.shown = text;
-    $("faults").replaceChildren(...operating.faults.map((fault) => {
-      const line = element("li");
-      const kind = fault.ended && !fault.effective ? "fault" : "";
-      line.append(element("p", kind, `${fault.fault}: ${fault.state}`));
-      if (!fault.ended) {
-        const button = element("button", "small", "End");
-        button.type = "button";
-        button.setAttribute("aria-label", `End ${fault.fault}`);
-        button.addEventListener("click", () => this.send({ type: "end-fault", injection: fault.injection }));
-        line.append(button);
-      }
-      return line;
-    }));
+    const there = new Set(operating.faults.map((fault) => fault.injection));
+    for (const [injection, { line }] of this.lines) {
+      if (!there.has(injection)) { line.remove(); this.lines.delete(injection); }
+    }
+    for (const fault of [...operating.faults].reverse()) {  // the newest is the first of the list
+      const { text, button } = this.lines.get(fault.injection) || this.add(fault);
+      text.className = fault.ended && !fault.effective ? "fault" : "";
+      say(text, `${fault.fault}: ${fault.state}`);
+      button.hidden = fault.ended;
+    }
+  }
+
+  add(fault) {
+    const made = { line: element("li"), text: element("p"), button: element("button", "small", "End") };
+    made.button.type = "button";
+    made.button.setAttribute("aria-label", `End ${fault.fault}`);
+    made.button.addEventListener("click", () => this.send({ type: "end-fault", injection: fault.injection }));
+    made.line.append(made.text, made.button);
+    $("faults").prepend(made.line);
+    this.lines.set(fault.injection, made);
+    return made;
   }
 }

@@ -135,7 +135,11 @@ export class AirportMap {
   }
 
   showRobot(pose, pilot) {
-    if (!pose || !finite(pose.value)) return;
+    if (!pose) return;
+    if (!finite(pose.value)) {
+      this.robot.classList.add("stale");  // where it was
+      return;
+    }
     const { x_m: x, y_m: y, yaw_rad: yaw } = pose.value;
     this.at = [x, y];
     if (this.following) this.look();

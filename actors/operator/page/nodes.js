@@ -32,7 +32,11 @@ export class ProcessTable {
     }
     sorted.forEach(([node], i) => {
       const row = this.rows.get(node.name) || this.add(node);
-      if (this.body.children[i] !== row.line) this.body.insertBefore(row.line, this.body.children[i] || null);
+      const there = this.body.children[i];
+      if (there !== row.line) {  // move the one that is out of place: a moved row loses the focus
+        if (this.body.children[i + 1] === row.line) this.body.append(there);
+        else this.body.insertBefore(row.line, there || null);
+      }
       const used = usage && usage.nodes ? usage.nodes[node.name] : undefined;
       row.dot.className = `dot ${STATES[node.state] || ""}`;
       row.line.classList.toggle("troubled", node.state !== "running");
@@ -57,7 +61,7 @@ export class ProcessTable {
     line.dataset.node = node.name;
     const name = element("th", "", node.name);
     name.scope = "row";
-    name.append(signalButton(node.name));
+    if (node.signals !== false) name.append(signalButton(node.name));
     line.append(name, element("td", "quiet kind", node.kind));
     const row = { line };
     for (const column of COLUMNS) {
