@@ -22,7 +22,7 @@ from actors.recording.process import Order, RecorderProcess
 from actors.recording.virtual import VirtualRecording
 from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
 from actors.supervision.launcher import Launcher, LaunchError
-from actors.supervision.run_plan import DEFAULT_PORT, RunPlan, load_system
+from actors.supervision.run_plan import DEFAULT_PORT, Layout, RunPlan, load_system
 from airport.formats import load_airport, load_mission
 from manager.specification import SystemSpec
 from manager.strategies import STRATEGIES
@@ -35,7 +35,7 @@ from sim.process_run import ProcessRun
 from sim.report import write_report
 from sim.report_record import RunRecord
 from sim.scenario import action_of, parse_fault
-from sim.virtual_run import VirtualRun
+from sim.virtual_run import LEAD_S, VirtualRun
 from sim.watched_run import WatchedRun, new_directory
 
 ROOT = Path(__file__).resolve().parent
@@ -189,17 +189,21 @@ class Run:
         recording = None
         if self._options.record:
             title = f"{self._mission.mission.name} on {self._mission.airport.name}"
-            recording = VirtualRecording(Path(self._options.record), self._plan.description, title,
-                                         overwrite=self._options.overwrite)
+            recording = VirtualRecording(
+                Path(self._options.record), self._plan.description, title,
+                nodes=Layout(self._plan, self._spec).members, lead_s=LEAD_S,
+                overwrite=self._options.overwrite)
         run = VirtualRun(self._plan, self._spec, self._mission, scenario=self._scenario,
                          network=find_network(self._options.network),
                          taps=[recording.take] if recording else [])
         self._console.virtual_banner(self._mission.airport.name, self._mission.mission,
                                      self._plan, self._spec.strategy)
-        result = run.run()
-        self._console.close()
-        if recording is not None:
-            print(f"launch.py: {recording.close()}", file=sys.stderr)
+        try:
+            result = run.run()
+        finally:
+            self._console.close()
+            if recording is not None:
+                print(f"launch.py: {recording.close()}", file=sys.stderr)
         self._console.speed(result.speed, result.messages, result.trace)
         for name, error in result.failures:
             print(f"launch.py: {name} failed: {error}", file=sys.stderr)

@@ -32,6 +32,9 @@ from airport.model import Airport
 from sim.scene import Scene, Solid, WorldError
 
 PIXELS_PER_M = 10
+MAX_PIXELS = 8192
+"""Longer side of the ground's picture; of an airport too large for it there are fewer a metre."""
+
 MARGIN_M = 30.0
 """Grass that is drawn round the airport."""
 
@@ -51,12 +54,15 @@ class Order(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class View(msgspec.Struct, forbid_unknown_fields=True):
-    """A line that asks for a picture: the pose, and obstacles as (name, x, y, radius) in `map`."""
+    """A line that asks for a picture: the pose, and obstacles as (name, x, y, radius) in `map`.
 
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    obstacles: tuple[tuple[str, float, float, float], ...] = ()
+    Numbers that are not finite come as null: JSON has no other way to say them.
+    """
+
+    x_m: float | None
+    y_m: float | None
+    yaw_rad: float | None
+    obstacles: tuple[tuple[str, float | None, float | None, float | None], ...] = ()
 
 
 class Camera:
@@ -77,14 +83,14 @@ class Camera:
     def picture(self, view: View) -> bytes:
         """Return a JPEG of what there is to see; NaN poses are taken for the last one."""
         scene = self._scene
-        if all(map(math.isfinite, (view.x_m, view.y_m, view.yaw_rad))):
-            scene.data.qpos[0:2] = view.x_m, view.y_m
-            scene.data.qpos[3:7] = (
-                math.cos(view.yaw_rad / 2), 0, 0, math.sin(view.yaw_rad / 2))
+        x_m, y_m, yaw_rad = map(_number, (view.x_m, view.y_m, view.yaw_rad))
+        if all(map(math.isfinite, (x_m, y_m, yaw_rad))):
+            scene.data.qpos[0:2] = x_m, y_m
+            scene.data.qpos[3:7] = math.cos(yaw_rad / 2), 0, 0, math.sin(yaw_rad / 2)
             ahead = 1.2
-            self._camera.lookat[:] = (view.x_m + ahead * math.cos(view.yaw_rad),
-                                      view.y_m + ahead * math.sin(view.yaw_rad), 0.3)
-            self._camera.azimuth = math.degrees(view.yaw_rad)
+            self._camera.lookat[:] = (x_m + ahead * math.cos(yaw_rad),
+                                      y_m + ahead * math.sin(yaw_rad), 0.3)
+            self._camera.azimuth = math.degrees(yaw_rad)
         self._put(view.obstacles)
         mujoco.mj_forward(scene.model, scene.data)
         self._renderer.update_scene(scene.data, self._camera, self._options)
@@ -92,8 +98,10 @@ class Camera:
         Image.fromarray(self._renderer.render()).save(out, "JPEG", quality=_JPEG_QUALITY)
         return out.getvalue()
 
-    def _put(self, obstacles: tuple[tuple[str, float, float, float], ...]) -> None:
-        wanted = {name: (x, y, r) for name, x, y, r in obstacles}
+    def _put(
+        self, obstacles: tuple[tuple[str, float | None, float | None, float | None], ...]
+    ) -> None:
+        wanted = {name: (_number(x), _number(y), _number(r)) for name, x, y, r in obstacles}
         for name in [n for n in self._scene.present if n not in wanted]:
             self._scene.remove(name)
         for name, (x, y, r) in wanted.items():
@@ -105,6 +113,10 @@ class Camera:
                                     shapely.Polygon())
                 except WorldError:
                     continue  # one too many, or one that makes no sense: the others are shown
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def dress(spec: Any, airport: Airport) -> None:
@@ -144,19 +156,23 @@ def dress(spec: Any, airport: Airport) -> None:
 def ground_image(airport: Airport) -> Image.Image:
     """Return the ground from above, north up: grass, pavement, graph and lights."""
     x0, y0, x1, y1 = _extent(airport)
+    pixels_per_m = min(PIXELS_PER_M, MAX_PIXELS / max(x1 - x0, y1 - y0))
     image = Image.new(
-        "RGB", (round((x1 - x0) * PIXELS_PER_M), round((y1 - y0) * PIXELS_PER_M)), _GRASS)
+        "RGB", (round((x1 - x0) * pixels_per_m), round((y1 - y0) * pixels_per_m)), _GRASS)
     pen = ImageDraw.Draw(image)
 
     def at(x: float, y: float) -> tuple[float, float]:
-        return (x - x0) * PIXELS_PER_M, (y1 - y) * PIXELS_PER_M
+        return (x - x0) * pixels_per_m, (y1 - y) * pixels_per_m
 
     def fill(shape: Any, colour: tuple[int, int, int]) -> None:
         for part in shapely.get_parts(shape):
             if part.geom_type == "Polygon" and not part.is_empty:
-                pen.polygon([at(x, y) for x, y in part.exterior.coords], colour)
+                mask = Image.new("1", image.size)  # what lies in a hole stays as it is
+                mask_pen = ImageDraw.Draw(mask)
+                mask_pen.polygon([at(x, y) for x, y in part.exterior.coords], 1)
                 for hole in part.interiors:
-                    pen.polygon([at(x, y) for x, y in hole.coords], _GRASS)
+                    mask_pen.polygon([at(x, y) for x, y in hole.coords], 0)
+                image.paste(colour, mask=mask)
 
     for surface in sorted(airport.surfaces, key=lambda s: s.kind == "runway"):
         fill(surface.polygon, _RUNWAY if surface.kind == "runway" else _PAVEMENT)

@@ -9,7 +9,9 @@ import signal
 import sys
 
 import httpx
+import msgspec
 import pytest
+import shapely
 from hmi_browser import CHROMIUM, browser
 from hmi_world import AIRPORT, World, free_port, served
 from PIL import Image
@@ -19,7 +21,8 @@ from actors import topics
 from actors.operator import camera_eye
 from actors.operator.camera_eye import CameraError, CameraEye, renderer
 from actors.operator.hmi import Hmi
-from sim.camera import ground_image
+from airport.model import Airport, Building, StartPose, Surface
+from sim.camera import MARGIN_M, MAX_PIXELS, View, ground_image
 
 ECHO = """
 import struct, sys
@@ -114,6 +117,38 @@ def test_the_ground_is_grass_where_it_is_prohibited_and_pavement_where_the_graph
     assert max(start) - min(start) < 20, "grey"
 
 
+def square(half_m: float) -> shapely.Polygon:
+    return shapely.box(-half_m, -half_m, half_m, half_m)
+
+
+def test_pavement_within_grass_and_grass_within_a_ring_are_drawn_as_what_they_are():
+    ring, island = square(20).difference(square(10)), square(3)
+    airport = Airport(
+        "island", {}, (), ring.union(island), StartPose(15.0, 0.0, 0.0),
+        (Surface("middle", "apron", island), Surface("ring", "taxiway", ring)),
+        (Building("tower", 40.0, 0.0, 2.0, 2.0, 5.0), Building("hut", -40.0, 0.0, 2.0, 2.0, 5.0),
+         Building("shed", 0.0, 40.0, 2.0, 2.0, 5.0), Building("barn", 0.0, -40.0, 2.0, 2.0, 5.0)))
+    assert max(len(part.interiors) for part in
+               shapely.get_parts(airport.prohibited_polygon(0.0))) == 1, "the ring is a hole in it"
+    image = ground_image(airport)
+    x0, _, _, y1 = airport.bounds_m
+
+    def grey(x: float, y: float) -> bool:
+        colour = image.getpixel((round((x - x0 + MARGIN_M) * 10), round((y1 + MARGIN_M - y) * 10)))
+        return max(colour) - min(colour) < 20
+
+    assert [grey(x, 0.0) for x in (0.0, 6.0, 15.0, 30.0)] == [True, False, True, False]
+
+
+def test_a_large_airport_has_a_picture_of_its_ground_that_fits_into_a_texture():
+    runway = shapely.box(0.0, 0.0, 4000.0, 45.0)
+    image = ground_image(Airport("long", {}, (), runway, StartPose(5.0, 5.0, 0.0),
+                                 (Surface("runway", "runway", runway),)))
+    assert image.size[0] == MAX_PIXELS
+    colour = image.getpixel((MAX_PIXELS // 2, image.size[1] // 2))
+    assert max(colour) - min(colour) < 20, "grey"
+
+
 class Seen(Hmi):
     """An HMI with the camera of the shipped systems, or another."""
 
@@ -140,6 +175,26 @@ async def test_the_page_gets_pictures_of_the_robot_and_other_sites_do_not():
         picture = Image.open(io.BytesIO(answer.content))
         assert (picture.format, picture.size) == ("JPEG", (416, 260))
         assert len(picture.convert("P").getcolors()) > 20, "not just one colour"
+
+
+async def test_a_pose_and_an_obstacle_that_are_no_numbers_end_no_renderer(monkeypatch):
+    monkeypatch.setattr(camera_eye, "PERIOD_S", 0.0)
+    hmi = Seen(World().context("hmi", 1, hmi_port=free_port()))
+    nan = float("nan")
+    hmi._state.pose(m.Pose(nan, -18.5, nan), 0.0, 0.0)
+    hmi._state.obstacles(m.ObstacleList((m.ObstacleCommand("crate", True, nan, 0.0, nan),)))
+    line = msgspec.json.encode(hmi._camera_view())
+    hmi._state.pose(m.Pose(-22.0, -18.5, 0.0), 0.0, 0.0)
+    hmi._state.obstacles(m.ObstacleList(()))
+    assert msgspec.json.decode(line, type=View).obstacles == (("crate", None, 0.0, None),)
+    try:
+        before = await hmi._camera.picture()
+    except CameraError as error:
+        pytest.skip(str(error))
+    renderer_before = hmi._camera._process
+    hmi._camera._view = lambda: msgspec.Raw(line)
+    assert await hmi._camera.picture() == before, "the last pose, and no obstacle"
+    assert hmi._camera._process is renderer_before
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import signal
 
 import msgspec
 import pytest
@@ -103,6 +104,20 @@ async def test_without_following_no_run_is_an_error_and_one_is_enough(machine):
     machine.runs = [run("first")]
     names = [s.run_id async for s in following.sessions(None, asyncio.Event(), follow=False)]
     assert names == ["first"]
+
+
+@pytest.mark.parametrize("nohup", [False, True])
+async def test_a_closed_terminal_ends_it_but_under_nohup(nohup):
+    stop = asyncio.Event()
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN if nohup else signal.SIG_DFL)
+    try:
+        with following.stopped_by_signals(stop):
+            os.kill(os.getpid(), signal.SIGHUP)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(stop.wait(), 0.1 if nohup else 10)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert stop.is_set() != nohup
 
 
 def test_a_run_is_over_when_its_launcher_is():

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
+import re
 import sys
+from types import SimpleNamespace
 
+import msgspec
 import pytest
+from stub_actors import ROOT
 from test_top_view import busy
 
 from actors import messages as m
 from actors import topics
 from actors.recording.views import Views
+from actors.runtime.clock import Clock
 from actors.runtime.envelope import Header
 from actors.supervision.process_usage import ProcessCount
 from actors.supervision.run_info import RunInfo
 from airport.formats import load_airport
-from toolbox.live_verb import SHOWN
+from toolbox.live_verb import SHOWN, _watch
 from toolbox.main import main
 
 RUN = RunInfo(1, 7450, 1.0, 0.0, "paper.toml", {}, "run", 0, 'a "title"\\ and\nmore')
@@ -34,7 +41,8 @@ def test_a_missing_extra_is_one_line_that_says_what_to_install(
 
 @pytest.mark.parametrize("arguments", [
     ["metrics", "--port", "99999"], ["live", "foxglove", "--port", "-1"],
-    ["metrics", "--host", "nobody.invalid"]])
+    ["metrics", "--host", "nobody.invalid"], ["metrics", "--host", ".."],
+    ["metrics", "--host", "a" * 64]])
 def test_an_address_that_is_none_is_named(arguments, capsys):
     pytest.importorskip("prometheus_client")
     pytest.importorskip("foxglove")
@@ -77,6 +85,31 @@ def test_a_run_becomes_metrics_that_prometheus_reads_back():
     assert 'rampart_mission_phase{rampart_mission_phase="running"} 1.0' in text
 
 
+def test_the_handbook_lists_every_metric_with_its_labels():
+    parser = pytest.importorskip("prometheus_client.parser")
+    from toolbox.metrics_families import Exposition
+
+    picture = busy()
+    for topic, body in (
+            (topics.HEARTBEAT, m.Heartbeat(1, 0, 0.1, 0, 0)),
+            (topics.PROCESS_EVENT, m.ProcessEvent("hmi", "crashed", 1, 1, "", "")),
+            (topics.RECOVERY, m.RecoveryReport(
+                m.RecoveryState.ACTIVATED, m.RecoveryPhase.ACTING, 1, ""))):
+        picture.heard(topic, Header("somebody", 1, 1, 1.0), body, 1.0)
+    for time_s in (0.0, 1.0):
+        picture.sample(time_s)
+    text = exposed(Exposition(RUN, 10.5, picture, {"hmi": ProcessCount(2.5, 4096, 1.0)}))
+    found = {s.name: set(s.labels) for f in parser.text_string_to_metric_families(text)
+             for s in f.samples}
+    listed = {}
+    for line in (ROOT / "docs" / "operations.md").read_text("utf-8").splitlines():
+        if line.startswith("| `rampart_"):
+            _, names, labels, _ = line.split("|")
+            for name in re.findall(r"`(?:rampart)?_(\w+)`", names):
+                listed[f"rampart_{name}"] = set(re.findall(r"\w+", labels))
+    assert listed == found
+
+
 def test_a_run_of_which_nothing_was_heard_yet_is_no_error():
     from toolbox.run_picture import RunPicture
 
@@ -84,6 +117,57 @@ def test_a_run_of_which_nothing_was_heard_yet_is_no_error():
     from toolbox.metrics_families import Exposition
 
     assert "rampart_up 1.0" in exposed(Exposition(RUN, 0.0, RunPicture()))
+
+
+@pytest.mark.parametrize("replay_of", ["", "run.mcap"])
+async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a_replay(
+        monkeypatch, replay_of):
+    pytest.importorskip("prometheus_client")
+    from toolbox import metrics_server
+
+    run = msgspec.structs.replace(RUN, pid=os.getpid(), replay_of=replay_of)
+    mine = m.NodeTable((m.NodeInfo("hmi", "operator", os.getpid(), m.NodeState.RUNNING, 1, 0),))
+    looks = []
+
+    async def one(*_, **__):
+        yield SimpleNamespace(run=run, clock=Clock(0.0))
+
+    class Observer:
+        def __init__(self, *_) -> None:
+            pass
+
+        def look(self, table):
+            looks.append(table)
+            return {"guards": [{"name": f"guard_{len(looks)}", "pid": os.getpid()}]}
+
+    monkeypatch.setattr(metrics_server, "sessions", one)
+    monkeypatch.setattr(metrics_server, "ProcessObserver", Observer)
+    monkeypatch.setattr(metrics_server, "LOOK_S", 0.001)
+    monkeypatch.setattr(metrics_server, "draw", lambda _session, picture: picture.heard(
+        topics.NODES, Header("supervisor", 1, 1, 0.0), mine, 0.0))
+    exporter, stop = metrics_server.Exporter(), asyncio.Event()
+    following = asyncio.create_task(exporter.follow(None, stop))
+    await asyncio.sleep(0.2)
+    seen = len(looks)
+    assert (seen > 2) != bool(replay_of), "nobody has asked yet"
+    assert set(exporter.look().processes) == (set() if replay_of else {"hmi", f"guard_{seen}"})
+    assert len(looks) == seen
+    stop.set()
+    await following
+
+
+def test_live_views_show_the_robot_as_large_as_the_system_says(tmp_path):
+    system = tmp_path / "system.toml"
+    system.write_text("[robot]\nlength_m = 1.5\nwidth_m = 0.9\n")
+    for file, size in ((system, (1.5, 0.9)), (tmp_path / "none.toml", (0.72, 0.614))):
+        shown = {}
+        viewer = SimpleNamespace(begin=lambda _run: None,
+                                 show=lambda channel, record, _at, to=shown: to.update(
+                                     {channel: record}))
+        _watch(SimpleNamespace(run=msgspec.structs.replace(RUN, system_file=str(file)),
+                               clock=Clock(0.0), listen=lambda *_: None), viewer)
+        box = shown["view/robot"].entities[0].cubes[0].size
+        assert (box.x, box.y) == size
 
 
 @pytest.mark.parametrize(("option", "value"), [("--save", "/nowhere/run.rrd"), ("--connect", "http://x")])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import inspect
+import itertools
 import json
 import re
 import resource
@@ -80,11 +82,14 @@ def test_time_is_simulated_and_begins_before_zero_where_the_run_does(tmp_path):
         writer = BagWriter(file, documents(), time_zero_s=-3.0)
         for number, at_s in enumerate((-2.5, 0.0, 1.25)):
             writer.take(*pose(number + 1, at_s))
-        writer.take(-1e30, topics.POSE.at(), encode(Header("x", 1, 1, NAN), m.Pose(0.0, 0.0, 0.0)))
+        for at_s, stamp in ((-1e30, NAN), (1e300, -1.7e308), (float("inf"), 1.8e299)):
+            writer.take(at_s, topics.POSE.at(),
+                        encode(Header("x", 1, 1, stamp), m.Pose(0.0, 0.0, 0.0)))
         writer.close()
     reader = BagReader(tmp_path / "run.mcap")
     times = [(message.log_time, message.publish_time) for _, message in reader.messages()]
-    assert times == [(500_000_000,) * 2, (3_000_000_000,) * 2, (4_250_000_000,) * 2, (0, 0)]
+    assert times == [(500_000_000,) * 2, (3_000_000_000,) * 2, (4_250_000_000,) * 2, (0, 0),
+                     (2**64 - 1, 0), (0, 2**64 - 1)]
     assert Summary(reader).time_zero_s == -3.0
 
 
@@ -102,13 +107,21 @@ def test_files_of_a_recording_cannot_be_written_elsewhere(tmp_path):
     assert list(tmp_path.parent.rglob("out.toml")) == list(tmp_path.iterdir()) == []
 
 
+def virtual_recording(path):
+    return VirtualRecording(path, PLAN, "a run", nodes=("localization", "DM1"), lead_s=1.0,
+                            overwrite=False)
+
+
 def test_the_same_run_in_virtual_time_gives_the_same_file(tmp_path):
     for name in ("a", "b"):
-        recording = VirtualRecording(tmp_path / name, PLAN, "a run", overwrite=False)
+        recording = virtual_recording(tmp_path / name)
         for one in sample():
             recording.take(*one)
         assert recording.close().startswith("recorded 24 messages")
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    summary = Summary(BagReader(tmp_path / "a"))
+    assert json.loads(summary.run["nodes"]) == ["localization", "DM1"]
+    assert summary.time_zero_s == -1.0
 
 
 # ---- views ----------------------------------------------------------------------------------
@@ -239,13 +252,24 @@ def test_a_file_cut_off_anywhere_is_read_as_far_as_it_goes(tmp_path):
     whole = path.read_bytes()
     everything = played(BagReader(path))
     counts = []
-    for length in [*range(8, len(whole), max(1, len(whole) // 150)), len(whole) - 1]:
+    ends = [len(whole) - cut for cut in (8, 4, 1)]  # of the bytes that end every file
+    for length in [*range(8, len(whole), max(1, len(whole) // 150)), *ends]:
         path.write_bytes(whole[:length])
-        found = played(BagReader(path))
+        reader = BagReader(path)
+        found = played(reader)
         assert found == everything[:len(found)], length
+        assert reader.damage, length
         counts.append(len(found))
     assert counts == sorted(counts)
     assert (counts[0], counts[-1]) == (0, len(everything))
+
+
+def test_a_file_whose_last_bytes_were_overwritten_is_damaged(tmp_path, capsys):
+    path = tmp_path / "run.mcap"
+    write(path, sample())
+    path.write_bytes(path.read_bytes()[:-8] + b"overgone")
+    assert main(["bag", "info", str(path)]) == 0
+    assert "closed     yes; damaged: the last bytes" in capsys.readouterr().out
 
 
 def test_a_recording_that_was_never_closed_keeps_what_was_flushed(tmp_path):
@@ -270,6 +294,30 @@ def test_an_independent_reader_takes_a_repaired_file(tmp_path, capsys):
         assert make_reader(file, validate_crcs=True).get_summary().statistics.message_count > 0
     with pytest.raises(BagError, match="is the file to be repaired"):
         repair(BagReader(path), path, overwrite=True)
+
+
+def test_a_repair_that_fails_leaves_nothing_behind_and_names_the_file_that_failed(
+        tmp_path, monkeypatch):
+    path, whole = tmp_path / "torn.mcap", tmp_path / "whole.mcap"
+    write(path, sample(4000), flush_every=500)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(BagError, match=f"^{whole}: File too large"):
+            repair(BagReader(path), whole)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not whole.exists()
+    raw = BagReader._raw
+
+    def failing(reader, file):
+        yield from itertools.islice(raw(reader, file), 5)
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(BagReader, "_raw", failing)
+    with pytest.raises(BagError, match=f"^{path}: cannot be read: Input/output error"):
+        repair(BagReader(path), whole)
+    assert not whole.exists()
 
 
 def test_a_chunk_that_was_overwritten_is_left_out_and_the_rest_is_read(tmp_path, capsys):
@@ -311,6 +359,13 @@ def test_mcap_files_of_others_can_be_looked_at_and_not_replayed(tmp_path, capsys
     assert "not a recording of a run, profile 'ros2'" in capsys.readouterr().out
     assert main(["replay", str(path)]) == 2
     assert "not a recording of a run" in capsys.readouterr().err
+
+
+def test_a_file_compressed_in_a_way_that_nobody_here_knows_is_refused(tmp_path, capsys):
+    path = foreign(tmp_path / "other.mcap")
+    path.write_bytes(path.read_bytes().replace(b"zstd", b"zpaq"))
+    assert main(["bag", "info", str(path)]) == 2
+    assert "compressed by 'zpaq'; known are lz4, zstd and none" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("content", "words"), [
@@ -375,7 +430,7 @@ def test_a_probe_leaves_nothing_behind(tmp_path):
 
 def test_a_disk_that_fills_up_ends_the_recording_and_not_the_run(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    recording = VirtualRecording(tmp_path / "run.mcap", PLAN, "a run", overwrite=False)
+    recording = virtual_recording(tmp_path / "run.mcap")
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))
     try:
         for number in range(8000):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import typing
 from enum import Enum
 
@@ -74,6 +75,20 @@ def test_garbage_comes_back_to_the_byte_and_says_that_it_is_none(payload):
     text, header, _ = form.recorded(payload)
     assert form.payload(text) == payload
     assert (header is None) == ("error" in json.loads(text))
+
+
+def test_garbage_in_the_form_of_an_envelope_with_a_text_that_is_none_is_garbage_too():
+    for name, body in ((b"\xa1\xff", b"\x93" + 3 * (b"\xcb" + struct.pack(">d", 1.0))),
+                       (b"\xa1x", b"\x92\xa1\xff\xa0")):
+        payload = b"\x95" + name + b"\x01\x01\xcb" + struct.pack(">d", 1.0) + body
+        form = MessageForm(topics.POSE if b"\xff" in name else topics.RESET)
+        text, header, _ = form.recorded(payload)
+        assert header is None
+        assert "error" in json.loads(text)
+        assert form.payload(text) == payload
+    nameless = b"\x95\xa1\xff\x01\x01\xcb" + bytes(8) + b"\xc0"
+    assert header_of(nameless) is None
+    assert renumbered(nameless, 1, 1.0) == nameless
 
 
 def test_a_message_that_json_can_hold_has_no_second_copy():

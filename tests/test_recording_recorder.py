@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
 
+import msgspec
 import pytest
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
@@ -61,6 +64,14 @@ def launcher():
     process.stdin.close()
 
 
+@pytest.fixture
+def dead():
+    """The number of a process that has ended."""
+    process = subprocess.Popen(["true"])
+    process.wait()
+    return process.pid
+
+
 class Robot:
     """One node that sends poses, numbered."""
 
@@ -107,24 +118,28 @@ def test_everything_is_written_from_the_first_message_to_the_last(recording):
     assert numbers(path) == list(range(1, 1001))
     summary = Summary(BagReader(path))
     assert (summary.reader.closed, summary.end["lost"]) == (True, "{}")
+    assert summary.end["ended"] == "the run has ended"
     assert -102 < summary.time_zero_s < -50  # it was there before simulated time 0
     assert summary.first_ns < 1e9
 
 
 def test_a_killed_recorder_leaves_a_readable_file_that_lacks_the_last_second_at_most(
         recording, port):
-    assert FLUSH_S + PERIOD_S < 1.0
     _, robot, path = recording
-    for goal in (1, 100, 200):  # it writes while it is being talked to
-        while len(numbers(path)) < goal:
-            robot.send(10)
-            time.sleep(0.02)
-    before = len(numbers(path))
-    robot.send(10)
-    os.kill(recorder_pid(port), signal.SIGKILL)
+    while not numbers(path):
+        robot.send()
+        time.sleep(0.02)
+    lost_s = FLUSH_S + PERIOD_S + 2 * FLUSH_S  # the last is for a busy machine
+    sent_s = [time.monotonic()] * robot.sent
+    while sent_s[-1] - sent_s[0] < lost_s + 1.0:  # it writes while it is being talked to
+        robot.send()  # not so many that they would fill a chunk, which is written when it is full
+        sent_s.append(time.monotonic())
+        time.sleep(0.02)
+    pid, killed_s = recorder_pid(port), time.monotonic()
+    os.kill(pid, signal.SIGKILL)
     kept = numbers(path)
     assert kept == list(range(1, len(kept) + 1))
-    assert len(kept) >= before
+    assert len(kept) >= sum(at_s < killed_s - lost_s for at_s in sent_s) > 0
     assert not BagReader(path).closed
     found = []
     with path.open("rb") as file, pytest.raises(EndOfFile):  # the independent reader
@@ -172,6 +187,68 @@ def test_a_launcher_that_is_killed_leaves_a_whole_recording_and_no_recorder(
     until(lambda: recorder_pid(port) is None, "the recorder was left")
     assert numbers(path) == list(range(1, 201))
     assert Summary(BagReader(path)).end["ended"] == "the run has ended"
+
+
+def test_who_ended_a_recording_is_told(recording, port):
+    _, robot, path = recording
+    robot.send(100)
+    until(lambda: numbers(path), "nothing is written")
+    os.kill(recorder_pid(port), signal.SIGTERM)
+    until(lambda: recorder_pid(port) is None, "it lives")
+    assert Summary(BagReader(path)).end["ended"] == "it was told to"
+
+
+def test_a_launcher_that_has_ended_before_its_recorder_has_begun_leaves_no_recorder(
+        port, tmp_path, dead):
+    read_end, write_end = os.pipe()
+    recorder = Recorder(port, tmp_path / "run.mcap", launcher=dead)
+    recorder.open()
+    assert recorder.run(read_end) == "the run has ended"
+    os.close(write_end)  # nobody reads that it is ready
+    os.close(read_end)
+    unread, answers = os.pipe()
+    os.close(unread)
+    order = msgspec.json.encode(Order(port, str(tmp_path / "run.mcap"), dead)).decode()
+    done = subprocess.run([sys.executable, "-m", "actors.recording.process", order], cwd=ROOT,
+                          stdout=answers, stderr=subprocess.PIPE, check=False, timeout=60)
+    os.close(answers)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_nodes_send_after_their_launcher_has_ended_is_recorded(port, tmp_path, dead):
+    path = tmp_path / "run.mcap"
+    read_end, write_end = os.pipe()
+    with AnsweringLauncher(port, time.monotonic(), dead):
+        recorder = Recorder(port, path)
+        recorder.open()
+        thread = threading.Thread(target=recorder.run, args=(read_end,))
+        robot = Robot(port)
+        robot.send(1)
+        thread.start()
+        until(path.exists, "it has not begun")
+        for _ in range(20):
+            time.sleep(0.02)
+            robot.send()
+        robot.tap.close()
+        thread.join()
+    os.close(read_end)
+    os.close(write_end)
+    assert numbers(path) == list(range(1, 22))
+    assert Summary(BagReader(path)).end["ended"] == "the run has ended"
+
+
+def test_a_recorder_that_does_not_start_is_not_waited_for(port, tmp_path, monkeypatch):
+    program = tmp_path / "python"
+    program.write_text("#!/bin/sh\nexec sleep 60\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr("actors.recording.process._START_S", 0.2)
+    recorder = RecorderProcess(Order(port, str(tmp_path / "run.mcap"), os.getpid()))
+    with pytest.raises(BagError, match=r"the recorder did not start within 0\.2 s"):
+        recorder.start()
+    assert recorder._process.returncode == -signal.SIGKILL
+    recorder.end()
 
 
 def test_a_recorder_that_is_stopped_when_its_launcher_dies_is_not_left_over(port, tmp_path):
@@ -256,6 +333,15 @@ def test_a_tap_looks_for_a_recorder_once_a_second_and_not_with_every_message(por
     assert looks == pytest.approx([0.0, 1.0, 2.0, 3.0], abs=0.02)
 
 
+def test_a_node_without_a_descriptor_left_goes_on_unrecorded(port, monkeypatch):
+    def none_left(*_arguments: object) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    node = Tap(port)
+    monkeypatch.setattr(socket, "socket", none_left)
+    node.take("rampart/k", b"")
+
+
 def test_topics_that_nobody_wants_are_left_out_and_gaps_are_told_all_the_same(
         port, tmp_path):
     path = tmp_path / "run.mcap"
@@ -300,7 +386,9 @@ def test_a_message_too_long_for_a_recording_is_left_out_and_those_after_it_are_n
     assert Summary(BagReader(path)).messages >= 2
 
 
-def test_a_run_that_is_there_is_recorded_until_ctrl_c(port, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_run_that_is_there_is_recorded_until_ctrl_c_or_the_terminal_is_closed(
+        port, tmp_path, number):
     path = tmp_path / "run.mcap"
     robot = Robot(port)
     robot.send(10)  # nobody records yet
@@ -309,7 +397,7 @@ def test_a_run_that_is_there_is_recorded_until_ctrl_c(port, tmp_path):
             [sys.executable, "-m", "toolbox.main", "record", str(path), "--port", str(port)],
             cwd=ROOT, stdout=subprocess.PIPE, text=True)
         until(lambda: robot.send() or numbers(path), "nothing is written", 30)
-        verb.send_signal(signal.SIGINT)
+        verb.send_signal(number)
         told = verb.communicate(timeout=20)[0]
     robot.tap.close()
     assert verb.returncode == 0, told
@@ -318,8 +406,22 @@ def test_a_run_that_is_there_is_recorded_until_ctrl_c(port, tmp_path):
     assert kept == list(range(kept[0], kept[-1] + 1))
     assert kept[0] > 10
     summary = Summary(BagReader(path))
+    assert summary.reader.closed
     assert summary.time_zero_s == 0.0
     assert summary.first_ns >= 100e9
+
+
+@pytest.mark.parametrize("error", [
+    BagError("it is full"), ValueError("no number"), OSError(24, "Too many open files")])
+def test_a_recording_that_fails_is_one_line(port, tmp_path, monkeypatch, capsys, error):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(Recorder, "run", fail)
+    monkeypatch.setattr("toolbox.record_verbs.stop_pipe", lambda: -1)
+    with AnsweringLauncher(port, time.monotonic()):
+        assert main(["record", str(tmp_path / "x.mcap"), "--port", str(port)]) == 1
+    assert capsys.readouterr().err == f"rampart: {error}\n"
 
 
 def test_without_a_run_there_is_nothing_to_record(port, capsys):
@@ -357,7 +459,7 @@ def test_a_real_run_is_recorded_whole_with_a_node_killed_on_the_way(tmp_path):
     assert recorder_pid(run.port) is None
     summary = Summary(BagReader(path))
     assert (summary.reader.closed, summary.reader.damage) == (True, "")
-    assert summary.end["lost"] == "{}"
+    assert (summary.end["lost"], summary.end["ended"]) == ("{}", "the run has ended")
     assert summary.run["mission"] == "AB"
     lives = {}
     for channel, message in BagReader(path).messages():

@@ -5,13 +5,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import os
+import signal
 import socket
+import subprocess
+import sys
 import time
 import urllib.request
 
 import msgspec
 import pytest
 from recording_samples import AnsweringLauncher, documents, pose, sample, write
+from stub_actors import ROOT as HERE
 from stub_actors import free_base_port
 from websockets.asyncio.client import connect as open_socket
 
@@ -20,7 +25,7 @@ from actors import topics
 from actors.operator.hmi_wishes import Wish
 from actors.recording.bag_reader import BagReader, key_of
 from actors.recording.bag_writer import BagWriter
-from actors.recording.message_form import form_of
+from actors.recording.message_form import MessageForm, form_of
 from actors.recording.recorder import Recorder
 from actors.runtime.envelope import ArrivalGuard, Header, encode
 from actors.runtime.topic import ROOT
@@ -154,6 +159,103 @@ async def test_only_what_is_wanted_is_played_from_where_it_is_wanted(tmp_path, p
     assert len(heard) == 1
 
 
+async def test_what_lies_before_the_start_holds_nobody_up_and_is_not_caught_up_with(
+        tmp_path, port, monkeypatch):
+    write(tmp_path / "run.mcap", [pose(n + 1, n * 0.2) for n in range(206)])
+    turns, begun, sent, decoded = [0], [], [], []
+    messages, payload = BagReader.messages, MessageForm.payload
+
+    def slow(reader):  # as of a file that is 1000 times as large
+        begun.append(turns[0])
+        for found in messages(reader):
+            time.sleep(0.005)
+            yield found
+
+    monkeypatch.setattr(BagReader, "messages", slow)
+    monkeypatch.setattr(MessageForm, "payload", lambda form, text: (
+        decoded.append(text), payload(form, text))[1])
+    player = Replay(tmp_path / "run.mcap", port=port, start_s=40.0)
+    monkeypatch.setattr(player, "_send", lambda *_: sent.append((time.monotonic(), turns[0])))
+
+    async def others():
+        while True:
+            turns[0] += 1
+            await asyncio.sleep(0)
+
+    task = asyncio.create_task(others())
+    monkeypatch.setattr(replaying, "ZenohBus", QuietBus)
+    await player.run(asyncio.Event())
+    task.cancel()
+    assert len(sent) == len(decoded) == 6
+    assert sent[-1][0] - sent[0][0] > 0.9, "one each 0.2 s, never sooner"
+    assert sent[0][1] - begun[0] >= 4, "others had their turn"
+
+
+class QuietBus:
+    """A bus that needs no time."""
+
+    def __init__(self, *_) -> None:
+        pass
+
+    async def open(self) -> None:
+        pass
+
+    async def close(self) -> None:
+        pass
+
+
+async def test_a_start_before_the_beginning_is_the_beginning(tmp_path, port):
+    write(tmp_path / "run.mcap", sample())
+    player = Replay(tmp_path / "run.mcap", port=port, start_s=-1000.0, rate=4.0)
+    async with asyncio.timeout(30):
+        await player.run(asyncio.Event())
+    assert player.played == len(sample())
+
+
+async def test_a_recording_of_which_nothing_can_be_read_ends_also_in_a_loop(
+        tmp_path, port, monkeypatch):
+    write(tmp_path / "run.mcap", sample())
+    monkeypatch.setattr(replaying, "form_of", lambda _key: form_of("rampart/no/topic"))
+    monkeypatch.setattr(MessageForm, "payload", lambda *_: int("no payload"))
+    player = Replay(tmp_path / "run.mcap", port=port, loop=True)
+    async with asyncio.timeout(30):
+        await player.run(asyncio.Event())
+    assert player.played == 0
+
+
+async def test_a_page_that_fails_is_said_to_have_ended(tmp_path, port, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("it is\nbroken")
+
+    write(tmp_path / "run.mcap", sample())
+    monkeypatch.setattr(replaying.ReplayPage, "_pose", fail)
+    said = []
+    player = Replay(tmp_path / "run.mcap", port=port, hmi_port=port + 30, rate=4.0,
+                    said=said.append)
+    async with asyncio.timeout(60):
+        await player.run(asyncio.Event(), 0.5)
+    assert said == ["the page has ended: RuntimeError: it is broken"]
+
+
+def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(tmp_path, port):
+    write(tmp_path / "run.mcap", sample())
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    verb = subprocess.Popen(
+        [sys.executable, "-m", "toolbox.main", "replay", str(tmp_path / "run.mcap"), "--loop",
+         "--port", str(port)], cwd=HERE, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "TMPDIR": str(folder)})
+    assert "playing" in verb.stdout.readline()
+    deadline = time.monotonic() + 30
+    while not list(folder.iterdir()):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    verb.send_signal(signal.SIGHUP)
+    told = verb.communicate(timeout=30)[0]
+    assert (verb.returncode in (0, 1), "played" in told) == (True, True), told
+    assert list(folder.iterdir()) == []
+
+
 async def test_the_rate_is_kept(tmp_path, port):
     write(tmp_path / "run.mcap", [pose(n + 1, n * 0.1) for n in range(11)])
     times = {}
@@ -231,7 +333,8 @@ async def test_a_second_replay_on_the_same_port_is_refused(tmp_path, port):
     (["--rate", "0"], "--rate 0: must be between"), (["--rate", "nan"], "--rate nan"),
     (["--start", "1000"], "--start 1000: the recording goes from 0.0 to 0.9"),
     (["--delay", "-1"], "--delay -1: must not be negative"),
-    (["--hmi-port", "80"], "--hmi-port 80: must be between 1024")])
+    (["--hmi-port", "80"], "--hmi-port 80: must be between 1024"),
+    (["--port", "7411", "--hmi-port", "7411"], "--hmi-port 7411: is the replay's own --port")])
 def test_a_replay_that_makes_no_sense_is_refused_in_one_line(
         tmp_path, port, capsys, arguments, words):
     write(tmp_path / "run.mcap", sample())

@@ -125,8 +125,8 @@ async def test_status_shows_the_run_at_a_glance(run, capsys):
     assert code == 0
     assert "test run" in out
     assert "mission   AB running, step 1 of 1, 0 lights measured" in out
-    assert "pilot     stop, stopped: RM2" in out
-    assert "manager   safety-first, active FTM1; activated RM1; latched RM1" in out
+    assert "pilot     stop, STOPPED: RM2" in out
+    assert "manager   safety-first, decision 1; ACTIVE FTM1; recovery RM1; latched RM1" in out
     assert "nodes     1 of 2 running, 2 restarts; hmi crashed" in out
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from types import SimpleNamespace
+
 import msgspec
 import pytest
 from hypothesis import given, settings
@@ -10,7 +13,10 @@ from rich.cells import cell_len
 
 from actors import messages as m
 from actors import topics
+from actors.runtime.clock import Clock
 from actors.runtime.envelope import Header
+from actors.supervision.run_info import RunInfo
+from toolbox import top_screen
 from toolbox.run_picture import COUNTED, DECODED, RunPicture
 from toolbox.top_view import Frame, lines, picture_json
 
@@ -121,7 +127,7 @@ def test_every_screen_fits(width, height, skip, words):
         for topic in COUNTED:
             picture.count(topic)
         picture.sample(float(second))
-    shown = screen(picture, width, height, skip=skip, note=words, title=words)
+    shown = screen(picture, width, height, skip=skip, title=words)
     assert len(shown) <= height
     assert all(cell_len(line) <= width for line in shown)
     if height >= 12:
@@ -167,3 +173,14 @@ def test_no_state_is_told_by_colour_alone(state):
     picture = busy()
     told(picture, topics.NODES, m.NodeTable((m.NodeInfo("hmi", "operator", 13, state, 1, 0),)))
     assert state.value in line_of(screen(picture), "hmi")
+
+
+@pytest.mark.parametrize("replay_of", ["", "run.mcap"])
+def test_on_a_replay_nobodys_processes_are_measured(monkeypatch, replay_of):
+    mine = m.NodeTable((m.NodeInfo("hmi", "operator", os.getpid(), m.NodeState.RUNNING, 1, 0),))
+    monkeypatch.setattr(top_screen, "draw", lambda _session, picture: told(
+        picture, topics.NODES, mine))
+    run = RunInfo(os.getpid(), 7450, 1.0, 0.0, "", {}, "run", 0, "AB", replay_of=replay_of)
+    shown = top_screen._Watch(SimpleNamespace(run=run, clock=Clock(0.0))).frame()
+    assert list(shown.usage) == ([] if replay_of else ["hmi", "launch.py"])
+    assert [row["name"] for row in shown.guards] == ([] if replay_of else ["launch.py"])

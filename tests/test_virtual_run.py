@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -10,10 +11,14 @@ import sys
 import pytest
 from checkpoint_runs import write_short_mission
 from real_run import RealRun
+from recording_samples import pose
 from stub_actors import ROOT
 
+import launch
+from actors.recording.bag_reader import BagReader, Summary
 from sim.campaign.job import Job, run_job, run_virtually
 from sim.scenario import PlannedFault, parse_fault
+from sim.virtual_run import LEAD_S
 
 SHORT = parse_fault("kill:mission_manager@6")
 """Loses the mission, so the run is over after ten simulated seconds."""
@@ -63,6 +68,24 @@ def test_the_trace_does_not_depend_on_the_process_it_is_made_in(tmp_path, system
         assert [fault["effective"] for fault in result["faults"]] == [True, True]
         traces.add(result["trace"])
     assert len(traces) == 1
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_a_run_that_is_broken_off_has_a_recording_with_all_that_was_sent(
+        tmp_path, monkeypatch, error):
+    class BrokenOff(launch.VirtualRun):
+        def run(self):
+            self._taps[0](*pose(1, 0.5))
+            raise error
+
+    monkeypatch.setattr(launch, "VirtualRun", BrokenOff)
+    path = tmp_path / "run.mcap"
+    with contextlib.suppress(RuntimeError):
+        assert launch.main(["--virtual", "--record", str(path), "--report", str(tmp_path)]) == 1
+    summary = Summary(BagReader(path))
+    assert (summary.reader.closed, summary.end["messages"]) == (True, "1")
+    assert {"osmosis_control", "supervisor"} <= set(json.loads(summary.run["nodes"]))
+    assert summary.time_zero_s == -LEAD_S
 
 
 def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():

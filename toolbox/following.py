@@ -66,7 +66,9 @@ async def sessions(
 def stopped_by_signals(stop: asyncio.Event) -> Iterator[None]:
     """Have SIGINT, SIGTERM and SIGHUP set an event."""
     loop = asyncio.get_running_loop()
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as it is under nohup
+        numbers.append(signal.SIGHUP)
     for number in numbers:
         loop.add_signal_handler(number, stop.set)
     try:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from actors import topics
+from actors.recording.run_documents import SYSTEM, footprint_m
 from actors.runtime.topic import ROOT, Topic
 from actors.supervision.run_info import RunInfo
 from airport.formats import load_airport
@@ -116,7 +117,7 @@ async def live(options: argparse.Namespace, viewer: Viewer) -> int:
 def _watch(session: Session, viewer: Viewer) -> None:
     from actors.recording.views import Views  # noqa: PLC0415 heavy
 
-    views = Views(_airport(session.run))
+    views = Views(_airport(session.run), _footprint_m(session.run))
 
     def now_ns() -> int:
         return max(0, int(session.clock.now() * 1e9))
@@ -146,6 +147,14 @@ def _airport(run: RunInfo) -> Airport | None:
         return load_airport(name) if name else None
     except (OSError, ValueError) as error:
         say(f"no map: {' '.join(str(error).split())}")
+        return None
+
+
+def _footprint_m(run: RunInfo) -> tuple[float, float] | None:
+    """Return length and width of the run's robot, None if its system does not say."""
+    try:
+        return footprint_m([(SYSTEM, "", Path(run.system_file).read_bytes())])
+    except OSError:
         return None
 
 

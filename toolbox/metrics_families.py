@@ -1,8 +1,9 @@
 """A picture of the run as Prometheus metric families. Pure.
 
 Names follow Prometheus' practice: base units, `_total` for what only grows. Times are in simulated
-seconds, but for processor time. What is counted is counted since the exporter joined the run; a
-scraper's `rate()` copes with the reset when the next run begins.
+seconds, but for processor time. Messages, process events, decisions, detections and recoveries are
+counted since the exporter joined the run; the other counts are those of the run, or of a process's
+life. A scraper's `rate()` copes with the reset when the next run or life begins.
 """
 
 from __future__ import annotations

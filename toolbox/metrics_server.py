@@ -27,6 +27,9 @@ from toolbox.output import UsageError, say
 from toolbox.run_picture import RunPicture
 from toolbox.session import Session
 
+_PROCESSES_EVERY = 4
+"""Rounds between two looks for the guards: `ProcessObserver` expects one a second."""
+
 
 async def metrics(options: argparse.Namespace) -> int:
     """Serve until interrupted."""
@@ -59,8 +62,9 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((host, port), family=family)
-    except OSError as error:
-        raise UsageError(f"cannot serve on {host} port {port}: {error.strerror or error}; "
+    except (OSError, UnicodeError) as error:  # the latter from names that no host can have
+        why = getattr(error, "strerror", None) or error
+        raise UsageError(f"cannot serve on {host} port {port}: {why}; "
                          "choose another --port or --host") from None
 
 
@@ -68,7 +72,8 @@ class Exporter:
     """Follows runs and says what there is now; a `look` for `metrics_families.Collector`."""
 
     def __init__(self) -> None:
-        self._now: tuple[Session, RunPicture, ProcessObserver] | None = None
+        self._now: tuple[Session, RunPicture] | None = None
+        self._guards: dict[str, int] = {}
 
     async def follow(self, port: int | None, stop: asyncio.Event) -> None:
         """Follow one run after the other until `stop`."""
@@ -77,9 +82,16 @@ class Exporter:
                 picture = RunPicture()
                 draw(session, picture)
                 run = session.run
-                self._now = (session, picture, ProcessObserver(run.base_port, run.pid))
+                observer = ProcessObserver(run.base_port, run.pid)
+                self._guards = {}
+                self._now = (session, picture)
+                looks = 0
                 while not stop.is_set() and not is_over(run):
                     picture.sample(session.clock.now())
+                    if looks % _PROCESSES_EVERY == 0 and not run.replay_of:
+                        guards = observer.look(picture.latest(topics.NODES))["guards"]
+                        self._guards = {row["name"]: row["pid"] for row in guards}
+                    looks += 1
                     with contextlib.suppress(TimeoutError):
                         await asyncio.wait_for(stop.wait(), LOOK_S)
                 self._now = None
@@ -88,11 +100,11 @@ class Exporter:
         """Return the exposition of this moment, None without a run."""
         if self._now is None:
             return None
-        session, picture, observer = self._now
+        session, picture = self._now
         table = picture.latest(topics.NODES)
-        guards = observer.look(table)["guards"]
-        pids = {node.name: node.pid for node in (table.nodes if table else ())} | {
-            row["name"]: row["pid"] for row in guards}
+        # On a replay nobody: the recorded numbers may be anybody's today.
+        nodes = table.nodes if table and not session.run.replay_of else ()
+        pids = {node.name: node.pid for node in nodes} | self._guards
         return Exposition(
             session.run, session.clock.now(), picture,
             {name: count for name, pid in pids.items() if (count := read_count(pid)) is not None})

@@ -10,6 +10,7 @@ from actors import messages as m
 from actors import topics
 from toolbox.output import NoEffectError, print_json, print_table, say
 from toolbox.session import Session, connect
+from toolbox.state_words import manager_in_words, mission_in_words, pilot_in_words
 
 _STATUS = (topics.MISSION_STATUS, topics.PILOT_STATUS, topics.MANAGER_STATUS, topics.NODES)
 _WAIT_S = 1.5
@@ -76,9 +77,9 @@ async def status(options: argparse.Namespace) -> int:
             "nodes": nodes.nodes if nodes else None})
         return 0
     _print_run(session, time_s)
-    say(f"mission   {_mission(mission)}")
-    say(f"pilot     {_pilot(pilot)}")
-    say(f"manager   {_manager(manager)}")
+    say(f"mission   {mission_in_words(mission)}")
+    say(f"pilot     {pilot_in_words(pilot)}")
+    say(f"manager   {manager_in_words(manager)}")
     say(f"nodes     {_nodes(nodes)}")
     return 0
 
@@ -88,32 +89,6 @@ def _print_run(session: Session, time_s: float) -> None:
     say(f"run       {run.title} (port {run.base_port}, pid {run.pid})")
     page = f", page {run.page}" if run.page else ""
     say(f"time      {time_s:.1f} s at rate {run.rate:g}{page}")
-
-
-def _mission(status: m.MissionStatus | None) -> str:
-    if status is None:
-        return "silent"
-    if not status.goals:
-        return status.phase.value
-    text = f"{status.name} {status.phase.value}, step {min(status.step + 1, len(status.goals))} " \
-           f"of {len(status.goals)}, {len(status.lights)} lights measured"
-    return f"{text}: {status.reason}" if status.reason else text
-
-
-def _pilot(status: m.PilotStatus | None) -> str:
-    if status is None:
-        return "silent"
-    text = f"{status.mode.value}, {'stopped' if status.stopped else 'driving'}"
-    return f"{text}: {status.reason}" if status.reason else text
-
-
-def _manager(status: m.ManagerStatus | None) -> str:
-    if status is None:
-        return "silent"
-    parts = [f"{label} {', '.join(names)}" for label, names in (
-        ("active", status.active), ("activated", status.activated), ("latched", status.latched),
-        ("silent modules", status.silent)) if names]
-    return f"{status.strategy}, {'; '.join(parts) or 'nothing active'}"
 
 
 def _nodes(table: m.NodeTable | None) -> str:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import fnmatch
-import signal
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -18,6 +16,7 @@ from actors.recording.process import stop_pipe, told
 from actors.recording.recorder import Recorder
 from actors.runtime.topic import ROOT
 from actors.supervision.run_info import NoRunError, RunInfo, find_run
+from toolbox.following import stopped_by_signals
 from toolbox.output import NoEffectError, UsageError, say
 from toolbox.replaying import DEFAULT_PORT, Replay
 
@@ -90,7 +89,7 @@ def record(options: argparse.Namespace) -> int:
     say(f"recording {run.title} in {path}; ctrl-C ends it")
     try:
         why = recorder.run(stop, options.duration)
-    except BagError as error:
+    except (BagError, ValueError, OSError) as error:
         raise NoEffectError(str(error)) from None
     say(f"{told(recorder)}; it ends because {why}")
     if recorder.writer is None or not recorder.writer.messages:
@@ -109,15 +108,13 @@ async def replay(options: argparse.Namespace) -> int:
     except BagError as error:
         raise UsageError(str(error)) from None
     stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        with contextlib.suppress(NotImplementedError):
-            asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    if player.summary.reader.damage:
-        say(f"{options.file}: damaged ({player.summary.reader.damage}); playing what is left")
-    page = f", page http://127.0.0.1:{options.hmi_port}/" if options.hmi_port else ""
-    say(f"playing {options.file} on port {options.port} at rate {options.rate:g}{page}; "
-        "ctrl-C ends it")
-    await player.run(stop, options.delay)
+    with stopped_by_signals(stop):
+        if player.summary.reader.damage:
+            say(f"{options.file}: damaged ({player.summary.reader.damage}); playing what is left")
+        page = f", page http://127.0.0.1:{options.hmi_port}/" if options.hmi_port else ""
+        say(f"playing {options.file} on port {options.port} at rate {options.rate:g}{page}; "
+            "ctrl-C ends it")
+        await player.run(stop, options.delay)
     refused = f", {player.refused} of another version left out" if player.refused else ""
     say(f"played {player.played} messages{refused}")
     if not player.played:
@@ -170,3 +167,6 @@ def _check(options: argparse.Namespace) -> None:
     for name, port in (("--port", options.port), ("--hmi-port", options.hmi_port or _PORTS[0])):
         if not _PORTS[0] <= port <= _PORTS[1]:
             raise UsageError(f"{name} {port}: must be between {_PORTS[0]} and {_PORTS[1]}")
+    if options.hmi_port == options.port:
+        raise UsageError(f"--hmi-port {options.hmi_port}: is the replay's own --port; choose "
+                         "another --hmi-port")

@@ -15,7 +15,7 @@ import os
 import socket
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,9 @@ GAP_S = 0.1
 """Simulated seconds between two laps."""
 
 _STRANGE: Topic[Any] = Topic("", Message, Qos.SENSOR, 0, "", "What was recorded on no topic's key.")
+_Due = tuple[int, float, str, bytes]
+"""Lap, simulated time, key, and payload as it was recorded."""
+
 _YIELD_EVERY = 50
 _LINGER_S = 0.3
 
@@ -96,7 +99,8 @@ class Replay:
         zero_s = summary.time_zero_s
         self._first_s = summary.first_ns / 1e9 + zero_s
         self._last_s = summary.last_ns / 1e9 + zero_s
-        self._start_s = self._first_s if start_s is None else start_s
+        self._lap_s = self._last_s - self._first_s + GAP_S
+        self._start_s = self._first_s if start_s is None else max(start_s, self._first_s)
         if self._start_s > self._last_s:
             raise UsageError(f"--start {start_s:g}: the recording goes from {self._first_s:.1f} to "
                              f"{self._last_s:.1f} simulated seconds")
@@ -114,6 +118,12 @@ class Replay:
         Raises:
             UsageError: a port is in use.
         """
+        async with contextlib.aclosing(self._messages(stop)) as messages:
+            first = await anext(messages, None)  # may lie deep in the file: no clock runs yet
+            await self._perform(first, messages, stop, delay_s)
+
+    async def _perform(self, first: _Due | None, messages: AsyncIterator[_Due],
+                       stop: asyncio.Event, delay_s: float) -> None:
         with tempfile.TemporaryDirectory(prefix="rampart-replay-") as directory:
             folder = Path(directory)
             clock = Clock(time.monotonic() + delay_s - self._start_s / self._rate, self._rate)
@@ -125,9 +135,14 @@ class Replay:
                     raise UsageError(f"--port {self._port}: {error}") from None
                 page = self._page(bus, clock, folder)
                 showing = asyncio.create_task(page.run()) if page else None
+                if showing:
+                    showing.add_done_callback(self._page_ended)
                 try:
-                    await self._play(bus, clock, stop)
-                    if page and not stop.is_set():
+                    due = first
+                    while due and await _until(clock.source_time(due[1]), stop):
+                        self._send(bus, *due)
+                        due = await anext(messages, None)
+                    if showing and not showing.done() and not stop.is_set():
                         self._said("the recording is over; the page stays, ctrl-C ends it")
                         await stop.wait()
                     await asyncio.sleep(_LINGER_S)  # what was sent last is still under way
@@ -139,37 +154,32 @@ class Replay:
 
     # -- playing --------------------------------------------------------------------------------
 
-    async def _play(self, bus: ZenohBus, clock: Clock, stop: asyncio.Event) -> None:
-        lap, lap_s = 0, self._last_s - self._first_s + GAP_S
-        while not stop.is_set():
-            for number, (at_s, key, payload) in enumerate(self._frames()):
-                due_s = at_s + lap * lap_s
-                if due_s < self._start_s:
-                    continue
-                if not await _until(clock.source_time(due_s), stop):
-                    return
-                self._send(bus, key, payload, lap, lap_s)
+    async def _messages(self, stop: asyncio.Event) -> AsyncGenerator[_Due, None]:
+        """Yield what is to be played, lap by lap, until `stop`; others get their turn meanwhile."""
+        zero_s = self.summary.time_zero_s
+        reader = BagReader(self._path)  # the summary's is asked for its channels meanwhile
+        lap, found = 0, True
+        while found:
+            found = self._loop and lap == 0  # what comes before the start is for later laps
+            for number, (channel, message) in enumerate(reader.messages()):
                 if number % _YIELD_EVERY == 0:
                     await asyncio.sleep(0)
-            if not self._loop:
-                return
+                if stop.is_set():
+                    return
+                at_s = message.log_time / 1e9 + zero_s + lap * self._lap_s
+                key = key_of(channel)
+                if at_s < self._start_s or key is None or not self._wants(key):
+                    continue
+                try:
+                    payload = form_of(key).payload(message.data)
+                except (ValueError, RecursionError):  # of another version of this program
+                    self.refused += 1
+                    continue
+                found = self._loop
+                yield lap, at_s, key, payload
             lap += 1
 
-    def _frames(self) -> Iterator[tuple[float, str, bytes]]:
-        """Return simulated time, key and payload of each message that is wanted."""
-        zero_s = self.summary.time_zero_s
-        for channel, message in self.summary.reader.messages():
-            key = key_of(channel)
-            if key is None or not self._wants(key):
-                continue
-            try:
-                payload = form_of(key).payload(message.data)
-            except (ValueError, RecursionError):  # of another version of this program
-                self.refused += 1
-                continue
-            yield message.log_time / 1e9 + zero_s, key, payload
-
-    def _send(self, bus: ZenohBus, key: str, payload: bytes, lap: int, lap_s: float) -> None:
+    def _send(self, bus: ZenohBus, lap: int, _at_s: float, key: str, payload: bytes) -> None:
         """Send a message; in later laps as of later lives, or readers would take it for a copy."""
         if self._loop:
             header = header_of(payload)
@@ -178,9 +188,14 @@ class Replay:
                     header.incarnation, self._lives.get(header.source, 0))
             elif header is not None:
                 lives = lap * self._lives.get(header.source, header.incarnation)
-                payload = renumbered(payload, lives, lap * lap_s)
+                payload = renumbered(payload, lives, lap * self._lap_s)
         bus.publish(form_of(key).topic or _STRANGE, key, payload)
         self.played += 1
+
+    def _page_ended(self, page: asyncio.Task[None]) -> None:
+        if not page.cancelled() and (error := page.exception()) is not None:
+            words = " ".join(str(error).split())
+            self._said(f"the page has ended: {type(error).__name__}: {words}")
 
     # -- being found ----------------------------------------------------------------------------
 
@@ -217,7 +232,7 @@ class Replay:
             nodes = [str(name) for name in json.loads(run.get("nodes", "[]"))]
         except ValueError:
             nodes = []
-        if not nodes:  # of a run in virtual time
+        if not nodes:  # 0.5.0 wrote none of a run in virtual time
             head = topics.HEARTBEAT.at("")
             nodes = [key.removeprefix(head) for key in self.summary.keys if key.startswith(head)]
         system = folder / SYSTEM

@@ -66,19 +66,20 @@ class _Watch:
         self._used: dict[str, Any] = {"nodes": {}, "guards": ()}
         draw(session, self.picture)
 
-    def frame(self, note: str = "") -> top_view.Frame:
+    def frame(self) -> top_view.Frame:
         """Look, and return what is to be shown."""
         session = self.session
         now_s = session.clock.now()
         self.picture.sample(now_s)
         table = self.picture.latest(topics.NODES)
-        if table is not None:  # before, nobody knows whom to look at
+        # Before, nobody knows whom to look at; on a replay the numbers may be anybody's today.
+        if table is not None and not session.run.replay_of:
             if self._looks % _USAGE_EVERY == 0:
                 self._used = self._processes.look(table)
             self._looks += 1
         return top_view.Frame(
             session.run.title, session.run.base_port, session.run.rate, now_s, self.picture,
-            self._used["nodes"], self._used["guards"], note, self.skip, self.by_cpu)
+            self._used["nodes"], self._used["guards"], self.skip, self.by_cpu)
 
 
 async def _once(watch: _Watch, options: argparse.Namespace, stop: asyncio.Event) -> int:

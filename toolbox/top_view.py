@@ -18,6 +18,7 @@ from actors import messages as m
 from actors import topics
 from manager.words import decision_in_words
 from toolbox.run_picture import RunPicture
+from toolbox.state_words import manager_in_words, mission_in_words, pilot_in_words
 
 _LABEL = 10
 _PROCESS_WIDTH = 57
@@ -38,7 +39,6 @@ class Frame:
         picture: what was heard.
         usage: per process name: `cpu` percent of a core, `mb` resident, `age_s` real seconds.
         guards: rows of processes that are in no table of the supervisor, as dicts.
-        note: a word to the user in the last line, e.g. that the run has ended.
         skip: so many processes are scrolled away.
         by_cpu: whether the busiest process comes first.
     """
@@ -50,7 +50,6 @@ class Frame:
     picture: RunPicture
     usage: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     guards: Sequence[Mapping[str, Any]] = ()
-    note: str = ""
     skip: int = 0
     by_cpu: bool = False
 
@@ -58,8 +57,7 @@ class Frame:
 def lines(frame: Frame, width: int, height: int) -> list[Text]:
     """Return the screen, at most `height` lines of at most `width` cells."""
     head = [_title(frame, width), *_state(frame, width)]
-    foot = Text(frame.note or "q quit, c sort by CPU, arrows scroll", style="reverse"
-                if frame.note else "dim")
+    foot = Text("q quit, c sort by CPU, arrows scroll", style="dim")
     room = height - len(head) - 2  # a heading, and the last line
     told = min(3, max(0, room - _LEAST_PROCESSES))
     head += _decisions(frame, told)
@@ -73,7 +71,7 @@ def picture_json(frame: Frame) -> dict[str, Any]:
     picture = frame.picture
     return {
         "title": frame.title, "port": frame.port, "rate": frame.rate,
-        "time_s": round(frame.time_s, 3), "note": frame.note,
+        "time_s": round(frame.time_s, 3),
         "mission": picture.latest(topics.MISSION_STATUS),
         "pose": picture.latest(topics.POSE),
         "control": picture.latest(topics.CONTROL_STATUS),
@@ -138,17 +136,12 @@ def _state(frame: Frame, width: int) -> list[Text]:
 
 
 def _mission(status: m.MissionStatus | None, width: int) -> str:
-    if status is None:
-        return "silent"
-    if not status.goals:
-        return status.phase.value
+    words = mission_in_words(status)
+    if status is None or not status.goals or width < 100:
+        return words
     steps = len(status.goals)
-    text = (f"{status.name} {status.phase.value}, step {min(status.step + 1, steps)} of {steps}, "
-            f"{len(status.lights)} lights measured")
-    if width >= 100:
-        done = round(_BAR * min(status.step, steps) / steps)
-        text = f"[{'#' * done}{'.' * (_BAR - done)}] {text}"
-    return f"{text}: {status.reason}" if status.reason else text
+    done = round(_BAR * min(status.step, steps) / steps)
+    return f"[{'#' * done}{'.' * (_BAR - done)}] {words}"
 
 
 def _robot(picture: RunPicture) -> str:
@@ -163,11 +156,7 @@ def _robot(picture: RunPicture) -> str:
 
 
 def _pilot(status: m.PilotStatus | None) -> tuple[str, str]:
-    if status is None:
-        return "silent", ""
-    text = f"{status.mode.value}, {'STOPPED' if status.stopped else 'driving'}"
-    return (f"{text}: {status.reason}" if status.reason else text,
-            "yellow" if status.stopped else "")
+    return pilot_in_words(status), "yellow" if status and status.stopped else ""
 
 
 def _safety(truth: m.GroundTruth | None) -> str:
@@ -183,15 +172,8 @@ def _safety(truth: m.GroundTruth | None) -> str:
 
 
 def _manager(status: m.ManagerStatus | None) -> tuple[str, str]:
-    if status is None:
-        return "silent", ""
-    parts = [f"{status.strategy}, decision {status.decision}"]
-    parts += [f"{word} {', '.join(names)}" for word, names in (
-        ("ACTIVE", status.active), ("recovery", status.activated),
-        ("latched", status.latched), ("silent", status.silent)) if names]
-    if len(parts) == 1:
-        parts.append("nothing active")
-    return "; ".join(parts), "yellow" if status.active or status.activated else ""
+    busy = status is not None and (status.active or status.activated)
+    return manager_in_words(status), "yellow" if busy else ""
 
 
 def _detections(picture: RunPicture) -> tuple[str, str]:

@@ -12,13 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from mcap.exceptions import InvalidMagic, McapError, UnsupportedCompressionError
+from mcap.exceptions import InvalidMagic, McapError
 from mcap.records import (
     Attachment,
     Channel,
     Chunk,
     DataEnd,
-    Footer,
     Header,
     McapRecord,
     Message,
@@ -32,6 +31,8 @@ from actors.recording.bag_writer import END, KEY, RUN, BagError
 _TORN = (McapError, CRCValidationError, struct.error, UnicodeDecodeError, EOFError, RuntimeError,
          MemoryError, OverflowError, ValueError)
 """What reading a record raises that was cut off or overwritten; lz4 raises RuntimeError."""
+
+_COMPRESSIONS = ("", "lz4", "zstd")
 
 
 class BagReader:
@@ -82,22 +83,25 @@ class BagReader:
         """Return metadata, attachments and messages in the order of the file.
 
         Raises:
-            BagError: it is compressed in a way that is not known here.
+            BagError: it is compressed in a way that is not known here, or cannot be read any more.
         """
         self._reset()
-        with self.path.open("rb") as file:
-            for record in self._raw(file):
-                if isinstance(record, Chunk):
-                    yield from self._messages(record)
-                elif isinstance(record, Metadata):
-                    self.metadata[record.name] = record.metadata
-                    yield record
-                elif isinstance(record, Attachment):
-                    yield record
-                elif isinstance(record, Header):
-                    self.profile, self.library = record.profile, record.library
-                else:
-                    yield from self._content(record)
+        try:
+            with self.path.open("rb") as file:
+                for record in self._raw(file):
+                    if isinstance(record, Chunk):
+                        yield from self._messages(record)
+                    elif isinstance(record, Metadata):
+                        self.metadata[record.name] = record.metadata
+                        yield record
+                    elif isinstance(record, Attachment):
+                        yield record
+                    elif isinstance(record, Header):
+                        self.profile, self.library = record.profile, record.library
+                    else:
+                        yield from self._content(record)
+        except OSError as error:
+            raise BagError(f"{self.path}: cannot be read: {error.strerror}") from None
 
     def messages(self) -> Iterator[tuple[Channel, Message]]:
         """Return the messages with their channels, in the order of the file."""
@@ -129,17 +133,15 @@ class BagReader:
             whole = file.tell()
             if isinstance(record, DataEnd):
                 self.closed = True
-            elif isinstance(record, Footer):
-                return
             elif not self.closed:  # after it comes the index, which says everything once more
                 yield record
 
     def _messages(self, chunk: Chunk) -> Iterator[McapRecord]:
+        if chunk.compression not in _COMPRESSIONS:  # the library would take it for not compressed
+            raise BagError(f"{self.path}: compressed by {chunk.compression!r}; known are lz4, "
+                           "zstd and none")
         try:
             parts = breakup_chunk(chunk, validate_crc=True)
-        except UnsupportedCompressionError:
-            raise BagError(f"{self.path}: compressed by {chunk.compression!r}; known are lz4, "
-                           "zstd and none") from None
         except (*_TORN, Exception) as error:  # zstandard has errors of its own
             self._damaged(f"a chunk ({type(error).__name__})")
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 from mcap.records import Attachment, Message, Metadata
@@ -14,8 +15,11 @@ from actors.recording.bag_writer import BagError, open_target
 def repair(reader: BagReader, target: Path, *, overwrite: bool = False) -> int:
     """Copy everything that can be read, and return how many messages that were.
 
+    A copy that does not come to its end is not left behind.
+
     Raises:
-        BagError: the target exists, is the source, or cannot be written.
+        BagError: the target exists, is the source, or cannot be written; or the source cannot be
+            read.
     """
     if target.exists() and target.samefile(reader.path):
         raise BagError(f"{target}: is the file to be repaired; give another name")
@@ -44,8 +48,14 @@ def repair(reader: BagReader, target: Path, *, overwrite: bool = False) -> int:
             first = next(records, None)
         writer.finish()
         file.close()
-    except OSError as error:
-        raise BagError(f"{target}: {error.strerror or error}") from None
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            file.close()
+        if target.is_file():  # and no device
+            target.unlink()
+        if isinstance(error, OSError):
+            raise BagError(f"{target}: {error.strerror or error}") from None
+        raise
     return copied
 
 

@@ -100,7 +100,6 @@ class BagWriter:
         self._zero_s = time_zero_s
         self._views = views
         self._wants = wants
-        self._last_ns = 0
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, _Entry | None] = {}
         self._view_channels: dict[str, int] = {}
@@ -133,7 +132,6 @@ class BagWriter:
         if channel is None:
             return
         log_ns = self._ns(at_s)
-        self._last_ns = max(self._last_ns, log_ns)
         if header is None:
             self.garbage += 1
             self._writer.add_message(channel[0], log_ns, text, log_ns)
@@ -214,7 +212,7 @@ class BagWriter:
 
     def _ns(self, at_s: float) -> int:
         seconds = (at_s - self._zero_s) if math.isfinite(at_s) else 0.0
-        return min(max(0, round(seconds * 1e9)), _MAX_NS)
+        return round(min(max(0.0, seconds * 1e9), _MAX_NS))
 
 
 def _why(error: OSError) -> str:

@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from actors import topics
-from actors.runtime.envelope import Envelope, Header, decode, pack
+from actors.runtime.envelope import UNREADABLE, Envelope, Header, decode, pack
 from actors.runtime.topic import ROOT, Topic
 
 B = TypeVar("B")
@@ -67,7 +67,7 @@ class MessageForm:
             return _garbage(payload, "no topic has this key"), None, None
         try:
             header, body = decode(self.topic, payload)
-        except (msgspec.MsgspecError, RecursionError) as error:
+        except UNREADABLE as error:
             return _garbage(payload, f"not a {self.topic.type.__name__}: {error}"), None, None
         parts = (header.source, header.incarnation, header.sequence, header.stamp)
         try:
@@ -116,7 +116,7 @@ def renumbered(payload: bytes, lives: int, later_s: float) -> bytes:
     """
     try:
         message = _any_message.decode(payload)
-    except (msgspec.MsgspecError, RecursionError):
+    except UNREADABLE:
         return payload
     head = (message.source, message.incarnation + lives, message.sequence,
             message.stamp + later_s)
@@ -127,7 +127,7 @@ def header_of(payload: bytes) -> Header | None:
     """Return the header of a payload, or None for garbage."""
     try:
         return _any_message.decode(payload)
-    except (msgspec.MsgspecError, RecursionError):
+    except UNREADABLE:
         return None
 
 

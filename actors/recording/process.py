@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -18,7 +19,7 @@ import msgspec
 import setproctitle
 
 from actors.recording.bag_writer import BagError
-from actors.recording.recorder import Recorder
+from actors.recording.recorder import RUN_ENDED, Recorder
 
 _ROOT = Path(__file__).resolve().parents[2]
 _READY = "ready"
@@ -61,6 +62,10 @@ class RecorderProcess:
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, env=environment)
         assert self._process.stdout is not None  # noqa: S101 for the type checker
         with self._process.stdout as answers:
+            if not select.select([answers], [], [], _START_S)[0]:
+                self._process.kill()
+                self._process.wait()
+                raise BagError(f"the recorder did not start within {_START_S:g} s")
             answer = answers.readline().strip()
         if answer != _READY:
             self._process.wait(_END_S)
@@ -71,7 +76,7 @@ class RecorderProcess:
         process, self._process = self._process, None
         if process is None:
             return
-        for number in (signal.SIGCONT, signal.SIGTERM):
+        for number in (signal.SIGCONT, RUN_ENDED):
             with contextlib.suppress(ProcessLookupError):
                 process.send_signal(number)
         try:
@@ -82,9 +87,12 @@ class RecorderProcess:
 
 
 def stop_pipe() -> int:
-    """Have SIGTERM and SIGINT readable from a file descriptor, and return it."""
+    """Have SIGTERM, SIGINT and SIGHUP readable from a file descriptor, and return it."""
     read_end, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-    for number in (signal.SIGTERM, signal.SIGINT):
+    numbers = [signal.SIGTERM, signal.SIGINT]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as it is under nohup
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
         signal.signal(number, lambda *_: None)
     signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
     return read_end
@@ -99,13 +107,14 @@ def record(order: Order) -> int:
     stop = stop_pipe()
     for number in (signal.SIGINT, signal.SIGHUP):  # the launcher's to handle; we see its end
         signal.signal(number, signal.SIG_IGN)
+    signal.signal(RUN_ENDED, lambda *_: None)
     recorder = Recorder(order.port, path, overwrite=order.overwrite, launcher=order.launcher)
     try:
         recorder.open()
     except BagError as error:
-        print(f"error: {error}", flush=True)
+        _answer(f"error: {error}")
         return 1
-    print(_READY, flush=True)
+    _answer(_READY)
     try:
         recorder.run(stop)
     except (BagError, ValueError, OSError) as error:
@@ -126,6 +135,12 @@ def told(recorder: Recorder) -> str:
              *([f"{writer.garbage} of them garbage"] if writer.garbage else []),
              f"{lost} lost" if lost else "none lost"]
     return "recorded " + ", ".join(parts)
+
+
+def _answer(text: str) -> None:
+    """Tell the launcher, if it is still there; past the buffer, which would be tried once more."""
+    with contextlib.suppress(OSError):
+        os.write(sys.stdout.fileno(), f"{text}\n".encode())
 
 
 def _say(text: str) -> None:

@@ -15,6 +15,7 @@ import math
 import os
 import select
 import selectors
+import signal
 import socket
 import time
 from collections.abc import Callable, Iterable
@@ -39,6 +40,10 @@ FLUSH_S = 0.8
 LAST_S = 2.0
 """Real seconds that nodes have to end after their launcher, while their sockets are still read."""
 
+RUN_ENDED = signal.SIGUSR1
+"""What the launcher of a run sends its recorder when all nodes have ended."""
+
+_RUN_ENDED = "the run has ended"
 _ASK_S = 0.2
 _WAITING_FRAMES = 500_000
 
@@ -93,7 +98,7 @@ class Recorder:
         """Record until a byte can be read from `stop`, or the run or its time is over; say why.
 
         Args:
-            stop: file descriptor.
+            stop: file descriptor; the byte is the number of a signal, `RUN_ENDED` or another.
             duration_s: real seconds.
 
         Raises:
@@ -103,24 +108,24 @@ class Recorder:
         poller.register(stop, select.POLLIN)
         pidfd = -1
         begun_s = time.monotonic()
-        why = ""
+        why, over = "", False
         try:
             while not why:
                 if pidfd < 0 and self._launcher is not None:
                     pidfd = _pidfd(self._launcher)
                     if pidfd < 0:
-                        why = "the run has ended"
+                        why, over = _RUN_ENDED, True
                         break
                     poller.register(pidfd, select.POLLIN)
                 ready = {fd for fd, _ in poller.poll(1000 * self._period_s())}
                 if pidfd in ready:
-                    why = "the run has ended"
+                    why, over = _RUN_ENDED, True
                 elif stop in ready:
-                    why = "it was told to"
+                    why = _RUN_ENDED if RUN_ENDED in os.read(stop, 64) else "it was told to"
                 elif duration_s is not None and time.monotonic() - begun_s >= duration_s:
                     why = f"its {duration_s:g} s are over"
                 self._turn()
-            self._finish(why, run_is_over=pidfd in ready)
+            self._finish(why, run_is_over=over)
         finally:
             if pidfd >= 0:
                 os.close(pidfd)

@@ -35,11 +35,3 @@ class SequenceGaps:
     def lost(self) -> dict[str, int]:
         """Return source → messages that were sent and not recorded."""
         return dict(self._lost)
-
-    @property
-    def heard(self) -> dict[str, int]:
-        """Source → messages that were numbered, over all lives heard."""
-        found: dict[str, int] = {}
-        for (source, _), last in self._last.items():
-            found[source] = found.get(source, 0) + last
-        return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,6 @@ from actors.recording.run_documents import collect
 
 FLUSH_S = 10.0
 """Simulated seconds between two hand-overs of the file: some tenths of a real one."""
-
-LEAD_S = 1.0
-"""Simulated seconds before simulated time 0 in which a virtual run starts."""
 
 
 class VirtualRecording:
@@ -26,22 +23,25 @@ class VirtualRecording:
         path: of the file.
         plan: what is run (`RunPlan.description`).
         title: for people.
+        nodes: names of the nodes.
+        lead_s: simulated seconds before simulated time 0 in which the run starts; a whole number.
         overwrite: the file may exist.
 
     Raises:
         BagError: the file cannot be made.
     """
 
-    def __init__(self, path: Path, plan: Mapping[str, Any], title: str, *, overwrite: bool) -> None:
+    def __init__(self, path: Path, plan: Mapping[str, Any], title: str, *,
+                 nodes: Iterable[str], lead_s: float, overwrite: bool) -> None:
         self._path = path
         self._failed = ""
         self._next_flush_s = 0.0
         documents = collect(plan, run_id=f"virtual-{plan.get('seed')}", title=title, rate=1.0,
-                            nodes=(), started="")
+                            nodes=tuple(nodes), started="")
         file = open_target(path, overwrite=overwrite)
         try:
             self._writer = BagWriter(
-                file, documents, time_zero_s=-LEAD_S, views=views_of(documents),
+                file, documents, time_zero_s=-lead_s, views=views_of(documents),
                 from_start=True)
         except OSError as error:
             file.close()
