@@ -249,9 +249,11 @@ async def test_the_stick_on_the_screen_and_a_gamepad_drive(world):
 
         await tab.value("window.pad.buttons[4].pressed = true")
         await drives(tab, world, left=-0.5)
-        await tab.value("window.pad.connected = false; dispatchEvent(new Event('gamepaddisconnected'))")
+        await tab.value("window.pad.connected = false;"
+                        "dispatchEvent(new Event('gamepaddisconnected'))")
         await stops(world)
-        await tab.value("window.pad.connected = true; dispatchEvent(new Event('gamepadconnected'))")
+        await tab.value("window.pad.connected = true;"
+                        "dispatchEvent(new Event('gamepadconnected'))")
         await tab.until(f"{WORDS}.includes('let go first, then press again')")
         await stops(world)  # plugging in moves nothing
         await tab.value("window.pad.buttons[4].pressed = false")
