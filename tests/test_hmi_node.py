@@ -13,7 +13,6 @@ from hmi_browser import CHROMIUM, browser
 from hmi_world import (
     AIRPORT,
     RATE,
-    World,
     eventually,
     free_port,
     hear,
@@ -27,13 +26,6 @@ from actors.operator import hmi_feed, hmi_server
 from actors.operator.hmi import Hmi
 from actors.operator.hmi_server import MAX_MESSAGE_BYTES, Visitor
 from actors.operator.hmi_wishes import OrderWish
-
-
-@pytest.fixture
-async def world():
-    made = World()
-    async with made.running(made.others):
-        yield made
 
 
 async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world):

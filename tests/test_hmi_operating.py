@@ -9,31 +9,16 @@ import json
 import httpx
 import pytest
 import websockets
-from hmi_world import World, eventually, free_port, hear, repeated, served
+from hmi_world import eventually, free_port, hear, repeated, served
 
 from actors import messages as m
 from actors import topics
-from actors.operator import hmi_stick
 from actors.supervision.kill_node import SignalError
 from actors.supervision.process_title import RunProcess
 from sim.offered_faults import offered_faults
 
 TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
-
-
-@pytest.fixture
-async def world():
-    made = World()
-    async with made.running(made.others):
-        yield made
-
-
-@pytest.fixture
-def patient(monkeypatch):
-    """For tests in which time is not the subject: a busy machine is no silent page."""
-    monkeypatch.setattr(hmi_stick, "SILENCE_S", 5.0)
-    monkeypatch.setattr(hmi_stick, "TICKET_S", 5.0)
 
 
 async def ask(page, **wish) -> dict:

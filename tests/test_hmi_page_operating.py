@@ -27,20 +27,6 @@ WORDS = "document.getElementById('stick-text').textContent"
 PAD = "document.getElementById('stick')"
 
 
-@pytest.fixture
-async def world():
-    made = World()
-    async with made.running(made.others):
-        yield made
-
-
-@pytest.fixture
-def patient(monkeypatch):
-    """For tests in which time is not the subject: a busy machine is no silent page."""
-    monkeypatch.setattr(hmi_stick, "SILENCE_S", 5.0)
-    monkeypatch.setattr(hmi_stick, "TICKET_S", 5.0)
-
-
 def alive(world: World):
     """Have the Safety Pilot and the manager heard, as in a run in which all is well."""
     def say() -> None:
@@ -146,8 +132,9 @@ async def test_a_connection_that_is_too_slow_is_told_so_and_not_flooded(world, m
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until(FREE)
         await tab.value(
-            "window.sent = 0; const send = WebSocket.prototype.send; WebSocket.prototype.send = "
-            "function(text) { window.sent += text.includes('\"held\":true'); send.call(this, text); }")
+            "window.sent = 0; const send = WebSocket.prototype.send;"
+            "WebSocket.prototype.send = function(text) {"
+            " window.sent += text.includes('\"held\":true'); send.call(this, text); }")
         await tab.value(f"{PAD}.focus()")
         await key(tab, "w", down=True)
         await tab.until(f"{WORDS}.includes('the connection is too slow to drive')")
