@@ -90,7 +90,10 @@ class BaseCommand(Message, frozen=True):
 
 
 class BrakeCommand(Message, frozen=True):
-    """Low-level brake. Engaged, it blocks the wheels whatever the velocity command says."""
+    """Low-level brake. Engaged, it blocks the wheels whatever the velocity command says.
+
+    Several may hold it; it is released when the last of them has let go.
+    """
 
     engaged: bool
     reason: str

@@ -29,7 +29,8 @@ BASE_STATUS = Topic("summit_xl/status", m.BaseStatus, Qos.STATE, 10, "base_link"
 BASE_COMMAND = Topic("summit_xl/command", m.BaseCommand, Qos.SENSOR, 20, "base_link",
                      "Velocity command; when it ceases the base brakes.")
 BRAKE = Topic("summit_xl/brake", m.BrakeCommand, Qos.COMMAND, 5, "base_link",
-              "Low-level brake: emergency stop, repeated while in force.")
+              "Low-level brake, repeated while in force. Each source lets go of its own hold only: "
+              "the base brakes as long as anybody holds it.")
 
 # Control chain.
 MISSION_REQUEST = Topic("mission/request", m.MissionRequest, Qos.COMMAND, 0, "map",

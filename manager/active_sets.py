@@ -107,6 +107,16 @@ class ActiveSets:
         return sum(any(contracts[r].latched for r in case.decision.recoveries)
                    for case in self.cases if not case.late)
 
+    @property
+    def stuck_behind_last_resort(self) -> int:
+        """In how many sets a latched last resort runs, and a repair that is needed never does.
+
+        `repairs-run` exempts these: the robot stands, and somebody has to come anyhow. But the
+        reset is refused as long as the last resort is decided on, which is as long as nobody
+        repairs by hand.
+        """
+        return sum(self._starve(case)[1] for case in self.cases if not case.late)
+
     # -- the properties: each yields a trace if the case violates it -----------------------------
 
     def _no_single_decision(self, case: Case) -> Trace | None:
@@ -196,12 +206,21 @@ class ActiveSets:
     def _starving_repair(self, case: Case) -> Trace | None:
         """Find a repair that is asked for and never run, though all recoveries succeed.
 
+        Exempt is what starves while a latched last resort runs (`stuck_behind_last_resort`).
+        """
+        trace, behind = self._starve(case)
+        return None if behind else trace
+
+    def _starve(self, case: Case) -> tuple[Trace | None, bool]:
+        """Return how a repair starves, if one does, and whether behind a latched last resort.
+
         What a repair is asked for persists until that repair has run, and so do the consequences
         that are detected above it. Everything else may go away by itself, and is let go.
         """
         recover = self.arrangement.mechanisms.recover
-        repairs = {name for name, c in self.arrangement.mechanisms.contracts.items()
-                   if c.kind.repairs}
+        contracts = self.arrangement.mechanisms.contracts
+        repairs = {name for name, c in contracts.items() if c.kind.repairs}
+        stops = {name for name in self.last_resort if contracts[name].latched}
         tree = self.arrangement.tree
         trace = [case.describe()]
         active = case.active
@@ -210,10 +229,8 @@ class ActiveSets:
             lasting = tuple(n for n in active if n in broken or any(
                 tree.is_above(n, b) for b in broken))
             if not broken:
-                return None
+                return None, False
             decision = self._by_set[lasting, case.late.intersection(lasting)].decision
-            if set(decision.recoveries) & self.last_resort:
-                return None  # it stops for good, which is counted elsewhere
             if lasting != active:
                 trace.append(f"what else was active goes away; {listing(lasting)} active: runs "
                              f"{listing(decision.recoveries)}")
@@ -221,7 +238,7 @@ class ActiveSets:
             if not cured:
                 waiting = listing(sorted({r for n in broken for r in recover[n]}))
                 trace.append(f"{waiting} never runs, so {listing(broken)} stays active for ever")
-                return tuple(trace)
+                return tuple(trace), bool(stops.intersection(decision.recoveries))
             active = tuple(n for n in lasting if n not in cured)
             trace.append(f"{listing(decision.recoveries)} done")
 

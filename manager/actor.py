@@ -51,11 +51,7 @@ ABSENCE_S = 0.3
 
 
 class FtmManager(Actor):
-    """Hears all detection and recovery modules, commands the recovery modules.
-
-    Parameters:
-        strategy: name of a strategy; that of the system spec if left out.
-    """
+    """Hears all detection and recovery modules, commands the recovery modules."""
 
     outputs = (topics.RECOVERY_COMMAND, topics.DECISION, topics.SHADOW,
                topics.MANAGER_STATUS, topics.ADAPTATION, topics.ADAPTED_SYSTEM)
@@ -65,8 +61,8 @@ class FtmManager(Actor):
         self._system: SystemSpec = context.shared["system"]
         self._document: Document = context.shared.get("document", {})
         self._adapted: m.AdaptedSystem | None = context.shared.get("adapted")
-        self._strategy = str(self.parameters.get("strategy", "")) or self._system.strategy
-        self._arbiter = build_arbiter(self._system, self._strategy)
+        self._strategy = self._system.strategy
+        self._arbiter = build_arbiter(self._system, first_life=context.incarnation == 1)
         now_s = self.clock.now()
         self.arbiter_state = self._arbiter.initial(
             now_s, (context.incarnation - 1) * DECISIONS_PER_LIFE)
@@ -126,8 +122,8 @@ class FtmManager(Actor):
             change = Change(Action(message.action), message.name,
                             msgspec.json.decode(message.values, type=dict[str, Any]))
             reason = self._change(change, message.by)
-        except (ValueError, msgspec.MsgspecError) as error:
-            reason = " ".join(str(error).split())
+        except Exception as error:  # whatever was typed, this manager guards a robot
+            reason = " ".join(str(error).split()) or type(error).__name__
         self.publish(topics.ADAPTATION, m.AdaptationAnswer(
             message.request, not reason, reason, self._version))
 
@@ -257,5 +253,6 @@ def forgive_absence(state: State, missed_s: float) -> State:
     replace = msgspec.structs.replace
     return replace(
         state,
+        started_s=state.started_s + missed_s,
         detections=tuple(replace(t, heard_s=t.heard_s + missed_s) for t in state.detections),
         recoveries=tuple(replace(t, ordered_s=t.ordered_s + missed_s) for t in state.recoveries))

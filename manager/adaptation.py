@@ -108,7 +108,7 @@ def parse_value(text: str) -> Any:
     """
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         if text and all(c.isalnum() or c in "_-./ :()," for c in text):
             return text
         raise ChangeError(f"{text!r}: expected a TOML value, e.g. 0.5, true, 'text' or [1, 2]"

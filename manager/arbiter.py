@@ -69,6 +69,9 @@ __all__ = [
 ]
 
 
+LARGEST_NUMBER = 1 << 53
+"""A decision number beyond it was never given, whoever reports or remembers it."""
+
 _is_at_rest = attrgetter("is_at_rest")
 
 
@@ -101,6 +104,10 @@ class Arbiter:
                 detection for ftm in mechanisms.names
                 if any(recovery in way for way in mechanisms.alternatives(ftm))
                 for detection in mechanisms.detect[ftm])
+            for recovery in mechanisms.recoveries}
+        self._mechanisms_of = {
+            recovery: frozenset(ftm for ftm in mechanisms.names
+                                if any(recovery in way for way in mechanisms.alternatives(ftm)))
             for recovery in mechanisms.recoveries}
 
     @staticmethod
@@ -228,7 +235,10 @@ class Arbiter:
 
     def _hear_recovery(self, state: State, event: RecoveryHeard, now: float) -> State:
         track = state.recoveries[self._recovery[event.recovery]]
+        number = state.number
         if event.activated and not state.oriented and not track.wanted and not track.heard:
+            if event.decision <= LARGEST_NUMBER:  # or it is no number that was ever given
+                number = max(number, event.decision)
             track = msgspec.structs.replace(
                 track, ordered_s=now, adopted=True,
                 latched=self.mechanisms.contracts[event.recovery].latched,
@@ -238,9 +248,17 @@ class Arbiter:
             track, now, activated=event.activated, phase=event.phase, decision=event.decision,
             reason=event.reason)
         if track.failure and not track.failed_for:
-            track = msgspec.structs.replace(track, failed_for=state.decision.active)
-        state = msgspec.structs.replace(state, number=max(state.number, event.decision))
-        return self._with_recovery(state, track)
+            track = msgspec.structs.replace(
+                track, failed_for=self._own(event.recovery, state.decision.active))
+        return self._with_recovery(msgspec.structs.replace(state, number=number), track)
+
+    def _own(self, recovery: str, active: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the active mechanisms for whose sake a recovery fails.
+
+        One that was chosen for another's sake, by block 4 or by escalation, fails for all.
+        """
+        own = self._mechanisms_of[recovery]
+        return tuple(name for name in active if name in own) or active
 
     def _reset(self, state: State, event: ResetAsked) -> tuple[State, ResetAnswered]:
         name = event.recovery
@@ -248,6 +266,8 @@ class Arbiter:
         if index < 0 or not state.recoveries[index].latched:
             problem = "it is not latched" if index >= 0 else "there is no such recovery module"
             return state, ResetAnswered(name, False, problem)
+        if not state.oriented:
+            return state, ResetAnswered(name, False, "not all modules have been heard yet")
         chosen = self._choose(state)[1]
         if name in chosen.recoveries:
             return state, ResetAnswered(
@@ -265,8 +285,10 @@ class Arbiter:
         believed = {track.name: track for track in detections}
         active = self._active(detections)
         recoveries = tuple(self._judge(track, believed, active, now) for track in state.recoveries)
-        oriented = state.oriented or now - state.started_s >= self.rules.startup_grace_s or (
-            all(t.ever_heard for t in detections) and all(t.heard for t in recoveries))
+        oriented = state.oriented or (
+            all(t.ever_heard or t.silent for t in detections) and (
+                all(t.heard for t in recoveries)
+                or now - state.started_s > self.rules.startup_grace_s))
         if oriented and not state.oriented:
             recoveries = tuple(msgspec.structs.replace(t, adopted=False) for t in recoveries)
         state = msgspec.structs.replace(
@@ -320,7 +342,8 @@ class Arbiter:
         failure = self._failure(track, believed, contract)
         if not failure:
             return track
-        return msgspec.structs.replace(track, failure=failure, failed_for=active)
+        return msgspec.structs.replace(
+            track, failure=failure, failed_for=self._own(track.name, active))
 
     @staticmethod
     def _failure(track: RecoveryTrack, believed: dict[str, DetectionTrack], contract: Contract
@@ -433,6 +456,17 @@ class Arbiter:
                    or not set(cause.nodes) <= set(track.command.nodes)
                    for cause in self._causes(state, track.name))
 
+    def _is_news(self, state: State, track: RecoveryTrack) -> bool:
+        """Tell whether there is more to a new cause than one more life of a node it was told of.
+
+        A repair whose detection does not clear, and blames one life of a node after the other, has
+        not ended the error.
+        """
+        told = {_without_life(node) for node in track.command.nodes}
+        return any((cause.name, cause.rises) not in track.cause
+                   or not {_without_life(node) for node in cause.nodes} <= told
+                   for cause in self._causes(state, track.name))
+
     def _release(self, track: RecoveryTrack, chosen: tuple[str, ...], number: int, now: float
                  ) -> RecoveryTrack:
         """Release a recovery, or let it drain."""
@@ -452,8 +486,8 @@ class Arbiter:
         if track.wanted:
             if not self._has_new_cause(state, track):
                 return msgspec.structs.replace(track, draining=False)
-            if not track.acknowledged:
-                ordered_s = track.ordered_s  # it has been deaf since then
+            if not track.acknowledged or not self._is_news(state, track):
+                ordered_s = track.ordered_s  # it has been deaf, or without success, since then
         elif any(self._blocks(other, track.name, state.decision.recoveries)
                  for other in state.recoveries):
             return track
@@ -479,12 +513,19 @@ class Arbiter:
         return not self.order.is_above(name, other.name)
 
 
-def build_arbiter(spec: SystemSpec, strategy: str = "") -> Arbiter:
+def _without_life(node: str) -> str:
+    """Return the name of a node that is blamed by its life, NODE#INCARNATION, or as it is."""
+    return node.partition("#")[0]
+
+
+def build_arbiter(spec: SystemSpec, strategy: str = "", *, first_life: bool = True) -> Arbiter:
     """Build the arbiter of a system.
 
     Args:
         spec: The system.
         strategy: Name of a strategy; "" for the one that the spec names.
+        first_life: Whether modules may be starting as well, and are waited for accordingly; those
+            of an arbiter that was respawned run already.
 
     Raises:
         UnknownStrategyError: No such strategy.
@@ -494,6 +535,7 @@ def build_arbiter(spec: SystemSpec, strategy: str = "") -> Arbiter:
         spec.build_mechanisms(patience_s(spec)), spec.build_ftm_tree(), spec.build_order())
     return Arbiter(
         arrangement, find_strategy(strategy or spec.strategy),
-        DetectionRules(timing.detection_silence_timeout_s, timing.startup_grace_s,
+        DetectionRules(timing.detection_silence_timeout_s,
+                       timing.startup_grace_s if first_life else timing.detection_silence_timeout_s,
                        timing.release_hold_s, timing.release_hold_max_s),
         find_strategy(spec.shadow) if spec.shadow else None)

@@ -18,13 +18,16 @@ import math
 
 import msgspec
 
-from manager.arbiter import Arbiter
+from manager.arbiter import LARGEST_NUMBER, Arbiter
 from manager.arbiter_state import State
 from manager.recovery_track import Command, RecoveryTrack
 
 
 class Latch(msgspec.Struct, frozen=True):
-    """A recovery that stays until it is reset: what it was told, and for which detections."""
+    """A recovery that stays until it is reset: what it was told last, and for which detections.
+
+    A safer one may have taken its place for a while.
+    """
 
     command: Command
     cause: tuple[tuple[str, int], ...]
@@ -50,7 +53,7 @@ def remember(state: State) -> Memory:
     return Memory(
         state.number,
         tuple(Latch(track.command, tuple(sorted(track.cause)))
-              for track in state.recoveries if track.latched and track.wanted),
+              for track in state.recoveries if track.latched),
         tuple((track.name, track.bucket_s, track.bucket_at_s)
               for track in state.detections if track.bucket_s > 0))
 
@@ -84,11 +87,8 @@ def _latched(latch: Latch, now: float) -> RecoveryTrack:
 
 def objection(memory: Memory) -> str:
     """Say why a memory makes no sense; "" if it does."""
-    if memory.number < 0:
+    if not 0 <= memory.number <= LARGEST_NUMBER:
         return f"decision number {memory.number}"
-    for latch in memory.latches:
-        if not latch.command.activate:
-            return f"{latch.command.recovery} is latched and not activated"
     for name, bucket_s, at_s in memory.buckets:
         if not (math.isfinite(bucket_s) and math.isfinite(at_s) and bucket_s >= 0):
             return f"bucket of {name} holds {bucket_s} s"

@@ -208,7 +208,7 @@ def _of_mechanism(spec: SystemSpec, mechanism: MechanismSpec, modules: _Modules)
         hazard = "the robot enters the prohibited area"
     else:
         parent = modules.mechanisms[str(modules.parents[mechanism.name])]
-        left_s = min(detections[name].latency_s for name in parent.detections)
+        left_s = min(detections[name].soonest_s for name in parent.detections)
         hazard = f"{parent.detect} of {parent.name} detects the consequence"
     # Which input of a gate opens it is not known: count on the slowest.
     detection_s = max(detections[name].latency_s for name in mechanism.detections)

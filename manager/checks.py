@@ -18,11 +18,13 @@ from manager.budget import braking_distance_m, check, find_false_alarms
 from manager.fault_tree import FaultTreeError
 from manager.gates import GateError, detection_gate, recovery_gate
 from manager.order import CycleError, PartialOrder, find_cycle
-from manager.schema import Hazard, Kind, Robot, SystemSpec
+from manager.parameters import find_wrong
+from manager.schema import DetectionSpec, Hazard, Kind, RecoverySpec, Robot, SystemSpec
 from manager.strategies import STRATEGIES
 
 SUPERVISOR = "supervisor"
-RESERVED = frozenset({SUPERVISOR, "spawner", "launch"})
+RESERVED = frozenset({
+    SUPERVISOR, "spawner", "spawner_a", "spawner_b", "launch", "observer", "injector"})
 
 
 class Finding(NamedTuple):
@@ -111,9 +113,17 @@ def _detections(spec: SystemSpec) -> Iterator[Finding]:
             if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
                 yield Finding(f"{path}.parameters.{key}", "expected a number > 0", (value,))
                 return
+        yield from _parameters(path, detection, nodes)
         if not detection.latency_s > 0:
             yield Finding(f"{path}.within_s", "missing; say within how many seconds the module "
                                               "detects, here or as parameters.timeout_s")
+
+
+def _parameters(path: str, module: DetectionSpec | RecoverySpec, nodes: Sequence[str],
+                derived: Sequence[str] = ()) -> Iterator[Finding]:
+    for name, problem in find_wrong(module.actor, module.parameters, nodes, derived):
+        value = (module.parameters[name],) if name in module.parameters else ()
+        yield Finding(f"{path}.parameters.{name}", problem, value)
 
 
 def _mechanisms(spec: SystemSpec) -> Iterator[Finding]:
@@ -145,6 +155,8 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
         if recovery.escalate_to and recovery.escalate_to not in names:
             yield _unknown(f"$.recovery[{index}].escalate_to", recovery.escalate_to,
                            "recovery module", names)
+        own = ["nodes"] if any(node.respawn == recovery.name for node in spec.nodes) else []
+        yield from _parameters(f"$.recovery[{index}]", recovery, [n.name for n in spec.nodes], own)
     cycle = find_cycle({r.name: [r.escalate_to] if r.escalate_to else [] for r in spec.recoveries})
     if cycle:
         yield Finding(f"$.recovery[{names.index(cycle[0])}].escalate_to",

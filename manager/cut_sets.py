@@ -23,7 +23,7 @@ import msgspec
 from oxidd.bdd import BDDFunction, BDDManager
 from oxidd.util import DDMemoryError
 
-from manager.formula import Connective, Formula
+from manager.formula import GENERATED, Connective, Formula
 from manager.zbdd import EMPTY, UNIT, Diagram, Families, TooManyNodesError, deep_recursion
 
 BOUNDS = (30_000, 300_000, 1_000_000, 5_000_000, 20_000_000)
@@ -356,7 +356,7 @@ def _prepare(formula: Formula) -> tuple[dict[str, Connective], list[str]]:
         lone = [e for e in gate.inputs if users[e] == 1 and e not in formula.house
                 and (e not in gates or e in modules)]
         if uniform and 2 <= len(lone) < len(gate.inputs):
-            gathered = f"{name}/lone"
+            gathered = f"{name}{GENERATED}lone"
             rest = tuple(e for e in gate.inputs if e not in lone)
             both = (gathered, *rest)
             gates[gathered] = Connective(

@@ -14,6 +14,9 @@ import msgspec
 from manager.fault_tree import FaultTree
 from manager.order import find_cycle
 
+GENERATED = ".."
+"""Stands in the names of gates and events that are made up; no name in a file can hold it."""
+
 
 class FormulaError(ValueError):
     """A formula that cannot be analysed. The message is one line."""

@@ -158,7 +158,8 @@ def _product(parts: list[tuple[tuple[str, ...], ...]]) -> Iterator[tuple[str, ..
             yield tuple(dict.fromkeys((*head, *tail)))
 
 
-_TOKEN = re.compile(r"\s*([A-Za-z][A-Za-z0-9_]*|\d+|[(),])")
+_TOKEN = re.compile(r"\s*([A-Za-z][A-Za-z0-9_]*|[0-9]+|[(),])")
+_MAX_DIGITS = 9
 _WORDS = frozenset({"and", "or", "not", "of"})
 
 
@@ -227,6 +228,9 @@ class _Parser:
             self._take(")")
             return gate
         if token.isdigit():
+            if len(token) > _MAX_DIGITS:
+                raise GateError(f"{token[:_MAX_DIGITS]}... of: between 1 and the number of inputs "
+                                "is right")
             return self._at_least(int(token))
         if not token or token in _WORDS or not token[0].isalpha():
             raise GateError(f"expected a name, got {token or 'the end'!r}")

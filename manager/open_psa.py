@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from itertools import count
 
 import msgspec
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 
-from manager.formula import Connective, Formula, FormulaError
+from manager.formula import GENERATED, Connective, Formula, FormulaError
 from manager.schema import SystemSpec
 
 CONNECTIVES = ("and", "or", "not", "xor", "nand", "nor", "iff", "imply", "atleast", "cardinality")
@@ -196,6 +197,7 @@ class _Reader:
                                                             "exactly one")
         pending = [(name, bodies[0], definition.path)]
         place = definition.place[:-1]
+        numbers = count(1)
         while pending:  # nested formulas become gates named after the one they are in
             own, body, path = pending.pop()
             here = f"{path}/{body.tag}" if len(path) < _PATH_SHOWN else f"{path[:_PATH_SHOWN]}..."
@@ -203,19 +205,18 @@ class _Reader:
                 self._gates[own] = Connective((self._refer(body, place, here),), 1, 1)
                 continue
             if body.tag == "constant":
-                self._house[f"{own}/constant"] = self._truth(body, path)
-                self._gates[own] = Connective((f"{own}/constant",), 1, 1)
+                self._house[f"{own}{GENERATED}constant"] = self._truth(body, path)
+                self._gates[own] = Connective((f"{own}{GENERATED}constant",), 1, 1)
                 continue
             if body.tag not in CONNECTIVES:
                 raise OpenPsaError(self._file, here[:200], "unknown connective; known: "
                                    f"{', '.join(CONNECTIVES)}")
             inputs = []
-            for number, child in enumerate(body, 1):
+            for child in body:
                 if child.tag in REFERENCES:
                     inputs.append(self._refer(child, place, here))
                 elif child.tag not in _ASIDE:
-                    nested = f"{name}/{len(self._gates) + len(pending)}.{number}"
-                    self._gates[nested] = Connective((), 0, 0)  # takes the name
+                    nested = f"{name}{GENERATED}{next(numbers)}"
                     pending.append((nested, child, here))
                     inputs.append(nested)
             self._gates[own] = self._connective(own, body, inputs, here)
@@ -263,8 +264,8 @@ class _Reader:
                     raise OpenPsaError(self._file, path, f"min = {low} is more than max = {high}")
                 return Connective(entries, low, high)
             case "imply":
-                self._gates[f"{name}/not"] = Connective((entries[0],), 1, 1, negated=True)
-                return Connective((f"{name}/not", entries[1]), 1, 2)
+                self._gates[f"{name}{GENERATED}not"] = Connective((entries[0],), 1, 1, negated=True)
+                return Connective((f"{name}{GENERATED}not", entries[1]), 1, 2)
             case "xor" | "iff":
                 return Connective(entries, 1, 1, negated=tag == "iff")
             case "and" | "nand":

@@ -21,14 +21,18 @@ from manager.gates import detection_gate, recovery_gate
 from manager.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
 from manager.order import PartialOrder, Tree, refine
 
-OptionalName = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z][A-Za-z0-9_]*)?$")]
-Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-ClassPath = Annotated[str, msgspec.Meta(pattern=r"^[a-z_]\w*(\.[a-z_]\w*)*:[A-Z]\w*$")]
+OptionalName = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z][A-Za-z0-9_]*)?\Z")]
+Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*\Z")]
+ClassPath = Annotated[str, msgspec.Meta(pattern=r"^[a-z_]\w*(\.[a-z_]\w*)*:[A-Z]\w*\Z")]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 DERIVED = math.nan
 """Default of a timing value that is derived; a file cannot say it, numbers there are finite."""
+
+
+_LONGEST_SHOWN = 200
+"""Characters of a value in a message."""
 
 
 class SpecificationError(ValueError):
@@ -44,8 +48,16 @@ class SpecificationError(ValueError):
         self.file = file
         self.path = path
         self.problem = problem
-        shown = f" = {value[0]!r}" if value else ""
+        shown = f" = {_shown(value[0])}" if value else ""
         super().__init__(" ".join(f"{file}: {path}{shown}: {problem}".split()))
+
+
+def _shown(value: object) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # an integer has too many digits
+        return "a number with thousands of digits"
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -187,7 +199,8 @@ class DetectionSpec(Table, frozen=True):
 
     Attributes:
         within_s: Longest time from the error to the report; a number or the name of a `[timing]`
-            value. May be left out if `parameters.timeout_s` says it.
+            value. May be left out if `parameters.timeout_s` says it; if both do, the longer one
+            counts.
         parameters: For the actor, as for a node. Keys that mean something here too: `watch`, a
             list of node names; `timeout_s`; `margin_m`, the distance at which it warns.
         name: Of the module, e.g. "DM1".
@@ -212,9 +225,21 @@ class DetectionSpec(Table, frozen=True):
 
     @property
     def latency_s(self) -> float:
-        """Longest time from the error to the report; NaN if the spec does not say."""
-        value = self.parameters.get("timeout_s", self.within_s)
-        return float(value)
+        """Longest time from the error to the report; NaN if the spec does not say.
+
+        Where both `within_s` and `parameters.timeout_s` say it, the longer one counts.
+        """
+        return max(self._times_s)
+
+    @property
+    def soonest_s(self) -> float:
+        """The shorter of the two, for whoever has to be faster than this module."""
+        return min(self._times_s)
+
+    @property
+    def _times_s(self) -> tuple[float, float]:
+        within_s = float(self.within_s)
+        return within_s, float(self.parameters.get("timeout_s", within_s))
 
 
 class RecoverySpec(Table, frozen=True):

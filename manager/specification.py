@@ -40,6 +40,7 @@ from manager.schema import (
     SystemSpec,
     Table,
     Timing,
+    Within,
 )
 
 __all__ = [
@@ -51,12 +52,24 @@ __all__ = [
 TABLES: dict[str, type[Table]] = {
     "": SystemSpec, "robot": Robot, "timing": Timing, "layers": Layers, "node": NodeSpec,
     "detection": DetectionSpec, "recovery": RecoverySpec, "mechanism": MechanismSpec,
-    "event": EventSpec, "gate": AtLeast,
+    "event": EventSpec, "gate": AtLeast, "against": Within,
 }
+
+_TOO_DEEP = "nested too deeply; a spec needs three levels"
 
 ENUMS: dict[tuple[str, str], type[Enum]] = {
     ("node", "kind"): Kind, ("recovery", "kind"): RecoveryKind, ("mechanism", "against"): Hazard,
 }
+
+LARGEST, SMALLEST = 1e9, 1e-9
+"""Of numbers that the analyses calculate with: squares and quotients of these are far from the
+limits of a float, and a thousand million seconds are thirty years.
+"""
+
+LARGEST_INTEGER = 2 ** 63 - 1
+"""In parameters, which go to an actor as they are, by way of MessagePack."""
+
+MAX_DEPTH = 32
 
 
 def parse_specification(text: str, file: str) -> SystemSpec:
@@ -86,9 +99,11 @@ def read_document(text: str, file: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SpecificationError(file, "$", f"not valid TOML: {error}") from None
+    except ValueError:
+        raise SpecificationError(file, "$", "an integer with thousands of digits; numbers have "
+                                 f"to be below {LARGEST:g}") from None
     except RecursionError:
-        raise SpecificationError(file, "$", "nested too deeply; a spec needs three levels"
-                                 ) from None
+        raise SpecificationError(file, "$", _TOO_DEEP) from None
 
 
 def check_document(document: dict[str, Any], file: str) -> SystemSpec:
@@ -101,8 +116,11 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
         SpecificationError: A field is missing, unknown or of the wrong type, or the spec makes no
             sense.
     """
-    for path, value in _find_unwritable(document, "$"):
-        raise SpecificationError(file, path, "expected a finite number", value)
+    for path, problem, shown in _find_unwritable(document):
+        raise SpecificationError(file, path, problem, *shown)
+    for key, value in document.items():  # by hand: msgspec gives no path that ends the key here
+        if key not in _known_fields(""):
+            raise _unknown_field(file, f"$.{key}", "", value)
     _check_orders(document.get("orders", {}), file)
     try:
         spec = msgspec.convert(document, SystemSpec)
@@ -120,16 +138,31 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
     return spec
 
 
-def _find_unwritable(value: object, path: str) -> Iterator[tuple[str, float]]:
-    """Find inf and nan: TOML has them, but no time or distance is one."""
-    if isinstance(value, float) and not math.isfinite(value):
-        yield path, value
-    elif isinstance(value, dict):
-        for key, member in value.items():
-            yield from _find_unwritable(member, f"{path}.{key}")
-    elif isinstance(value, list):
-        for index, member in enumerate(value):
-            yield from _find_unwritable(member, f"{path}[{index}]")
+def _find_unwritable(document: dict[str, Any]) -> Iterator[tuple[str, str, tuple[object, ...]]]:
+    """Find nesting without end, and numbers that no time, distance or count is.
+
+    Yields:
+        Path, what is wrong, and the value if it can be shown.
+    """
+    left: list[tuple[object, str, int, bool]] = [(document, "$", 0, False)]
+    while left:
+        value, path, depth, free = left.pop()
+        if depth > MAX_DEPTH:
+            yield "$", _TOO_DEEP, ()
+        elif isinstance(value, dict):
+            left += [(member, f"{path}.{key}", depth + 1, free or key == "parameters")
+                     for key, member in reversed(value.items())]
+        elif isinstance(value, list):
+            left += [(member, f"{path}[{index}]", depth + 1, free)
+                     for index, member in reversed([*enumerate(value)])]
+        elif isinstance(value, float) and not math.isfinite(value):
+            yield path, "expected a finite number", (value,)
+        elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+            yield path, f"expected an integer of at most {LARGEST_INTEGER}", (value,)
+        elif isinstance(value, int | float) and not free and value and not (
+                SMALLEST <= abs(value) <= LARGEST):
+            yield path, f"out of all proportion; between {SMALLEST:g} and {LARGEST:g} is right", (
+                value,)
 
 
 def _check_orders(orders: object, file: str) -> None:
@@ -186,8 +219,9 @@ def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
 def _explain(error: msgspec.ValidationError, document: dict[str, Any],
              file: str) -> SpecificationError:
     """Turn msgspec's words into ours: add the value, and what is known where names are wrong."""
-    problem, _, path = str(error).partition(" - at `")
-    path = path.rstrip("`") or "$"
+    # A problem may quote a key of the file, the path at the end cannot.
+    found = re.fullmatch(r"(?s)(.*) - at `([^`]*)`", str(error))
+    problem, path = (found[1], found[2]) if found else (str(error), "$")
     steps = re.findall(r"\w+", path)
     value: Any = document
     for step in steps:
@@ -196,13 +230,11 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any],
     table, field = ([""] * 2 + words)[-2:]
 
     missing = re.search(r"missing required field `(\w+)`", problem)
-    unknown = re.search(r"unknown field `(.+?)`", problem)
     if missing:
         return SpecificationError(file, path, f"required field {missing[1]!r} is missing")
-    if unknown:
-        known = [f.encode_name for f in msgspec.structs.fields(TABLES[field])]
-        return SpecificationError(file, f"{path}.{unknown[1]}",
-                                  f"unknown field; known: {', '.join(known)}", value[unknown[1]])
+    if "unknown field `" in problem:
+        key = next(key for key in value if key not in _known_fields(field))
+        return _unknown_field(file, f"{path}.{key}", field, value[key])
     if (table, field) in ENUMS:
         known = [member.value for member in ENUMS[table, field]]
         problem = f"unknown {field}; known: {', '.join(known)}"
@@ -213,3 +245,12 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any],
     elif "regex" in problem:
         problem = "expected a name: a letter, then letters, digits and underscores"
     return SpecificationError(file, path, problem.replace("`", ""), value)
+
+
+def _known_fields(table: str) -> list[str]:
+    return [field.encode_name for field in msgspec.structs.fields(TABLES[table])]
+
+
+def _unknown_field(file: str, path: str, table: str, value: object) -> SpecificationError:
+    return SpecificationError(
+        file, path, f"unknown field; known: {', '.join(_known_fields(table))}", value)

@@ -131,7 +131,10 @@ class Transitions:
             AsTold(exclusive=exclusive), DetectionRules(1.0, 0.0, 0.0, 0.0))
 
     def initial(self) -> Situation:
-        """Return the state in which all are idle and have been heard."""
+        """Return the state in which all are idle and have been heard.
+
+        Before that an arbiter adopts what an earlier one ordered; it is not explored.
+        """
         state = self.arbiter.initial(0.0)
         return self._canonical(msgspec.structs.replace(state, oriented=True),
                                tuple(Module() for _ in self.names) if self.with_modules else ())

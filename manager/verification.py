@@ -32,13 +32,18 @@ MEANING = {
     "none-cut-off": "no recovery is released half-way",
     "monotone": "one more active mechanism never leads to a less safe recovery",
     "no-harm": "no recovery disables what another one needs",
-    "repairs-run": "a repair that is needed is run some time",
+    "repairs-run": "a repair that is needed is run some time, unless the last resort latches",
     "order-agrees-with-tree": "no mechanism is safer than one above it",
 }
 """Names of the properties, each with its meaning in one line."""
 
-_ESCALATIONS_AT_ONCE = 3
-"""So many recoveries may have failed when the sets that can be asked for are collected."""
+_ALL_FAILURES_OF = 10
+"""Of so many recoveries that escalation can lead to, every combination may have failed when the
+sets that can be asked for are collected; of more recoveries only
+"""
+
+_FAILURES_AT_ONCE = 3
+"""so many."""
 
 Progress = Callable[[str], None]
 
@@ -53,6 +58,8 @@ class Report(msgspec.Struct, frozen=True):
         states: How many states of the arbiter were visited, over all strategies.
         permissiveness: For each strategy, in how many active sets the robot must stop until
             somebody resets it.
+        stuck_behind_last_resort: For each strategy, in how many active sets a latched last resort
+            runs and a repair that is needed never does; `repairs-run` exempts these.
         properties: The system's strategy first.
     """
 
@@ -61,6 +68,7 @@ class Report(msgspec.Struct, frozen=True):
     active_sets: int
     states: int
     permissiveness: dict[str, int]
+    stuck_behind_last_resort: dict[str, int]
     properties: tuple[Property, ...]
 
 
@@ -94,11 +102,12 @@ def verify(spec: SystemSpec, strategies: Iterable[str] = (), together: int = 2,
     safety = spec.build_safety_order()
     explorer = _Explorer(arrangement, together)
     properties = [order_agrees_with_tree(arrangement, safety)]
-    permissiveness = {}
+    permissiveness, stuck = {}, {}
     for name in names:
         progress(f"{name}: {2 ** len(spec.mechanisms) - 1} active sets")
         sets = ActiveSets(arrangement, safety, find_strategy(name))
         permissiveness[name] = sets.stops_for_good
+        stuck[name] = sets.stuck_behind_last_resort
         statically = {p.name: p for p in sets.check()}
         states, violations = 0, dict[str, list[Violation]]()
         for what, count, found in explorer.run(sets):
@@ -108,7 +117,7 @@ def verify(spec: SystemSpec, strategies: Iterable[str] = (), together: int = 2,
                 violations.setdefault(violation.name, []).append(violation)
         properties += _merge(name, statically, states, violations)
     return Report(spec.name, spec.strategy, 2 ** len(spec.mechanisms) - 1, explorer.states,
-                  permissiveness, tuple(properties))
+                  permissiveness, stuck, tuple(properties))
 
 
 _OF_STATES = ("one-decision", "no-conflicting-claims", "emergency-stop-at-once", "recovery-ends",
@@ -184,10 +193,13 @@ def _askable(sets: ActiveSets) -> frozenset[frozenset[str]]:
     decisions = {(c.decision.recoveries, c.decision.mechanisms): c.decision for c in sets.cases}
     found = set()
     for decision in decisions.values():
-        concerned = [n for n in names if n in _reachable(decision.recoveries, decision.mechanisms,
-                                                         arrangement)]
-        for size in range(min(_ESCALATIONS_AT_ONCE, len(concerned)) + 1):
+        reachable = _reachable(decision.recoveries, decision.mechanisms, arrangement)
+        concerned = [n for n in names if n in reachable]
+        most = len(concerned) if len(concerned) <= _ALL_FAILURES_OF else _FAILURES_AT_ONCE
+        for size in range(most + 1):
             for failed in combinations(concerned, size):
+                if size and not set(failed).intersection(decision.recoveries):
+                    continue  # of what runs nothing has failed
                 found.add(frozenset(escalate(
                     decision, dict.fromkeys(failed, "failed"), arrangement).recoveries))
     return frozenset(found)
@@ -199,6 +211,7 @@ def _reachable(recoveries: tuple[str, ...], mechanisms: tuple[str, ...], arrange
     recover, tree = arrangement.mechanisms.recover, arrangement.tree
     found = set(recoveries)
     for mechanism in mechanisms:
+        found |= set(chain.from_iterable(arrangement.mechanisms.alternatives(mechanism)))
         for upper in tree.chain(tree.root, mechanism):
             found |= set(recover[upper])
     for name in list(found):

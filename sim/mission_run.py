@@ -61,7 +61,7 @@ class MissionRun:
             elif isinstance(message, ControlStatus):
                 self._end.control(message, clock.now())
             elif isinstance(message, GroundTruth):
-                self._end.truth(clock.now())
+                self._end.truth(message.twist, clock.now())
 
         sinks: list[Sink] = [to_end, JudgeSink(self.judge), self._recorder.feed]
         return [*sinks, self.console.take] if self.console else sinks

@@ -1,17 +1,25 @@
 """When is a run over? Pure: fed with what the observer hears, asked once in a while.
 
-A run ends when the mission has ended, when it was lost (the Mission Manager forgot it), when
-nothing has progressed for the patience of the person who started it, or when the world is gone.
+A run ends when the mission has ended and the robot stands, when the mission was lost (the Mission
+Manager forgot it), when nothing has progressed for the patience of the person who started it, or
+when the world is gone. A robot that drives on after its mission is looked at for a minute: it may
+be on its way into the grass.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from actors.messages import ControlPhase, ControlStatus, MissionPhase, MissionStatus
+from actors.messages import ControlPhase, ControlStatus, MissionPhase, MissionStatus, Twist
 
 SETTLE_S = 1.5
 """After the mission's end the robot gets this long to come to rest, and the records to arrive."""
+
+WATCH_S = 60.0
+"""After the mission's end a robot that does not come to rest is looked at this long."""
+
+STANDING_MPS, STANDING_RADPS = 0.05, 0.1
+"""Slower than this, by ground truth, it stands."""
 
 LOST_AFTER_S = 3.0
 ACCEPT_WITHIN_S = 30.0
@@ -42,6 +50,7 @@ class RunEnd:
     _over: str = ""
     _lost_at_s: float | None = None
     _truth_at_s: float | None = None
+    _moves: bool = False
 
     def mission(self, status: MissionStatus, now_s: float) -> None:
         """Take the mission's state."""
@@ -72,13 +81,16 @@ class RunEnd:
                 status.distance_to_go_m < self._nearest_m - _STEP_TOWARDS_GOAL_M:
             self._nearest_m, self._progress_at_s = status.distance_to_go_m, now_s
 
-    def truth(self, now_s: float) -> None:
-        """Note that the world turns."""
+    def truth(self, twist: Twist, now_s: float) -> None:
+        """Note that the world turns, and whether the robot moves in it."""
         self._truth_at_s = now_s
+        self._moves = (abs(twist.linear_mps) > STANDING_MPS
+                       or abs(twist.angular_radps) > STANDING_RADPS)
 
     def ended(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
-        if self._over_at_s is not None and now_s - self._over_at_s >= SETTLE_S:
+        if self._over_at_s is not None and \
+                now_s - self._over_at_s >= (WATCH_S if self._moves else SETTLE_S):
             return self._over
         if self._truth_at_s is not None and now_s - self._truth_at_s > WORLD_SILENT_S:
             return "the world is gone: no ground truth from the simulator"

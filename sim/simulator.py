@@ -56,6 +56,7 @@ class Simulator(Actor):
         self._dead_man_s = timeout_s if parameters.get("dead_man", True) else None
         self._asked_s = self._skipped_s = 0.0
         self._real_time_factor = 1.0
+        self._brakes: set[str] = set()
 
     def on_start(self) -> None:
         """Build the world at the present time."""
@@ -103,10 +104,14 @@ class Simulator(Actor):
             self.report_diagnostic("velocity command", "not finite, refused", header.source)
 
     @on(topics.BRAKE)
-    def brake(self, message: m.BrakeCommand, _header: Header) -> None:
-        """Engage or release the brake."""
+    def brake(self, message: m.BrakeCommand, header: Header) -> None:
+        """Have the source hold the brake or let go of it; nobody lets go for another."""
         self._advance()
-        self._world.brake(message.engaged)
+        if message.engaged:
+            self._brakes.add(header.source)
+        else:
+            self._brakes.discard(header.source)
+        self._world.brake(bool(self._brakes))
 
     @on(topics.OBSTACLE)
     def obstacle(self, message: m.ObstacleCommand, header: Header) -> None:

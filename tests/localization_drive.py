@@ -7,8 +7,8 @@ Faults act through the project's own gate, as they do in the nodes.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -139,3 +139,21 @@ def disturbed(faults: Iterable[tuple[Fault, float, float]], seed: int = 1,
             yield now_s, reading
 
 
+WRONG_STAMPS: dict[str, Callable[[float], float]] = {
+    "far ahead": lambda now_s: now_s + 1e9, "ahead": lambda now_s: now_s + 0.25,
+    "infinite": lambda _: math.inf, "no number": lambda _: math.nan}
+"""The stamp of a reading by what time it is."""
+
+Items = Iterable[tuple[float, Reading | Truth]]
+
+
+def mis_stamped(items: Items, topic: Topic[Any], wrong: str, from_s: float, *, once: bool
+                ) -> Iterator[tuple[float, Reading | Truth]]:
+    """Yield what arrives; one reading of a topic, or all from then on, with a wrong stamp."""
+    done = False
+    for now_s, item in items:
+        if isinstance(item, Reading) and item.topic is topic and now_s >= from_s and not done:
+            done = once
+            yield now_s, replace(item, stamp_s=WRONG_STAMPS[wrong](now_s))
+        else:
+            yield now_s, item

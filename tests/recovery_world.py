@@ -56,15 +56,19 @@ class Base(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.engaged = False
+        self.holders: set[str] = set()
         self.deaf = False
         self.orders: list[bool] = []
 
+    @property
+    def engaged(self) -> bool:
+        return bool(self.holders)
+
     @on(topics.BRAKE)
-    def brake(self, message: m.BrakeCommand, _header: Header) -> None:
+    def brake(self, message: m.BrakeCommand, header: Header) -> None:
         self.orders.append(message.engaged)
         if not self.deaf:
-            self.engaged = message.engaged
+            (self.holders.add if message.engaged else self.holders.discard)(header.source)
 
     @every(0.1)
     def status(self) -> None:

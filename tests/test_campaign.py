@@ -22,6 +22,7 @@ from sim.campaign import execute as execution
 from sim.campaign.execute import BackendError, JobError, execute
 from sim.campaign.job import Job, RunResult, run_job
 from sim.campaign.paper_tables import (
+    AS_THE_PAPER,
     CONDITIONS,
     FAULTS,
     FULL,
@@ -272,6 +273,19 @@ def test_a_row_of_nothing_but_ineffective_runs_says_so():
     assert (row.worst, row.safe.of, row.ineffective) == ("no effect", 0, 1)
 
 
+@pytest.mark.parametrize(("ended", "success", "safe", "words"), [
+    ({"safe": False, "collisions": 1}, 2, 1, "success, unsafe"),
+    ({"success": False}, 1, 2, "fail, safe")])
+def test_a_run_that_ends_badly_is_counted_though_its_fault_is_said_to_have_changed_nothing(
+        ended, success, safe, words):
+    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
+    row, = table(runs_of(result(), result(outcomes=nothing, detected_after_s=None, **ended)))
+    assert (row.runs, row.ineffective, row.worst) == (2, 0, words)
+    assert (row.success.count, row.success.of, row.safe.count, row.safe.of) == (
+        success, 2, safe, 2)
+    assert row.undetected == 0, "nothing to detect"
+
+
 def test_the_worst_run_is_unsafe_before_failed_before_close():
     close, failed, unsafe = (
         result(obstacle_m=0.1), result(success=False), result(safe=False))
@@ -282,11 +296,13 @@ def test_the_worst_run_is_unsafe_before_failed_before_close():
 
 def test_conditions_are_rows_of_their_own():
     runs = [run for condition in (
-        {"obstacles": 0}, {"obstacles": 2}, {"ftm": False}, {"strategy": "mission-first"})
+        {"obstacles": 0}, {"obstacles": 2}, {"ftm": False}, {"strategy": "mission-first"},
+        {"retuned": AS_THE_PAPER})
         for run in runs_of(result(), **condition)]
-    assert [(r.obstacles, r.ftm, r.strategy) for r in table([*runs, *runs])] == [
-        (0, True, ""), (2, True, ""), (0, False, ""), (0, True, "mission-first")]
-    assert total(runs, "all").runs == 4
+    assert [(r.obstacles, r.ftm, r.strategy, r.retuned) for r in table([*runs, *runs])] == [
+        (0, True, "", {}), (2, True, "", {}), (0, False, "", {}), (0, True, "mission-first", {}),
+        (0, True, "", AS_THE_PAPER)]
+    assert total(runs, "all").runs == 5
 
 
 def test_undetected_and_stopped_for_good_are_counted():
@@ -311,6 +327,21 @@ def test_every_row_of_the_papers_tables_is_run_under_every_condition():
     assert {cell.ours for cell in found} == {"success, safe"}
     assert [c.agrees for c in found if c.fault == "none"] == [True] * 6
     assert not any(c.agrees for c in found if c.fault == "command not updated")
+
+
+@pytest.mark.parametrize(("ended", "ours", "counts"), [
+    ({}, "success, safe", (1, 3, 3)), ({"safe": False}, "success, unsafe", (0, 4, 3))])
+def test_in_the_papers_tables_a_run_without_effect_has_not_survived_but_an_unsafe_one_counts(
+        ended, ours, counts):
+    jobs = [job for job in full_jobs() if job.row == "command not updated" and job.obstacles == 0]
+    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
+    cell, = cells([Run(job, result(outcomes=nothing, **ended) if job is jobs[2] else result())
+                   for job in jobs])
+    assert (cell.runs, cell.ours) == (len(jobs), ours)
+    assert (cell.ineffective, cell.success, cell.safe) == counts
+    cell, = cells([Run(job, result(outcomes=nothing)) for job in jobs])
+    assert (cell.ineffective, cell.success, cell.safe, cell.ours, cell.agrees) == (
+        4, 0, 0, "no effect", False)
 
 
 def test_the_full_system_is_given_the_runs_of_table_v_and_keeps_its_own_strategy():
@@ -356,6 +387,18 @@ def test_the_search_goes_where_the_margin_is_small():
     best = made[0][0].faults[0]
     assert best.fault == "gps-drift"
     assert abs(best.at_s - 100) < 10
+
+
+def test_the_search_is_told_of_an_unsafe_run_though_its_fault_had_no_effect(monkeypatch):
+    optuna = pytest.importorskip("optuna")
+    told = []
+    monkeypatch.setattr(optuna.Study, "tell", lambda _self, _trial, value: told.append(value))
+    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
+    results = iter([result(outcomes=nothing),
+                    result(outcomes=nothing, safe=False, collisions=1)])
+    search(Space(tuple(BASES), {"sensor": ("gps-bias",)}, sudden_obstacle=False), 2,
+           lambda _jobs: [next(results)], seed=1)
+    assert told == [2.0, -1.0]
 
 
 def test_what_is_unsafe_for_longer_is_further_down():
@@ -462,6 +505,25 @@ def test_the_papers_tables_are_of_its_system_and_full_of_the_full_one_unless_one
     assert rampart(["campaign", "--paper", *chosen, "--out", str(tmp_path)]) == 0
     assert jobs_in(tmp_path) == jobs
     assert ("Table III" in capsys.readouterr().out) == ("--full" not in chosen)
+
+
+def test_the_papers_conditions_are_rows_of_their_own_for_scripts_too(tmp_path, made_up, capsys):
+    assert rampart(["campaign", "--paper", "--json", "--out", str(tmp_path)]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert len(rows) == len(CONDITIONS) * len(FAULTS) * 2
+    assert sum(row["runs"] for row in rows) == len(paper_jobs())
+    assert [(r["runs"], r["ftm"], r["retuned"]) for r in rows
+            if (r["fault"], r["obstacles"]) == ("command not updated", 0)] == [
+        (4, False, {}), (4, True, AS_THE_PAPER), (4, True, {})]
+
+
+def test_runs_without_a_fault_are_not_counted_as_survived_with_fault_tolerance(
+        tmp_path, made_up, capsys):
+    assert rampart(["campaign", "--fault", "none", "--fault", "gps-bias", "--seeds", "3",
+                    "--obstacles", "0", "--out", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "6 runs, 6 of them made now" in text
+    assert "with fault tolerance: 3 of 3 (" in text
 
 
 def test_a_row_of_the_full_system_that_is_not_as_expected_is_told_and_is_exit_code_1(

@@ -123,7 +123,7 @@ def test_a_baseline_alone_is_reported_without_figures_of_mechanisms_it_has_not()
     page = render(OUT, ABOUT, [run("gps-bias", ftm=False, safe=False, obstacle_m=0.0)])
     (row,) = rows(page, "gps-bias")
     assert row[6:] == ["–", "–", "0.00 m", "0.80 m", "–", "0"]  # noqa: RUF001
-    assert "with FTM and an effective fault" not in page
+    assert "with FTM and a fault" not in page
     assert headline([run(affected=0)]) == "In 1 run the fault had no effect."
 
 
@@ -137,12 +137,32 @@ def test_a_single_run_has_its_figures_in_the_table_of_all_faults():
 
 
 def test_runs_without_effect_count_for_nothing_but_their_number():
-    runs = [run("gps-bias", seed=1), run("gps-bias", seed=2, safe=False, affected=0)]
-    (row,) = rows(render(OUT, ABOUT, runs), "gps-bias")
+    runs = [run("gps-bias", seed=1), run("gps-bias", seed=2, affected=0)]
+    page = render(OUT, ABOUT, runs)
+    (row,) = rows(page, "gps-bias")
     assert row[2] == "2 1 no effect"
+    assert "not counted, no effect 1" in text_of(page.replace("<dd", " <dd"))
     assert row[4] == f"1 of 1 {interval(rate(1, 1))}"
     assert "In 1 run more the fault had no effect." in headline(runs)
     assert "none of 1 run " in headline(runs)
+
+
+@pytest.mark.parametrize(("ended", "safe", "complete"), [
+    ({"safe": False, "collisions": 1}, 1, 2), ({"success": False}, 2, 1)])
+def test_a_run_that_ends_badly_counts_though_its_fault_had_no_effect(ended, safe, complete):
+    runs = [run("gps-bias", seed=1), run("gps-bias", seed=2, affected=0, **ended)]
+    page = render(OUT, ABOUT, runs)
+    (row,) = rows(page, "gps-bias")
+    assert row[2] == "2"
+    assert (row[3].split()[0], row[4].split()[0]) == (str(complete), str(safe))
+    assert row[5].startswith(f"{'success' if complete == 2 else 'fail'}, "
+                             f"{'safe' if safe == 2 else 'unsafe'}")
+    assert f"{'none' if safe == 2 else '1'} of 2 runs " in headline(runs)
+    assert f"{complete} completed the mission" in headline(runs)
+    assert "In 1 of these the fault had no effect" in headline(runs)
+    assert "an effective fault" not in headline(runs)
+    assert f"of these unsafe {2 - safe}" in text_of(page.replace("<dd", " <dd"))
+    assert "Smallest margin with FTM" in page
 
 
 def test_the_headline_gives_the_upper_bound_of_the_interval_when_no_run_was_unsafe():
@@ -256,6 +276,15 @@ def test_the_papers_runs_are_shown_as_its_tables_beside_its_verdicts():
     assert v == shipped
     assert v[1:3] == ["fail, safe", "✓ fail, safe"]
     assert "Where the verdicts differ" not in page
+
+
+def test_the_papers_tables_tell_how_many_of_their_runs_had_no_effect():
+    runs = paper_runs()
+    at = next(i for i, r in enumerate(runs) if r.job.row == "control node crash")
+    runs[at] = Run(runs[at].job, run("gps-bias", affected=0).result)
+    iv = next(row for row in rows(render(OUT, ABOUT, runs), "controlnodecrash") if len(row) == 7)
+    several = len(paper_tables.FAULTS["control node crash"])
+    assert iv[3] == f"{several} 1 no effect, 0 success, 0 safe"
 
 
 def test_the_papers_rows_on_the_full_system_are_a_table_of_their_own():

@@ -220,7 +220,8 @@ def test_modules_that_there_are_no_more_are_left_out_of_a_memory():
 
 @pytest.mark.parametrize(("memory", "why"), [
     (Memory(-1), "decision number -1"),
-    (Memory(1, (Latch(Command("RM1", False, 1), ()),)), "RM1 is latched and not activated"),
+    (Memory(2**60), "decision number 1152921504606846976"),
+    (Memory(1, (Latch(Command("RM2", False, 1), ()),)), ""),  # beneath a safer one
     (Memory(1, (), (("DM1", float("nan"), 0.0),)), "bucket of DM1"),
     (Memory(1), ""),
 ])

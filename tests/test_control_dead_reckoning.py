@@ -29,7 +29,7 @@ def reckoning(bridge_m: float = 3.0) -> DeadReckoning:
 
 def straight(it: DeadReckoning, from_s: float, to_s: float, speed_mps: float = 1.0) -> None:
     for i in range(round(from_s / PERIOD_S), round(to_s / PERIOD_S) + 1):
-        it.odometry(i * PERIOD_S, (speed_mps * i * PERIOD_S, 0.0, 0.0))
+        it.odometry(i * PERIOD_S, (speed_mps * i * PERIOD_S, 0.0, 0.0), i * PERIOD_S)
 
 
 def test_before_the_first_pose_there_is_none():
@@ -41,47 +41,47 @@ def test_before_the_first_pose_there_is_none():
 def test_a_fresh_pose_is_given_as_it_is():
     it = reckoning()
     straight(it, 0.0, 1.0)
-    it.pose(1.0, (5.0, 6.0, 0.7))
+    it.pose(1.0, (5.0, 6.0, 0.7), 1.0)
     assert it.estimate(1.0 + AFTER_S) == (5.0, 6.0, 0.7)
 
 
 def test_a_stale_pose_is_carried_on_from_its_stamp_not_from_its_arrival():
     it = reckoning()
     straight(it, 0.0, 2.0)
-    it.pose(0.5, (5.0, 6.0, math.pi / 2))  # it arrives 1.5 s late
+    it.pose(0.5, (5.0, 6.0, math.pi / 2), 2.0)  # it arrives 1.5 s late
     assert it.estimate(2.0) == pytest.approx((5.0, 7.5, math.pi / 2))
 
 
 def test_beyond_the_bound_there_is_no_pose_and_a_fresh_one_helps():
     it = reckoning(bridge_m=2.0)
     straight(it, 0.0, 1.0)
-    it.pose(1.0, (0.0, 0.0, 0.0))
+    it.pose(1.0, (0.0, 0.0, 0.0), 1.0)
     straight(it, 1.0, 2.9)
     assert it.estimate(2.9) == pytest.approx((1.9, 0.0, 0.0))
     straight(it, 2.92, 3.1)
     assert it.estimate(3.1) is None
-    it.pose(3.1, (9.0, 0.0, 0.0))
+    it.pose(3.1, (9.0, 0.0, 0.0), 3.1)
     assert it.estimate(3.1) == (9.0, 0.0, 0.0)
 
 
 def test_standing_it_may_be_bridged_for_long():
     it = reckoning(bridge_m=0.5)
     straight(it, 0.0, 60.0, speed_mps=0.0)
-    it.pose(59.0, (1.0, 2.0, 3.0))
+    it.pose(59.0, (1.0, 2.0, 3.0), 60.0)
     assert it.estimate(60.0) == pytest.approx((1.0, 2.0, 3.0))
 
 
 def test_without_fresh_odometry_a_stale_pose_is_not_bridged():
     it = reckoning()
     straight(it, 0.0, 1.0)
-    it.pose(1.0, (0.0, 0.0, 0.0))
+    it.pose(1.0, (0.0, 0.0, 0.0), 1.0)
     assert it.estimate(1.19) is not None
     assert it.estimate(1.3) is None
 
 
 def test_a_pose_older_than_the_odometry_that_is_kept_is_not_bridged():
     it = reckoning(bridge_m=100.0)
-    it.pose(0.0, (0.0, 0.0, 0.0))
+    it.pose(0.0, (0.0, 0.0, 0.0), 0.0)
     straight(it, 1.0, 5.0, speed_mps=0.1)
     assert it.estimate(5.0) is None
 
@@ -90,10 +90,47 @@ def test_a_pose_older_than_the_odometry_that_is_kept_is_not_bridged():
 def test_what_is_no_number_changes_nothing(pose):
     it = reckoning()
     straight(it, 0.0, 1.0)
-    it.pose(0.9, (1.0, 2.0, 0.0))
-    it.pose(1.0, pose)
-    it.odometry(1.02, pose)
+    it.pose(0.9, (1.0, 2.0, 0.0), 1.0)
+    it.pose(1.0, pose, 1.0)
+    it.odometry(1.02, pose, 1.02)
     assert it.estimate(1.1) == pytest.approx((1.1, 2.0, 0.0))
+
+
+WRONG_STAMPS = [1e9, 1.3, math.inf, math.nan]
+
+
+@pytest.mark.parametrize("stamp_s", WRONG_STAMPS)
+def test_odometry_of_no_possible_time_shuts_out_none(stamp_s):
+    it = reckoning()
+    it.odometry(stamp_s, (50.0, 0.0, 0.0), 0.0)
+    straight(it, 0.0, 1.0)
+    it.pose(1.0, (5.0, 6.0, 0.0), 1.0)
+    it.odometry(stamp_s, (50.0, 0.0, 0.0), 1.01)
+    straight(it, 1.02, 2.0)
+    assert it.estimate(2.0) == pytest.approx((6.0, 6.0, 0.0))
+
+
+@pytest.mark.parametrize("stamp_s", WRONG_STAMPS)
+def test_a_pose_of_no_possible_time_is_not_believed_and_shuts_out_none(stamp_s):
+    it = reckoning()
+    straight(it, 0.0, 1.0)
+    it.pose(1.0, (5.0, 6.0, 0.0), 1.0)
+    it.pose(stamp_s, (50.0, 60.0, 0.0), 1.05)
+    straight(it, 1.02, 2.0)
+    assert it.estimate(2.0) == pytest.approx((6.0, 6.0, 0.0))
+    it.pose(2.0, (6.1, 6.0, 0.0), 2.0)
+    assert it.estimate(2.0) == (6.1, 6.0, 0.0)
+
+
+@pytest.mark.parametrize("absurd", [1e160, 1.7e308, -1.7e308])
+def test_a_number_beyond_all_measure_is_as_good_as_none(absurd):
+    it = reckoning()
+    straight(it, 0.0, 1.0)
+    it.pose(0.9, (1.0, 2.0, 0.0), 0.9)
+    it.pose(1.0, (absurd, absurd, -absurd), 1.0)
+    it.odometry(1.02, (-absurd, absurd, absurd), 1.02)
+    straight(it, 1.04, 1.1)
+    assert it.estimate(1.1) == pytest.approx((1.2, 2.0, 0.0))
 
 
 @pytest.mark.parametrize("bridge_m", [0.0, -1.0, math.nan, math.inf])
@@ -111,12 +148,12 @@ moves = st.lists(st.tuples(st.floats(-0.02, 0.02), st.floats(-0.05, 0.05)), min_
 def test_it_moves_the_pose_as_the_wheels_moved_whatever_the_frame_of_odom(moves, x_m, yaw, start):
     it = DeadReckoning(100.0, after_s=0.0)
     odom, truth = (1.0, -2.0, start), (x_m, 0.5, yaw)
-    it.odometry(0.0, odom)
-    it.pose(0.0, truth)
+    it.odometry(0.0, odom, 0.0)
+    it.pose(0.0, truth, 0.0)
     for i, (forward, turn) in enumerate(moves, start=1):
         odom, truth = ((x + forward * math.cos(w + turn / 2), y + forward * math.sin(w + turn / 2),
                         w + turn) for x, y, w in (odom, truth))
-        it.odometry(i * PERIOD_S, odom)
+        it.odometry(i * PERIOD_S, odom, i * PERIOD_S)
     found = it.estimate(len(moves) * PERIOD_S)
     assert found is not None
     assert found[:2] == pytest.approx(truth[:2], abs=1e-9)
@@ -129,9 +166,9 @@ def test_on_the_simulated_robot_three_metres_cost_a_quarter_of_a_metre_at_most(f
     for now_s, item in disturbed([]):
         if isinstance(item, Reading) and item.topic is topics.ODOMETRY:
             pose = item.body.pose
-            it.odometry(now_s, (pose.x_m, pose.y_m, pose.yaw_rad))
+            it.odometry(now_s, (pose.x_m, pose.y_m, pose.yaw_rad), now_s)
         elif isinstance(item, Reading) and item.topic is topics.ABSOLUTE_POSE and now_s <= from_s:
-            it.pose(now_s, (item.body.x_m, item.body.y_m, item.body.yaw_rad))
+            it.pose(now_s, (item.body.x_m, item.body.y_m, item.body.yaw_rad), now_s)
         elif isinstance(item, Truth) and now_s > from_s + AFTER_S:
             found = it.estimate(now_s)
             if found is None:
@@ -159,7 +196,11 @@ class Robot(Actor):
         self.speeds.append(message.linear_mps)
 
 
-def test_osmosis_control_drives_on_for_the_bound_and_then_stops():
+@pytest.mark.parametrize("mis_stamped", [None, topics.ODOMETRY, topics.POSE],
+                         ids=["nothing", "odometry", "a pose"])
+def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
+    """Also when it has once heard something from the future."""
+
     async def scenario(system: System) -> list[tuple[float, float]]:
         robot = system.start("robot", Robot)
         system.start("control", BridgedControl, bridge_m=2.0)
@@ -174,6 +215,9 @@ def test_osmosis_control_drives_on_for_the_bound_and_then_stops():
             if world.x_m < 3.0:
                 robot.publish(topics.POSE, odom)
                 lost_at_m = world.x_m
+            if i == 60 and mis_stamped is not None:
+                robot.publish(mis_stamped, m.Odometry(odom, m.Twist(0.0, 0.0))
+                              if mis_stamped is topics.ODOMETRY else odom, stamp=1e9)
             await asyncio.sleep(0.05)
             world.move(robot.speeds[-1], 0.0)
             seen.append((world.x_m - lost_at_m, robot.speeds[-1]))

@@ -154,6 +154,26 @@ def test_a_bound_that_makes_no_sense_is_refused_in_one_line(bridge_m):
         play(None, bridge_m=bridge_m)
 
 
+class Device(Actor):
+    outputs = (topics.ABSOLUTE_POSE,)
+
+
+@pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
+def test_the_papers_localization_outlives_a_stamp_from_the_future(stamp_s):
+    async def whole():
+        async with System(system=shipped_system(), airport=field_airport()) as system:
+            ear, device = system.start("ear", Ear), system.start("device", Device)
+            system.start("localization", Localization)
+            await system.settle()
+            for i in range(10):
+                device.publish(topics.ABSOLUTE_POSE, m.Pose(float(i), 0.0, 0.0),
+                               stamp=stamp_s if i == 3 else None)
+                await asyncio.sleep(0.05)
+            return [pose.x_m for *_, pose in ear.poses]
+
+    assert run(whole) == [0.0, 1.0, 2.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]
+
+
 def test_the_papers_localization_is_what_it_was():
     assert set(heard(Member("localization", Localization, {}))) == {"summit_xl/absolute_pose"}
     assert Localization.outputs == (topics.POSE,)

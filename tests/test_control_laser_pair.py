@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from virtual_loop import System, run, shipped_system
 
+from actors import messages as m
+from actors import topics
 from actors.control.laser_pair import LOWER, UPPER, LaserPair
+from actors.control.safety_pilot import SafetyPilot
 from actors.messages import LaserScan
+from actors.runtime.actor import Actor, Context, Header, on
 
 RAYS, TOP_M, PERIOD_S = 5, 8.0, 0.05
 ANGLE_MIN = -0.2
@@ -34,8 +40,8 @@ class Bench:
     def __init__(self):
         self.pair, self.view, self.changes = LaserPair(), None, 0
 
-    def feed(self, laser, message, stamp_s):
-        view = self.pair.take(laser, message, stamp_s)
+    def feed(self, laser, message, stamp_s, now_s=None):
+        view = self.pair.take(laser, message, stamp_s, stamp_s if now_s is None else now_s)
         if view is not None:
             self.view = view
             self.changes += 1
@@ -99,6 +105,32 @@ def test_whatever_one_of_them_does_the_view_stays_fresh_and_right(bad, way):
             assert distances(bench.view)[0] == 3.0
 
 
+WRONG_STAMPS = [1e9, 0.6, math.inf, math.nan]
+
+
+@pytest.mark.parametrize("stamp_s", WRONG_STAMPS)
+@pytest.mark.parametrize("laser", [LOWER, UPPER])
+def test_a_sweep_of_no_possible_time_is_no_view_and_shuts_out_none(laser, stamp_s):
+    bench = Bench()
+    for i in range(20):
+        now_s = i * PERIOD_S
+        bench.feed(LOWER, healthy(i), now_s)
+        if i == 8:
+            assert bench.pair.take(laser, healthy(99, (8,) * 5), stamp_s, now_s) is None
+        bench.feed(UPPER, healthy(i + 100), now_s)
+        assert (bench.view.stamp_s, distances(bench.view)[0]) == (now_s, 3.0)
+
+
+@pytest.mark.parametrize("stamp_s", WRONG_STAMPS)
+def test_if_all_stamps_are_wrong_the_view_grows_old(stamp_s):
+    bench = Bench()
+    bench.feed(LOWER, healthy(0), 0.0)
+    for i in range(1, 10):
+        bench.feed(LOWER, healthy(i), stamp_s, i * PERIOD_S)
+        bench.feed(UPPER, healthy(i), stamp_s, i * PERIOD_S)
+    assert bench.view.stamp_s == 0.0
+
+
 @pytest.mark.parametrize("way", ["stuck", "biased"])
 def test_without_any_that_can_be_believed_there_is_no_view_and_a_reason(way):
     bench = Bench()
@@ -138,6 +170,40 @@ def test_a_number_that_is_none_hides_no_echo_of_the_other():
     bench.feed(UPPER, healthy(1, (math.nan, 8, 3, 8, 8)), 0.0)
     bench.feed(LOWER, healthy(2, (1, math.nan, math.nan, 8, 8)), 0.0)
     assert distances(bench.view) == [1.0, 3.0]
+
+
+class Rest(Actor):
+    """All that the pilot hears, and the base."""
+
+    outputs = (topics.COMMAND, topics.SCAN, topics.MANAGER_STATUS)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.speeds: list[float] = []
+
+    @on(topics.BASE_COMMAND)
+    def base(self, message: m.BaseCommand, _header: Header) -> None:
+        self.speeds.append(message.linear_mps)
+
+
+@pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
+def test_one_sweep_from_the_future_neither_blinds_the_safety_pilot_nor_stops_it_for_good(stamp_s):
+    async def scenario() -> None:
+        async with System(system=shipped_system()) as system:
+            rest = system.start("rest", Rest)
+            system.start("safety_pilot", SafetyPilot)
+            await system.settle()
+            for i in range(80):
+                rest.publish(topics.MANAGER_STATUS, m.ManagerStatus((), (), (), (), "", 0))
+                rest.publish(topics.COMMAND, m.Twist(0.8, 0.0))
+                rest.publish(topics.SCAN, healthy(i, (8,) * 5 if i < 60 else (0.6,) * 5),
+                             stamp=stamp_s if i == 30 else None)
+                await asyncio.sleep(PERIOD_S)
+                if i == 58:
+                    assert set(rest.speeds[-20:]) == {0.8}
+            assert rest.speeds[-1] == 0.0, "there is something in the way"
+
+    run(scenario)
 
 
 rays = st.lists(st.floats(0.25, 8.0, width=32), min_size=RAYS, max_size=RAYS)

@@ -322,10 +322,15 @@ def test_no_order_of_messages_breaks_the_machine(events):
 
 def test_a_pose_without_a_newer_stamp_is_not_passed_on():
     pose = m.Pose(0.0, 0.0, 0.0)
-    assert is_newer(pose, 1.0, 0.9)
-    assert not is_newer(pose, 1.0, 1.0)
-    assert not is_newer(pose, float("nan"), 0.0)
-    assert not is_newer(m.Pose(float("nan"), 0.0, 0.0), 2.0, 1.0)
+    assert is_newer(pose, 1.0, 0.9, 1.0)
+    assert not is_newer(pose, 1.0, 1.0, 1.0)
+    assert not is_newer(pose, float("nan"), 0.0, 1.0)
+    assert not is_newer(m.Pose(float("nan"), 0.0, 0.0), 2.0, 1.0, 2.0)
+
+
+@pytest.mark.parametrize("ahead_s", [0.25, 1e9, float("inf")])
+def test_a_pose_from_the_future_is_not_passed_on_and_shuts_out_none(ahead_s):
+    assert not is_newer(m.Pose(0.0, 0.0, 0.0), 1.0 + ahead_s, 0.9, 1.0)
 
 
 @pytest.mark.parametrize(("stick", "expected"), [

@@ -10,8 +10,19 @@ import pytest
 from detection_timeline import table
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from localization_drive import LEGS, START_RAD, Reading, Truth, disturbed, drive, fault
+from localization_drive import (
+    LEGS,
+    START_RAD,
+    WRONG_STAMPS,
+    Reading,
+    Truth,
+    disturbed,
+    drive,
+    fault,
+    mis_stamped,
+)
 
+from actors import messages as m
 from actors import topics
 from actors.control.motion_check import ImuCheck, OdometryCheck
 from actors.control.planar_ekf import PlanarEkf
@@ -43,8 +54,8 @@ class Outcome:
 def feed(pose_filter: PoseFilter, reading: Reading, now_s: float) -> None:
     body, stamp_s = reading.body, reading.stamp_s
     if reading.topic is topics.IMU:
-        pose_filter.imu(stamp_s, body.yaw_rad, body.yaw_rate_radps, body.accel_x_mps2,
-                        body.accel_y_mps2)
+        pose_filter.imu(stamp_s, body.yaw_rad, body.yaw_rate_radps,
+                        (body.accel_x_mps2, body.accel_y_mps2), now_s)
     elif reading.topic is topics.ODOMETRY:
         pose = body.pose
         pose_filter.odometry(stamp_s, (pose.x_m, pose.y_m, pose.yaw_rad), body.twist.linear_mps,
@@ -58,9 +69,13 @@ def feed(pose_filter: PoseFilter, reading: Reading, now_s: float) -> None:
 
 def run(*faults, start_s=0.0, seed=1, limits=None, judge_to_s=FOR_EVER):
     """Drive with faults, (name or fault, from s, to s); compare with the truth at 20 Hz."""
-    pose_filter, outcome = PoseFilter(limits), Outcome()
     found = [(fault(f) if isinstance(f, str) else f, a, b) for f, a, b in faults]
-    for now_s, item in disturbed(found, seed):
+    return run_all(disturbed(found, seed), start_s, limits, judge_to_s)
+
+
+def run_all(items, start_s=0.0, limits=None, judge_to_s=FOR_EVER):
+    pose_filter, outcome = PoseFilter(limits), Outcome()
+    for now_s, item in items:
         if now_s < start_s:
             continue
         if isinstance(item, Reading):
@@ -152,6 +167,54 @@ def test_any_single_fault_of_a_source_is_bridged(name, how):
     assert outcome.worst_m < BOUND_M
     assert outcome.worst_rad < 0.1
     assert outcome.lost_s < 0.11
+
+
+SOURCES = [topics.GPS, topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE]
+
+
+@pytest.mark.parametrize("wrong", WRONG_STAMPS)
+@pytest.mark.parametrize("topic", SOURCES, ids=lambda topic: topic.key)
+@pytest.mark.parametrize("once", [True, False], ids=["once", "permanent"])
+def test_stamps_of_no_possible_time_are_bridged_like_any_other_fault(topic, wrong, once):
+    outcome = run_all(mis_stamped(disturbed([]), topic, wrong, 4.0, once=once))
+    assert outcome.worst_m < BOUND_M
+    assert outcome.worst_rad < 0.1
+    assert outcome.lost_s < 0.11
+    if once:
+        assert outcome.excluded == set()
+
+
+@pytest.mark.parametrize("wrong", WRONG_STAMPS)
+@pytest.mark.parametrize("topic", SOURCES, ids=lambda topic: topic.key)
+def test_a_source_is_silent_when_it_falls_silent_after_a_stamp_of_no_possible_time(topic, wrong):
+    pose_filter, wrong_s = PoseFilter(), math.inf
+    for now_s, item in mis_stamped(disturbed([]), topic, wrong, 4.0, once=True):
+        if isinstance(item, Reading) and (item.topic is not topic or now_s <= wrong_s):
+            wrong_s = now_s if item.topic is topic and now_s >= 4.0 else wrong_s
+            feed(pose_filter, item, now_s)
+        if now_s > 6.0:
+            break
+    assert [reason for _, reason in pose_filter.status(6.0).excluded] == ["silent or late"]
+
+
+@pytest.mark.parametrize("topic", SOURCES, ids=lambda topic: topic.key)
+def test_one_reading_beyond_all_measure_neither_ends_it_nor_stays_in_it(topic):
+    def items():
+        at_s = 4.0
+        for now_s, item in disturbed([]):
+            hit = now_s >= at_s and isinstance(item, Reading) and item.topic is topic
+            for bad in (1e300, -1e300) if hit else ():
+                at_s = math.inf
+                yield now_s, Reading(topic, now_s - (0.001 if bad < 0 else 0.002), {
+                    topics.GPS: m.GpsFix(bad, bad, bad, bad, abs(bad)),
+                    topics.IMU: m.Imu(bad, bad, bad, bad),
+                    topics.ODOMETRY: m.Odometry(m.Pose(bad, bad, bad), m.Twist(bad, bad)),
+                    topics.ABSOLUTE_POSE: m.Pose(bad, bad, bad)}[topic])
+            yield now_s, item
+
+    outcome = run_all(items())
+    assert outcome.worst_m < 0.03
+    assert outcome.excluded == set()
 
 
 @pytest.mark.parametrize(("name", "excluded"), [
@@ -270,12 +333,13 @@ def test_odometry_is_checked_against_itself(linear_mps, twist_mps, reason):
 def test_the_imu_is_checked_against_itself(rate_radps, said_radps, noise, reason):
     check = ImuCheck()
     for i in range(300):
-        check.take(0.01 * i, rate_radps * 0.01 * i, said_radps, noise * 0.05 * (i % 2), 0.0)
+        check.take(0.01 * i, rate_radps * 0.01 * i, said_radps, (noise * 0.05 * (i % 2), 0.0),
+                   0.01 * i)
     assert check.trust.reason == reason
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_what_is_no_number_is_not_used(bad):
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e160, 1.7e308, -1.7e308])
+def test_what_is_no_number_or_beyond_all_measure_is_not_used(bad):
     pose_filter, other = PoseFilter(), PoseFilter()
     for now_s, item in disturbed([]):
         if now_s > 4.0:
@@ -284,10 +348,11 @@ def test_what_is_no_number_is_not_used(bad):
             feed(pose_filter, item, now_s)
             feed(other, item, now_s)
             later_s = item.stamp_s + 1e-4
-            pose_filter.imu(later_s, bad, 0.0, 0.0, 0.0)
+            pose_filter.imu(later_s, bad, 0.0, (0.0, 0.0), now_s)
             pose_filter.odometry(later_s, (0.0, bad, 0.0), 0.0, now_s)
             pose_filter.gps(later_s, (bad, 0.0), (0.0, 0.0), 0.02, now_s)
             pose_filter.gps(later_s, (0.0, 0.0), (0.0, 0.0), -1.0, now_s)
+            pose_filter.gps(later_s, (0.0, 0.0), (0.0, bad), 0.02, now_s)
             pose_filter.absolute_pose(later_s, 0.0, 0.0, bad, now_s)
     assert pose_filter.estimate() == other.estimate()
     assert pose_filter.status(4.0) == other.status(4.0)

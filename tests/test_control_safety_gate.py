@@ -110,9 +110,9 @@ def test_an_order_ends_only_by_the_word_of_who_gave_it():
 
 def test_the_stick_pre_empts_until_it_is_silent():
     bench = Bench()
-    bench.send(-0.3, stick=True)
+    bench.send(0.3, stick=True)
     bench.send(0.5)
-    assert bench.out() == (-0.3, 0.0)
+    assert bench.out() == (0.3, 0.0)
     bench.wait(0.31)
     bench.send(0.5)
     assert bench.out() == (0.5, 0.0)
@@ -224,6 +224,32 @@ def test_the_baseline_keeps_only_repetition_obstacle_stop_and_joystick():
     assert bench.out() == (0.5, 0.0), "what no base can execute is not kept"
     bench.gate.scan(wall(0.1), bench.now)
     assert bench.out() == (0.0, 0.0)
+
+
+def test_backwards_where_no_laser_looks_drives_the_stick_alone_and_slowly():
+    bench = Bench()
+    bench.send(-0.2, 0.4, stick=True)
+    assert bench.out() == (-0.2, 0.4)
+    bench.send(-1.0, 0.4, stick=True)
+    assert bench.out() == (-LIMITS.reverse_mps, 0.4)
+    assert "no laser looks back" in bench.gate.output(bench.now).reason
+    bench.wait(0.31)
+    assert "backwards, where no laser looks" in bench.send(-0.2)
+    assert bench.out() == (0.0, 0.0)
+    assert bench.send(0.2) == ""
+    assert bench.out() == (0.2, 0.0)
+
+
+@pytest.mark.parametrize("stamp_s", [3600.0, math.inf, math.nan, -math.inf])
+def test_a_sweep_with_a_stamp_from_elsewhere_is_no_fresh_one(stamp_s):
+    bench = Bench()
+    bench.scanner = False
+    bench.gate.scan(NO_POINTS, bench.now + stamp_s)
+    for _ in range(20):
+        bench.wait(0.1)
+        bench.send(0.5)
+        assert bench.out() == (0.0, 0.0)
+        assert bench.reason() == "no fresh laser scan"
 
 
 @pytest.mark.parametrize(("points", "linear", "angular", "expected"), [

@@ -83,6 +83,17 @@ def test_a_respawned_comparison_claims_nothing_before_it_knows(events, expected)
     assert Bench(known_after_s=0.2).play(events) == expected
 
 
+@pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
+def test_a_command_from_the_future_is_not_compared_when_its_sender_is_silent(stamp_s):
+    bench = Bench()
+    bench.play("==")
+    bench.comparison.heard("active", GOOD, stamp_s, 1, 0.2)
+    for tick in range(20):
+        now_s = 0.5 + 0.05 * tick
+        bench.comparison.heard("standby", TURNS, now_s, 1, now_s)
+    assert not bench.comparison.active
+
+
 def test_the_reason_names_both_commands():
     bench = Bench()
     bench.play("wwww")

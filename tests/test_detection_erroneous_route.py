@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 
 import msgspec
 import pytest
@@ -257,6 +258,30 @@ def test_content_that_is_old_is_as_good_as_none():
     monitor, found = watch(story, 4.0, monitor, 1.0)
     assert found is not None
     assert monitor.nodes == ("graph_planner#1",)
+
+
+@pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
+def test_a_stamp_of_no_possible_time_does_not_hide_that_its_sender_is_silent(stamp_s):
+    monitor, _ = watch(Story(), 1.0)
+    monitor.heard(Story().route, "graph_planner", 1, stamp_s, 1.0)
+    story = Story()
+    story.silent = {"route"}
+    monitor, _ = watch(story, 4.0, monitor, 1.0)
+    assert monitor.nodes == ("graph_planner#1",)
+    monitor.heard(story.route, "graph_planner", 1, 5.0, 5.0)
+    assert not monitor.active
+
+
+def test_a_pose_beyond_all_measure_does_not_end_the_watch_on_progress():
+    def drive(story, now_s):
+        story.pose = (now_s, 20.0)
+
+    monitor = ConsistencyMonitor(ConsistencyLimits(), 0.0)
+    for x_m in (0.0, 1e300):
+        monitor.pose(x_m, 20.0, 0.0)
+    monitor, found = watch(Story(), 6.0, monitor, each=drive)
+    assert found == pytest.approx(3.0, abs=0.21)
+    assert monitor.nodes == ("osmosis_control#1",)
 
 
 def test_a_delay_that_is_shorter_is_borne():

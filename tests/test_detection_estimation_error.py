@@ -7,7 +7,16 @@ import math
 
 import pytest
 from detection_timeline import Ear
-from localization_drive import LEGS, Reading, Truth, disturbed, drive, fault
+from localization_drive import (
+    LEGS,
+    WRONG_STAMPS,
+    Reading,
+    Truth,
+    disturbed,
+    drive,
+    fault,
+    mis_stamped,
+)
 from virtual_loop import System, run, shipped_system
 
 from actors import messages as m
@@ -31,9 +40,13 @@ def honest(truth: Truth, _now_s: float) -> m.Pose:
 
 def watch(lie=honest, faults=(), to_s=END_S, monitor=None, seed=1):
     """Return when the monitor was active: list of (since s, to s)."""
+    return watch_all(disturbed(faults, seed), lie, to_s, monitor)
+
+
+def watch_all(items, lie=honest, to_s=END_S, monitor=None):
     monitor = monitor or EstimationMonitor(known=True, wait_until_s=0.0)
     spans: list[list[float]] = []
-    for now_s, item in disturbed(faults, seed):
+    for now_s, item in items:
         if now_s > to_s:
             break
         if isinstance(item, Truth):
@@ -52,9 +65,9 @@ def watch(lie=honest, faults=(), to_s=END_S, monitor=None, seed=1):
 def feed(monitor: EstimationMonitor, item: Reading, now_s: float) -> None:
     body, track = item.body, monitor.vote.track
     if item.topic is topics.IMU:
-        track.imu(item.stamp_s, body.yaw_rad, body.yaw_rate_radps)
+        track.imu(item.stamp_s, body.yaw_rad, body.yaw_rate_radps, now_s)
     elif item.topic is topics.ODOMETRY:
-        track.odometry(item.stamp_s, body.pose.yaw_rad, body.twist.linear_mps)
+        track.odometry(item.stamp_s, body.pose.yaw_rad, body.twist.linear_mps, now_s)
     elif item.topic is topics.GPS:
         monitor.gps(Fix(body.x_m, body.y_m, body.velocity_x_mps, body.velocity_y_mps,
                         body.accuracy_m), item.stamp_s, now_s)
@@ -113,6 +126,30 @@ def test_a_pose_that_is_stuck_with_fresh_stamps_is_found_out_within_half_a_metre
 def test_the_fault_of_a_sensor_is_not_taken_for_localizations(name, how):
     what = fault(name) if how == "permanent" else fault(name, on_s=0.7, off_s=1.6)
     assert watch(faults=[(what, FROM_S, math.inf)]) == []
+
+
+@pytest.mark.parametrize("wrong", WRONG_STAMPS)
+@pytest.mark.parametrize("topic", [topics.GPS, topics.IMU, topics.ODOMETRY],
+                         ids=lambda topic: topic.key)
+def test_wrong_stamps_of_a_sensor_are_not_taken_for_localizations(topic, wrong):
+    assert watch_all(mis_stamped(disturbed([]), topic, wrong, FROM_S, once=False)) == []
+
+
+@pytest.mark.parametrize("wrong", WRONG_STAMPS)
+@pytest.mark.parametrize("topic", [topics.GPS, topics.IMU, topics.ODOMETRY],
+                         ids=lambda topic: topic.key)
+def test_after_one_wrong_stamp_a_lie_is_found_out_as_ever(topic, wrong):
+    items = mis_stamped(disturbed([]), topic, wrong, FROM_S - 2.0, once=True)
+    (since_s, _), *_ = watch_all(items, lying(0.7, 0.7))
+    assert FROM_S < since_s <= FROM_S + 0.25
+
+
+@pytest.mark.parametrize("stamp_s", [1e9, 1.25, math.inf, math.nan])
+def test_a_pose_with_a_wrong_stamp_does_not_hide_those_after_it(stamp_s):
+    monitor = EstimationMonitor(known=True, wait_until_s=0.0)
+    monitor.pose(m.Pose(0.0, 0.0, 0.0), stamp_s, 1.0, "localization#1")
+    monitor.pose(m.Pose(1.0, 0.0, 0.0), 1.05, 1.05, "localization#1")
+    assert monitor.vote.position.stamp_s == 1.05
 
 
 def test_a_localization_that_is_silent_is_not_its_business():

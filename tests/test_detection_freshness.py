@@ -16,7 +16,8 @@ from actors.detection.freshness_monitor import FreshnessMonitor
 from actors.detection.module import EXCUSE_S, DetectionModule, IllegalTransitionError
 from actors.runtime.wiring import Member, heard
 
-# f fresh sample, o the first sample once more, d delayed by 1 s, + stamped 100 s ahead, n no number
+# f fresh sample, o the first sample once more, d delayed by 1 s, + stamped 100 s ahead,
+# i infinitely far ahead, n no number
 TIMELINES = {
     "a steady stream is fresh": ("ffffffff", "--------"),
     "it stops and goes on": ("ff......fff.", "----AAAAAA--"),
@@ -29,15 +30,18 @@ TIMELINES = {
     "the hold starts anew when it goes stale in between": ("f...f....fff", "---AAAAAAAA-"),
     "one sample is not enough to be fresh again": ("f...f......", "---AAAAAAAA"),
     "samples that come too rarely are not enough": ("f....f...f...f", "---AAAAAAAAAAA"),
-    "a stamp from the future buys no credit": ("+.....", "---AAA"),
-    "a stamp from the future does not make honest ones look old": ("+fffff", "------"),
+    "a stamp from the future is not a sample": ("+++++++", "-----AA"),
+    "a source with a wrong clock is not fresh for ever": ("f++++++", "---AAAA"),
+    "a stamp from the future does not make honest ones look old": ("+f+fffff", "--------"),
     "a stamp that is no number is not a sample": ("fnnnnn", "---AAA"),
+    "an infinite one neither": ("fiiiii", "---AAA"),
     "old samples after fresh ones change nothing": ("ffofofof", "--------"),
 }
 
 
 def stamp(event: str, now_s: float) -> float:
-    return {"f": now_s, "o": 0.0, "d": now_s - 1.0, "+": now_s + 100.0, "n": math.nan}[event]
+    return {"f": now_s, "o": 0.0, "d": now_s - 1.0, "+": now_s + 100.0, "n": math.nan,
+            "i": math.inf}[event]
 
 
 @pytest.mark.parametrize(("events", "expected"), **table(TIMELINES))
@@ -122,6 +126,44 @@ def test_a_respawned_module_is_idle_as_soon_as_it_hears_a_fresh_sample():
             await system.settle()
             source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
             await system.settle()
+            assert ear.states == ["idle"]
+
+    run(scenario)
+
+
+def test_a_respawned_module_whose_first_sample_is_old_never_says_idle():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            source = system.start("source", Source)
+            system.start("DM6", LocalizationFreshness, timeout_s=0.5)
+            await asyncio.sleep(1.05)
+            await system.kill("DM6")
+            ear.heard.clear()
+            system.start("DM6", LocalizationFreshness, timeout_s=0.5)
+            await system.settle()
+            source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0), stamp=system.clock.now() - 0.9)
+            await asyncio.sleep(0.001)
+            assert ear.states == ["active"]
+
+    run(scenario)
+
+
+def test_a_module_that_was_itself_stopped_may_find_an_old_sample_first_in_its_mail():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            source = system.start("source", Source)
+            system.start("DM2", CommandFreshness, timeout_s=0.3)
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            await asyncio.sleep(0.1)
+            loop = asyncio.get_running_loop()
+            assert isinstance(loop, VirtualLoop)
+            loop.jump(2.0)
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0), stamp=system.clock.now() - 1.0)
+            await asyncio.sleep(EXCUSE_S / 2)
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            await asyncio.sleep(0.2)
             assert ear.states == ["idle"]
 
     run(scenario)

@@ -2,36 +2,53 @@
 
 from __future__ import annotations
 
+import asyncio
+import math
+from pathlib import Path
+
 import pytest
+from detection_timeline import Ear
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from virtual_loop import System, run
 
-from actors.detection.pilot_output_monitor import PilotOutputMonitor
+import systems
+from actors import messages as m
+from actors import topics
+from actors.control.safety_pilot import SafetyPilot
+from actors.detection.pilot_output import PilotOutput
+from actors.detection.pilot_output_monitor import PilotLimits, PilotOutputMonitor
+from actors.runtime.actor import Actor
+from manager.specification import parse_specification
 
 PERIOD_S = 0.05
+HELD_S = 0.99
+OSMOSIS = parse_specification(
+    (Path(systems.__file__).parent / "osmosis.toml").read_text(encoding="utf-8"), "osmosis.toml")
 
 
 class Bench:
     """A pilot that is fed one command a period, and what it makes of it."""
 
     def __init__(self) -> None:
-        self.monitor = PilotOutputMonitor("safety_pilot", 0.0, 5.0)
+        self.monitor = PilotOutputMonitor("safety_pilot", 0.0, 5.0, PilotLimits(held_s=HELD_S))
         self.now = 0.0
         self.life = 1
         self.monitor.said(stopped=False, reason="", now_s=0.0)
         self.drive(10)
 
-    def drive(self, ticks, asked=(0.8, 0.1), sent=None, *, first="asked", age_s=0.0):
+    def drive(self, ticks, asked=(0.8, 0.1), sent=None, *, first="asked", age_s=0.0,
+              by="active"):
         """Let periods pass. `sent` None: what was asked; False: nothing is sent."""
         for _ in range(ticks):
             self.now += PERIOD_S
             got = asked if sent is None else sent
             if first == "asked":
-                self.monitor.asked(*asked, self.now)
+                self.monitor.asked(*asked, self.now, by)
             if got is not False:
                 self.monitor.sent(*got, self.now - age_s, self.life, self.now)
             if first == "sent":
-                self.monitor.asked(*asked, self.now + 0.001)
+                self.monitor.asked(*asked, self.now + 0.001, by)
             while self.monitor.due_s <= self.now:
                 self.monitor.expire(self.monitor.due_s)
         return self.monitor.active
@@ -92,10 +109,14 @@ def test_standstill_needs_no_explanation():
 
 
 @pytest.mark.parametrize(("what", "arguments"), [
-    ("it is silent", {"sent": False}), ("it sends old news", {"age_s": 0.4})])
+    ("it is silent", {"sent": False}), ("it sends old news", {"age_s": 0.4}),
+    ("its stamps are of the future", {"age_s": -1e9}),
+    ("its stamps are infinite", {"age_s": -math.inf}),
+    ("its stamps are no numbers", {"age_s": math.nan})])
 def test_a_pilot_that_is_late_is_accused_before_the_dead_man_trips(what, arguments):
     bench = Bench()
-    assert not bench.drive(5, **{**arguments, **({"age_s": 0.2} if "age_s" in arguments else {})})
+    bearable = {"age_s": 0.2} if arguments.get("age_s") == 0.4 else {}
+    assert not bench.drive(5, **{**arguments, **bearable})
     assert bench.drive(2, **arguments), what
     assert "no fresh command" in bench.monitor.reason
 
@@ -115,6 +136,81 @@ def test_a_new_life_that_is_as_wrong_is_accused_by_its_own_number():
     bench.life = 2
     assert bench.drive(6, sent=(1.3, 0.1))
     assert bench.monitor.nodes == ("safety_pilot#2",)
+
+
+@pytest.mark.parametrize("sent", [(0.8, 0.1), (0.7, 0.2)], ids=["active", "standby"])
+def test_when_nobody_asks_any_more_the_pilot_may_go_on_with_a_last_command_for_its_timeout(sent):
+    bench = Bench()
+    bench.drive(1, (0.7, 0.2), by="standby")
+    assert not bench.drive(18, sent=sent, first="nobody")
+
+
+def test_a_pilot_that_goes_on_for_longer_is_accused():
+    bench = Bench()
+    last_s = bench.now
+    while not bench.drive(1, sent=(0.8, 0.1), first="nobody"):
+        assert bench.now - last_s < HELD_S + 0.2
+    assert bench.now - last_s > HELD_S
+    assert "nobody has asked for" in bench.monitor.reason
+
+
+def test_while_nobody_asks_it_may_not_send_anything_else():
+    bench = Bench()
+    bench.drive(6, sent=(0.8, 0.1), first="nobody")
+    assert bench.drive(4, sent=(0.9, 0.1), first="nobody")
+
+
+def test_a_pilot_that_is_stuck_at_an_old_command_is_accused_as_soon_while_new_ones_come():
+    """A command that another one of the same computer has replaced explains nothing for long."""
+    bench = Bench()
+    assert not bench.drive(6, (0.3, -0.4), (0.8, 0.1))
+    assert bench.drive(4, (0.3, -0.4), (0.8, 0.1))
+
+
+def test_what_a_joystick_asked_for_last_is_not_held():
+    bench = Bench()
+    bench.says("the joystick pre-empts")
+    bench.drive(20, (-0.2, 0.5), by="")
+    assert bench.drive(10, sent=(-0.2, 0.5), first="nobody")
+
+
+def test_a_respawned_module_claims_nothing_of_a_pilot_whose_output_is_old_when_it_is_heard():
+    monitor = PilotOutputMonitor("safety_pilot", 10.0, 0.3, known=False)
+    monitor.sent(0.0, 0.0, 9.0, 1, 10.01)
+    assert not monitor.known
+    monitor.sent(0.0, 0.0, 1e9, 1, 10.02)
+    assert not monitor.known
+    monitor.sent(0.0, 0.0, 10.03, 1, 10.03)
+    assert (monitor.known, monitor.active) == (True, False)
+
+
+class Rest(Actor):
+    """All that the pilot hears."""
+
+    outputs = (topics.COMMAND, topics.STANDBY_COMMAND, topics.SCAN, topics.MANAGER_STATUS)
+
+
+@pytest.mark.parametrize("silent_s", [0.5, 5.0])
+def test_a_sound_pilot_is_not_accused_when_both_computers_of_the_command_fall_silent(silent_s):
+    """With the pilot itself, and the timeout of the shipped system."""
+
+    async def scenario():
+        async with System(system=OSMOSIS) as system:
+            ear, rest = system.start("ear", Ear), system.start("rest", Rest)
+            system.start("safety_pilot", SafetyPilot)
+            system.start("DM12", PilotOutput)
+            await system.settle()
+            told = m.ManagerStatus((), (), (), (), "safety-first", 0)
+            for i in range(round((3.0 + silent_s) * 20)):
+                rest.publish(topics.MANAGER_STATUS, told)
+                rest.publish(topics.SCAN, m.LaserScan(0.0, 0.1, 8.0, b""))
+                if i < 40 or i >= 40 + silent_s * 20:
+                    rest.publish(topics.COMMAND, m.Twist(0.8, 0.1))
+                    rest.publish(topics.STANDBY_COMMAND, m.Twist(0.8, 0.1))
+                await asyncio.sleep(PERIOD_S)
+            return ear.states
+
+    assert run(scenario) == ["idle"]
 
 
 def test_before_the_system_runs_silence_is_start_up_and_then_it_is_not():

@@ -100,12 +100,15 @@ def fence() -> FenceMonitor:
 
 
 # m in the middle, e at the edge, c cleared by less than the hysteresis; n a fix of no numbers,
-# o the first fix once more, b a fix with a bad accuracy
+# o the first fix once more, b a fix with a bad accuracy, v one with a velocity that cannot be;
+# in the middle with a wrong stamp: + far ahead, i infinite, t no number
 FIXES = {
     "m": fix(0.0, 1.0, 0.0), "o": fix(0.0, 1.0, 0.0), "e": fix(2.0, 0.0, 0.0),
     "c": fix(1.95, 0.0, 0.0), "n": Fix(math.nan, 0.0, 0.0, 0.0, 0.05),
     "b": Fix(0.0, 0.0, 0.0, 0.0, 4.0), "w": Fix(0.0, 0.0, 0.0, 0.0, -1.0),
+    "v": Fix(0.0, 0.0, 1e200, 0.0, 0.05),
 }
+STAMPS = {"o": 0.0, "+": 1e9, "i": math.inf, "t": math.nan}
 
 
 @pytest.mark.parametrize(("events", "expected"), **table({
@@ -119,6 +122,13 @@ FIXES = {
     "the fixes cease, and come again": ("mm.....mmm", "----AAAAA-"),
     "fixes without numbers are none": ("mnnnnn", "---AAA"),
     "a negative accuracy is none": ("mwwwww", "---AAA"),
+    "a velocity that cannot be is none": ("mvvvvv", "---AAA"),
+    "and does no harm to those after it": ("mvmmvm", "------"),
+    "fixes from the future are none": ("m+++++", "---AAA"),
+    "and shut out none": ("+mm+mm", "------"),
+    "fixes that are infinitely ahead": ("miiiii", "---AAA"),
+    "fixes of no time": ("mttttt", "---AAA"),
+    "a fix from the future does not say that it is safe again": ("me++++", "-AAAAA"),
     "a frozen receiver": ("moooooo", "---AAAA"),
     "a receiver that has lost its accuracy is no barrier": ("mb", "-A"),
     "at the edge, then blind": ("e.....", "AAAAAA"),
@@ -127,9 +137,18 @@ def test_fence_timeline(events, expected):
     monitor = fence()
 
     def handle(event: str, now_s: float) -> None:
-        monitor.fix(FIXES[event], 0.0 if event == "o" else now_s, now_s)
+        monitor.fix(FIXES.get(event, FIXES["m"]), STAMPS.get(event, now_s), now_s)
 
     assert play(monitor, handle, events) == expected
+
+
+@pytest.mark.parametrize("speed_mps", [1e6, 1e155, 1.7e308, math.inf, math.nan])
+def test_a_velocity_that_cannot_be_makes_a_fix_unusable_and_raises_nothing(speed_mps):
+    assert not Fix(0.0, 0.0, speed_mps, 0.0, 0.05).is_usable
+    assert not Fix(0.0, 0.0, 0.0, -speed_mps, 0.05).is_usable
+    monitor = fence()
+    monitor.fix(Fix(0.0, 0.0, speed_mps, speed_mps, 0.05), 0.0, 0.0)
+    assert not monitor.active
 
 
 def test_the_reason_tells_what_was_found_first():

@@ -7,7 +7,16 @@ import math
 
 import pytest
 from detection_timeline import Ear
-from localization_drive import LEGS, Reading, Truth, disturbed, drive, fault
+from localization_drive import (
+    LEGS,
+    WRONG_STAMPS,
+    Reading,
+    Truth,
+    disturbed,
+    drive,
+    fault,
+    mis_stamped,
+)
 from shapely.geometry import box
 from virtual_loop import System, run, shipped_system
 
@@ -31,10 +40,14 @@ NAMES += [f"{mode}:{key}" for mode in ("drop", "freeze", "delay", "corrupt") for
 
 def follow(*faults, seed=1, blind_s=10.0, blind_m=5.0):
     """Drive with faults; return the worst error beyond its bound, and how long it knew nothing."""
+    return follow_all(disturbed(faults, seed), blind_s, blind_m)
+
+
+def follow_all(items, blind_s=10.0, blind_m=5.0):
     where = VotedPosition(0.05, blind_s, blind_m)
     worst_m, unknown, seen_s, looked_s = 0.0, 0.0, 0.0, 0.0
     truth = None
-    for now_s, item in disturbed(faults, seed):
+    for now_s, item in items:
         if isinstance(item, Truth):
             truth = item
             unknown = max(unknown, now_s - seen_s)
@@ -56,9 +69,9 @@ def follow(*faults, seed=1, blind_s=10.0, blind_m=5.0):
 def feed(where: VotedPosition, item: Reading, now_s: float) -> None:
     body, stamp_s = item.body, item.stamp_s
     if item.topic is topics.IMU:
-        where.vote.track.imu(stamp_s, body.yaw_rad, body.yaw_rate_radps)
+        where.vote.track.imu(stamp_s, body.yaw_rad, body.yaw_rate_radps, now_s)
     elif item.topic is topics.ODOMETRY:
-        where.odometry(stamp_s, body.pose.yaw_rad, body.twist.linear_mps)
+        where.odometry(stamp_s, body.pose.yaw_rad, body.twist.linear_mps, now_s)
     elif item.topic is topics.GPS:
         where.gps(Fix(body.x_m, body.y_m, body.velocity_x_mps, body.velocity_y_mps,
                       body.accuracy_m), stamp_s, now_s)
@@ -80,6 +93,49 @@ def test_any_single_fault_leaves_it_a_position_that_is_right_to_decimetres(name,
     worst_m, unknown_s = follow((what, FROM_S, math.inf))
     assert worst_m < 0.4
     assert unknown_s < 0.45  # shorter than the module's patience
+
+
+SOURCES = [topics.GPS, topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE]
+
+
+@pytest.mark.parametrize("wrong", WRONG_STAMPS)
+@pytest.mark.parametrize("topic", SOURCES, ids=lambda topic: topic.key)
+def test_a_source_whose_stamps_are_wrong_is_as_good_as_silent(topic, wrong):
+    worst_m, unknown_s = follow_all(mis_stamped(disturbed([]), topic, wrong, FROM_S, once=False))
+    assert worst_m < 0.4
+    assert unknown_s < 0.45
+
+
+@pytest.mark.parametrize("wrong", WRONG_STAMPS)
+@pytest.mark.parametrize("topic", SOURCES, ids=lambda topic: topic.key)
+@pytest.mark.parametrize("later", ["gps-bias", "absolute-pose-bias"])
+def test_one_wrong_stamp_is_over_when_another_source_fails_later(topic, wrong, later):
+    items = disturbed([(fault(later), FROM_S + 4.0, math.inf)])
+    worst_m, unknown_s = follow_all(mis_stamped(items, topic, wrong, FROM_S, once=True))
+    assert worst_m < 0.4
+    assert unknown_s < 0.45
+
+
+@pytest.mark.parametrize("topic", SOURCES, ids=lambda topic: topic.key)
+def test_one_absurd_number_is_over_too(topic):
+    """Finite, and too large for a square: it neither ends the module nor stays in its sums."""
+
+    def items():
+        at_s = FROM_S
+        for now_s, item in disturbed([(fault("absolute-pose-dropout"), FROM_S + 4.0, math.inf)]):
+            for sign in (1e300, -1e300) if now_s >= at_s and isinstance(item, Reading) \
+                    and item.topic is topic else ():
+                at_s = math.inf
+                yield now_s, Reading(topic, now_s - 0.001 - (sign > 0) * 0.001, {
+                    topics.GPS: m.GpsFix(sign, sign, sign, sign, abs(sign)),
+                    topics.IMU: m.Imu(sign, sign, sign, sign),
+                    topics.ODOMETRY: m.Odometry(m.Pose(sign, sign, sign), m.Twist(sign, sign)),
+                    topics.ABSOLUTE_POSE: m.Pose(sign, sign, sign)}[topic])
+            yield now_s, item
+
+    worst_m, unknown_s = follow_all(items())
+    assert worst_m < 0.4
+    assert unknown_s < 0.45
 
 
 @pytest.mark.parametrize("names", [
@@ -109,8 +165,8 @@ def vote(a, gps, wheels_mps, seconds=3.0, start=0.0):
     it = PositionVote("a")
     for i in range(round(seconds * 50)):
         t = start + 0.02 * i
-        it.track.imu(t, 0.0, 0.0)
-        it.track.odometry(t, 0.0, wheels_mps)
+        it.track.imu(t, 0.0, 0.0, t)
+        it.track.odometry(t, 0.0, wheels_mps, t)
         if i % 5 == 0 and a is not None:
             it.see_position(t, (t, a(t)), t)
         if i % 5 == 0 and gps is not None:
@@ -200,6 +256,34 @@ def states(gps_y_m, pose_y_m, seconds=6.0, gps=True, pose=True):
 ])
 def test_the_actor_needs_two(gps_y_m, pose_y_m, gps, pose, expected):
     assert states(gps_y_m, pose_y_m, gps=gps, pose=pose)[0] == expected
+
+
+@pytest.mark.parametrize("topic", [topics.ODOMETRY, topics.IMU], ids=lambda topic: topic.key)
+def test_the_actor_is_not_blinded_by_one_stamp_from_the_future(topic):
+    """GPS goes wrong later and is outvoted at once: the robot is in its lane, and that is known."""
+
+    async def scenario():
+        async with System(system=shipped_system(), airport=lane()) as system:
+            ear, robot = system.start("ear", Ear), system.start("robot", Robot)
+            module = system.start("DM1", VotedArea, margin_m=0.6)
+            await system.settle()
+            for i in range(160):
+                t = 0.05 * i
+                said = {topics.IMU: m.Imu(0.0, 0.001 * i, 0.0, 0.0),
+                        topics.ODOMETRY: m.Odometry(m.Pose(t, 0.0, 0.0), m.Twist(1.0, 0.0)),
+                        topics.ABSOLUTE_POSE: m.Pose(t, 0.0, 0.0)}
+                if i % 2 == 0:
+                    said[topics.GPS] = m.GpsFix(t, 3.0 if t >= 5.0 else 0.0, 1.0, 0.0, 0.05)
+                for key, body in said.items():
+                    robot.publish(key, body, stamp=1e9 if key is topic and i == 40 else None)
+                await asyncio.sleep(0.05)
+            assert ear.states == ["idle"]
+            vote = module._where.vote
+            assert vote.outlier == GPS
+            assert not vote.wheels_fresh(system.clock.now() + 1.0)
+            assert vote.track.place[0] == pytest.approx(t, abs=0.2)
+
+    run(scenario)
 
 
 def test_its_reason_says_what_it_misses():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 
 import pytest
 from detection_timeline import Ear, play, table
@@ -83,6 +84,17 @@ def test_it_names_those_who_failed_and_why():
     assert core.nodes == ("a", "b", "c")
     core.beat("a", 2, 0.6, 0.6)
     assert core.nodes == ("b", "c")
+
+
+@pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
+def test_a_heartbeat_of_no_possible_time_does_not_bring_the_dead_to_life(stamp_s):
+    core = WatchdogCore(["a"], 0.3, 0.0, 0.5)
+    core.beat("a", 1, 0.0, 0.0)
+    core.peer("a", 1, False, 0.1)
+    core.beat("a", 1, stamp_s, 0.11)
+    assert core.nodes == ("a",)
+    core.beat("a", 1, 0.12, 0.12)
+    assert core.nodes == ()
 
 
 def test_strangers_are_ignored():

@@ -458,12 +458,3 @@ def test_it_hears_only_modules_and_people_and_commands_all_recovery_modules():
         "manager/adapt": None}
     assert published(member)["recovery/{name}/command"] is None
     assert published(member)["heartbeat/{name}"] == ("ftm_manager",)
-
-
-def test_a_strategy_by_parameter_must_be_a_known_one():
-    async def scenario() -> None:
-        async with System(system=shipped_system()) as system:
-            with pytest.raises(ValueError, match="unknown strategy 'coin-toss'"):
-                system.start("ftm_manager", FtmManager, strategy="coin-toss")
-
-    run(scenario)

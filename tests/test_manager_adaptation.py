@@ -101,6 +101,13 @@ def test_a_gate_and_an_order_and_a_strategy_are_changed():
     ("retune", "DM2", {"timeout_s": 5.0},
      "paper.toml: $.timing: the time budget does not fit: FTM2 needs 5.150 s (detection 5.000 + "
      "arbitration 0.050 + actuation 0.100) of 1.250 s before the robot drifts out of the corridor"),
+    ("retune", "DM1", {"hold_s": -1},
+     "paper.toml: $.detection[0].parameters.hold_s = -1: expected a number, 0 or more"),
+    ("retune", "DM3", {"hold": 1},
+     "paper.toml: $.detection[2].parameters.hold = 1: unknown parameter; Bounds takes hold_s, "
+     "suspects"),
+    ("retune", "FTM3", {"against": {"within_s": 5.0, "hazard": "x", "typo": 1}},
+     "paper.toml: $.mechanism[2].against.typo = 1: unknown field; known: within_s, hazard"),
     ("retune", "FTM3", {"detect": "DM3 and not DM3"},
      "paper.toml: $.mechanism[2].detect = 'DM3 and not DM3': it can never be active"),
     ("retune", "RM3", {"deadline_s": "soon"},
@@ -155,9 +162,10 @@ def test_values_are_read_as_toml_and_words_as_text(text, value):
     assert parse_value(text) == value
 
 
-def test_a_value_that_is_neither_is_refused():
+@pytest.mark.parametrize("text", ["{;}", "+" + "9" * 5000, "[" * 5000])
+def test_a_value_that_is_neither_is_refused(text):
     with pytest.raises(ChangeError, match="expected a TOML value"):
-        parse_value("{;}")
+        parse_value(text)
 
 
 def test_a_change_is_described_in_a_few_words():
@@ -241,6 +249,23 @@ def test_the_new_strategy_decides_from_then_on():
         assert any(s.strategy == "safety-first" and s.recoveries == ("RM2",)
                    for s in engineer.shadows)
         assert system.incarnations["osmosis_control"] == 2
+
+    in_adaptable_system(scenario)
+
+
+@pytest.mark.parametrize("values", [
+    '{"against": {"within_s": 5.0, "hazard": "x", "typo": 1}}',
+    '{"timeout_s": 1' + 400 * "0" + "}",
+    '{"value": ' + 5000 * "[" + 5000 * "]" + "}",
+    '{"value": NaN}', "[]", "\xff", ""])
+def test_whatever_is_typed_the_manager_refuses_it_and_lives(values):
+    async def scenario(system: Whole, engineer: Engineer) -> None:
+        for action, name in (("retune", "FTM2"), ("set", "strategy")):
+            answer = await engineer.ask(action, name, values)
+            assert not answer.accepted
+            assert answer.reason
+            assert "\n" not in answer.reason
+        assert (await engineer.ask("set", "strategy", '{"value": "guarded-repair"}')).accepted
 
     in_adaptable_system(scenario)
 

@@ -1,8 +1,9 @@
 """The arbiter when recoveries fail, and when the manager itself is killed, as timelines."""
 
-from manager_bench import DMS, RMS, Bench, commands, edited
+from manager_bench import DMS, RMS, Bench, commands, edited, osmosis
 
-from manager.arbiter import Phase
+from manager.arbiter import Phase, build_arbiter
+from manager.arbiter_memory import Memory, objection, recall, remember
 
 ACTING, DONE, IDLE, FAILED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.FAILED
 
@@ -151,6 +152,45 @@ def test_failures_are_forgiven_when_their_cause_is_gone():
     assert commands(bench.active("DM4", "osmosis_control")) == [("RM3", True)]
 
 
+def test_a_failure_is_forgiven_with_its_own_cause_whatever_else_is_active():
+    bench = Bench()
+    bench.active("DM4", "osmosis_control")
+    bench.active("DM5", "hmi")
+    bench.report("RM3", ACTING)
+    bench.report("RM3", FAILED)
+    assert bench.state.recoveries[2].failed_for == ("FTM4",)
+    bench.idle("DM4")
+    bench.report("RM2", IDLE)
+    bench.wait(20.0, hearing=DMS)
+    assert not bench.state.recoveries[2].failure
+
+
+def test_a_repair_whose_detection_blames_one_life_after_the_other_has_failed():
+    bench = Bench()
+    life = 1
+    bench.active("DM4", f"osmosis_control#{life}")
+    deadline_s = bench.arbiter.mechanisms.contracts["RM3"].deadline_s
+    while bench.orders == "RM3" and bench.now < 10 * deadline_s:
+        bench.report("RM3", ACTING)
+        bench.report("RM3", DONE)
+        bench.wait(deadline_s / 3)
+        life += 1
+        bench.active("DM4", f"osmosis_control#{life}")
+    assert "RM2" in bench.orders
+    assert bench.now <= 2 * deadline_s
+
+
+def test_a_repair_of_one_node_after_the_other_has_not_failed():
+    bench = Bench()
+    deadline_s = bench.arbiter.mechanisms.contracts["RM3"].deadline_s
+    for node in ("osmosis_control#1", "graph_planner#1", "mission_manager#1"):
+        bench.active("DM4", node)
+        bench.report("RM3", ACTING)
+        bench.report("RM3", DONE)
+        bench.wait(0.8 * deadline_s)
+    assert bench.orders == "RM3"
+
+
 def test_a_respawned_recovery_module_is_commanded_again():
     bench = Bench()
     bench.active("DM2")
@@ -239,6 +279,82 @@ def test_the_wait_for_orientation_ends_with_the_grace():
         bench.idle(dm)
     bench.wait(0.2)
     assert bench.orders == ""
+
+
+def respawned() -> Bench:
+    """The arbiter of a manager that was respawned: modules run already."""
+    bench = Bench(oriented=False)
+    bench.arbiter = build_arbiter(osmosis(), first_life=False)
+    return bench
+
+
+def test_a_respawned_manager_waits_for_a_module_no_longer_than_for_any_silent_one():
+    bench = respawned()
+    for rm in RMS:
+        bench.report(rm, IDLE)
+    others = tuple(dm for dm in DMS if dm != "DM1")
+    for dm in others:
+        bench.idle(dm)
+    silence_s = osmosis().timing.detection_silence_timeout_s
+    bench.wait(silence_s - 0.1, hearing=others)
+    assert bench.orders == ""
+    bench.wait(0.2, hearing=others)
+    assert bench.orders == "RM1"
+
+
+def test_what_was_adopted_is_not_let_go_in_between_if_its_module_stays_silent():
+    bench = respawned()
+    bench.report("RM2", DONE, decision=41)
+    for rm in ("RM1", "RM3", "RM4", "RM5"):
+        bench.report(rm, IDLE)
+    others = tuple(dm for dm in DMS if dm != "DM2")
+    for dm in others:
+        bench.idle(dm)
+    outputs = bench.wait(3.0, hearing=others)
+    assert ("RM2", False) not in commands(outputs)
+    assert bench.orders == "RM2"
+
+
+def test_nothing_is_reset_before_all_modules_have_been_heard():
+    bench = respawned()
+    bench.report("RM1", DONE, decision=41)
+    answer = bench.reset("RM1")
+    assert not answer.granted
+    assert answer.reason == "not all modules have been heard yet"
+    for rm in RMS[1:]:
+        bench.report(rm, IDLE)
+    for dm in DMS:
+        bench.idle(dm)
+    assert bench.reset("RM1").granted
+
+
+def test_a_number_that_was_never_given_is_not_counted_on_from():
+    for number in (2**64 - 1, 2**63, -5):
+        bench = respawned()
+        bench.report("RM2", DONE, decision=number)
+        bench.active("DM1")
+        assert 0 < bench.state.number < 100
+        assert objection(Memory(bench.state.number)) == ""
+    assert "decision number" in objection(Memory(2**64 - 1))
+    bench = Bench()
+    bench.report("RM2", DONE, decision=10**6)  # nobody asks
+    bench.active("DM1")
+    assert bench.state.number < 100
+
+
+def test_a_latch_beneath_a_safer_recovery_survives_the_manager():
+    spec = edited(RM2={"latched": True})
+    bench = Bench(spec)
+    bench.active("DM2")
+    bench.report("RM2", DONE)
+    bench.active("DM1")
+    assert bench.orders == "RM1"
+    memory = remember(bench.state)
+    assert {latch.command.recovery for latch in memory.latches} == {"RM1", "RM2"}
+    assert objection(memory) == ""
+    state = recall(bench.arbiter, memory, 100.0, 0)
+    assert set(state.latched) == {"RM1", "RM2"}
+    assert [t.wanted for t in state.recoveries[:2]] == [True, False]
 
 
 def test_a_later_report_of_activation_is_not_adopted():

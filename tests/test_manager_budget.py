@@ -115,10 +115,12 @@ def test_derived_timeouts_always_fit_whatever_the_robot(speed, brake, clearance,
                     corridor_clearance_m=clearance)
     spec = changed(SPEC, mobile=robot, timing=derive_timeouts(robot, Timing()))
     detections = tuple(
-        changed(d, parameters=d.parameters | {"timeout_s": getattr(spec.timing, {
+        changed(d, within_s=timeout_s, parameters=d.parameters | {"timeout_s": timeout_s})
+        if "timeout_s" in d.parameters else d
+        for d in SPEC.detections
+        for timeout_s in [getattr(spec.timing, {
             "DM2": "command_timeout_s", "DM6": "localization_timeout_s"}.get(
-                d.name, "heartbeat_timeout_s"))})
-        if "timeout_s" in d.parameters else d for d in SPEC.detections)
+                d.name, "heartbeat_timeout_s"))])
     spec = changed(spec, detections=detections)
     if list(find_false_alarms(spec)):
         return

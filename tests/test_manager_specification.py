@@ -1,15 +1,22 @@
 """The shipped system loads; every way to get a spec wrong is refused in one line that helps."""
 
 import ast
+import copy
+import tomllib
+from datetime import date
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from manager_bench import OSMOSIS, osmosis
+from stub_actors import ROOT
 
 import manager
 from manager.schema import Kind
-from manager.specification import SpecificationError, parse_specification
+from manager.specification import SpecificationError, check_document, parse_specification
 
 FILE = "systems/paper.toml"
 
@@ -85,6 +92,28 @@ def test_gates_can_be_and_or_at_least():
         "command_not_updated", "localization_error", "erroneous_command")) == (2, 2, 1)
 
 
+@pytest.mark.parametrize(("within_s", "timeout_s", "longest", "soonest"), [
+    (50.0, 0.64, 50.0, 0.64), (0.1, 0.64, 0.64, 0.1)])
+def test_of_two_latencies_the_longer_counts_and_the_shorter_for_the_mechanism_below(
+        within_s, timeout_s, longest, soonest):
+    crash = next(d for d in osmosis().detections if d.name == "DM2")
+    crash = msgspec.structs.replace(crash, within_s=within_s, parameters={"timeout_s": timeout_s})
+    assert (crash.latency_s, crash.soonest_s) == (longest, soonest)
+
+
+def test_a_latency_that_does_not_fit_is_refused_though_the_timeout_would():
+    timeout = 'timeout_s = "command_timeout_s" }'
+    assert "the time budget does not fit: FTM2 needs 50.150 s" in refusal(
+        edit((timeout, f"{timeout}\nwithin_s = 50.0")))
+
+
+def test_modules_of_other_people_take_what_they_like():
+    spec = parse_specification(edit(
+        ('"actors.detection.freshness:CommandFreshness"', '"my.own:Freshness"'),
+        ('topic = "control/command", ', 'topic = 3, hold_s = -1, anything = [true], ')), FILE)
+    assert spec.detections[1].parameters["hold_s"] == -1
+
+
 FTM2 = 'name = "FTM2"\ndetect = "DM2"\nrecover = "RM2"\nevent = "command_not_updated"\n'
 HMI = 'name = "hmi"\nactor = "actors.operator.hmi:Hmi"\nkind = "non-control"\nrespawn = "RM4"'
 PROHIBITED = 'of = ["erroneous_graph", "erroneous_command", "actuator_failure"]'
@@ -124,6 +153,55 @@ REFUSED = {
                             ["$.node[4].actor = 'actors.operator.hmi': expected 'module:Class'"]),
     "a name with a slash": ([('name = "hmi"', 'name = "h/mi"')],
                             ["$.node[4].name = 'h/mi': expected a name"]),
+    "unknown field of a hazard in words": (
+        [('against = "runaway"', 'against = { within_s = 5.0, hazard = "x", bogus = 1 }')],
+        ["$.mechanism[2].against.bogus = 1: unknown field; known: within_s, hazard"]),
+    "unknown field with a backtick": ([("width_m =", '"wid`th - at `$.x[9]`" =')],
+                                      ["$.robot.wid`th - at `$.x[9]` = 0.614: unknown field"]),
+    "unknown top-level field with a backtick": (
+        [('title = "Runway light', '"ti`tle - at `$.robot" = "Runway light')],
+        ["$.ti`tle - at `$.robot = 'Runway", "known: name, title"]),
+    "a name with a newline": ([('name = "safety_pilot"', 'name = "safety_pilot\\n"')],
+                              ["= 'safety_pilot\\n': expected a name"]),
+    # magnitudes
+    "a number of thousands of digits": ([("width_m = 0.614", "width_m = " + "9" * 5000)],
+                                        ["$: an integer with thousands of digits"]),
+    "the same in hexadecimal": ([("width_m = 0.614", "width_m = 0x" + "f" * 5000)],
+                                ["$.robot.width_m = a number with thousands of digits: expected"]),
+    "a gate with thousands of digits": ([('detect = "DM3"', f'detect = "{"9" * 5000} of (DM3)"')],
+                                        ["999...: 999999999... of: between 1 and the number of"]),
+    "a timeout that no float holds": (
+        [('timeout_s = "command_timeout_s"', "timeout_s = 1" + "0" * 400)],
+        ["$.detection[1].parameters.timeout_s = 1000", "...: expected an integer of at most 9223"]),
+    "a speed whose square no float holds": (
+        [("top_speed_mps = 1.0", "top_speed_mps = 1e200")],
+        ["$.robot.top_speed_mps = 1e+200: out of all proportion; between 1e-09 and 1e+09 is ri"]),
+    "a brake that hardly brakes": ([("braking_mps2 = 2.0", "braking_mps2 = 1e-320")],
+                                   ["$.robot.braking_mps2 = 1e-320: out of all proportion"]),
+    "a clearance beyond the stars": (
+        [("corridor_clearance_m = 1.5", "corridor_clearance_m = 1e306")],
+        ["$.robot.corridor_clearance_m = 1e+306: out of all proportion"]),
+    "tables without end": ([("[layers]", f"[{'.'.join('a' * 5000)}]")],
+                           ["$: nested too deeply; a spec needs three levels"]),
+    # parameters
+    "a negative hold": ([('topic = "control/command",', 'hold_s = -1,')],
+                        ["$.detection[1].parameters.hold_s = -1: expected a number, 0 or more"]),
+    "a misspelt parameter": ([("margin_m = 0.6", "margim_m = 0.6")],
+                             ["$.detection[0].parameters.margim_m = 0.6: unknown parameter; "
+                              "ProhibitedArea takes margin_m, gps_timeout_s, hold_s"]),
+    "a parameter of a module that has none": (
+        [('actor = "actors.recovery.emergency_stop:EmergencyStop"',
+          'actor = "actors.recovery.emergency_stop:EmergencyStop"\nparameters = { x = 1 }')],
+        ["$.recovery[0].parameters.x = 1: unknown parameter; EmergencyStop takes none"]),
+    "a topic that the class does not hear": (
+        [('topic = "control/command"', 'topic = "localization/pose"')],
+        ["$.detection[1].parameters.topic = 'localization/pose': expected 'control/command'"]),
+    "a suspect that is no node": (
+        [('topic = "control/command",', 'suspects = ["osmosis"],')],
+        ["$.detection[1].parameters.suspects = ['osmosis']: expected a list of node names"]),
+    "a watchdog that watches nobody": (
+        [('watch = ["localization"], ', "")],
+        ["$.detection[6].parameters.watch: missing; without it the module does not start"]),
     # names
     "duplicate node": ([('name = "hmi"', 'name = "teleoperation"')],
                        ["$.node[5].name = 'teleoperation': duplicate name, already at $.node[4]"]),
@@ -325,3 +403,49 @@ def test_the_core_of_the_manager_imports_nothing_of_the_project():
             assert {m.split(".")[0] for m in modules} <= allowed, path.name
             assert not {"time", "asyncio", "random"} & set(modules), path.name
             assert "manager.actor" not in modules, path.name
+
+
+SHIPPED = {name: tomllib.loads((ROOT / "systems" / f"{name}.toml").read_text(encoding="utf-8"))
+           for name in ("paper", "osmosis", "cell")}
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8)
+    | st.sampled_from([0, -1, 1e-320, 1e200, 1e306, 10 ** 400, date(2020, 1, 1),
+                       "9" * 5000 + " of (DM1)", "not DM1", "(" * 99, "RM1 and RM2", "a\nb"]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner,
+                                                                max_size=3), max_leaves=4)
+
+
+def places(value: Any) -> list[tuple[Any, Any]]:
+    """Return every container and key within a document."""
+    inner = list(value.items() if isinstance(value, dict) else enumerate(value)
+                 if isinstance(value, list) else ())
+    return [(value, key) for key, _ in inner] + [p for _, v in inner for p in places(v)]
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(sorted(SHIPPED)), st.data())
+def test_a_document_with_anything_anywhere_is_a_system_or_refused_in_one_line(name, data):
+    document = copy.deepcopy(SHIPPED[name])
+    for _ in range(data.draw(st.integers(1, 3))):
+        known = places(document)
+        at, key = known[data.draw(st.integers(0, len(known) - 1))]
+        match data.draw(st.sampled_from(["anything", "another", "delete", "unknown", "nest"])):
+            case "anything":
+                at[key] = data.draw(VALUES)
+            case "another":
+                other, place = known[data.draw(st.integers(0, len(known) - 1))]
+                at[key] = copy.deepcopy(other[place])
+            case "delete":
+                del at[key]
+            case "unknown" if isinstance(at, dict):
+                at[data.draw(st.text(max_size=8))] = data.draw(VALUES)
+            case _:
+                at[key] = data.draw(st.sampled_from([[at[key]], {"x": at[key]}]))
+        if not document:
+            break
+    refused = ""
+    try:
+        check_document(document, FILE)
+    except SpecificationError as error:
+        refused = str(error)
+    assert len(refused.splitlines()) <= 1

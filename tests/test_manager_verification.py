@@ -6,7 +6,7 @@ from itertools import combinations
 
 import msgspec
 import pytest
-from manager_bench import osmosis
+from manager_bench import Bench, edited, osmosis
 
 from manager import active_sets, transitions
 from manager.active_sets import ActiveSets, order_agrees_with_tree
@@ -18,7 +18,7 @@ from manager.order import PartialOrder
 from manager.safety_first import SafetyFirst
 from manager.strategies import STRATEGIES, UnknownStrategyError
 from manager.transitions import Transitions, explore
-from manager.verification import MEANING, Report, TooLargeError, verify
+from manager.verification import MEANING, Report, TooLargeError, _askable, verify
 from toolbox.main import main
 
 SPEC = osmosis()
@@ -68,6 +68,22 @@ def test_in_how_many_sets_the_robot_stops_for_good(report):
                                      "simultaneous": 88, "guarded-repair": 88}
 
 
+def test_repairs_that_starve_behind_the_last_resort_are_counted_apart(report):
+    assert report.stuck_behind_last_resort == {"safety-first": 66, "mission-first": 56,
+                                               "simultaneous": 62, "guarded-repair": 0}
+
+
+@pytest.mark.parametrize(("strategy", "failing", "stuck"), [
+    ("safety-first", 98, 0), ("simultaneous", 90, 0), ("guarded-repair", 0, 0)])
+def test_a_last_resort_that_does_not_latch_excuses_no_repair_from_running(
+        strategy, failing, stuck):
+    spec = edited(RM1={"latched": False})
+    arrangement = Arrangement(spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order())
+    sets = ActiveSets(arrangement, arrangement.order, STRATEGIES[strategy])
+    counts = {p.name: p.count for p in sets.check()}
+    assert (counts["repairs-run"], sets.stuck_behind_last_resort) == (failing, stuck)
+
+
 def test_what_holds_has_no_counterexample_and_what_fails_has_the_shortest_first(report):
     for checked in report.properties:
         assert checked.holds == (checked.count == 0) == (not checked.counterexamples)
@@ -108,6 +124,33 @@ def test_two_recoveries_at_a_time_and_all_together_lead_to_the_same_verdicts():
     assert whole.states > 3 * by_pairs.states / 2
     assert {(p.name, p.holds) for p in by_pairs.properties} == {
         (p.name, p.holds) for p in whole.properties}
+
+
+def test_every_alternative_and_every_number_of_failures_is_explored():
+    """RM5 is asked for when two alternatives before it fail, RM6 when all four fail."""
+    first, _, _, crash, *_ = SPEC.mechanisms
+    replace = msgspec.structs.replace
+    recoveries = [replace(r, escalate_to="RM6" if r.name == "RM3" else "") for r in SPEC.recoveries]
+    spec = replace(
+        SPEC, recoveries=(*recoveries, replace(recoveries[1], name="RM6")),
+        mechanisms=(first, replace(crash, recover="RM3 or RM4 or RM5 or RM2")),
+        orders={"safer": {"RM1": tuple(f"RM{i}" for i in range(2, 7))}})
+    arrangement = Arrangement(spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order())
+    sets = ActiveSets(arrangement, arrangement.order, SafetyFirst())
+    assert _askable(sets) == {frozenset({f"RM{i}"}) for i in range(1, 7)}
+
+
+def test_the_start_of_a_manager_is_not_explored_and_holds_less():
+    """The example in docs/verification.md: if this fails, the limits there can be narrowed."""
+    bench = Bench(oriented=False)
+    bench.active("DM6")
+    bench.report("RM2", Phase.DEGRADED, 41)  # ordered by the manager before this one
+    assert bench.orders == "RM2 (RM5)"
+    assert bench.arbiter.mechanisms.overlap("RM2", "RM5")
+    assert not bench.state.oriented
+    start = two("RM2", "RM5").initial().state
+    assert start.oriented
+    assert not any(track.adopted for track in start.recoveries)
 
 
 # ---- broken arbiters --------------------------------------------------------------------------
@@ -365,8 +408,9 @@ def test_the_command_refuses_nonsense_in_one_line(capsys, monkeypatch):
 def test_the_command_prints_json_of_the_promised_shape(capsys):
     assert main(["verify", "paper", "--strategy", "safety-first", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert {"states", "permissiveness", "properties"} <= told.keys()
+    assert {"states", "permissiveness", "stuck_behind_last_resort", "properties"} <= told.keys()
     assert told["permissiveness"] == {"safety-first": 90}
+    assert told["stuck_behind_last_resort"] == {"safety-first": 66}
     assert told["states"] > 1000
     for row in told["properties"]:
         assert {"name", "strategy", "holds", "count", "counterexamples"} <= row.keys()
@@ -385,4 +429,6 @@ def test_the_command_prints_a_table_the_states_and_the_traces(capsys):
     assert "127 active sets, " in told
     assert "FAILS in 32" in told
     assert "90 of 127" in told
+    assert "66 of 127" in told
+    assert "not explored: the start of a manager" in told
     assert "  2. RM3 never runs, so FTM4 stays active for ever" in told

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+from typing import Any
+
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from manager_bench import osmosis
 from stub_actors import ROOT
 
@@ -91,6 +96,85 @@ def test_the_top_may_be_chosen():
 def test_formulas_nested_by_the_thousand_are_read():
     body = "<or>" * 4000 + events("a") + "</or>" * 4000
     assert cut_sets(mef(gate("top", body))) == sets("a")
+
+
+def test_formulas_nested_side_by_side_are_not_taken_for_each_other():
+    def pair(x: str, y: str, z: str) -> str:
+        return f"<and><or>{events(x, y)}</or>{events(z)}</and>"
+
+    body = f"<or>{pair('a', 'b', 'c')}{pair('d', 'e', 'f')}{pair('g', 'h', 'i')}</or>"
+    assert cut_sets(mef(gate("top", body))) == sets("a c", "b c", "d f", "e f", "g i", "h i")
+
+
+@pytest.mark.parametrize(("definitions", "expected"), [
+    ([gate("top", f'<or><gate name="top/lone"/>{events("a", "b")}<gate name="g"/></or>'),
+      gate("g", f'<and><gate name="top/lone"/>{events("z")}</and>'),
+      gate("top/lone", f"<and>{events('p', 'q')}</and>")], sets("a", "b", "p q")),
+    ([gate("g/not", f"<and>{events('p', 'q')}</and>"),
+      gate("top", '<and><gate name="g/not"/><gate name="g"/></and>'),
+      gate("g", f"<imply>{events('x', 'y')}</imply>")], sets("p q")),
+    ([gate("top", f'<and><gate name="g"/>{events("g/constant")}</and>'),
+      gate("g", '<constant value="true"/>')], sets("g/constant")),
+])
+def test_a_name_keeps_its_meaning_whatever_it_looks_like(definitions, expected):
+    assert cut_sets(mef(*definitions)) == expected
+
+
+HOLDS = {
+    "and": lambda inputs, _: all(inputs), "or": lambda inputs, _: any(inputs),
+    "nand": lambda inputs, _: not all(inputs), "nor": lambda inputs, _: not any(inputs),
+    "not": lambda inputs, _: not inputs[0], "xor": lambda inputs, _: inputs[0] != inputs[1],
+    "iff": lambda inputs, _: inputs[0] == inputs[1],
+    "imply": lambda inputs, _: not inputs[0] or inputs[1],
+    "atleast": lambda inputs, k: sum(inputs) >= k,
+}
+"""What each connective means, said once more."""
+
+LEAVES = st.sampled_from([*"abcde", "top/lone", "top/1", "top/not"])
+
+
+def inner(parts: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    """Return formulas (connective, inputs, k) over parts."""
+    return st.one_of(
+        st.tuples(st.sampled_from(["and", "or", "nand", "nor"]),
+                  st.lists(parts, min_size=1, max_size=4), st.just(0)),
+        st.tuples(st.just("not"), st.lists(parts, min_size=1, max_size=1), st.just(0)),
+        st.tuples(st.sampled_from(["xor", "iff", "imply"]),
+                  st.lists(parts, min_size=2, max_size=2), st.just(0)),
+        st.tuples(st.just("atleast"), st.lists(parts, min_size=2, max_size=4),
+                  st.integers(1, 2)))
+
+
+FORMULAS = inner(st.recursive(LEAVES, inner, max_leaves=12))
+
+
+def written(formula: Any, gates: dict[str, Any]) -> str:
+    if isinstance(formula, str):
+        return f'<{"gate" if formula in gates else "basic-event"} name="{formula}"/>'
+    tag, parts, k = formula
+    least = f' min="{k}"' if k else ""
+    return f"<{tag}{least}>{''.join(written(part, gates) for part in parts)}</{tag}>"
+
+
+def holds(formula: Any, gates: dict[str, Any], occurred: frozenset[str]) -> bool:
+    if isinstance(formula, str):
+        return holds(gates[formula], gates, occurred) if formula in gates else formula in occurred
+    tag, parts, k = formula
+    return HOLDS[tag]([holds(part, gates, occurred) for part in parts], k)
+
+
+@settings(max_examples=150, deadline=None)
+@given(FORMULAS, inner(st.sampled_from("abcde")), inner(st.sampled_from("abcde")))
+def test_nested_formulas_have_the_minimal_sets_that_brute_force_finds(top, lone, negation):
+    gates = {"top/lone": lone, "top/not": negation}  # names that a reader might make up as well
+    text = mef(gate("top", written(top, gates)),
+               *(gate(name, written(body, gates)) for name, body in gates.items()))
+    minimal: list[frozenset[str]] = []
+    for size in range(7):
+        for chosen in map(frozenset, combinations([*"abcde", "top/1"], size)):
+            if holds(top, gates, chosen) and not any(smaller <= chosen for smaller in minimal):
+                minimal.append(chosen)
+    assert cut_sets(text, "top") == set(minimal)
 
 
 @pytest.mark.parametrize("system", ["osmosis", "cell"])

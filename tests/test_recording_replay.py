@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
 import os
 import signal
 import socket
@@ -127,7 +128,7 @@ async def test_every_lap_passes_the_guard_that_drops_copies(tmp_path, port):
     sent = [*(pose(n + 1, n * 0.02) for n in range(5)),
             *(pose(n + 1, 0.1 + n * 0.02, incarnation=2) for n in range(5))]
     write(tmp_path / "run.mcap", sent)
-    guard, taken, refused = ArrivalGuard(), [], []
+    guard, taken, refused = ArrivalGuard(lambda: math.inf), [], []
     receive = guard.receiver(topics.POSE, lambda _key, message: taken.append(message),
                              lambda key, reason: refused.append(reason))
     player = Replay(tmp_path / "run.mcap", port=port, loop=True, rate=2.0)

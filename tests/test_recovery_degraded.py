@@ -87,8 +87,43 @@ def test_the_brake_of_an_emergency_stop_is_not_released():
             assert system.incarnations["safety_pilot"] == 2
             boss.release("RM7")
             await asyncio.sleep(0.5)
-            assert False not in base.orders
-            assert base.engaged
+            assert base.holders == {"RM1"}
+
+    run(scenario)
+
+
+def test_a_module_that_is_respawned_during_an_emergency_stop_lets_go_of_its_own_brake_only():
+    async def scenario() -> None:
+        async with System() as system:
+            boss, base, _ = await braking(system)
+            boss.order("RM1")
+            await system.settle()
+            for _ in range(3):
+                await system.kill("RM7")
+                system.start("RM7", RespawnBraked, nodes=["safety_pilot"])
+                for _ in range(20):
+                    boss.release("RM7")  # as the manager does that finds it idle
+                    await system.settle()
+                    assert base.engaged
+                    await asyncio.sleep(0.01)
+
+    run(scenario)
+
+
+def test_the_farewells_of_an_emergency_stop_leave_the_brake_that_a_respawn_holds():
+    async def scenario() -> None:
+        async with System() as system:
+            boss, base, supervisor = await braking(system)
+            supervisor.delay_s = 0.9
+            boss.order("RM1")
+            await asyncio.sleep(0.3)
+            boss.release("RM1")
+            await asyncio.sleep(0.1)
+            boss.order("RM7", nodes=("safety_pilot#1",))
+            await system.settle()
+            while system.incarnations["safety_pilot"] == 1:
+                assert base.engaged
+                await asyncio.sleep(0.02)
 
     run(scenario)
 

@@ -155,7 +155,7 @@ def test_a_base_that_is_respawned_gets_the_brake_engaged_again():
             await system.settle()
             boss.order("RM1")
             await asyncio.sleep(0.5)
-            base.engaged = False  # it has forgotten
+            base.holders.clear()  # it has forgotten
             await asyncio.sleep(0.35)
             assert base.engaged
             assert boss.phases == ["idle", "acting", "degraded"]
@@ -323,7 +323,7 @@ def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_reports_failu
             base.deaf = True
             boss.order("RM1")
             await system.settle()
-            base.engaged = True
+            base.holders.add("somebody")
             asyncio.get_running_loop().jump(5.0)  # type: ignore[attr-defined]
             await asyncio.sleep(0.5)
             assert boss.phases == ["idle", "acting", "degraded"]

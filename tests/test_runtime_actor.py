@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import asyncio
 import inspect
+import math
 import socket
 import textwrap
 from collections.abc import AsyncIterator, Callable
@@ -99,7 +100,7 @@ def make_bus(request: pytest.FixtureRequest) -> MakeBus:
 async def running(cls: type[Actor], name: str, make_bus: MakeBus, incarnation: int = 1,
                   rate: float = 1.0) -> AsyncIterator[Actor]:
     loop = asyncio.get_running_loop()
-    clock = Clock(loop.time(), rate, loop.time)
+    clock = Clock(0.0, rate, loop.time)  # one for all actors
     actor = cls(Context(name, incarnation, clock, make_bus(name, incarnation)))
     task = asyncio.create_task(actor.run())
     await eventually(lambda: actor._progress > 0 or task.done() or bool(actor._timers))
@@ -155,6 +156,19 @@ async def test_garbage_is_counted_and_reported_and_the_actor_goes_on(make_bus):
             await eventually(lambda: len(listener.heard) == 1)
 
 
+async def test_a_message_from_the_future_is_refused_and_shuts_out_none_that_is_of_now(make_bus):
+    async with running(Listener, "listener", make_bus) as listener:
+        async with running(Talker, "talker", make_bus) as talker:
+            await eventually(lambda: bool(listener.peers))
+            now_s = talker.clock.now()
+            for count, stamp_s in enumerate((now_s + 3600.0, math.inf, math.nan), start=1):
+                talker.publish(topics.POSE, m.Pose(9.0, 0.0, 0.0), stamp=stamp_s)
+                await eventually(lambda count=count: listener._rejected == count)
+            talker.publish(topics.POSE, m.Pose(1.0, 0.0, 0.0))
+            await eventually(lambda: len(listener.heard) == 1)
+            assert listener.heard[0][0].x_m == 1.0
+
+
 async def test_a_superseded_incarnation_is_refused(make_bus):
     async with running(Listener, "listener", make_bus) as listener:
         async with running(Talker, "talker", make_bus, incarnation=2) as talker:
@@ -186,7 +200,7 @@ async def test_publishing_an_undeclared_topic_raises(make_bus):
 
 
 async def test_a_handler_that_raises_ends_its_actor_only(make_bus):
-    clock = Clock(asyncio.get_running_loop().time())
+    clock = Clock(0.0)
     victim = Listener(Context("listener", 1, clock, make_bus("listener", 1)))
     task = asyncio.create_task(victim.run())
     async with running(Talker, "talker", make_bus) as talker:

@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from stub_actors import ROOT
 
 from actors.runtime.checkpoint import (
+    BUSY_TIMES,
     FAILED_LIVES,
     GENERATIONS,
     RETRY_S,
@@ -347,19 +348,74 @@ def test_where_no_directory_can_be_is_one_line(tmp_path):
         store.save(1, b"x")
 
 
-def test_a_lock_that_somebody_holds_is_not_waited_for(sqlite_store, file):
-    saved(sqlite_store)
+@contextlib.contextmanager
+def locked(file: Path) -> Iterator[None]:
     stale = sqlite3.connect(file, isolation_level=None)
     stale.execute("BEGIN IMMEDIATE")
-    with pytest.raises(CheckpointError, match="database is locked"):
-        sqlite_store(2).load()
+    try:
+        yield
+    finally:
+        stale.execute("ROLLBACK")
+        stale.close()
+
+
+def test_a_lock_that_somebody_holds_is_not_waited_for(sqlite_store, file):
+    saved(sqlite_store)
     store = sqlite_store(2)
-    with pytest.raises(BusyError, match="database is locked"):
+    with locked(file), pytest.raises(BusyError, match="database is locked"):
         store.save(1, b"x")
-    stale.execute("ROLLBACK")
-    stale.close()
     store.save(1, b"after")
     assert states(sqlite_store(3))[0] == b"after"
+
+
+def test_what_was_kept_is_found_though_somebody_holds_the_lock_while_it_is_looked_for(
+        sqlite_store, file):
+    first = Desk(sqlite_store(1))
+    first.keeper.keep(COUNTER, Counter(7, 0))
+    first.keeper.close()
+    second = Desk(sqlite_store(2), expected=True)
+    with locked(file):
+        assert second.keeper.kept(COUNTER) == Counter(7, 0)
+    second.keeper.keep(COUNTER, Counter(8, 0))
+    assert second.told == []
+    assert Desk(sqlite_store(3)).keeper.kept(COUNTER) == Counter(8, 0)
+
+
+def test_a_life_that_could_not_claim_does_so_with_its_first_save_and_older_ones_are_refused(
+        sqlite_store, file):
+    old, new = sqlite_store(1), sqlite_store(2)
+    old.save(1, b"old")
+    with locked(file):
+        assert states(new) == [b"old"]
+    for _ in range(GENERATIONS):
+        old.save(1, b"a ghost's")  # as long as nothing of its successor's is there
+    new.save(1, b"new")
+    with pytest.raises(SupersededError):
+        old.save(1, b"a ghost's, too late")
+    assert states(sqlite_store(3))[0] == b"new"
+
+
+def test_a_superseded_life_finds_nothing_though_the_lock_keeps_it_from_claiming(
+        sqlite_store, file):
+    sqlite_store(2).save(1, b"new")
+    old = sqlite_store(1)
+    with locked(file), pytest.raises(SupersededError):
+        old.load()
+    with pytest.raises(SupersededError):
+        old.save(1, b"a ghost's")
+    assert states(sqlite_store(2)) == [b"new"]
+
+
+def test_the_failures_of_former_lives_are_known_though_the_lock_keeps_one_from_claiming(
+        sqlite_store, file):
+    first = sqlite_store(1)
+    first.save(1, b"bad")
+    first.note_failures(2)
+    second = sqlite_store(2)
+    with locked(file):
+        assert second.load().failures == 2
+    second.note_failures(3)
+    assert sqlite_store(3).load().failures == 3
 
 
 IN_A_PROCESS = """
@@ -383,6 +439,13 @@ if what == "full":  # python ignores SIGXFSZ: writing beyond the limit fails, as
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     store.save(1, b"room again")
     store.close()
+elif what == "full at load":
+    resource.setrlimit(resource.RLIMIT_FSIZE, (33_000, resource.RLIM_INFINITY))  # the log is larger
+    print(store.load().records[0].state.decode())
+    try:
+        store.save(1, b"x")
+    except CheckpointError as problem:
+        print(problem)
 else:
     if os.getuid() == 0:
         os.setuid(65534)
@@ -409,6 +472,16 @@ def test_a_full_disk_is_one_line_and_the_states_before_it_stay(sqlite_store, fil
     records = sqlite_store(2).load().records
     assert records[0].state == b"room again"
     assert records[1].state == b"%04d" % (int(count) - 1) * 500
+
+
+def test_what_was_kept_is_found_though_the_disk_is_full(sqlite_store, file):
+    store = sqlite_store(1)
+    for number in range(60):
+        store.save(1, b"%04d" % number * 50)
+    found, error = in_a_process(file, "full at load")
+    assert found == "0059" * 50
+    assert error.startswith(f"{file}: ")
+    assert states(sqlite_store(2))[0] == b"0059" * 50
 
 
 @pytest.mark.parametrize("exists", [True, False])
@@ -583,6 +656,24 @@ def test_a_store_that_is_locked_for_a_moment_is_no_trouble_and_for_long_it_is():
         desk.keeper.keep(COUNTER, Counter(2, 0))
     assert desk.told == ["n.sqlite: database is locked; going on without checkpoints"]
     assert store.attempts < 15
+
+
+def test_a_store_that_is_locked_for_a_moment_while_it_is_read_is_read_again():
+    class Locked(Broken):
+        def load(self):
+            self.attempts += 1
+            if self.attempts < BUSY_TIMES:
+                raise BusyError("n.sqlite: database is locked")
+            return self.inner.load()
+
+    desk = Desk(Locked(Shelf(1, (record(3, {"count": 4, "step": 0}),))), expected=True)
+    assert desk.keeper.kept(COUNTER) == Counter(4, 0)
+    assert desk.told == []
+    stays = Broken(Shelf())
+    stays.error = BusyError("n.sqlite: database is locked")
+    desk = Desk(stays)
+    assert desk.keeper.kept(COUNTER) is None
+    assert desk.told == ["n.sqlite: database is locked; starting without a checkpoint"]
 
 
 def test_a_superseded_keeper_is_told_so_and_tries_no_more():

@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
-from actors.messages import ControlPhase, ControlStatus, Goal, MissionPhase, MissionStatus, Mode
-from sim.run_end import ACCEPT_WITHIN_S, LOST_AFTER_S, SETTLE_S, WORLD_SILENT_S, RunEnd
+from actors.messages import (
+    ControlPhase,
+    ControlStatus,
+    Goal,
+    MissionPhase,
+    MissionStatus,
+    Mode,
+    Twist,
+)
+from sim.run_end import (
+    ACCEPT_WITHIN_S,
+    LOST_AFTER_S,
+    SETTLE_S,
+    WATCH_S,
+    WORLD_SILENT_S,
+    RunEnd,
+)
 
+STANDS = Twist(0.0, 0.0)
 GOALS = (Goal(1.0, 2.0, Mode.TAXI), Goal(3.0, 4.0, Mode.TAXI))
 
 
@@ -22,6 +38,19 @@ def test_a_mission_that_succeeded_ends_the_run_once_the_robot_has_settled():
     end.mission(mission(MissionPhase.SUCCEEDED, 2), 9.0)
     assert end.ended(9.0 + SETTLE_S - 0.1) is None
     assert end.ended(9.0 + SETTLE_S) == "mission succeeded"
+
+
+def test_a_robot_that_drives_on_after_its_mission_is_watched_until_it_stands_or_for_a_minute():
+    for twist in (Twist(0.3, 0.0), Twist(0.0, -0.5)):
+        end = RunEnd(60.0)
+        end.mission(mission(MissionPhase.RUNNING), 1.0)
+        end.mission(mission(MissionPhase.SUCCEEDED, 2), 9.0)
+        end.truth(twist, 20.0)
+        assert end.ended(20.0) is None
+        end.truth(STANDS, 21.0)
+        assert end.ended(21.0) == "mission succeeded"
+        end.truth(twist, 9.0 + WATCH_S)
+        assert end.ended(9.0 + WATCH_S) == "mission succeeded"
 
 
 def test_a_mission_manager_that_forgot_its_mission_ends_the_run_and_a_flicker_does_not():
@@ -59,7 +88,7 @@ def test_a_mission_nobody_takes_and_a_world_that_is_gone_end_the_run():
     assert RunEnd(100.0).ended(ACCEPT_WITHIN_S) is None
     assert "no mission was accepted" in (RunEnd(100.0).ended(ACCEPT_WITHIN_S + 0.1) or "")
     end = RunEnd(100.0)
-    end.truth(2.0)
+    end.truth(STANDS, 2.0)
     assert end.ended(2.0 + WORLD_SILENT_S) is None
     assert "the world is gone" in (end.ended(2.1 + WORLD_SILENT_S) or "")
 

@@ -94,6 +94,16 @@ def test_commands_move_the_robot_and_the_brake_holds_it():
     assert bench.last(topics.TRUTH).twist.linear_mps > 0.4
 
 
+def test_the_brake_is_released_when_the_last_who_holds_it_lets_go():
+    bench = Bench()
+    for source, engaged, brakes in (
+            ("RM1", True, True), ("RM7", False, True), ("RM7", True, True), ("RM1", False, True),
+            ("RM1", False, True), ("RM7", False, False)):
+        bench.actor.brake(m.BrakeCommand(engaged, "test"), Header(source, 1, 1, bench.now_s))
+        bench.run(0.2, m.BaseCommand(0.0, 0.0))
+        assert bench.last(topics.BASE_STATUS).brake_engaged is brakes
+
+
 @pytest.mark.parametrize(("parameters", "stands"), [({}, True), ({"dead_man": False}, False)])
 def test_the_dead_man_can_be_switched_off(parameters, stands):
     bench = Bench(**parameters)

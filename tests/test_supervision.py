@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -14,7 +15,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 import pytest
-from stub_actors import ROOT, launched, stub_plan, write_stub_system
+from stub_actors import ROOT, free_base_port, launched, stub_plan, write_stub_system
 
 from actors import topics
 from actors.messages import Diagnostic, NodeTable, ProcessEvent, RespawnRequest
@@ -24,8 +25,10 @@ from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.kill_node import main as kill_node
 from actors.supervision.launcher import Launcher, LaunchError
 from actors.supervision.process_title import find_processes
+from actors.supervision.processes import OsProcesses
 from actors.supervision.restart_policy import RestartPolicy
 from actors.supervision.run_info import find_runs
+from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
 pytestmark = pytest.mark.processes
 
@@ -183,6 +186,107 @@ async def test_nodes_come_back_whatever_happens_to_the_spawners(tmp_path):
             await eventually(lambda i=incarnation: witness.state("DM1") == ("running", i + 1), 20)
             await eventually(lambda o=old: all(
                 process(port, v) not in {None, p} for v, p in o.items()), 20)
+
+
+async def test_a_supervisor_without_descriptors_harms_nobody_and_goes_on_when_it_has_some(tmp_path):
+    async with running(tmp_path) as (_, witness):
+        before = {r.name: r.pid for r in witness.table.nodes}
+        limits = resource.prlimit(before["supervisor"], resource.RLIMIT_NOFILE)
+        resource.prlimit(before["supervisor"], resource.RLIMIT_NOFILE, (3, limits[1]))
+        os.kill(before["DM3"], signal.SIGKILL)
+        await eventually(lambda: any(
+            e.node == "supervisor" and e.context == "hold" for e in witness.errors))
+        resource.prlimit(before["supervisor"], resource.RLIMIT_NOFILE, limits)
+        await eventually(lambda: witness.state("DM3")[0] == "running"
+                         and witness.state("DM3")[1] > 1)
+        os.kill(witness.pid("DM3"), signal.SIGKILL)
+        incarnation = witness.state("DM3")[1]
+        await eventually(lambda: witness.state("DM3") == ("running", incarnation + 1))
+        after = {r.name: r.pid for r in witness.table.nodes}
+        assert {n for n, pid in after.items() if pid != before[n]} == {"DM3"}
+
+
+async def test_a_process_that_nobody_holds_does_not_keep_its_node_down(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        os.kill(witness.pid("DM1"), signal.SIGKILL)
+        await eventually(lambda: witness.state("DM1") == ("running", 2))
+        victim, supervisor = witness.pid("DM1"), process(port, "supervisor")
+        os.kill(supervisor, signal.SIGSTOP)
+        os.kill(victim, signal.SIGKILL)
+        await eventually(lambda: process(port, "DM1") is None)
+        client = SpawnerClient(port)
+        orphan = client.fork(("DM1",), 1)  # it has the port, and is too old to be heard
+        client.close()
+        await eventually(lambda: listens(launcher.ports["DM1"]))
+        os.kill(supervisor, signal.SIGCONT)
+        await eventually(lambda: witness.state("DM1")[0] == "running"
+                         and witness.pid("DM1") not in {victim, orphan})
+        assert [p.pid for p in find_processes(port) if "DM1" in p.names] == [witness.pid("DM1")]
+        assert witness.saw("DM1", "adopted")
+        assert sum(e.node == "DM1" and e.event == "respawned" for e in witness.events) < 5
+
+
+def listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+_MUTE_SPAWNER = """
+import os, socket, sys, time
+from actors.supervision.process_title import set_title
+from actors.supervision.spawner import address
+port, how = int(sys.argv[1]), sys.argv[2]
+listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+listener.bind(address(port, "a"))
+listener.listen()
+print("ready", flush=True)
+connection, _ = listener.accept()
+connection.recv(100_000)
+if os.fork() == 0:
+    listener.close()
+    connection.close()
+    set_title(port, os.getppid() if how == "stranger" else int(sys.argv[3]), ("DM1",), 2)
+    os.write(1, b"%d\\n" % os.getpid())
+    time.sleep(60)
+time.sleep(0.1)
+if how != "dies":
+    time.sleep(60)
+os._exit(1)
+"""
+
+
+@pytest.mark.parametrize("how", ["dies", "hangs", "stranger"])
+def test_the_child_of_a_spawner_that_forked_and_did_not_answer_is_found(how):
+    port = free_base_port()
+    spawner = subprocess.Popen(
+        [sys.executable, "-c", _MUTE_SPAWNER, str(port), how, str(os.getpid())],
+        stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    machine, child = OsProcesses(port, os.getpid()), 0
+    try:
+        assert spawner.stdout.readline() == "ready\n"
+        if how == "stranger":  # of another run: not this one's child
+            with pytest.raises(SpawnerUnavailableError):
+                machine.fork(("DM1",), 2)
+            child = int(spawner.stdout.readline())
+        else:
+            found = machine.fork(("DM1",), 2)
+            child = int(spawner.stdout.readline())
+            assert found == child
+        assert spawner.wait(5) != 0
+    finally:
+        machine.close()
+        spawner.kill()
+        spawner.wait()
+        spawner.stdout.close()
+        if child:
+            os.kill(child, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("pid", [-1, 0, 1 << 22, 1 << 40])
+async def test_a_process_with_a_number_that_no_process_can_have_is_gone(pid):
+    with pytest.raises(ProcessLookupError):
+        OsProcesses(1, 1).hold(pid, lambda: None)
 
 
 async def test_the_launcher_turns_while_supervisor_and_both_spawners_are_dead(tmp_path):

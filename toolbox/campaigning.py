@@ -309,7 +309,7 @@ def _show(options: argparse.Namespace, spec: SystemSpec, runs: Sequence[Run], ma
         if len(shown) > 60:
             say(f"... and {len(shown) - 60} rows more, in the report")
     say(f"\n{len(runs)} runs, {made} of them made now")
-    protected = [run for run in runs if run.job.ftm]
+    protected = [run for run in runs if run.job.ftm and run.job.faults]
     if protected:
         all_of_them = total(protected, "all")
         say(f"with fault tolerance: {_rate(all_of_them.safe)} safe, {_rate(all_of_them.success)} "
@@ -345,9 +345,10 @@ def _show_paper(spec: SystemSpec, runs: Sequence[Run]) -> None:
         for row in table_iii(spec)])
     for title in ("IV", "V"):
         say(f"\nTable {title}: mission and safety, worst run of each row\n")
-        print_table(("condition", "fault", "obst.", "paper", "ours", "runs", "success", "safe", ""),
-                    [(c.condition, c.fault, c.obstacles, c.paper, c.ours, c.runs, c.success,
-                      c.safe, "agrees" if c.agrees else f"differs: run {c.worst_key}")
+        print_table(("condition", "fault", "obst.", "paper", "ours", "runs", "no effect",
+                     "success", "safe", ""),
+                    [(c.condition, c.fault, c.obstacles, c.paper, c.ours, c.runs, c.ineffective,
+                      c.success, c.safe, "agrees" if c.agrees else f"differs: run {c.worst_key}")
                      for c in cells(runs) if c.table == title])
     _show_differing(cells(runs))
 
@@ -356,8 +357,8 @@ def _show_full(runs: Sequence[Run]) -> None:
     say("The paper's rows on the full system, worst run of each row; expected in each: success, "
         "safe\n")
     found = cells(runs)
-    print_table(("fault", "obst.", "paper", "ours", "runs", "success", "safe", ""),
-                [(c.fault, c.obstacles, c.paper, c.ours, c.runs, c.success, c.safe,
+    print_table(("fault", "obst.", "paper", "ours", "runs", "no effect", "success", "safe", ""),
+                [(c.fault, c.obstacles, c.paper, c.ours, c.runs, c.ineffective, c.success, c.safe,
                   "as expected" if c.agrees else f"NOT as expected: run {c.worst_key}")
                  for c in found])
     _show_differing(found)

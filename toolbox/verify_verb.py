@@ -19,9 +19,10 @@ def add(verbs: Any, formatter: Any) -> None:
     parser = verbs.add_parser(
         "verify", formatter_class=formatter, help="check every property of the arbitration",
         description="Check the arbitration of a system exhaustively: what each strategy decides\n"
-                    "for every set of active mechanisms, and every reachable state of the arbiter\n"
-                    "that carries it out. A property holds, or the shortest counterexamples are\n"
-                    "shown. docs/verification.md explains the properties.",
+                    "for every set of active mechanisms, and every state of the arbiter that\n"
+                    "carries it out, from when it has heard every module. A property holds, or\n"
+                    "the shortest counterexamples are shown. docs/verification.md explains the\n"
+                    "properties, and what is not looked at.",
         epilog="examples:\n  rampart verify\n"
                "  rampart verify my_system.toml --strategy safety-first\n"
                "  rampart verify cell --json\n"
@@ -56,7 +57,9 @@ def run(options: argparse.Namespace) -> int:
         print_json({
             "system": report.system, "strategy": report.strategy,
             "active_sets": report.active_sets, "states": report.states,
-            "permissiveness": report.permissiveness, "properties": report.properties})
+            "permissiveness": report.permissiveness,
+            "stuck_behind_last_resort": report.stuck_behind_last_resort,
+            "properties": report.properties})
     else:
         _show(spec, report, time.monotonic() - start)
     wanted = set(options.strategy or [spec.strategy]) | {""}
@@ -83,9 +86,16 @@ def _show(spec: SystemSpec, report: Report, seconds: float) -> None:
                          "holds" if checked.holds else f"FAILS in {checked.count}")
         rows.append((name, *cells, meaning))
     print_table(("property", *strategies, ""), rows)
-    say("\nactive sets in which the robot must stop until somebody resets it:")
-    for strategy, count in report.permissiveness.items():
-        say(f"  {strategy:<16} {count:>5} of {report.active_sets}")
+    for words, counts in (
+            ("in which the robot must stop until somebody resets it", report.permissiveness),
+            ("in which a repair that is needed never runs while the last resort keeps the robot "
+             "stopped;\nit cannot be reset until somebody repairs by hand, and repairs-run exempts "
+             "them", report.stuck_behind_last_resort)):
+        say(f"\nactive sets {words}:")
+        for strategy, count in counts.items():
+            say(f"  {strategy:<16} {count:>5} of {report.active_sets}")
+    say("\nnot explored: the start of a manager, until it has heard every module or its grace has "
+        "passed")
     for checked in report.properties:
         for trace in checked.counterexamples[:1]:
             say(f"\n{checked.name} fails{f' under {checked.strategy}' if checked.strategy else ''},"

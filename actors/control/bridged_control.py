@@ -31,12 +31,14 @@ class BridgedControl(OsmosisControl):
     def odometry(self, message: Odometry, header: Header) -> None:
         """Keep the way that the wheels make."""
         pose = message.pose
-        self._reckoning.odometry(header.stamp, (pose.x_m, pose.y_m, pose.yaw_rad))
+        self._reckoning.odometry(
+            header.stamp, (pose.x_m, pose.y_m, pose.yaw_rad), self.clock.now())
 
     @on(topics.POSE)
     def pose(self, message: Pose, header: Header) -> None:
         """Keep the latest pose."""
-        self._reckoning.pose(header.stamp, (message.x_m, message.y_m, message.yaw_rad))
+        self._reckoning.pose(
+            header.stamp, (message.x_m, message.y_m, message.yaw_rad), self.clock.now())
         super().pose(message, header)
 
     def _where(self) -> Pose | None:

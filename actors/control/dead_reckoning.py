@@ -14,6 +14,8 @@ from bisect import bisect_right
 from collections import deque
 from operator import itemgetter
 
+from actors.control.plausible import is_possible, is_sane
+
 Pose2 = tuple[float, float, float]
 """x m, y m, yaw rad."""
 
@@ -45,15 +47,15 @@ class DeadReckoning:
         self._way: deque[tuple[float, Pose2, float]] = deque(maxlen=_KEPT)
         self._start: tuple[float, Pose2, float] | None = None
 
-    def pose(self, stamp_s: float, pose: Pose2) -> None:
-        """Take a pose in `map`; one that is not newer, or no number, changes nothing."""
-        if stamp_s > self._stamp_s and all(map(math.isfinite, pose)):
+    def pose(self, stamp_s: float, pose: Pose2, now_s: float) -> None:
+        """Take a pose in `map`; one not newer, of the future, or no number changes nothing."""
+        if stamp_s > self._stamp_s and is_possible(stamp_s, now_s) and is_sane(*pose):
             self._pose, self._stamp_s, self._start = pose, stamp_s, None
 
-    def odometry(self, stamp_s: float, pose: Pose2) -> None:
+    def odometry(self, stamp_s: float, pose: Pose2, now_s: float) -> None:
         """Take a pose in `odom`."""
         way = self._way
-        if not math.isfinite(sum(pose)):
+        if not is_possible(stamp_s, now_s) or not is_sane(*pose):
             return
         if not way:
             way.append((stamp_s, pose, 0.0))

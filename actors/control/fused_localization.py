@@ -41,7 +41,7 @@ class FusedLocalization(Actor):
     def imu(self, message: Imu, header: Header) -> None:
         """Take a reading of the gyro."""
         self._filter.imu(header.stamp, message.yaw_rad, message.yaw_rate_radps,
-                         message.accel_x_mps2, message.accel_y_mps2)
+                         (message.accel_x_mps2, message.accel_y_mps2), self.clock.now())
 
     @on(topics.ODOMETRY)
     def odometry(self, message: Odometry, header: Header) -> None:

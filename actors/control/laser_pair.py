@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from actors.control.laser_check import LaserCheck
+from actors.control.plausible import is_possible
 from actors.control.polyline import NO_POINTS, Array, scan_points
 from actors.messages import LaserScan
 
@@ -46,15 +47,18 @@ class LaserPair:
         self._faults = ["", ""]
         self._seen_s = -math.inf
 
-    def take(self, laser: int, sweep: LaserScan, stamp_s: float) -> LaserView | None:
+    def take(self, laser: int, sweep: LaserScan, stamp_s: float, now_s: float
+             ) -> LaserView | None:
         """Take a sweep of one laser; return the new view, or None if the present one stays.
 
         Args:
             laser: `LOWER` or `UPPER`.
             sweep: In `base_link`.
-            stamp_s: When it was measured.
+            stamp_s: When it was measured. A sweep from the future, or with a stamp that is no
+                number, shows nothing: the view grows old.
+            now_s: Now.
         """
-        if stamp_s < self._seen_s - _TOGETHER_S:
+        if not is_possible(stamp_s, now_s) or stamp_s < self._seen_s - _TOGETHER_S:
             return None  # late: what the other one has seen since is worth more
         other = 1 - laser
         self._sweeps[laser] = sweep

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 
 from actors import topics
+from actors.control.plausible import is_possible
 from actors.messages import Pose
 from actors.runtime.actor import Actor, Context, Header, on
 
 
-def is_newer(pose: Pose, stamp_s: float, last_stamp_s: float) -> bool:
+def is_newer(pose: Pose, stamp_s: float, last_stamp_s: float, now_s: float) -> bool:
     """Whether a measurement is usable and later than the last one passed on."""
-    return stamp_s > last_stamp_s and all(
+    return stamp_s > last_stamp_s and is_possible(stamp_s, now_s) and all(
         math.isfinite(value) for value in (pose.x_m, pose.y_m, pose.yaw_rad)
     )
 
@@ -32,6 +33,6 @@ class Localization(Actor):
     @on(topics.ABSOLUTE_POSE)
     def absolute_pose(self, pose: Pose, header: Header) -> None:
         """Pass a measurement on with its own stamp."""
-        if is_newer(pose, header.stamp, self._last_stamp_s):
+        if is_newer(pose, header.stamp, self._last_stamp_s, self.clock.now()):
             self._last_stamp_s = header.stamp
             self.publish(topics.POSE, pose, stamp=header.stamp)

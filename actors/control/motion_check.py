@@ -18,6 +18,7 @@ import math
 from dataclasses import dataclass
 
 from actors.control.planar_ekf import wrap
+from actors.control.plausible import is_possible, is_sane
 
 BACK_AFTER_S = 1.0
 """How long a device must have been without a flaw to be believed again."""
@@ -108,7 +109,7 @@ class OdometryCheck:
             None for the first message, one after a gap, an old one, one that is no number, and
             one with a flaw; `trust` may deny more.
         """
-        if not stamp_s > self.stamp_s or not math.isfinite(sum(pose) + linear_mps):
+        if not stamp_s > self.stamp_s or not is_sane(*pose, linear_mps):
             return None
         then_s, was = self.stamp_s, self._pose
         self.stamp_s, self._pose, self.speed_mps = stamp_s, pose, linear_mps
@@ -155,14 +156,13 @@ class ImuCheck:
         self._sum = 0.0
         self._flat = 0
 
-    def take(self, stamp_s: float, yaw_rad: float, rate_radps: float, accel_x_mps2: float,
-             accel_y_mps2: float) -> None:
-        """Take a message."""
-        if not stamp_s > self.stamp_s or not math.isfinite(
-                yaw_rad + rate_radps + accel_x_mps2 + accel_y_mps2):
+    def take(self, stamp_s: float, yaw_rad: float, rate_radps: float,
+             acceleration: tuple[float, float], now_s: float) -> None:
+        """Take a message; the acceleration is along x and y, m/s2."""
+        if not stamp_s > self.stamp_s or not is_possible(stamp_s, now_s) \
+                or not is_sane(yaw_rad, rate_radps, *acceleration):
             return
         then_s, then_yaw = self.stamp_s, self.yaw_rad
-        acceleration = (accel_x_mps2, accel_y_mps2)
         same = (rate_radps == self.rate_radps and yaw_rad == then_yaw
                 and acceleration == self._acceleration)
         self._flat = self._flat + 1 if same else 0

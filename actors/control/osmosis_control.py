@@ -143,7 +143,7 @@ class OsmosisControl(Actor):
         self._see(UPPER, message, header)
 
     def _see(self, laser: int, message: LaserScan, header: Header) -> None:
-        view = self._lasers.take(laser, message, header.stamp)
+        view = self._lasers.take(laser, message, header.stamp, self.clock.now())
         if view is not None and not view.fault:  # the Safety Pilot stops who sees nothing
             self._points = view.points
             self._begin()

@@ -28,6 +28,7 @@ from dataclasses import dataclass
 
 from actors.control.motion_check import ImuCheck, OdometryCheck, Trust
 from actors.control.planar_ekf import PlanarEkf, wrap
+from actors.control.plausible import AHEAD_S, is_sane
 from actors.control.position_source import FilterLimits, PositionSource
 
 ABSOLUTE_POSE, GPS, ODOMETRY, IMU = "absolute pose", "GPS", "odometry", "IMU"
@@ -64,7 +65,8 @@ class PoseFilter:
         limits: noise, gates and bounds.
 
     Attributes:
-        imu: takes an IMU reading: stamp s, yaw rad, rate rad/s, acceleration along x and y m/s2.
+        imu: takes an IMU reading: stamp s, yaw rad, rate rad/s, acceleration along x and y m/s2
+            as a pair, and what time it is.
     """
 
     def __init__(self, limits: FilterLimits | None = None) -> None:
@@ -191,7 +193,7 @@ class PoseFilter:
         """Take an absolute pose."""
         source = self._pose
         if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s \
-                or not math.isfinite(x_m + y_m + yaw_rad):
+                or not is_sane(x_m, y_m, yaw_rad):
             return
         then_s, was = source.stamp_s, source.reading
         source.stamp_s, source.reading = stamp_s, (x_m, y_m, yaw_rad)
@@ -224,7 +226,7 @@ class PoseFilter:
         source = self._gps
         x_m, y_m = position
         if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s or not accuracy_m >= 0 \
-                or not math.isfinite(x_m + y_m + velocity[0] + velocity[1] + accuracy_m):
+                or not is_sane(x_m, y_m, accuracy_m) or not math.hypot(*velocity) <= _FASTEST_MPS:
             return
         then_s = source.stamp_s
         same = (x_m, y_m, 0.0) == source.reading and velocity == source.velocity
@@ -426,6 +428,7 @@ _WHEEL_TURN_SHARE, _WHEEL_RAD2_PER_S = 0.15, 1e-5
 _UNKNOWN_TURN_RADPS, _UNKNOWN_SPEED_MPS = 1.0, 0.3
 _CREEP_MPS = 0.05
 _TOP_SPEED_MPS = 1.0
+_FASTEST_MPS = 100.0
 _GPS_REPEATS = 2
 _GPS_VELOCITY_SD_MPS, _SIDESLIP_RAD = 0.03, 0.03
 _COURSE_FROM_MPS, _STRAIGHT_RADPS = 0.4, 0.1
@@ -438,7 +441,7 @@ _IMU_HEADING_SD_RAD = 0.05
 
 
 def _timely(stamp_s: float, now_s: float) -> bool:
-    return -_MAX_AGE_S <= now_s - stamp_s <= _MAX_AGE_S
+    return -AHEAD_S <= now_s - stamp_s <= _MAX_AGE_S
 
 
 def _state(trust: Trust, stamp_s: float, fresh_s: float, now_s: float) -> str:

@@ -29,6 +29,9 @@ STRICTNESS = (PilotMode.AUTO, PilotMode.TELEOPERATION, PilotMode.STOP)
 _FUTURE_S = 0.1
 """A stamp this far ahead of now is no clock jitter but wrong."""
 
+_STANDING_MPS = 1e-3
+"""What a computer of the command may round to."""
+
 _SLOWED = 0.999
 """Below this share of the command the reason says that obstacles slow the robot."""
 
@@ -59,6 +62,7 @@ class GateLimits:
     Args:
         max_linear_mps: largest speed, either direction.
         max_angular_radps: largest turn rate, either direction.
+        reverse_mps: largest speed backwards, where no laser looks; only the joystick drives there.
         command_timeout_s: age at which a command is stale.
         scan_timeout_s: age at which a scan is.
         joystick_timeout_s: silence after which the stick counts as released.
@@ -71,6 +75,7 @@ class GateLimits:
 
     max_linear_mps: float = 1.0
     max_angular_radps: float = 2.0
+    reverse_mps: float = 0.25
     command_timeout_s: float = 0.5
     scan_timeout_s: float = 0.5
     joystick_timeout_s: float = 0.3
@@ -200,7 +205,7 @@ class SafetyGate:
                 return (f"command {command.source}:{position[0]}/{position[1]} is out of sequence,"
                         f" newest is {newest[0]}/{newest[1]}")
             line.newest[command.source] = position
-        line.fault = self._fault(command, now)
+        line.fault = self._fault(command, now) or self._reverse_fault(line, command)
         if line.fault:
             self.refused += 1
             if self._checks.bounds:
@@ -232,6 +237,11 @@ class SafetyGate:
                 return f"command is stamped {-age_s:.2f} s ahead of now"
         return ""
 
+    def _reverse_fault(self, line: _Line, command: Stamped) -> str:
+        if self._checks.bounds and line is not self._stick and command.linear_mps < -_STANDING_MPS:
+            return f"command of {command.linear_mps:.2f} m/s is backwards, where no laser looks"
+        return ""
+
     @property
     def mode(self) -> PilotMode:
         """The strictest engaged order's mode, auto without any."""
@@ -253,7 +263,9 @@ class SafetyGate:
             return GateOutput(0.0, 0.0, mode, True, passing or "no command yet")
         wanted, passing = self._bounded(wanted, passing)
         linear, angular = limited(*wanted, self._points, self._limits.room)
-        reason = "the joystick pre-empts" if stick and mode is PilotMode.AUTO else passing
+        reason = passing
+        if stick and mode is PilotMode.AUTO:
+            reason = ", ".join(filter(None, ("the joystick pre-empts", passing)))
         stopped = (linear, angular) == (0.0, 0.0) != wanted
         if abs(linear) < abs(wanted[0]) * _SLOWED or stopped:
             reason = "obstacle: stopped" if linear == 0.0 else "obstacle: slowed down"
@@ -270,8 +282,10 @@ class SafetyGate:
 
     def _bounded(self, wanted: tuple[float, float], passing: str
                  ) -> tuple[tuple[float, float], str]:
-        """Return a command no faster than the orders allow; the turn rate is kept."""
-        top_mps = self.top_speed_mps
+        """Return a command no faster than orders and eyes allow; the turn rate is kept."""
+        top_mps, reverse_mps = self.top_speed_mps, self._limits.reverse_mps
+        if self._checks.scan and wanted[0] < -reverse_mps:
+            wanted, passing = (-reverse_mps, wanted[1]), passing or "slowly: no laser looks back"
         if not top_mps or abs(wanted[0]) <= top_mps:
             return wanted, passing
         return (math.copysign(top_mps, wanted[0]), wanted[1]), passing or "speed bounded by order"
@@ -300,8 +314,8 @@ class SafetyGate:
                 return "just started, orders may not have arrived yet"
         if self._checks.scan and self._scan_fault:
             return self._scan_fault
-        if self._checks.scan and now - self._scan_s > limits.scan_timeout_s:
-            return "no fresh laser scan"
+        if self._checks.scan and not -_FUTURE_S <= now - self._scan_s <= limits.scan_timeout_s:
+            return "no fresh laser scan"  # nor is one with a stamp from the future, or none
         return ""
 
     def _unusable(self, line: _Line, now: float) -> str:

@@ -99,7 +99,7 @@ class SafetyPilot(Actor):
         self._tell()
 
     def _see(self, laser: int, message: LaserScan, header: Header) -> None:
-        view = self._lasers.take(laser, message, header.stamp)
+        view = self._lasers.take(laser, message, header.stamp, self.clock.now())
         if view is None:
             return
         self._gate.scan(view.points, view.stamp_s, view.fault)

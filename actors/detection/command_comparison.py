@@ -13,6 +13,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from actors.detection.plausible import is_possible
+
 
 @dataclass(frozen=True, slots=True)
 class ComparisonLimits:
@@ -107,7 +109,7 @@ class CommandComparison:
         if incarnation != one.incarnation:
             one.incarnation = incarnation
             self._linear.since_s = self._angular.since_s = math.inf
-        if not all(map(math.isfinite, (*command, stamp_s))):
+        if not all(map(math.isfinite, command)) or not is_possible(stamp_s, now_s):
             return  # the subject of others
         one.linear_mps, one.angular_radps = command
         one.stamp_s = stamp_s

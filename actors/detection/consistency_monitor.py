@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from actors.detection.plausible import is_possible, is_sane
 from actors.messages import (
     ControlPhase,
     ControlStatus,
@@ -119,7 +120,8 @@ class ConsistencyMonitor:
             body: the message.
             source: who says it.
             incarnation: in which life; with a new one all its errors are forgiven.
-            stamp_s: when it was true.
+            stamp_s: when it was true; one from the future, or that is no number, says that it
+                is not updated.
             now_s: now.
         """
         kind = type(body).__name__
@@ -129,7 +131,8 @@ class ConsistencyMonitor:
                 if said.source == source and said.incarnation < incarnation:
                     del self._said[other]  # what its former life said is void
             self._since_s.clear()
-        self._said[kind] = _Said(body, min(stamp_s, now_s), source, incarnation)
+        true_s = min(stamp_s, now_s) if is_possible(stamp_s, now_s) else -math.inf
+        self._said[kind] = _Said(body, true_s, source, incarnation)
         if isinstance(body, ControlStatus):
             told = (body.mission_id, body.step, body.distance_to_go_m)
             if told != self._progress[0]:
@@ -138,7 +141,7 @@ class ConsistencyMonitor:
 
     def pose(self, x_m: float, y_m: float, now_s: float) -> None:
         """Take note of where the robot is, in `map`."""
-        if not (math.isfinite(x_m) and math.isfinite(y_m)):
+        if not is_sane(x_m, y_m):
             return
         if self._pose is not None:
             self._odometer_m += math.dist(self._pose, (x_m, y_m))

@@ -15,6 +15,7 @@ from actors import messages as m
 from actors import topics
 from actors.detection.geofence import Fix
 from actors.detection.module import DetectionModule
+from actors.detection.plausible import is_sane
 from actors.detection.position_vote import PositionVote
 from actors.runtime.actor import Context, Header, on
 
@@ -65,7 +66,7 @@ class EstimationMonitor:
     def pose(self, pose: m.Pose, stamp_s: float, now_s: float, suspect: str) -> None:
         """Take the pose under test; `suspect` is the life of the node that says it."""
         vote = self.vote
-        if not math.isfinite(pose.yaw_rad) or not vote.see_position(
+        if not is_sane(pose.yaw_rad) or not vote.see_position(
                 stamp_s, (pose.x_m, pose.y_m), now_s):
             return
         if not self.active:
@@ -112,13 +113,14 @@ class EstimationError(DetectionModule):
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
         """Hear the heading."""
-        self.monitor.vote.track.imu(header.stamp, message.yaw_rad, message.yaw_rate_radps)
+        self.monitor.vote.track.imu(
+            header.stamp, message.yaw_rad, message.yaw_rate_radps, self.clock.now())
 
     @on(topics.ODOMETRY)
     def odometry(self, message: m.Odometry, header: Header) -> None:
         """Hear the way that the wheels made."""
         self.monitor.vote.track.odometry(
-            header.stamp, message.pose.yaw_rad, message.twist.linear_mps)
+            header.stamp, message.pose.yaw_rad, message.twist.linear_mps, self.clock.now())
 
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:

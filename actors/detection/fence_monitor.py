@@ -6,8 +6,6 @@ number counts the same: after the timeout the monitor is active.
 
 from __future__ import annotations
 
-import math
-
 from actors.detection.freshness_monitor import FreshnessMonitor
 from actors.detection.geofence import (
     DistanceBound,
@@ -17,6 +15,7 @@ from actors.detection.geofence import (
     intrusion,
     reach_m,
 )
+from actors.detection.plausible import is_possible
 
 
 class FenceMonitor:
@@ -67,7 +66,7 @@ class FenceMonitor:
 
     def fix(self, fix: Fix, stamp_s: float, now_s: float) -> None:
         """Take note of a fix in `map`, measured at `stamp_s`."""
-        if not fix.is_usable or math.isnan(stamp_s):
+        if not fix.is_usable or not is_possible(stamp_s, now_s):
             return
         self._freshness.heard(stamp_s, now_s)
         extra_m = self._limits.hysteresis_m if self._intrusion else 0.0

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+from actors.detection.plausible import is_possible
+
 
 class FreshnessMonitor:
     """Active while the newest content is older than the timeout.
@@ -42,8 +44,12 @@ class FreshnessMonitor:
 
     @property
     def known(self) -> bool:
-        """Whether anything was heard, or missed."""
-        return self._known or self.active or self._newest_s > -math.inf
+        """Whether anything fresh was heard, or missed.
+
+        Content that is old already says no more than that something is wrong: idle may not be
+        claimed, and `expire` makes it active.
+        """
+        return self._known or self.active
 
     @property
     def due_s(self) -> float:
@@ -60,15 +66,17 @@ class FreshnessMonitor:
         """Take note of a sample.
 
         Args:
-            stamp_s: when its content was true. A stamp from the future counts as now, so a wrong
-                clock buys no credit; one that is not a number counts as nothing.
+            stamp_s: when its content was true. A stamp from the future, or one that is not a
+                number, counts as nothing: a frozen source with a wrong clock is not fresh.
             now_s: now.
         """
-        stamp_s = now_s if stamp_s > now_s else stamp_s
-        if not stamp_s > self._newest_s:
+        if not is_possible(stamp_s, now_s) or not stamp_s > self._newest_s:
             return
-        self._newest_s = stamp_s
-        if not self.active or now_s >= self._stale_s:
+        self._newest_s = min(stamp_s, now_s)
+        if now_s >= self._stale_s:
+            return
+        self._known = True
+        if not self.active:
             return
         if self._fresh_since_s is None:
             self._fresh_since_s = now_s

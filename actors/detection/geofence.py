@@ -28,6 +28,9 @@ _LEAST_STEP_M = 0.02
 _ROUNDING_M = 1e-6
 """Far more than the rounding errors of distances."""
 
+_FASTEST_MPS = 100.0
+"""Nothing that drives on an airport is faster: a receiver that says so says nothing."""
+
 
 @dataclass(frozen=True, slots=True)
 class FenceLimits:
@@ -57,9 +60,10 @@ class Fix(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def is_usable(self) -> bool:
-        """Whether all of it are numbers."""
-        return self.accuracy_m >= 0 and all(map(math.isfinite, (
-            self.x_m, self.y_m, self.velocity_x_mps, self.velocity_y_mps, self.accuracy_m)))
+        """Whether all of it are numbers, and the speed is one that can be."""
+        return self.accuracy_m >= 0 \
+            and all(map(math.isfinite, (self.x_m, self.y_m, self.accuracy_m))) \
+            and math.hypot(self.velocity_x_mps, self.velocity_y_mps) <= _FASTEST_MPS
 
 
 class DistanceBound:

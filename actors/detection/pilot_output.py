@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 from actors import messages as m
 from actors import topics
 from actors.detection.module import DetectionModule
 from actors.detection.pilot_output_monitor import PilotLimits, PilotOutputMonitor
 from actors.runtime.actor import Context, Header, on
 from actors.runtime.parameters import amount
+from manager.schema import SystemSpec
 
 
 class PilotOutput(DetectionModule):
@@ -25,8 +28,12 @@ class PilotOutput(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
+        system: SystemSpec = context.shared["system"]
         usual = PilotLimits()
         limits = PilotLimits(
+            # As the Safety Pilot has it: without its checks it goes on for ever.
+            held_s=(system.timing.command_timeout_s if system.layers.safety_pilot_checks
+                    else math.inf),
             timeout_s=amount(self.parameters, "timeout_s", usual.timeout_s),
             wrong_s=amount(self.parameters, "wrong_s", usual.wrong_s),
             hold_s=amount(self.parameters, "hold_s", usual.hold_s))
@@ -41,12 +48,12 @@ class PilotOutput(DetectionModule):
     @on(topics.COMMAND)
     def command(self, message: m.Twist, _header: Header) -> None:
         """Hear what Osmosis Control asks for."""
-        self.monitor.asked(message.linear_mps, message.angular_radps, self.clock.now())
+        self.monitor.asked(message.linear_mps, message.angular_radps, self.clock.now(), "active")
 
     @on(topics.STANDBY_COMMAND)
     def standby(self, message: m.Twist, _header: Header) -> None:
         """Hear what its standby asks for."""
-        self.monitor.asked(message.linear_mps, message.angular_radps, self.clock.now())
+        self.monitor.asked(message.linear_mps, message.angular_radps, self.clock.now(), "standby")
 
     @on(topics.TELEOP_COMMAND)
     def joystick(self, message: m.Twist, _header: Header) -> None:

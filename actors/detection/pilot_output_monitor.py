@@ -3,7 +3,8 @@
 The Safety Pilot only ever takes away: it lets a command pass, slows it down, or stops. So each
 component of what the base gets is explained by a command that was given a moment ago, between that
 and zero; exactly that one, while the pilot says that commands pass unchanged; and nothing but zero
-while it says that it stops.
+while it says that it stops. When a computer of the command falls silent the pilot goes on with its
+last one for a while, and that one explains what it sends for as long.
 
 What the pilot sends at once upon a command may arrive here before the command does. So an output
 is judged when the next one arrives, a period later, when all that explains it has come. One that
@@ -16,6 +17,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from itertools import chain, takewhile
+
+from actors.detection.plausible import is_possible
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +28,7 @@ class PilotLimits:
 
     Args:
         recent_s: a command younger than this explains an output.
+        held_s: so does the last one of a computer of the command, so long: the pilot's timeout.
         rounding: relative and absolute difference that is none.
         wrong_s: how long outputs may be without explanation.
         timeout_s: how old the newest output may be.
@@ -32,6 +37,7 @@ class PilotLimits:
     """
 
     recent_s: float = 0.3
+    held_s: float = 0.3
     rounding: float = 1e-3
     wrong_s: float = 0.1
     timeout_s: float = 0.3
@@ -60,6 +66,7 @@ class PilotOutputMonitor:
         self._pilot = pilot
         self._incarnation = 0
         self._asked: deque[tuple[float, float, float]] = deque(maxlen=64)
+        self._held: dict[str, tuple[float, float, float]] = {}
         self._newest_s = -math.inf
         self._first_due_s = start_s + grace_s
         self._last: tuple[float, float, float] | None = None
@@ -71,8 +78,8 @@ class PilotOutputMonitor:
 
     @property
     def known(self) -> bool:
-        """Whether an output was heard, or missed."""
-        return self._known or self.active or self._newest_s > -math.inf
+        """Whether a fresh output was heard, or missed."""
+        return self._known or self.active
 
     @property
     def due_s(self) -> float:
@@ -90,9 +97,13 @@ class PilotOutputMonitor:
         if now_s >= self._overdue_s and not self.active:
             self._accuse(f"no fresh command for the base for {self.limits.timeout_s:g} s")
 
-    def asked(self, linear_mps: float, angular_radps: float, now_s: float) -> None:
-        """Take a command that was given to the pilot, by whomever."""
-        self._asked.append((now_s, linear_mps, angular_radps))
+    def asked(self, linear_mps: float, angular_radps: float, now_s: float,
+              computer: str = "") -> None:
+        """Take a command given to the pilot: by a computer of it, or by a joystick ("")."""
+        asked = (now_s, linear_mps, angular_radps)
+        self._asked.append(asked)
+        if computer:
+            self._held[computer] = asked
 
     def said(self, *, stopped: bool, reason: str, now_s: float) -> None:
         """Take the pilot's own word: whether it stops the robot, and why commands are changed."""
@@ -109,8 +120,10 @@ class PilotOutputMonitor:
             self._wrong_since_s = math.inf
             self._said_s = now_s
             self._last = None
-        self._newest_s = max(self._newest_s, min(stamp_s, now_s))
+        if is_possible(stamp_s, now_s):
+            self._newest_s = max(self._newest_s, min(stamp_s, now_s))
         fresh = now_s < self._overdue_s
+        self._known = self._known or (fresh and self._newest_s > -math.inf)
         last, self._last = self._last, (now_s, linear_mps, angular_radps)
         wrong = self._unexplained(*last) if last is not None else ""
         self._wrong_since_s = min(self._wrong_since_s, now_s) if wrong else math.inf
@@ -137,9 +150,10 @@ class PilotOutputMonitor:
             return f"{_shown(linear_mps, angular_radps)} while the safety pilot says that it stops"
         exactly = self._says_unchanged and has_said
         moves = turns = False
-        for asked_s, linear_asked, angular_asked in reversed(self._asked):
-            if sent_s - asked_s > limits.recent_s:
-                break
+        recent = takewhile(lambda asked: sent_s - asked[0] <= limits.recent_s,
+                           reversed(self._asked))
+        held = (asked for asked in self._held.values() if sent_s - asked[0] <= limits.held_s)
+        for _, linear_asked, angular_asked in chain(recent, held):
             moves = moves or self._explains(linear_asked, linear_mps, exactly=exactly)
             turns = turns or self._explains(angular_asked, angular_radps, exactly=exactly)
             if moves and turns:

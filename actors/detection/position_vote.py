@@ -22,6 +22,7 @@ import math
 from dataclasses import dataclass
 
 from actors.detection.geofence import Fix
+from actors.detection.plausible import AHEAD_S, is_possible, is_sane
 
 GPS = "GPS"
 WHEELS = "dead reckoning"
@@ -75,9 +76,9 @@ class Track:
         self._wheels_rad = 0.0
         self._fallback_rad = 0.0  # from the wheels' heading to that in `map`, for want of an IMU
 
-    def imu(self, stamp_s: float, yaw_rad: float, rate_radps: float) -> None:
+    def imu(self, stamp_s: float, yaw_rad: float, rate_radps: float, now_s: float) -> None:
         """Take the IMU's heading."""
-        if stamp_s > self._imu[0] and math.isfinite(yaw_rad + rate_radps):
+        if stamp_s > self._imu[0] and is_possible(stamp_s, now_s) and is_sane(yaw_rad, rate_radps):
             self._imu = (stamp_s, yaw_rad, rate_radps)
 
     @property
@@ -88,9 +89,10 @@ class Track:
             return yaw_rad + self._align_rad
         return self._fallback_rad + self._wheels_rad
 
-    def odometry(self, stamp_s: float, yaw_rad: float, linear_mps: float) -> float:
+    def odometry(self, stamp_s: float, yaw_rad: float, linear_mps: float, now_s: float) -> float:
         """Take odometry; return the way made since the last, m."""
-        if not stamp_s > self.stamp_s or not math.isfinite(yaw_rad + linear_mps):
+        if not stamp_s > self.stamp_s or not is_possible(stamp_s, now_s) \
+                or not is_sane(yaw_rad, linear_mps):
             return 0.0
         dt_s = stamp_s - self.stamp_s
         self.stamp_s = stamp_s
@@ -221,8 +223,8 @@ class PositionVote:
         return True
 
     def _usable(self, witness: Witness, stamp_s: float, place: Place, now_s: float) -> bool:
-        return (stamp_s > witness.stamp_s and math.isfinite(sum(place))
-                and abs(now_s - stamp_s) <= self.limits.gps_fresh_s)
+        return (stamp_s > witness.stamp_s and is_sane(*place)
+                and -AHEAD_S <= now_s - stamp_s <= self.limits.gps_fresh_s)
 
     def _forget_s(self, witness: Witness) -> float:
         """While it is not clear who is wrong, and later of who is, nothing is taken for usual.

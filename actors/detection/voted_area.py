@@ -49,9 +49,9 @@ class VotedPosition:
         self._fix: Fix | None = None
         self.by_gps = False
 
-    def odometry(self, stamp_s: float, yaw_rad: float, linear_mps: float) -> None:
+    def odometry(self, stamp_s: float, yaw_rad: float, linear_mps: float, now_s: float) -> None:
         """Take the way that the wheels made."""
-        self._since_m += self.vote.track.odometry(stamp_s, yaw_rad, linear_mps)
+        self._since_m += self.vote.track.odometry(stamp_s, yaw_rad, linear_mps, now_s)
 
     def gps(self, fix: Fix, stamp_s: float, now_s: float) -> None:
         """Take a GPS fix."""
@@ -121,7 +121,8 @@ class VotedArea(DetectionModule):
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
         """Hear the heading."""
-        self._where.vote.track.imu(header.stamp, message.yaw_rad, message.yaw_rate_radps)
+        self._where.vote.track.imu(
+            header.stamp, message.yaw_rad, message.yaw_rate_radps, self.clock.now())
 
     @on(topics.ABSOLUTE_POSE)
     def absolute_pose(self, message: m.Pose, header: Header) -> None:
@@ -140,8 +141,9 @@ class VotedArea(DetectionModule):
     @on(topics.ODOMETRY)
     def odometry(self, message: m.Odometry, header: Header) -> None:
         """Hear the way that the wheels made; look, if GPS gives no occasion."""
-        self._where.odometry(header.stamp, message.pose.yaw_rad, message.twist.linear_mps)
-        waited_s = self.clock.now() - self._looked_s
+        now_s = self.clock.now()
+        self._where.odometry(header.stamp, message.pose.yaw_rad, message.twist.linear_mps, now_s)
+        waited_s = now_s - self._looked_s
         if waited_s >= (1.5 if self._where.by_gps else 0.99) * GPS_PERIOD_S:
             self._look()
 

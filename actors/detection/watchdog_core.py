@@ -16,6 +16,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from operator import attrgetter
 
+from actors.detection.plausible import is_possible
+
 
 @dataclass(slots=True)
 class _Life:
@@ -85,8 +87,9 @@ class WatchdogCore:
             return
         if incarnation > life.incarnation:
             self._succeed(life, incarnation)
-        elif life.gone_s is not None and stamp_s <= life.gone_s:
-            return  # sent before it died, and under way since
+        elif life.gone_s is not None and (
+                stamp_s <= life.gone_s or not is_possible(stamp_s, now_s)):
+            return  # sent before it died, and under way since; or nobody knows when
         life.gone_s = None
         life.heard = True
         life.failure = ""

@@ -4,26 +4,16 @@ Whoever commands the wheels is wrong, and until its successor has settled nobody
 recovery goes past it as the emergency stop does, but lets go by itself: when the new Safety Pilot
 lives, it is that which stops the robot until it knows all orders.
 
-It does not claim the brakes, since an emergency stop must have nobody to wait for. Instead it asks
-whether one is in force before it lets go, and then leaves the brake as it is.
+It does not claim the brakes, since an emergency stop must have nobody to wait for. Each may hold
+the brake and let go of it: the base brakes as long as anybody holds it (`topics.BRAKE`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from actors import topics
-from actors.messages import (
-    BrakeCommand,
-    RecoveryCommand,
-    RecoveryPhase,
-    RecoveryReport,
-    RecoveryState,
-)
+from actors.messages import BrakeCommand, RecoveryCommand, RecoveryPhase
 from actors.recovery.respawn import Respawn
-from actors.runtime.actor import Context, Header, on
-from actors.runtime.topic import Topic
+from actors.runtime.actor import Context
 
 
 class RespawnBraked(Respawn):
@@ -33,7 +23,6 @@ class RespawnBraked(Respawn):
 
     Parameters:
         nodes: names of the nodes that it may respawn.
-        brakes_of: names of the recoveries whose brake it must not release; RM1 by default.
     """
 
     outputs = (*Respawn.outputs, topics.BRAKE)
@@ -42,21 +31,6 @@ class RespawnBraked(Respawn):
         super().__init__(context)
         # An earlier life may have died with the brake held.
         self._holds = context.incarnation > 1
-        self._others: dict[str, bool] = {}
-
-    @classmethod
-    def names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]
-    ) -> tuple[str, ...] | None:
-        """Hear of the recoveries that brake as well."""
-        if topic is topics.RECOVERY:
-            return tuple(parameters.get("brakes_of", ("RM1",)))
-        return super().names(topic, name, parameters)
-
-    @on(topics.RECOVERY)
-    def other(self, message: RecoveryReport, header: Header) -> None:
-        """Hear whether somebody else holds the brake."""
-        self._others[header.source] = message.state is RecoveryState.ACTIVATED
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Brake, then ask for the nodes."""
@@ -85,6 +59,6 @@ class RespawnBraked(Respawn):
             self._brake(engaged=True, why="the safety pilot is being respawned")
 
     def _brake(self, *, engaged: bool, why: str) -> None:
-        if engaged or (self._holds and not any(self._others.values())):
+        if engaged or self._holds:
             self.publish(topics.BRAKE, BrakeCommand(engaged, why))
         self._holds = engaged

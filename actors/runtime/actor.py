@@ -136,7 +136,7 @@ class Actor:
         self.clock = context.clock
         self.parameters = context.parameters
         self._bus = context.bus
-        self._guard = ArrivalGuard()
+        self._guard = ArrivalGuard(context.clock.now)
         self._injections = InjectionDesk(self)
         self._in_force = self._injections.gate.in_force
         self._last_sent = self._injections.gate.last

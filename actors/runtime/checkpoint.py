@@ -12,6 +12,7 @@ The paper's controller has no checkpoints ("it hasn't been implemented yet", sec
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
@@ -87,6 +88,8 @@ class CheckpointStore(Protocol):
 
     def load(self) -> Loaded:
         """Return what was kept, and claim the store: older incarnations are refused from now on.
+
+        What can be read is returned even if the store cannot be claimed; the first save claims it.
 
         Raises:
             SupersededError: a newer incarnation has claimed it.
@@ -279,7 +282,7 @@ class Keeper:
         self._used = True
         self._began_s = self._now()
         try:
-            loaded = self._store.load()
+            loaded = self._load()
         except CheckpointError as error:
             self._superseded = isinstance(error, SupersededError)
             self._report(f"{error}; starting without a checkpoint")
@@ -340,6 +343,13 @@ class Keeper:
     def close(self) -> None:
         """Close the store."""
         self._store.close()
+
+    def _load(self) -> Loaded:
+        """Load, again if somebody holds the lock; each attempt waits as long as the store does."""
+        for _ in range(BUSY_TIMES - 1):
+            with contextlib.suppress(BusyError):
+                return self._store.load()
+        return self._store.load()
 
     def _note(self, failures: int) -> None:
         self._failures = failures

@@ -20,7 +20,9 @@ this costs two microseconds and leaves no rate of missed ones to argue about. A 
 finds damaged is set aside, and what could still be read of it is used.
 
 *Claimed.* Whoever loads claims the file for its incarnation, and every save asks, in the same
-transaction, whether the claim still stands: an older process that lives on is refused.
+transaction, whether the claim still stands: an older process that lives on is refused. What can be
+read is used even if the claim fails, for a lock or a full disk; then the first save claims, and
+its generation follows all that the older process has written by then.
 
 Assumed: the directory is on a local file system (SQLite's locks and shared log index do not work
 over most network ones), and the disk keeps what it has acknowledged to have synced.
@@ -113,24 +115,9 @@ class SqliteCheckpoints:
     # -- the protocol ---------------------------------------------------------------------------
 
     def load(self) -> Loaded:
-        """Return what was kept, and claim the file; see `CheckpointStore`."""
-        problems: list[str] = []
-        records: list[Record] = []
-        failures = 0
-        try:
-            self._open()
-            if self._is_ours():
-                records, problems = self._read()
-            failures = self._claim()
-        except sqlite3.Error as error:
-            if not _is_damage(error):
-                self._close_connection()
-                raise self._error(error) from None
-            problems.append(self._set_aside(error))
-            self._begin_anew()
-        records.sort(key=lambda record: -record.generation)
-        self._generation = max((record.generation for record in records), default=0)
-        return Loaded(tuple(records), tuple(problems), failures)
+        """Return what was kept, and claim the file if that is possible; see `CheckpointStore`."""
+        loaded, _ = self._load_and_claim()
+        return loaded
 
     def save(self, version: int, state: bytes) -> None:
         """Keep a state; see `CheckpointStore`."""
@@ -200,11 +187,43 @@ class SqliteCheckpoints:
     def _ready(self) -> sqlite3.Connection:
         """Return the connection, opened and claimed for this incarnation if it was not."""
         if self._connection is None:
-            loaded = self.load()
+            loaded, unclaimed = self._load_and_claim()
+            if unclaimed:
+                raise unclaimed
             if loaded.problems:
                 self._trouble = "; ".join(loaded.problems)
         assert self._connection is not None  # noqa: S101 for the type checker
         return self._connection
+
+    def _load_and_claim(self) -> tuple[Loaded, CheckpointError | None]:
+        """Return what was kept, and why the file could not be claimed; then it is not open."""
+        problems: list[str] = []
+        records: list[Record] = []
+        failures = 0
+        was_read = False
+        unclaimed: CheckpointError | None = None
+        try:
+            self._open()
+            owner = self._owner()
+            if owner is not None and owner[0] == self._run:
+                if owner[1] > self._incarnation:
+                    raise self._superseded()
+                failures = owner[2]
+                records, problems = self._read()
+            was_read = True
+            self._claim()
+        except sqlite3.Error as error:
+            if _is_damage(error):
+                problems.append(self._set_aside(error))
+                self._begin_anew()
+            else:
+                self._close_connection()
+                unclaimed = self._error(error)
+                if not was_read:
+                    raise unclaimed from None
+        records.sort(key=lambda record: -record.generation)
+        self._generation = max((record.generation for record in records), default=0)
+        return Loaded(tuple(records), tuple(problems), failures), unclaimed
 
     def _open(self) -> None:
         if self._connection is not None:
@@ -276,12 +295,8 @@ class SqliteCheckpoints:
         row = self._connection.execute("SELECT run, incarnation, failures FROM owner").fetchone()
         return row and (str(row[0]), int(row[1]), int(row[2]))
 
-    def _is_ours(self) -> bool:
-        owner = self._owner()
-        return owner is not None and owner[0] == self._run
-
-    def _claim(self) -> int:
-        """Claim the file and return the failures noted in it."""
+    def _claim(self) -> None:
+        """Claim the file; the failures noted in it stay, the states of another run do not."""
         assert self._connection is not None  # noqa: S101
         failures = 0
         with _transaction(self._connection) as connection:
@@ -294,7 +309,6 @@ class SqliteCheckpoints:
                 failures = owner[2]
             connection.execute("REPLACE INTO owner VALUES (0, ?, ?, ?, 0)",
                                (self._run, self._incarnation, failures))
-        return failures
 
     def _read(self) -> tuple[list[Record], list[str]]:
         """Return the sound records and what is wrong with others; each is read by itself."""

@@ -1,7 +1,8 @@
 """The wire format: a msgpack array of header and body, and the guard that checks what arrives.
 
 `[source, incarnation, sequence, stamp, body]`. The guard refuses what does not decode, what an
-older incarnation of a node still sends after its successor was heard, and what comes twice.
+older incarnation of a node still sends after its successor was heard, what comes twice, and what is
+stamped ahead of now: it would stay fresh for ever, and shut out all that is true after it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ B = TypeVar("B")
 UNREADABLE = (ValueError, RecursionError)
 """What decoding the bytes of a stranger raises: msgspec's errors are ValueErrors, and so is that of
 a text which is no UTF-8; nesting without end is the other."""
+
+AHEAD_S = 0.1
+"""A stamp this far ahead of now (simulated seconds) is no jitter of a clock but wrong."""
 
 _REMEMBERED_COMMANDS = 64
 
@@ -76,9 +80,14 @@ the topics of which only the newest counts; of commands, by key, the last number
 
 
 class ArrivalGuard:
-    """Decides for each arriving payload whether the actor may see it."""
+    """Decides for each arriving payload whether the actor may see it.
 
-    def __init__(self) -> None:
+    Args:
+        now: returns simulated seconds.
+    """
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
         self._lives: dict[str, Life] = {}
 
     def receiver(
@@ -90,17 +99,21 @@ class ArrivalGuard:
         Args:
             topic: Which.
             take: Called with the key and the message, unless it is a duplicate or was overtaken.
-            refuse: Called with the key and the reason, if it does not decode or comes from a
-                superseded incarnation.
+            refuse: Called with the key and the reason, if it does not decode, is stamped ahead of
+                now, or comes from a superseded incarnation.
         """
         unpack, kind = _decoders.get(topic.type) or _decoder(topic.type), topic.type.__name__
         lives, meet, is_command = self._lives, self._meet, topic.qos is Qos.COMMAND
+        now = self._now
 
         def receive(key: str, payload: bytes) -> None:  # made of every message
             try:
                 message = unpack(payload)
             except UNREADABLE as error:
                 refuse(key, f"not a {kind}: {error}")
+                return
+            if not message.stamp - now() <= AHEAD_S:  # nor is one that is no number
+                refuse(key, f"stamped {message.stamp - now():.2f} s ahead of now")
                 return
             life = lives.get(message.source)
             if life is None or life[0] != message.incarnation:

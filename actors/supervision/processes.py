@@ -22,6 +22,10 @@ from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableE
 __all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerUnavailableError"]
 
 
+_PID_LIMIT = 1 << 22
+"""No process of Linux has a higher number."""
+
+
 class Living(NamedTuple):
     """A process of the run that is there already."""
 
@@ -60,6 +64,7 @@ class Processes(Protocol):
 
         Raises:
             SpawnerUnavailableError: Nobody could do it now.
+            OSError: Likewise, for want of memory or descriptors.
         """
 
     def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
@@ -67,6 +72,7 @@ class Processes(Protocol):
 
         Raises:
             ProcessLookupError: It is gone already.
+            OSError: There is no descriptor left to hold it by.
         """
 
     def adapt(self, adapted: AdaptedSystem) -> None:
@@ -140,10 +146,13 @@ class OsProcesses:
 
     def fork(self, names: tuple[str, ...], incarnation: int) -> int:
         """Have a spawner fork; raises SpawnerUnavailableError if none answers."""
-        return self._spawner.fork(names, incarnation)
+        return self._spawner.fork(names, incarnation, orphan=lambda: next(
+            (p.pid for p in self.living() if (p.names, p.incarnation) == (names, incarnation)), 0))
 
     def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
         """Open a pidfd; raises ProcessLookupError if there is no such process."""
+        if not 0 < pid < _PID_LIMIT:  # as a heartbeat may claim; no lack of descriptors
+            raise ProcessLookupError(pid)
         return _OsHandle(pid, ended)
 
     def adapt(self, adapted: AdaptedSystem) -> None:

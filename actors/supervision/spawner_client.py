@@ -1,7 +1,8 @@
 """The supervisor's and the launcher's side of the spawners: fork through whichever lives.
 
 A spawner that does not answer in time is killed before the other one is asked, so that no
-second process of the same incarnation can appear later.
+second process of the same incarnation can appear later. It may have forked before: its child is
+looked for.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import contextlib
 import os
 import signal
 import socket
+from collections.abc import Callable
 
 import msgspec
 
@@ -42,11 +44,20 @@ class SpawnerClient:
         self._port = port
         self._connections: dict[str, socket.socket] = {}
         self._adapt: Adapt | None = None
+        self._unanswered = False
 
     def fork(
-        self, names: tuple[str, ...], incarnation: int, known: dict[str, int] | None = None
+        self, names: tuple[str, ...], incarnation: int, known: dict[str, int] | None = None,
+        orphan: Callable[[], int] = lambda: 0,
     ) -> int:
         """Fork a process for the named actors and return its pid.
+
+        Args:
+            names: of the actors.
+            incarnation: of the process.
+            known: see `ForkRequest`.
+            orphan: returns the pid of that process if it is there already, else 0; asked when a
+                spawner heard the request and did not answer.
 
         Raises:
             SpawnerUnavailableError: no spawner could do it.
@@ -58,6 +69,8 @@ class SpawnerClient:
             reply = self.ask(name, ForkRequest(names, incarnation, known or {}))
             if reply is not None and reply.child:
                 return reply.child
+            if self._unanswered and (child := orphan()):
+                return child
             failures.append(f"spawner_{name}: {reply.error if reply else 'no answer'}")
         raise SpawnerUnavailableError("; ".join(failures))
 
@@ -78,6 +91,7 @@ class SpawnerClient:
 
     def ask(self, name: str, request: Request) -> Reply | None:
         """Send a request and return the reply, or None if the spawner is dead or was hung."""
+        self._unanswered = False
         for _ in range(2):  # a kept connection may be to a spawner that has been replaced
             connection = self._connections.pop(name, None)
             requests = [request]
@@ -90,6 +104,7 @@ class SpawnerClient:
             try:
                 for one in requests:
                     connection.send(msgspec.json.encode(one))
+                    self._unanswered = True
                     data = connection.recv(MAX_DATAGRAM)
             except TimeoutError:
                 _kill_peer(connection)
@@ -98,6 +113,7 @@ class SpawnerClient:
             except OSError:
                 data = b""
             if data:
+                self._unanswered = False
                 self._connections[name] = connection
                 return msgspec.json.decode(data, type=Reply)
             connection.close()
@@ -110,7 +126,10 @@ class SpawnerClient:
         self._connections.clear()
 
     def _connect(self, name: str) -> socket.socket | None:
-        connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        except OSError:  # no descriptor left
+            return None
         connection.settimeout(ANSWER_TIMEOUT_S)
         try:
             connection.connect(address(self._port, name))

@@ -15,7 +15,8 @@ silent Safety Pilot trips the dead man.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,8 +34,10 @@ from actors.messages import (
     RespawnRequest,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.timer import Timer
 from actors.runtime.topic import Topic
 from actors.supervision.processes import (
+    Living,
     OsProcesses,
     Processes,
     ProcessHandle,
@@ -56,21 +59,35 @@ _CHECK_S = 0.1
 
 _RETRY_S = 0.05
 _DEAD = (NodeState.CRASHED, NodeState.GIVEN_UP)
+_HEALTHY = (NodeState.RUNNING, NodeState.STARTING)
 
 
 @dataclass(slots=True)
 class _Process:
-    """One process of the run as the supervisor knows it. Times are the event loop's seconds."""
+    """One process of the run as the supervisor knows it. Times are the event loop's seconds.
+
+    Attributes:
+        unheld: It may be there, but there was no descriptor left to hold it by.
+        highest: The highest incarnation that there was.
+        next_step: Of its respawn, while that is under way; there is never more than one.
+    """
 
     unit: Unit
     policy: RestartPolicy = field(default_factory=RestartPolicy)
     pid: int = 0
     handle: ProcessHandle | None = None
+    unheld: bool = False
     incarnation: int = 0
+    highest: int = 0
     state: NodeState = NodeState.CRASHED
     started_s: float = 0.0
     heard_s: dict[str, float] = field(default_factory=dict)
-    respawning: bool = False
+    next_step: Timer | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The actors in it."""
+        return tuple(n.name for n in self.unit.nodes)
 
 
 class Supervisor(Actor):
@@ -89,7 +106,8 @@ class Supervisor(Actor):
         self._processes = {u.name: _Process(u) for u in self._layout.units.values()}
         for node, incarnation in context.shared.get("known_incarnations", {}).items():
             if node in self._layout.unit_of:
-                self._processes[self._layout.unit_of[node]].incarnation = incarnation
+                process = self._processes[self._layout.unit_of[node]]
+                process.incarnation = process.highest = incarnation
         adapted: AdaptedSystem | None = context.shared.get("adapted")
         self._version = (0, adapted.version if adapted else 0)
         if adapted is not None:
@@ -109,20 +127,24 @@ class Supervisor(Actor):
 
     def on_start(self) -> None:
         """Adopt what lives, start what does not, in the order of the spec."""
-        living = {p.names: p for p in self._machine.living()}
+        living = self._machine.living()
         for process in self._processes.values():
-            found = living.get(tuple(n.name for n in process.unit.nodes))
-            if found is not None:
-                self._adopt(process, found.pid, found.incarnation)
-            elif self.context.incarnation == 1 or self._owns(process):
+            if self._adopt_living(process, living):
+                continue
+            if self.context.incarnation == 1 or self._owns(process):
                 self._spawn(process, by=self.name)
         self._publish_table()
 
     def on_stop(self) -> None:
-        """End all processes in reverse order: SIGTERM, then SIGKILL for those that linger."""
+        """End all processes in reverse order: SIGTERM, then SIGKILL for those that linger.
+
+        After a failure nobody is ended: the next life adopts them.
+        """
         handles = []
         for process in reversed(self._processes.values()):
-            if process.handle is not None and process.state is not NodeState.CRASHED:
+            if not self._stopping:
+                self._unwatch(process)
+            elif process.handle is not None and process.state is not NodeState.CRASHED:
                 process.handle.ignore()
                 handles.append(process.handle)
         self._machine.end(handles, STOP_GRACE_S)
@@ -133,12 +155,17 @@ class Supervisor(Actor):
     @on(topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
         """Note that a node's loop turns; adopt a process that was not known."""
-        process = self._processes[self._layout.unit_of[header.source]]
+        unit = self._layout.unit_of.get(header.source)
+        if unit is None:
+            return
+        process = self._processes[unit]
         if header.incarnation > process.incarnation or (
                 header.incarnation == process.incarnation and process.pid != message.pid
                 and process.state in _DEAD):
             self._adopt(process, message.pid, header.incarnation)
-        if header.incarnation != process.incarnation:
+        if (header.incarnation, message.pid) != (process.incarnation, process.pid):
+            return
+        if process.next_step is not None:  # said before it was killed
             return
         process.heard_s[header.source] = self._loop.time()
         if process.state in (NodeState.STARTING, NodeState.STOPPED, NodeState.WEDGED):
@@ -193,11 +220,8 @@ class Supervisor(Actor):
                 request.node, "refused", 0, 0, request.by, f"no such node: {request.node!r}"))
             return
         process = self._processes[unit]
-        healthy = process.state in (NodeState.RUNNING, NodeState.STARTING)
-        if healthy and process.incarnation > request.failed_incarnation:
+        if process.state in _HEALTHY and process.incarnation > request.failed_incarnation:
             self._event(process, "respawned", request.by, "already")
-            return
-        if process.respawning:
             return
         self._respawn(process, request.by)
 
@@ -249,10 +273,20 @@ class Supervisor(Actor):
     def _exited(self, process: _Process, pid: int) -> None:
         if process.pid != pid:  # it was replaced while the news waited in the mailbox
             return
+        self._process_ended(process)
+
+    def _process_ended(self, process: _Process, detail: str = "") -> None:
         self._unwatch(process)
-        if process.respawning:
+        if process.next_step is not None or process.state is NodeState.GIVEN_UP:
             return
-        self._event(process, "crashed", self.name)
+        self._event(process, "crashed", self.name, detail)
+        if process.state is NodeState.STARTING:
+            # Never heard: another life that nobody holds may have its port.
+            try:
+                if self._adopt_living(process, self._machine.living()):
+                    return
+            except OSError as error:  # no descriptor left to look with
+                self.report_diagnostic("search", str(error), process.unit.name)
         self._lost(process, NodeState.CRASHED)
 
     def _owns(self, process: _Process) -> bool:
@@ -264,6 +298,8 @@ class Supervisor(Actor):
     # -- acting ---------------------------------------------------------------------------------
 
     def _respawn(self, process: _Process, by: str) -> None:
+        if process.next_step is not None:
+            return
         delay_s = process.policy.delay_s(self._loop.time())
         if process.handle is not None:
             process.handle.ignore()
@@ -274,59 +310,90 @@ class Supervisor(Actor):
                 f"{process.policy.intensity} restarts in {process.policy.period_s:.0f} s"))
             self._publish_table()
             return
-        process.respawning = True
+        if process.state in _HEALTHY:
+            process.state = NodeState.CRASHED
         if delay_s > 0 or not _is_gone(process):
             # The port is free only when the old process is: a few more milliseconds.
-            self.call_later(max(delay_s, 0.002) * self.clock.rate,
-                            lambda: self._finish_respawn(process, by))
+            self._go_on(process, max(delay_s, 0.002), lambda: self._finish_respawn(process, by))
         else:
             self._finish_respawn(process, by)
 
+    def _go_on(self, process: _Process, delay_s: float, step: Callable[[], None]) -> None:
+        process.next_step = self.call_later(delay_s * self.clock.rate, step)
+
     def _finish_respawn(self, process: _Process, by: str) -> None:
         if not _is_gone(process):
-            self.call_later(0.002 * self.clock.rate, lambda: self._finish_respawn(process, by))
+            self._go_on(process, 0.002, lambda: self._finish_respawn(process, by))
             return
         process.policy.restarted(self._loop.time())
         self._spawn(process, by)
 
     def _spawn(self, process: _Process, by: str) -> None:
-        names = tuple(n.name for n in process.unit.nodes)
-        incarnation = process.incarnation + 1
+        incarnation = process.highest + 1
         try:
-            pid = self._machine.fork(names, incarnation)
-        except SpawnerUnavailableError as error:
+            pid = self._machine.fork(process.names, incarnation)
+        except (SpawnerUnavailableError, OSError) as error:
             self.report_diagnostic("fork", str(error), process.unit.name)
-            self.call_later(_RETRY_S * self.clock.rate, lambda: self._spawn(process, by))
-            process.respawning = True
+            self._go_on(process, _RETRY_S, lambda: self._spawn(process, by))
             return
-        first = process.incarnation == 0
-        process.respawning = False
-        self._watch(process, pid, incarnation)
+        first = process.highest == 0
+        self._take(process, pid, incarnation)
         process.state = NodeState.STARTING
         process.started_s = self._loop.time()
         self._event(process, "started" if first else "respawned", by)
         self._publish_table()
+        self._hold(process, pid)
 
     def _adopt(self, process: _Process, pid: int, incarnation: int) -> None:
-        process.respawning = False
-        self._watch(process, pid, incarnation)
-        if process.pid:
-            process.state = NodeState.RUNNING
-            now = self._loop.time()
-            process.heard_s = {n.name: now for n in process.unit.nodes}
-            self._event(process, "adopted", self.name)
+        self._take(process, pid, incarnation)
+        process.state = NodeState.RUNNING
+        now = self._loop.time()
+        process.heard_s = dict.fromkeys(process.names, now)
+        self._event(process, "adopted", self.name)
+        self._hold(process, pid)
 
-    def _watch(self, process: _Process, pid: int, incarnation: int) -> None:
+    def _adopt_living(self, process: _Process, living: Sequence[Living]) -> bool:
+        """Adopt the highest life that is there and end the others; False if there is none."""
+        found = sorted((p for p in living if p.names == process.names),
+                       key=lambda p: p.incarnation, reverse=True)
+        for other in found[1:]:
+            with contextlib.suppress(OSError):  # gone, or for the next search
+                handle = self._machine.hold(other.pid, lambda: None)
+                handle.kill()
+                handle.close()
+        if found:
+            self._adopt(process, found[0].pid, found[0].incarnation)
+        return bool(found)
+
+    def _take(self, process: _Process, pid: int, incarnation: int) -> None:
+        if process.next_step is not None:
+            process.next_step.cancel()
+            process.next_step = None
         self._unwatch(process)
         process.pid, process.incarnation, process.heard_s = pid, incarnation, {}
+        process.highest = max(process.highest, incarnation)
+
+    def _hold(self, process: _Process, pid: int) -> None:
+        if process.pid != pid:  # it was replaced while this waited
+            return
         try:
             process.handle = self._machine.hold(pid, lambda: self._mailbox.put_latest(
                 f"exit {pid}", lambda: self._exited(process, pid)))
         except ProcessLookupError:
-            self._event(process, "crashed", self.name, "it ended before it could be watched")
-            self._lost(process, NodeState.CRASHED)
+            self._process_ended(process, "it ended before it could be watched")
+            return
+        except OSError as error:  # no descriptor left: perhaps later
+            process.unheld = True
+            self.report_diagnostic("hold", str(error), process.unit.name)
+            self.call_later(_RETRY_S * self.clock.rate, lambda: self._hold(process, pid))
+            return
+        process.unheld = False
+        if process.next_step is not None or process.state is NodeState.GIVEN_UP:
+            process.handle.ignore()
+            process.handle.kill()
 
     def _unwatch(self, process: _Process) -> None:
+        process.unheld = False
         if process.handle is not None:
             process.handle.close()
             process.handle = None
@@ -350,4 +417,4 @@ class Supervisor(Actor):
 
 
 def _is_gone(process: _Process) -> bool:
-    return process.handle is None or process.handle.gone()
+    return not process.unheld and (process.handle is None or process.handle.gone())

@@ -13,7 +13,7 @@ from sim.clearance import EXACT_BELOW_M
 
 def distributions(runs: Sequence[Run]) -> list[charts.Chart]:
     """Return the charts of some runs; those without anything to show are left out."""
-    counted = [run for run in runs if run.result.effective]
+    counted = [run for run in runs if run.result.counts]
     faulty = [run for run in counted if run.job.ftm and run.job.faults]
     made = []
     for name, title, words, done in (

@@ -134,6 +134,15 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
         return not self.outcomes or any(outcome.effective for outcome in self.outcomes)
 
     @property
+    def counts(self) -> bool:
+        """Whether it counts: a fault changed something, or the run ended badly all the same.
+
+        A run in which nothing was changed and nothing went wrong survived nothing. One that was
+        unsafe or lost its mission is never left out, whatever its fault is said to have done.
+        """
+        return self.effective or not (self.safe and self.success)
+
+    @property
     def margin_m(self) -> float:
         """The smaller of the two clearances; how far from unsafe the run was."""
         return min(math.inf if m is None else m for m in (self.obstacle_m, self.prohibited_m))

@@ -25,7 +25,7 @@ import msgspec
 from manager.schema import SystemSpec
 from manager.strategies import decide
 from sim.campaign.job import Job
-from sim.campaign.statistics import verdict, worst
+from sim.campaign.statistics import NO_EFFECT, verdict, worst
 from sim.campaign.store import Run
 from sim.scenario import PlannedFault
 
@@ -101,7 +101,7 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
     """One verdict of table IV or V: the paper's, what is expected of us, ours, of how many runs.
 
     Expected is the paper's verdict, but `GOOD` of the full system. `worst_key` is the worst run's,
-    `story` its decisions.
+    `story` its decisions. `ineffective` runs count for nothing else; see `RunResult.counts`.
     """
 
     table: str
@@ -112,6 +112,7 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
     expected: str
     ours: str
     runs: int
+    ineffective: int
     success: int
     safe: int
     worst_key: str
@@ -187,16 +188,18 @@ def cells(runs: Iterable[Run]) -> list[Cell]:
 
 
 def _cell(condition: str, paper: str, runs: Sequence[Run]) -> Cell:
-    bad = worst(runs)
+    counted = [run for run in runs if run.result.counts]
+    bad = worst(counted or runs)
     decisions = [f"{d.t_s:.2f} s {', '.join(d.active) or 'nothing'}: "
                  f"{' and '.join(d.recoveries) or 'nothing to recover'}"
                  for d in bad.result.decisions[:6]]
     return Cell(
         table="IV" if condition == CONDITIONS[0] else "V", fault=bad.job.row,
         obstacles=bad.job.obstacles, condition=condition, paper=paper,
-        expected=GOOD if condition == FULL else paper, ours=verdict(bad), runs=len(runs),
-        success=sum(r.result.success for r in runs),
-        safe=sum(r.result.safe for r in runs), worst_key=bad.job.key,
+        expected=GOOD if condition == FULL else paper,
+        ours=verdict(bad) if counted else NO_EFFECT, runs=len(runs),
+        ineffective=len(runs) - len(counted), success=sum(r.result.success for r in counted),
+        safe=sum(r.result.safe for r in counted), worst_key=bad.job.key,
         worst_fault=bad.job.text(), story="; ".join(decisions), reasons=bad.result.reasons)
 
 

@@ -122,14 +122,18 @@ def headline(runs: Sequence[Run]) -> str:
     if not faulty:
         return (f"{_runs(len(runs))} without a fault: {_many(runs, 'unsafe')}, "
                 f"{_many(runs, 'complete')}.")
+    odd = sum(run.result.counts and not run.result.effective for run in faulty)
     parts: list[str] = []
     for ftm, name in ((True, "With fault tolerance"), (False, "Without fault tolerance")):
-        counted = [run for run in faulty if run.job.ftm == ftm and run.result.effective]
+        counted = [run for run in faulty if run.job.ftm == ftm and run.result.counts]
         if counted:
-            more = "" if parts else "with an effective fault "
+            more = "" if parts or odd else "with an effective fault "
             parts.append(f"{name} {_many(counted, 'unsafe', more)}; "
                          f"{_many(counted, 'complete')}.")
-    if lost := sum(not run.result.effective for run in faulty):
+    if odd:
+        parts.append(f"In {odd:,} of these the fault had no effect; what ends badly counts all "
+                     "the same.")
+    if lost := sum(not run.result.counts for run in faulty):
         parts.append(f"In {_runs(lost)}{' more' if parts else ''} the fault had no effect.")
     return " ".join(parts).replace(" %", "\N{NO-BREAK SPACE}%")
 
@@ -165,13 +169,14 @@ def _figures(runs: Sequence[Run]) -> list[tuple[str, str, str]]:
     """Return name, value and class of the figures at the top; of runs with FTM and a fault."""
     figures = [("runs in all", f"{len(runs):,}", "")]
     protected = [run for run in runs if run.job.ftm and run.job.faults]
-    if not any(run.result.effective for run in protected):
+    if not any(run.result.counts for run in protected):
         return figures
     row = total(protected, "")
     unsafe = row.safe.of - row.safe.count
     return [
         *figures,
-        ("with FTM and an effective fault", f"{row.safe.of:,}", ""),
+        ("with FTM and a fault, counted", f"{row.safe.of:,}", ""),
+        ("not counted, no effect", f"{row.ineffective:,}", ""),
         ("of these unsafe", f"{unsafe:,}", "bad-text" if unsafe else "good-text"),
         ("mission completed", f"{percent(row.success.share)} %", ""),
         ("detected after, median",

@@ -101,7 +101,7 @@ def search(space: Space, budget: int, run: Run, *, seed: int, at_once: int = 1,
         trials = [study.ask() for _ in range(min(at_once, budget - len(made)))]
         jobs = [space.job(trial, seed) for trial in trials]
         for trial, job, result in zip(trials, jobs, run(jobs), strict=True):
-            study.tell(trial, margin(result) if result.effective else 2.0)
+            study.tell(trial, margin(result) if result.counts else 2.0)
             made.append((job, result))
             seen(job, result)
     return sorted(made, key=lambda pair: margin(pair[1]))

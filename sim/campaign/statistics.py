@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import msgspec
 
+from sim.campaign.job import Job
 from sim.campaign.store import Run
 
 CONFIDENCE_Z = 1.959963984540054
 """Two-sided 95 %."""
+
+NO_EFFECT = "no effect"
+"""The verdict on a row of which no run counts."""
 
 
 class Rate(msgspec.Struct, frozen=True):
@@ -41,13 +46,15 @@ class Spread(msgspec.Struct, frozen=True):
 class Row(msgspec.Struct, frozen=True, kw_only=True):
     """All runs with one fault under one condition.
 
-    `ineffective` runs, in which the fault changed nothing, count for nothing else.
+    `ineffective` runs, in which the fault changed nothing, count for nothing else, unless they
+    were unsafe or failed: see `RunResult.counts`.
     """
 
     fault: str
     obstacles: int
     ftm: bool
     strategy: str
+    retuned: dict[str, dict[str, Any]]
     runs: int
     ineffective: int
     success: Rate
@@ -104,31 +111,38 @@ def worst(runs: Iterable[Run]) -> Run:
 
 
 def table(runs: Iterable[Run]) -> list[Row]:
-    """Return one row per fault, obstacles, FTM and strategy, in order of first appearance."""
-    rows: dict[tuple[str, int, bool, str], list[Run]] = {}
+    """Return one row per fault and condition, in order of first appearance.
+
+    The condition: obstacles, FTM, strategy, and what was retuned.
+    """
+    rows: dict[tuple[object, ...], list[Run]] = {}
     for run in runs:
         job = run.job
-        rows.setdefault((job.row, job.obstacles, job.ftm, job.strategy), []).append(run)
-    return [_row(*condition, found) for condition, found in rows.items()]
+        retuned = msgspec.json.encode(job.retuned, order="deterministic")
+        rows.setdefault(
+            (job.row, job.obstacles, job.ftm, job.strategy, retuned), []).append(run)
+    return [_row(found[0].job, found) for found in rows.values()]
 
 
 def total(runs: Sequence[Run], name: str) -> Row:
     """Return all runs as one row; there must be one at least."""
-    return _row(name, -1, True, "", list(runs))
+    return _row(Job(row=name, obstacles=-1), runs)
 
 
-def _row(fault: str, obstacles: int, ftm: bool, strategy: str, runs: list[Run]) -> Row:
-    counted = [run for run in runs if run.result.effective]
+def _row(condition: Job, runs: Sequence[Run]) -> Row:
+    counted = [run for run in runs if run.result.counts]
     results = [run.result for run in counted]
     bad = worst(counted or runs)
     return Row(
-        fault=fault, obstacles=obstacles, ftm=ftm, strategy=strategy, runs=len(runs),
+        fault=condition.row, obstacles=condition.obstacles, ftm=condition.ftm,
+        strategy=condition.strategy, retuned=condition.retuned, runs=len(runs),
         ineffective=len(runs) - len(counted),
         success=rate(sum(r.success for r in results), len(results)),
         safe=rate(sum(r.safe for r in results), len(results)),
-        worst=verdict(bad) if counted else "no effect", worst_key=bad.job.key,
+        worst=verdict(bad) if counted else NO_EFFECT, worst_key=bad.job.key,
         stopped_for_good=sum(r.stopped_for_good for r in results),
-        undetected=sum(bool(r.outcomes) and r.detected_after_s is None for r in results),
+        undetected=sum(bool(r.outcomes) and r.effective and r.detected_after_s is None
+                       for r in results),
         false_alarms=sum(r.false_alarms for r in results),
         detected_after_s=spread(r.detected_after_s for r in results),
         recovered_after_s=spread(r.recovered_after_s for r in results),

@@ -1,0 +1,26 @@
+"""Which stamps and readings are possible at all: what is not must do no harm, now or later.
+
+A stamp from the future would shut out all honest ones after it and stay fresh for ever. A number
+beyond all measure would overflow in a square, or stay in a sum for good. Localization has the same
+rules in code of its own (`actors.control.plausible`): who checks shares nothing with the checked.
+"""
+
+from __future__ import annotations
+
+import math
+
+AHEAD_S = 0.1
+"""A stamp this far ahead of now is no clock jitter but wrong; the Safety Pilot's limit, too."""
+
+ABSURD = 1e7
+"""No coordinate in m, no angle in rad and no rate of this robot is as large."""
+
+
+def is_possible(stamp_s: float, now_s: float) -> bool:
+    """Whether something may have been true at `stamp_s`: a number, and not ahead of now."""
+    return math.isfinite(stamp_s) and stamp_s <= now_s + AHEAD_S
+
+
+def is_sane(*values: float) -> bool:
+    """Whether all are numbers, and none is absurd."""
+    return sum(map(abs, values)) < ABSURD
