@@ -17,6 +17,9 @@ from stub_actors import ROOT, free_base_port
 from actors.supervision.process_title import find_processes
 from actors.supervision.run_info import RunInfo, find_runs
 
+HANGS_UP = ("env", "--default-signal=HUP")
+"""Before a command: its terminal can be closed, also where the tests themselves run under nohup."""
+
 
 class RealRun:
     """A `launch.py` process of its own ports and report directory; a context manager."""

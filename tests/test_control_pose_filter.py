@@ -147,6 +147,21 @@ def test_a_fresh_life_with_gps_and_wheels_alone_has_its_heading_from_the_course(
     assert outcome.worst_rad < 0.15
 
 
+def test_a_fresh_life_that_hears_only_what_is_late_already_says_nothing_until_that_is_over():
+    pose_filter = PoseFilter()
+    for step in range(20):  # as on a machine that is busy with starting everybody
+        now_s = 0.05 * step
+        pose_filter.absolute_pose(now_s - 0.25, 1.0, 2.0, 0.5, now_s)
+        assert pose_filter.estimate() is None
+    for step in range(20, 30):
+        now_s = 0.05 * step
+        pose_filter.absolute_pose(now_s, 1.0, 2.0, 0.5, now_s)
+        estimate = pose_filter.estimate()
+        if estimate is not None:
+            assert (estimate.x_m, estimate.y_m) == pytest.approx((1.0, 2.0), abs=0.01)
+    assert estimate is not None
+
+
 def test_a_fresh_life_that_hears_two_positions_that_contradict_each_other_says_nothing():
     outcome = run(("gps-bias", 0.0, FOR_EVER), start_s=4.0)
     assert outcome.told == 0

@@ -8,6 +8,7 @@ import msgspec
 
 from actors import topics
 from actors.control.closures import Closures, without
+from actors.control.plausible import is_sane
 from actors.control.route_search import PlannedRoute, plan_route
 from actors.messages import Blockage, ControlStatus, GoalOrder, Mode, Pose, Route
 from actors.runtime.actor import Actor, Context, Header, every, on
@@ -73,7 +74,9 @@ class GraphPlanner(Actor):
 
     @on(topics.POSE)
     def pose(self, message: Pose, _header: Header) -> None:
-        """Keep the latest pose; plan if a goal was waiting for it."""
+        """Keep the latest pose, if it is one; plan if a goal was waiting for it."""
+        if not is_sane(message.x_m, message.y_m, message.yaw_rad):
+            return
         self._pose = message
         if self._route is None:
             self._plan()

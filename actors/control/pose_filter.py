@@ -384,6 +384,8 @@ class PoseFilter:
         pose, gps, limits = self._pose, self._gps, self.limits
         first_s = self._first_s = now_s if self._first_s is None else self._first_s
         by_pose, by_gps = pose.fresh(now_s), gps.fresh(now_s)
+        if not (by_pose or by_gps):  # what came is late already, on a machine that is busy
+            return
         x_m, y_m, yaw_rad = pose.reading
         heading_sd_rad: float | None = limits.absolute_sd_rad
         if by_pose and by_gps:
