@@ -34,6 +34,7 @@ strategy to walk out of the trap.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from operator import attrgetter
 
 import msgspec
@@ -99,16 +100,13 @@ class Arbiter:
         self._detection = {name: i for i, name in enumerate(mechanisms.detections)}
         self._recovery = {name: i for i, name in enumerate(mechanisms.recoveries)}
         self._needy = {name for name, c in mechanisms.contracts.items() if c.needs}
-        self._detections_for = {
-            recovery: frozenset(
-                detection for ftm in mechanisms.names
-                if any(recovery in way for way in mechanisms.alternatives(ftm))
-                for detection in mechanisms.detect[ftm])
-            for recovery in mechanisms.recoveries}
         self._mechanisms_of = {
             recovery: frozenset(ftm for ftm in mechanisms.names
                                 if any(recovery in way for way in mechanisms.alternatives(ftm)))
             for recovery in mechanisms.recoveries}
+        self._detections_for = {
+            recovery: frozenset(detection for ftm in mine for detection in mechanisms.detect[ftm])
+            for recovery, mine in self._mechanisms_of.items()}
 
     @staticmethod
     def _repaired_by(mechanisms: Mechanisms) -> dict[str, tuple[str, ...]]:
@@ -452,19 +450,14 @@ class Arbiter:
         """
         if not track.wanted or not self.mechanisms.contracts[track.name].kind.repairs:
             return False
-        return any((cause.name, cause.rises) not in track.cause
-                   or not set(cause.nodes) <= set(track.command.nodes)
-                   for cause in self._causes(state, track.name))
+        return self._is_news(state, track)
 
-    def _is_news(self, state: State, track: RecoveryTrack) -> bool:
-        """Tell whether there is more to a new cause than one more life of a node it was told of.
-
-        A repair whose detection does not clear, and blames one life of a node after the other, has
-        not ended the error.
-        """
-        told = {_without_life(node) for node in track.command.nodes}
+    def _is_news(self, state: State, track: RecoveryTrack,
+                 named: Callable[[str], str] = str) -> bool:
+        """Tell whether its causes, with nodes named like this, are more than it was told of."""
+        told = {named(node) for node in track.command.nodes}
         return any((cause.name, cause.rises) not in track.cause
-                   or not {_without_life(node) for node in cause.nodes} <= told
+                   or not {named(node) for node in cause.nodes} <= told
                    for cause in self._causes(state, track.name))
 
     def _release(self, track: RecoveryTrack, chosen: tuple[str, ...], number: int, now: float
@@ -486,8 +479,10 @@ class Arbiter:
         if track.wanted:
             if not self._has_new_cause(state, track):
                 return msgspec.structs.replace(track, draining=False)
-            if not track.acknowledged or not self._is_news(state, track):
-                ordered_s = track.ordered_s  # it has been deaf, or without success, since then
+            if not track.acknowledged or not self._is_news(state, track, _without_life):
+                # It has been deaf since then; or its detection has not cleared and blames one life
+                # of a node after the other: it has not ended the error.
+                ordered_s = track.ordered_s
         elif any(self._blocks(other, track.name, state.decision.recoveries)
                  for other in state.recoveries):
             return track

@@ -61,6 +61,15 @@ async def drives(tab, world, **position: float) -> None:
     await tab.until("document.getElementById('stick-state').textContent === 'you drive'")
 
 
+async def drive_ahead(tab, world, hmi) -> None:
+    """Open the page and hold the key W on its stick."""
+    await tab.show(f"http://{await served(hmi)}/")
+    await tab.until(FREE)
+    await tab.value(f"{PAD}.focus()")
+    await key(tab, "w", down=True)
+    await drives(tab, world, forward=0.5)
+
+
 async def stops(world) -> None:
     await eventually(lambda: world.others.stick[-1] == RELEASED)
     count = len(world.others.stick)
@@ -109,11 +118,7 @@ async def test_the_keyboard_drives_while_a_key_is_held_and_everything_else_stops
 async def test_a_key_that_is_let_go_under_another_one_is_let_go(world, name):
     held = {"Alt": 1, "Control": CONTROL_HELD, "Meta": 4}[name]
     async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
-        await tab.show(f"http://{await served(hmi)}/")
-        await tab.until(FREE)
-        await tab.value(f"{PAD}.focus()")
-        await key(tab, "w", down=True)
-        await drives(tab, world, forward=0.5)
+        await drive_ahead(tab, world, hmi)
         await key(tab, f"{name}Left", down=True, modifiers=held)
         await stops(world)
         await key(tab, "w", down=False, modifiers=held)
@@ -148,11 +153,7 @@ async def test_a_connection_that_is_too_slow_is_told_so_and_not_flooded(world, m
 @pytest.mark.usefixtures("patient")
 async def test_the_page_says_why_teleoperation_does_not_follow_it(world):
     async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
-        await tab.show(f"http://{await served(hmi)}/")
-        await tab.until(FREE)
-        await tab.value(f"{PAD}.focus()")
-        await key(tab, "w", down=True)
-        await drives(tab, world, forward=0.5)
+        await drive_ahead(tab, world, hmi)
         world.others.publish(topics.ERROR_REPORT, m.Diagnostic(
             "teleoperation", "joystick", "not followed: /dev/input/js0 has the stick", "hmi", 1))
         await tab.until("document.getElementById('stick-state').textContent === 'not followed'")
@@ -163,11 +164,7 @@ async def test_the_page_says_why_teleoperation_does_not_follow_it(world):
 
 async def test_a_page_that_hangs_has_let_go_and_is_to_press_again(world):
     async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
-        await tab.show(f"http://{await served(hmi)}/")
-        await tab.until(FREE)
-        await tab.value(f"{PAD}.focus()")
-        await key(tab, "w", down=True)
-        await drives(tab, world, forward=0.5)
+        await drive_ahead(tab, world, hmi)
         await tab.value("{ const end = Date.now() + 700; while (Date.now() < end); }")
         await tab.until(f"{WORDS}.includes('let go of the stick and press again')")
         await stops(world)

@@ -19,15 +19,13 @@ from dataclasses import dataclass, field
 import msgspec
 
 from actors.control.command_pair import CommandPair, PairLimits
+from actors.control.plausible import AHEAD_S
 from actors.control.polyline import NO_POINTS, Array
 from actors.control.swept_path import StoppingRoom, limited
 from actors.messages import PilotMode
 
 STRICTNESS = (PilotMode.AUTO, PilotMode.TELEOPERATION, PilotMode.STOP)
 """Modes from the most permissive to the strictest; declared here, once."""
-
-_FUTURE_S = 0.1
-"""A stamp this far ahead of now is no clock jitter but wrong."""
 
 _STANDING_MPS = 1e-3
 """What a computer of the command may round to."""
@@ -233,7 +231,7 @@ class SafetyGate:
             age_s = now - command.stamp_s
             if not age_s <= limits.command_timeout_s:
                 return f"command is {age_s:.2f} s old, limit {limits.command_timeout_s:.2f} s"
-            if age_s < -_FUTURE_S:
+            if age_s < -AHEAD_S:
                 return f"command is stamped {-age_s:.2f} s ahead of now"
         return ""
 
@@ -314,7 +312,7 @@ class SafetyGate:
                 return "just started, orders may not have arrived yet"
         if self._checks.scan and self._scan_fault:
             return self._scan_fault
-        if self._checks.scan and not -_FUTURE_S <= now - self._scan_s <= limits.scan_timeout_s:
+        if self._checks.scan and not -AHEAD_S <= now - self._scan_s <= limits.scan_timeout_s:
             return "no fresh laser scan"  # nor is one with a stamp from the future, or none
         return ""
 

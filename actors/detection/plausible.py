@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 
-AHEAD_S = 0.1
-"""A stamp this far ahead of now is no clock jitter but wrong; the Safety Pilot's limit, too."""
+from actors.runtime.envelope import AHEAD_S
+
+__all__ = ["AHEAD_S", "is_possible", "is_sane"]
 
 ABSURD = 1e7
 """No coordinate in m, no angle in rad and no rate of this robot is as large."""

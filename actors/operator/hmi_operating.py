@@ -51,6 +51,7 @@ OWN_DEATH_S = 0.2
 _STALE_S = 1.5
 """Simulated seconds after which the Safety Pilot counts as silent; half a real one at least."""
 
+_LET_GO = m.Joystick(0.0, 0.0, dead_man=False)
 _DRIVEN_BY = ("teleoperation", "safety_pilot")
 """Nodes between a page's stick and the base."""
 
@@ -90,7 +91,7 @@ class Operating:
 
     def start(self) -> None:
         """Let go of the stick in case a former life of the HMI died while a page held it."""
-        self._actor.publish(topics.JOYSTICK, m.Joystick(0.0, 0.0, dead_man=False))
+        self._actor.publish(topics.JOYSTICK, _LET_GO)
 
     # -- wishes ---------------------------------------------------------------------------------
 
@@ -207,7 +208,7 @@ class Operating:
 
     def _release(self, why: str) -> None:
         """Tell the robot that the dead man was released, and the pages why if nobody meant it."""
-        self._actor.publish(topics.JOYSTICK, m.Joystick(0.0, 0.0, dead_man=False))
+        self._actor.publish(topics.JOYSTICK, _LET_GO)
         self._note = why
         if why:
             self._state.log(self._now(), "note", f"stick released: {why}")
@@ -219,7 +220,7 @@ class Operating:
             self._ticking.cancel()
             self._ticking = None
         if self._desk.holder is not None:
-            self._actor.publish(topics.JOYSTICK, m.Joystick(0.0, 0.0, dead_man=False))
+            self._actor.publish(topics.JOYSTICK, _LET_GO)
 
     # -- what it hears --------------------------------------------------------------------------
 

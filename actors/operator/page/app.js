@@ -3,7 +3,7 @@
 import { $, Memory, clock, element, pill, say } from "./dom.js";
 import { NO_TOKEN, protocols } from "./access.js";
 import { Camera } from "./camera.js";
-import { DecisionLog, EventLog } from "./log.js";
+import { DecisionLog, EventLog, LINES } from "./log.js";
 import { AirportMap } from "./map.js";
 import { ProcessTable } from "./nodes.js";
 import { Operating } from "./operate.js";
@@ -32,7 +32,6 @@ let toastTimer = 0;
 
 const SILENT_MS = 4000;      // the HMI speaks once a second at least
 const OPENING_MS = 10000;
-const LOG_LINES = 60;
 
 // ---- connection: reconnects by itself, and notices a server that only hangs -------------------
 
@@ -87,7 +86,7 @@ function receive(message) {
 function take(message) {
   link("good", "live");
   for (const [name, value] of Object.entries(message)) {
-    if (LOGS.includes(name)) fresh[name] = [...fresh[name], ...value].slice(-LOG_LINES);
+    if (LOGS.includes(name)) fresh[name] = [...fresh[name], ...value].slice(-LINES);
     else picture[name] = value;
     changed.add(name);
   }

@@ -3,7 +3,7 @@
 
 import { clock, element } from "./dom.js";
 
-const LINES = 60;
+export const LINES = 60;
 
 class Log {
   constructor(list, empty) {
