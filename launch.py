@@ -199,7 +199,8 @@ class Run:
         self._console.virtual_banner(self._mission.airport.name, self._mission.mission,
                                      self._plan, self._spec.strategy)
         try:
-            result = run.run()
+            with _interruptible_between_bytecodes(run):
+                result = run.run()
         finally:
             self._console.close()
             if recording is not None:
@@ -251,6 +252,27 @@ def _interruptible(run: ProcessRun | WatchedRun) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(
             number, interrupt, signal.Signals(number).name)
+
+
+@contextlib.contextmanager
+def _interruptible_between_bytecodes(run: VirtualRun) -> Iterator[None]:
+    """As `_interruptible`, for a loop that never waits and so reads no signals from its pipe."""
+
+    def interrupt(number: int, _frame: object) -> None:
+        if run.interrupted:
+            raise KeyboardInterrupt
+        run.interrupted = f"interrupted by {signal.Signals(number).name}"
+
+    ends = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in ends}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:  # as SIGHUP is under nohup
+            signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _plan(options: argparse.Namespace) -> tuple[RunPlan, SystemSpec]:

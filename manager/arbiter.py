@@ -43,7 +43,6 @@ from manager import detection_track, recovery_track
 from manager.arbiter_state import (
     DecisionMade,
     DetectionHeard,
-    DetectionRestarted,
     Input,
     Output,
     RecoveryHeard,
@@ -64,9 +63,9 @@ from manager.schema import SystemSpec
 from manager.strategies import Decider, find_strategy
 
 __all__ = [
-    "Arbiter", "Command", "DecisionMade", "DetectionHeard", "DetectionRestarted", "Input",
-    "Output", "Phase", "RecoveryHeard", "ResetAnswered", "ResetAsked", "ShadowDiffered", "State",
-    "Tick", "build_arbiter",
+    "Arbiter", "Command", "DecisionMade", "DetectionHeard", "Input", "Output",
+    "Phase", "RecoveryHeard", "ResetAnswered", "ResetAsked", "ShadowDiffered", "State", "Tick",
+    "build_arbiter",
 ]
 
 
@@ -184,9 +183,6 @@ class Arbiter:
                     self.rules, now,
                     active=event.active, reason=event.reason, nodes=event.nodes,
                     since_s=event.since_s))
-            case DetectionRestarted() if event.detection in self._detection:
-                state = self._with_detection(state, detection_track.excuse(
-                    state.detections[self._detection[event.detection]], now))
             case RecoveryHeard() if event.recovery in self._recovery:
                 state = self._hear_recovery(state, event, now)
             case ResetAsked():

@@ -19,12 +19,6 @@ class DetectionHeard(msgspec.Struct, frozen=True, tag=True):
     since_s: float = 0.0
 
 
-class DetectionRestarted(msgspec.Struct, frozen=True, tag=True):
-    """Input: a detection module's process has died and is being respawned."""
-
-    detection: str
-
-
 class RecoveryHeard(msgspec.Struct, frozen=True, tag=True):
     """Input: a report of a recovery module, for the decision it last obeyed."""
 
@@ -46,7 +40,7 @@ class Tick(msgspec.Struct, frozen=True, tag=True):
     """Input: nothing but time has passed."""
 
 
-Input = DetectionHeard | DetectionRestarted | RecoveryHeard | ResetAsked | Tick
+Input = DetectionHeard | RecoveryHeard | ResetAsked | Tick
 
 
 class DecisionMade(msgspec.Struct, frozen=True, tag=True):

@@ -3,9 +3,8 @@
 Belief differs from the last report in two ways.
 
 *Silence counts as active.* A module that has died cannot say so, hence one that was not heard for
-`silence_timeout_s` is taken for active. When the arbiter learns that the module is being
-respawned, the module has the whole timeout to come back, but only once per report heard: one that
-crashes again and again without ever reporting must not be excused for ever.
+`silence_timeout_s` is taken for active, whatever the reason: also while it is being respawned,
+which takes a fraction of the timeout, and one that crashes again and again is not excused for ever.
 
 *Active at once, idle after a while.* A flapping module must not thrash the arbiter: a recovery
 started and released with every flap. So it has to stay idle for a hold before it is believed. The
@@ -43,7 +42,6 @@ class DetectionTrack(msgspec.Struct, frozen=True):
         name: Of the module.
         heard_s: When it was last heard, or else when its time to report began to run.
         ever_heard: Whether it was heard at all since the arbiter started.
-        excused: A respawn has bought it time since it was last heard.
         reported: What it last said: active or not.
         silent: Not heard for too long.
         active: What the arbiter acts on.
@@ -59,7 +57,6 @@ class DetectionTrack(msgspec.Struct, frozen=True):
     name: str
     heard_s: float
     ever_heard: bool = False
-    excused: bool = False
     reported: bool = False
     silent: bool = False
     active: bool = False
@@ -85,17 +82,10 @@ def hear(track: DetectionTrack, rules: DetectionRules, now: float, *, active: bo
          nodes: tuple[str, ...], since_s: float) -> DetectionTrack:
     """Take in a report that arrives at `now`."""
     heard = msgspec.structs.replace(
-        track, heard_s=now, ever_heard=True, excused=False, silent=False, reported=active)
+        track, heard_s=now, ever_heard=True, silent=False, reported=active)
     if active:
         heard = msgspec.structs.replace(heard, nodes=nodes, reason=reason)
     return _follow(track, heard, rules, now, since_s)
-
-
-def excuse(track: DetectionTrack, now: float) -> DetectionTrack:
-    """Take note that the module's process is being respawned."""
-    if track.excused:
-        return track
-    return msgspec.structs.replace(track, heard_s=now, excused=True)
 
 
 def pass_time(track: DetectionTrack, rules: DetectionRules, now: float) -> DetectionTrack:

@@ -1,9 +1,9 @@
 """What follows a recovery that fails.
 
-An alternative that its mechanism names; else the recovery that its contract names; else that of
-the mechanism above, which is the next barrier
-on the way to the top event. At the root there is nothing above: a last resort that fails stays in
-force, for releasing it could only make things worse.
+An alternative that its mechanism names, all of it; else the recovery that its contract names; else
+that of the mechanism above, which is the next barrier on the way to the top event. At the root
+there is nothing above: a last resort that fails stays in force, for releasing it could only make
+things worse.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ def escalate(decision: Decision, failures: Mapping[str, str], arrangement: Arran
         sakes = [name for name in decision.mechanisms if recovery in recover[name]]
         tried = succession(recovery, sakes or decision.mechanisms, failures, arrangement)
         recoveries[tried[-1]] = None
+        if len(tried) > 1:
+            recoveries.update(dict.fromkeys(_companions(tried[-1], sakes, failures, arrangement)))
         rejected.extend((failed, f"failed: {failures[failed]}; escalated to {following}")
                         for failed, following in pairwise(tried))
     taken = _compatible(tuple(recoveries), arrangement)
@@ -71,6 +73,14 @@ def succession(recovery: str, sakes: Iterable[str], failures: Container[str],
             break
         tried.append(following)
     return tried
+
+
+def _companions(recovery: str, sakes: Iterable[str], failures: Container[str],
+                arrangement: Arrangement) -> tuple[str, ...]:
+    """Return what an alternative runs together with a recovery, itself included; () for none."""
+    ways = (way for mechanism in sakes for way in arrangement.mechanisms.alternatives(mechanism))
+    return next((way for way in ways if recovery in way
+                 and not any(one in failures for one in way)), ())
 
 
 def _compatible(recoveries: tuple[str, ...], arrangement: Arrangement) -> tuple[str, ...]:

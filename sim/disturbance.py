@@ -33,6 +33,7 @@ class Disturbance:
     on_s: float = 0.0
     off_s: float = 0.0
     seed: int = 0
+    stamp_s: float = 0.0
 
     def order(self, injection: str, duration_s: float) -> Injection:
         """Return the message that orders it, under an id, for simulated seconds."""
@@ -40,7 +41,7 @@ class Disturbance:
             injection, self.topic, self.mode, duration_s, self.delay_s,
             dict(self.set_fields), dict(self.ramp_fields), self.keep_ends,
             dict(self.add_fields), dict(self.noise_fields),
-            self.share, self.on_s, self.off_s, self.seed)
+            self.share, self.on_s, self.off_s, self.seed, self.stamp_s)
 
 
 @dataclass(frozen=True, slots=True)

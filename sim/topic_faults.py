@@ -8,12 +8,15 @@ illuminances, intensities and whole numbers only grow, since hardly any of them 
 whole numbers by 1 to 3. Truth values, words and texts stay. So does `pid`: the supervisor kills
 by it, and a wrong one may be a stranger's process.
 
+`restamp:TOPIC` is a clock that is wrong by a constant, ahead or behind, drawn as well.
+
 The topics below `world/` are left out, because the judge goes by them and a fault there would
 falsify the verdict, and so are those that carry the injections themselves.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from random import Random
 from typing import Any
@@ -46,6 +49,10 @@ numbers without a unit, such as ratios and stick positions."""
 
 _ONLY_GROW = ("_s", "_lux", "_cd")
 
+STAMPS_S = (0.02, 5.0)
+"""Least and greatest error of a stamp: from one that nobody need notice to one beyond every
+freshness timeout. Drawn by its logarithm, so that the small ones are as frequent as the large."""
+
 _ANY_RUN = RunPlan("", DEFAULT_PORT, rate=1.0, seed=0, system_file="", strategy="", airport="",
                    mission="", obstacles=0, ftm=True, hmi_port=0)
 """Which keys a system publishes follows from its spec; nothing in the plan of a run matters."""
@@ -56,6 +63,7 @@ _TITLES = {
     "stuck": "{} repeats its last content with fresh stamps",
     "delay": "{} arrives " + f"{DELAY_S:g} s late",
     "duplicate": "each message on {} is sent twice",
+    "restamp": "the stamps on {} are wrong by a constant",
     "corrupt": "each number on {} is wrong by a constant",
 }
 
@@ -66,7 +74,7 @@ def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
     Args:
         mode: one of `MODES`.
         key: of a declared topic or one member of a family, with or without `rampart/`.
-        seed: of the offsets that `corrupt` draws, and of the gate's chance.
+        seed: of what `restamp` and `corrupt` draw, and of the gate's chance.
 
     Raises:
         UnknownFaultError: no such mode or topic, or the two do not go together.
@@ -83,10 +91,11 @@ def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
         raise UnknownFaultError(f"no fault {f'{mode}:{key}'!r}: {reason}")
     if reason := _senseless(mode, topic.type):
         raise UnknownFaultError(f"no fault {f'{mode}:{key}'!r}: {reason}")
+    draw = Random(f"{short} {seed}")  # noqa: S311 no secret
     what = Disturbance(
         short, mode, DELAY_S if mode == "delay" else 0.0,
-        add_fields=plausible_offsets(topic.type, Random(f"{short} {seed}"))  # noqa: S311
-        if mode == "corrupt" else {}, seed=seed)
+        add_fields=plausible_offsets(topic.type, draw) if mode == "corrupt" else {}, seed=seed,
+        stamp_s=stamp_error_s(draw) if mode == "restamp" else 0.0)
     return Fault(f"{mode}:{short}", _TITLES[mode].format(short), (what,), (), DURATION_S, GROUP)
 
 
@@ -150,6 +159,12 @@ def plausible_offsets(kind: type[msgspec.Struct], draw: Random) -> dict[str, flo
             least, most = next((a, b) for end, a, b in SPREADS if path.endswith(end))
             offsets[path] = round(sign * draw.uniform(least, most), 3)
     return offsets
+
+
+def stamp_error_s(draw: Random) -> float:
+    """Return by how much a stamp is wrong, s, above 0 for ahead; never 0."""
+    size_s = math.exp(draw.uniform(*map(math.log, STAMPS_S)))
+    return round(draw.choice((-1.0, 1.0)) * size_s, 3)
 
 
 def _numbers(kind: Any, path: str = "") -> Iterator[tuple[str, Any]]:

@@ -116,6 +116,9 @@ class VirtualRun:
         taps: Hear each message as it is sent: simulated time, key, payload.
         shared: What actors share, as `run_plan.load_shared` gives it, perhaps for another seed or
             number of obstacles; loaded if None.
+
+    Attributes:
+        interrupted: Whoever sets it, perhaps from a signal handler, ends the run for this reason.
     """
 
     def __init__(self, plan: RunPlan, spec: SystemSpec, mission: MissionRun,
@@ -127,6 +130,7 @@ class VirtualRun:
         self.plan = msgspec.structs.replace(
             plan, run_id=f"virtual-{plan.seed}", rate=1.0, hmi_port=0, launcher_pid=1)
         self.mission = mission
+        self.interrupted: str | None = None
         self._spec = spec
         self._network = network or NETWORKS["measured"]
         self._scenario = tuple(scenario)
@@ -186,7 +190,7 @@ class VirtualRun:
         why = None
         while why is None and not any(task.done() for task in watching):
             await asyncio.sleep(_LOOK_S)
-            why = self.mission.over(clock.now())
+            why = self.interrupted or self.mission.over(clock.now())
         now_s = clock.now()
         machine.shut_down()
         for actor in actors:

@@ -12,7 +12,6 @@ from manager.arbiter import (
     Command,
     DecisionMade,
     DetectionHeard,
-    DetectionRestarted,
     Phase,
     RecoveryHeard,
     ResetAnswered,
@@ -68,9 +67,6 @@ class Bench:
         """Report as a module does that has obeyed its last command (or that decision)."""
         number = self.state.desired[rm].decision if decision is None else decision
         return self.send(RecoveryHeard(rm, phase is not Phase.IDLE, phase, number))
-
-    def restarted(self, dm: str) -> list:
-        return self.send(DetectionRestarted(dm))
 
     def reset(self, rm: str) -> ResetAnswered:
         return next(o for o in self.send(ResetAsked(rm, "the tower"))

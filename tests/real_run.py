@@ -17,8 +17,8 @@ from stub_actors import ROOT, free_base_port
 from actors.supervision.process_title import find_processes
 from actors.supervision.run_info import RunInfo, find_runs
 
-HANGS_UP = ("env", "--default-signal=HUP")
-"""Before a command: its terminal can be closed, also where the tests themselves run under nohup."""
+HEEDS_SIGNALS = ("env", "--default-signal=HUP,INT")
+"""Before a command: undoes what nohup, and shells with what they start in the background, do."""
 
 
 class RealRun:

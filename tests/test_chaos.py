@@ -64,7 +64,7 @@ def test_the_same_or_less_is_no_leak_nor_are_spare_connections_and_a_little_memo
     {"descriptors": {"supervisor": 60, "spawner_a": 11}},
     {"memory_mb": {"supervisor": 110.0, "spawner_a": 50.0}},
     {"processes": 35}, {"zombies": 1}, {"listening": 34}, {"half_closed": 1},
-    {"shared_memory": frozenset("ab")}], ids=str)
+    {"shared_memory": frozenset("ab")}], ids=" ".join)
 def test_whatever_becomes_more_is_one_leak(after):
     assert len(leaks(COUNTS, replace(COUNTS, **after))) == 1
 

@@ -21,6 +21,7 @@ from actors.operator.hmi_injection import (
     Injections,
     places,
 )
+from actors.runtime.envelope import AHEAD_S
 from actors.runtime.injection import MODES, flaw
 from sim.offered_faults import offered_faults
 from sim.topic_faults import modes_of
@@ -191,6 +192,14 @@ def test_no_place_is_offered_that_must_not_be_disturbed():
                          "heartbeat/localization"}
     assert all(modes_of(key) for key in KEYS)
     assert set(injections().choice()["modes"]) < set(MODES)
+
+
+def test_every_mode_that_is_offered_can_be_ordered_as_it_stands():
+    faults = injections()
+    for mode in faults.choice()["modes"]:
+        (order,) = faults.order(f"{mode}:localization/pose", 0.0, None, 0.0).orders
+        assert (order.mode, order.delay_s > 0, order.stamp_s > AHEAD_S) == (
+            mode, mode == "delay", mode == "restamp")
 
 
 @BUSY

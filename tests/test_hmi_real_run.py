@@ -13,6 +13,8 @@ from hmi_browser import CHROMIUM, browser
 from real_run import RealRun
 from stub_actors import ROOT, free_base_port
 
+pytestmark = pytest.mark.processes
+
 
 def text(name: str) -> str:
     return f"document.getElementById('{name}').textContent"

@@ -271,17 +271,6 @@ def test_a_silent_detection_module_counts_as_active():
     assert "silent" in bench.state.desired["RM1"].reason
 
 
-def test_a_detection_module_that_is_respawned_has_the_whole_timeout():
-    bench = Bench()
-    others = tuple(dm for dm in DMS if dm != "DM2")
-    bench.wait(0.8, hearing=others)
-    bench.restarted("DM2")
-    bench.wait(0.9, hearing=others)
-    assert bench.orders == ""
-    bench.wait(0.2, hearing=others)
-    assert bench.orders == "RM2"
-
-
 def test_a_flapping_detection_module_does_not_thrash():
     bench = Bench()
     for _ in range(60):  # a flap a second for a minute

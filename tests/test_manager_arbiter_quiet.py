@@ -11,7 +11,6 @@ from manager_bench import DMS, RMS, osmosis
 from manager.arbiter import (
     Arbiter,
     DetectionHeard,
-    DetectionRestarted,
     Phase,
     RecoveryHeard,
     ResetAsked,
@@ -25,7 +24,6 @@ INPUTS = st.one_of(
     st.builds(DetectionHeard, st.sampled_from(DMS), st.booleans(), st.sampled_from(["", "why"])),
     # Calm far more often than not, or the short way would hardly be taken.
     st.builds(DetectionHeard, st.sampled_from(DMS), st.just(False)),
-    st.builds(DetectionRestarted, st.sampled_from(DMS)),
     st.builds(RecoveryHeard, st.sampled_from(RMS), st.booleans(), st.sampled_from(Phase),
               st.integers(0, 4)),
     st.builds(RecoveryHeard, st.sampled_from(RMS), st.just(False), st.just(Phase.IDLE),

@@ -307,6 +307,19 @@ def test_when_both_alternatives_have_failed_it_escalates_beyond_them():
     assert bench.orders in {"RM2", "RM5"}
 
 
+def test_all_of_an_alternative_is_run_and_not_only_its_first_recovery():
+    bench = Bench(system(mechanisms={"FTM2": {"recover": "RM2 or (RM3 and RM4)"}}))
+    assert commands(bench.active("DM2")) == [("RM2", True)]
+    bench.report("RM2", ACTING)
+    assert sorted(commands(bench.report("RM2", FAILED))) == [
+        ("RM2", False), ("RM3", True), ("RM4", True)]
+    assert any(name == "RM2" and why.endswith("escalated to RM3")
+               for name, why in bench.decisions[-1].decision.rejected)
+    work(bench, "RM3", "RM4")
+    bench.idle("DM2")
+    assert sorted(commands(bench.wait(1.0))) == [("RM3", False), ("RM4", False)]
+
+
 # ---- needs ------------------------------------------------------------------------------------
 
 

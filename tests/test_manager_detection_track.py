@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from manager.detection_track import (
     DetectionRules,
     DetectionTrack,
-    excuse,
     hear,
     pass_time,
     release_hold_s,
@@ -18,7 +17,7 @@ RULES = DetectionRules(silence_timeout_s=0.95, startup_grace_s=2.0, release_hold
 
 
 def play(reports: str, rules: DetectionRules = RULES) -> str:
-    """A: reports active, i: reports idle, -: says nothing, r: is respawned.
+    """A: reports active, i: reports idle, -: says nothing.
 
     Out: A believed active, S active because silent, . believed idle.
     """
@@ -27,8 +26,6 @@ def play(reports: str, rules: DetectionRules = RULES) -> str:
         now = tick / 10
         if report in "Ai":
             track = hear(track, rules, now, active=report == "A", reason="", nodes=(), since_s=now)
-        elif report == "r":
-            track = excuse(track, now)
         track = pass_time(track, rules, now)
         beliefs += "S" if track.silent else "A" if track.active else "."
     return beliefs
@@ -50,17 +47,6 @@ def play(reports: str, rules: DetectionRules = RULES) -> str:
     # never heard: the grace of two seconds, then silent
     ("-----------------------",
      ".....................SS"),
-    # a respawn gives it the whole timeout again, once
-    ("i-------r----------",
-     ".................." "S"),
-    ("i-------r---r---r--------",
-     ".................." "SSSSSSS"),
-    # heard in between, it earns another
-    ("i-------ri-------r--------",
-     ".........................."),
-    # a respawn does not undo silence
-    ("i----------r--",
-     "..........SSSS"),
 ])
 def test_timeline(reports, beliefs):
     assert beliefs == play(reports)

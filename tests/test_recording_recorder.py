@@ -20,7 +20,7 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
-from real_run import HANGS_UP, RealRun
+from real_run import HEEDS_SIGNALS, RealRun
 from recording_samples import AnsweringLauncher, pose
 from stub_actors import ROOT, free_base_port
 
@@ -394,7 +394,7 @@ def test_a_run_that_is_there_is_recorded_until_ctrl_c_or_the_terminal_is_closed(
     robot.send(10)  # nobody records yet
     with AnsweringLauncher(port, time.monotonic() - 100.0):
         verb = subprocess.Popen(
-            [*HANGS_UP, sys.executable, "-m", "toolbox.main", "record", str(path),
+            [*HEEDS_SIGNALS, sys.executable, "-m", "toolbox.main", "record", str(path),
              "--port", str(port)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
         until(lambda: robot.send() or numbers(path), "nothing is written", 30)
         verb.send_signal(number)

@@ -16,7 +16,7 @@ import urllib.request
 
 import msgspec
 import pytest
-from real_run import HANGS_UP
+from real_run import HEEDS_SIGNALS
 from recording_samples import AnsweringLauncher, documents, pose, sample, write
 from stub_actors import ROOT as HERE
 from stub_actors import free_base_port
@@ -244,7 +244,7 @@ def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(tmp_path, po
     folder = tmp_path / "folder"
     folder.mkdir()
     verb = subprocess.Popen(
-        [*HANGS_UP, sys.executable, "-m", "toolbox.main", "replay", str(tmp_path / "run.mcap"),
+        [*HEEDS_SIGNALS, sys.executable, "-m", "toolbox.main", "replay", str(tmp_path / "run.mcap"),
          "--loop", "--port", str(port)], cwd=HERE, stdout=subprocess.PIPE, text=True,
         env={**os.environ, "TMPDIR": str(folder)})
     assert "playing" in verb.stdout.readline()

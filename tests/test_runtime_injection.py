@@ -69,6 +69,8 @@ def sent(faults: FaultGate, times_s) -> list[tuple[float, float, float, int] | N
     ("stuck", {}, (11.0, 12.0, 0.0, 1), (11.0, 13.0, 0.0, 1)),
     ("delay", {"delay_s": 0.3}, (12.0, 12.0, 0.3, 1), (13.0, 13.0, 0.3, 1)),
     ("duplicate", {}, (12.0, 12.0, 0.0, 2), (13.0, 13.0, 0.0, 2)),
+    ("restamp", {"stamp_s": -2.5}, (12.0, 9.5, 0.0, 1), (13.0, 10.5, 0.0, 1)),
+    ("restamp", {"stamp_s": 0.5}, (12.0, 12.5, 0.0, 1), (13.0, 13.5, 0.0, 1)),
     ("corrupt", {"set_fields": {"x_m": 7}}, (7.0, 12.0, 0.0, 1), (7.0, 13.0, 0.0, 1)),
     ("corrupt", {"add_fields": {"x_m": 5.0}}, (17.0, 12.0, 0.0, 1), (18.0, 13.0, 0.0, 1)),
     ("corrupt", {"ramp_fields": {"x_m": 0.5}}, (12.25, 12.0, 0.0, 1), (13.75, 13.0, 0.0, 1)),
@@ -303,6 +305,7 @@ def test_an_angle_that_is_set_and_a_value_that_is_no_number_are_left_as_they_wer
     ("stuck", {}, 0),                               # it does not move anyway
     ("freeze", {}, 2),                              # same content, but the stamp is old
     ("duplicate", {}, 2),
+    ("restamp", {"stamp_s": 0.1}, 2),
 ])
 def test_a_message_that_leaves_as_it_came_is_not_affected(mode, fields, affected):
     faults = FaultGate()
@@ -344,6 +347,10 @@ def test_an_order_with_the_id_of_another_takes_its_place_and_keeps_its_count():
     ("delay", {"delay_s": -0.1}, "delay_s = -0.1"),
     ("delay", {"delay_s": math.inf}, "delay_s = inf"),
     ("delay", {}, "delay_s = 0: must be above 0"),
+    ("restamp", {}, "stamp_s = 0: must be finite seconds"),
+    ("restamp", {"stamp_s": math.nan}, "stamp_s = nan"),
+    ("restamp", {"stamp_s": math.inf}, "stamp_s = inf"),
+    ("drop", {"stamp_s": -math.inf}, "stamp_s = -inf"),
     ("drop", {"share": 1.1}, "share = 1.1: must be between 0 and 1"),
     ("drop", {"share": -0.1}, "share = -0.1"),
     ("drop", {"share": math.nan}, "share = nan"),

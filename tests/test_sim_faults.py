@@ -95,7 +95,7 @@ def test_every_fault_changes_real_messages_of_its_topic_and_leaves_them_readable
                 assert out is None
                 continue
             assert travels(publisher.topic, out.body)
-            if disturbance.mode in ("delay", "duplicate"):
+            if disturbance.mode in ("delay", "duplicate", "restamp"):
                 assert out.body == body
         assert all(not news.reason for news in publisher.gate.take_news())
 
@@ -107,7 +107,7 @@ def test_every_published_topic_has_all_modes_that_make_sense(key):
     if key.startswith(("world/", "inject/")):
         assert modes_of(key) == ()
     elif key.startswith("hello/"):
-        assert modes_of(key) == ("drop", "freeze", "delay", "duplicate")
+        assert modes_of(key) == ("drop", "freeze", "delay", "duplicate", "restamp")
     else:
         assert set(MODES) - set(modes_of(key)) <= {"corrupt"}
 
@@ -188,6 +188,16 @@ def test_offsets_stay_within_what_their_unit_makes_plausible(seed):
     assert 50.0 <= offsets["lights.intensity_cd"] <= 150.0
     assert 1.0 <= offsets["step_times_s"] <= 10.0
     assert 0.1 <= abs(offsets["lights.ratio"]) <= 0.5
+
+
+def test_a_wrong_stamp_comes_from_its_seed_ahead_as_often_as_behind_small_as_often_as_large():
+    errors_s = [topic_fault("restamp", "summit_xl/scan", seed).disturbances[0].stamp_s
+                for seed in range(400)]
+    assert errors_s == [topic_fault("restamp", "summit_xl/scan", seed).disturbances[0].stamp_s
+                        for seed in range(400)]
+    assert all(0.02 <= abs(error_s) <= 5.0 for error_s in errors_s)
+    assert 150 < sum(error_s > 0 for error_s in errors_s) < 250
+    assert 150 < sum(abs(error_s) < 0.316 for error_s in errors_s) < 250
 
 
 # -- sensors ---------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import os
 import resource
@@ -13,6 +14,7 @@ import sys
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 import pytest
 from stub_actors import ROOT, free_base_port, launched, stub_plan, write_stub_system
@@ -22,12 +24,14 @@ from actors.messages import Diagnostic, NodeTable, ProcessEvent, RespawnRequest
 from actors.runtime.actor import Actor, Context, Header, on
 from actors.runtime.clock import Clock
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
+from actors.supervision import node_process
 from actors.supervision.kill_node import main as kill_node
 from actors.supervision.launcher import Launcher, LaunchError
 from actors.supervision.process_title import find_processes
 from actors.supervision.processes import OsProcesses
 from actors.supervision.restart_policy import RestartPolicy
 from actors.supervision.run_info import find_runs
+from actors.supervision.run_plan import Layout, load_system
 from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
 pytestmark = pytest.mark.processes
@@ -137,6 +141,19 @@ async def test_error_reports_of_all_nodes_and_its_own_are_passed_on_by_the_super
         names = {r.name for r in witness.table.nodes}
         await eventually(lambda: names <= {e.node for e in witness.errors})
         assert {e.offender for e in witness.errors} == {topics.INJECT.at()}
+
+
+async def test_the_world_and_nobody_else_goes_before_others_where_that_is_permitted(tmp_path):
+    lower = f"import os; os.setpriority(os.PRIO_PROCESS, 0, {node_process.WORLD_NICE})"
+    permitted = subprocess.run([sys.executable, "-c", lower], check=False,
+                               stderr=subprocess.DEVNULL).returncode == 0
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    async with running(tmp_path) as (_launcher, witness):
+        nice = {row.name: {os.getpriority(os.PRIO_PROCESS, int(thread.name))
+                           for thread in Path(f"/proc/{row.pid}/task").iterdir()}
+                for row in witness.table.nodes}
+    assert nice.pop("simulator") == {node_process.WORLD_NICE if permitted else own}
+    assert set().union(*nice.values()) == {own}
 
 
 async def test_the_supervisor_comes_back_and_adopts_the_living(tmp_path):
@@ -311,6 +328,38 @@ async def test_the_launcher_turns_while_supervisor_and_both_spawners_are_dead(tm
         assert turns > rounds  # it does nothing but look when nothing can be done
         await eventually(lambda: witness.state("supervisor") == ("running", 2), 20)
         assert {r.name: r.pid for r in witness.table.nodes if r.name not in victims} == nodes
+
+
+async def test_a_supervisor_that_ends_whenever_it_starts_is_not_started_without_end(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        told, lives = [], set()
+        launcher.on_trouble = told.append
+        launcher._policy = RestartPolicy(intensity=6, period_s=6.0)
+        while not told:
+            pid = process(launcher.plan.base_port, "supervisor")
+            if pid is not None:
+                lives.add(pid)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            await asyncio.sleep(0.002)
+        assert len(lives) == 7  # the first and six more
+        assert told == ["the supervisor ended 6 times within 6 s: it is started less often from "
+                        "now on"]
+        await eventually(lambda: witness.state("supervisor") == (
+            "running", launcher.supervisor_incarnation), 20)
+        assert launcher.supervisor_incarnation == 8
+        assert len(told) == 1
+
+
+def test_what_fails_before_the_actors_of_a_process_start_is_told(tmp_path, monkeypatch, capfd):
+    def broken(*_: object) -> None:
+        raise RuntimeError("no title today")
+
+    monkeypatch.setattr(node_process, "set_title", broken)
+    plan = stub_plan(write_stub_system(tmp_path))
+    layout = Layout(plan, load_system(plan))
+    assert node_process.node_main(layout, ("supervisor",), 3, {}, -1) == node_process.EXIT_FAILED
+    assert "supervisor #3 failed: RuntimeError: no title today" in capfd.readouterr().err
 
 
 async def test_a_launcher_that_cannot_look_says_so_once_and_goes_on(tmp_path):

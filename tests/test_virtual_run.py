@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from checkpoint_runs import write_short_mission
-from real_run import RealRun
+from real_run import HEEDS_SIGNALS, RealRun
 from recording_samples import pose
 from stub_actors import ROOT
 
@@ -86,6 +88,27 @@ def test_a_run_that_is_broken_off_has_a_recording_with_all_that_was_sent(
     assert (summary.reader.closed, summary.end["messages"]) == (True, "1")
     assert {"osmosis_control", "supervisor"} <= set(json.loads(summary.run["nodes"]))
     assert summary.time_zero_s == -LEAD_S
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_run_in_order_with_its_report_and_its_recording(tmp_path, number):
+    path = tmp_path / "run.mcap"
+    launched = subprocess.Popen(
+        [*HEEDS_SIGNALS, sys.executable, "launch.py", "--virtual", "--record", str(path),
+         "--report", str(tmp_path / "report"), "--json"], cwd=ROOT, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True)
+    while not (path.exists() and path.stat().st_size > 1_000_000):
+        assert launched.poll() is None, launched.communicate()
+        time.sleep(0.01)
+    launched.send_signal(number)
+    out, errors = launched.communicate(timeout=30)
+    assert launched.returncode == 1, errors
+    result = json.loads(out.splitlines()[-1])
+    assert f"ended: interrupted by {number.name}" in result["reasons"]
+    assert list((tmp_path / "report").glob("*.html"))
+    summary = Summary(BagReader(path))
+    assert summary.reader.closed
+    assert int(summary.end["messages"]) > 1000
 
 
 def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():

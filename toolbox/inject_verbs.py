@@ -40,6 +40,8 @@ _EPILOG = """examples:
   rampart inject drop:control/command --share 0.3 three messages in ten are lost
 your own:
   rampart inject --topic localization/pose --mode delay --delay 0.8
+  rampart inject --topic summit_xl/scan --mode restamp --stamp=-0.2
+                                                  stamped 0.2 s before the truth
   rampart inject --topic localization/pose --mode corrupt --ramp x_m=0.25
   rampart inject --topic control/command --mode corrupt --set angular_radps=2.5
   rampart inject --topic summit_xl/scan --mode corrupt --add ranges_f32=0.4 \\
@@ -72,11 +74,14 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
     when.add_argument("--on", type=float, metavar="S", help="intermittent: in force for S ...")
     when.add_argument("--off", type=float, metavar="S", help="... and away for S, repeating")
     when.add_argument("--seed", type=int, metavar="N",
-                      help="of share, noise and the numbers of corrupt:TOPIC; default 0")
+                      help="of share, noise and what restamp:TOPIC and corrupt:TOPIC draw; "
+                           "default 0")
     own = parser.add_argument_group("a fault of your own, instead of FAULT")
     own.add_argument("--topic", metavar="KEY", help="e.g. control/command or detection/DM2")
     own.add_argument("--mode", metavar="MODE", help=", ".join(MODES))
     own.add_argument("--delay", type=float, metavar="S", help="for delay: simulated seconds")
+    own.add_argument("--stamp", type=float, metavar="S",
+                     help="for restamp: added to each stamp, simulated seconds; above 0 is ahead")
     own.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE",
                      help="for corrupt: overwrite a field; may be repeated, as all below")
     own.add_argument("--add", action="append", default=[], metavar="FIELD=BIAS",
@@ -123,7 +128,7 @@ def choose(options: argparse.Namespace) -> Fault:
 
 
 def _known_fault(options: argparse.Namespace) -> Fault:
-    for name in ("mode", "delay", "set", "add", "ramp", "noise", "keep_ends"):
+    for name in ("mode", "delay", "stamp", "set", "add", "ramp", "noise", "keep_ends"):
         if getattr(options, name):
             raise UsageError(f"--{name.replace('_', '-')} goes with --topic, not with a "
                              "FAULT of the catalogue")
@@ -148,6 +153,8 @@ def _own_fault(options: argparse.Namespace) -> Fault:
         raise UsageError("--mode delay goes with --delay S, and no other mode does")
     if options.delay is not None and not 0 < options.delay < float("inf"):
         raise UsageError(f"--delay {options.delay:g}: must be seconds above 0")
+    if (options.stamp is not None) != (options.mode == "restamp"):
+        raise UsageError("--mode restamp goes with --stamp S, and no other mode does")
     disturbance = Disturbance(
         key.removeprefix(f"{ROOT}/"), options.mode, options.delay or 0.0,
         set_fields=dict(_setting(text, topic) for text in options.set),
@@ -155,7 +162,7 @@ def _own_fault(options: argparse.Namespace) -> Fault:
         ramp_fields=dict(_amount("--ramp", text, topic) for text in options.ramp),
         noise_fields=dict(_amount("--noise", text, topic) for text in options.noise),
         keep_ends=tuple(options.keep_ends),
-        seed=options.seed or 0)
+        seed=options.seed or 0, stamp_s=options.stamp or 0.0)
     reason = flaw(disturbance.order("", _DEFAULT_DURATION_S), topic.type)
     if reason:
         raise UsageError(f"--topic {options.topic}: {reason}")

@@ -32,7 +32,10 @@ DELAY_S = 1.5
 """Delay of `delay:TOPIC`: longer than any freshness timeout of the shipped system."""
 
 OWN_DURATION_S = 10.0
-MODES = ("drop", "freeze", "stuck", "delay", "duplicate")
+STAMP_S = 0.5
+"""Error of `restamp:TOPIC`: ahead, and more than anybody accepts."""
+
+MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp")
 """Modes that fit any topic; what to corrupt in a message is for the catalogue."""
 
 MAX_WAITING = 16
@@ -174,7 +177,8 @@ class Injections:
             raise FaultError(f"topic {key[:60]!r}: this system has none of that key that can be "
                              "disturbed")
         order = m.Injection(f"{injection}.1", key, mode, OWN_DURATION_S,
-                            delay_s=DELAY_S if mode == "delay" else 0.0)
+                            delay_s=DELAY_S if mode == "delay" else 0.0,
+                            stamp_s=STAMP_S if mode == "restamp" else 0.0)
         if reason := flaw(order):
             raise FaultError(reason)
         return (order,), OWN_DURATION_S

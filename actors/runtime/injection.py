@@ -27,7 +27,7 @@ from actors.runtime.topics import (
     INJECTION_RESULT,
 )
 
-MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "corrupt")
+MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp", "corrupt")
 
 UNTOUCHED = (INJECT.key, INJECTION_REPORT.key, INJECTION_REQUEST.key, INJECTION_RESULT.key)
 """Keys that carry injections and their results, and therefore cannot be disturbed."""
@@ -154,6 +154,8 @@ class FaultGate:
                 return Outgoing(out.body, out.stamp, out.delay_s + order.delay_s, out.copies)
             case "duplicate":
                 return Outgoing(out.body, out.stamp, out.delay_s, out.copies + 1)
+            case "restamp":
+                return Outgoing(out.body, out.stamp + order.stamp_s, out.delay_s, out.copies)
             case "corrupt":
                 body = corrupt(out.body, order, now_s - active.since_s, active.draw)
                 return Outgoing(body, out.stamp, out.delay_s, out.copies)
@@ -210,6 +212,9 @@ def _wrong_time(order: Injection) -> str:
                 "both above 0, any other both 0")
     if order.mode == "delay" and not order.delay_s > 0:
         return "delay_s = 0: must be above 0 for a delay"
+    if not math.isfinite(order.stamp_s) or (order.mode == "restamp" and order.stamp_s == 0):
+        return (f"stamp_s = {order.stamp_s:g}: must be finite seconds, above 0 to stamp ahead, "
+                "below 0 behind, not 0 for a restamp")
     return ""
 
 

@@ -40,10 +40,11 @@ class Injection(Message, frozen=True):
 
     Modes: `drop` sends nothing; `freeze` repeats the last healthy message with its old stamp;
     `stuck` repeats its body with fresh stamps; `delay` sends `delay_s` later; `duplicate` sends
-    the same payload twice; `corrupt` changes fields. The `*_fields` and `keep_ends` count only
-    with corrupt: `set_fields` overwrites, `ramp_fields` adds rate * elapsed seconds, `add_fields`
-    adds a bias, `noise_fields` adds Gaussian noise of that standard deviation, `keep_ends`
-    shortens sequences to their first and last element. A field of a nested struct is named
+    the same payload twice; `restamp` adds `stamp_s` to the stamp, as a clock that goes wrong;
+    `corrupt` changes fields. The `*_fields` and `keep_ends` count only with corrupt:
+    `set_fields` overwrites, `ramp_fields` adds rate * elapsed seconds, `add_fields` adds a bias,
+    `noise_fields` adds Gaussian noise of that standard deviation, `keep_ends` shortens
+    sequences to their first and last element. A field of a nested struct is named
     `outer.inner`, through sequences too; numbers in sequences and `*_f32` arrays are changed
     element by element, and `*_rad` stays in (-pi, pi].
 
@@ -68,6 +69,7 @@ class Injection(Message, frozen=True):
     on_s: float = 0.0
     off_s: float = 0.0
     seed: int = 0
+    stamp_s: float = 0.0
 
 
 class InjectionReport(Message, frozen=True):

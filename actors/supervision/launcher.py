@@ -26,6 +26,7 @@ from actors.runtime.unix_peer import is_same_user
 from actors.supervision import run_info
 from actors.supervision.lifeline import kill_leftovers
 from actors.supervision.process_title import find_processes
+from actors.supervision.restart_policy import RestartPolicy
 from actors.supervision.run_plan import SUPERVISOR, RunPlan
 from actors.supervision.spawner import NAMES
 from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
@@ -83,6 +84,7 @@ class Launcher:
         self._supervisor_pid = 0
         self._supervisor_heard_s = 0.0
         self._trouble = ""
+        self._policy = RestartPolicy()
         self._info: socket.socket | None = None
         self._guard: asyncio.Task[None] | None = None
 
@@ -187,7 +189,8 @@ class Launcher:
                 self._supervisor_heard_s += stall_s
             try:
                 all_there = await self._look_after_guards()
-                self._trouble = ""
+                if all_there:
+                    self._trouble = ""
             except OSError as error:  # no descriptors or no memory left: perhaps later
                 all_there = False
                 self._report(f"cannot look after supervisor and spawners: {error.strerror}")
@@ -214,8 +217,23 @@ class Launcher:
                 os.kill(self._supervisor_pid, signal.SIGKILL)
         if supervisor is None or silent:
             await self._supervisor_gone(GUARD_PERIOD_S)  # its port is free only then
-            all_there &= self._bring_back(SUPERVISOR)
+            all_there &= await self._bring_supervisor_back()
         return all_there
+
+    async def _bring_supervisor_back(self) -> bool:
+        # At once as a rule. One that ends whenever it starts would leave nothing to anybody else.
+        policy = self._policy
+        delay_s = policy.delay_s(time.monotonic())
+        if delay_s is None:
+            self._report(f"the supervisor ended {policy.intensity} times within "
+                         f"{policy.period_s:.0f} s: it is started less often from now on")
+            return False
+        if delay_s:
+            await asyncio.sleep(delay_s)
+        if not self._bring_back(SUPERVISOR):
+            return False
+        policy.restarted(time.monotonic())
+        return True
 
     def _report(self, trouble: str) -> None:
         if trouble != self._trouble:

@@ -14,7 +14,7 @@ const GROUPS = { paper: "The paper's", sensor: "Sensors", actuator: "Actuators" 
 const WAYS = {
   drop: "nothing arrives", freeze: "the last message again and again, old stamp included",
   stuck: "the last content with fresh stamps", delay: "every message late",
-  duplicate: "every message twice",
+  duplicate: "every message twice", restamp: "every message stamped half a second ahead",
 };
 
 /** A button in a node's row; a click on it opens the dialog of its signals. */
