@@ -351,6 +351,21 @@ async def test_a_supervisor_that_ends_whenever_it_starts_is_not_started_without_
         assert len(told) == 1
 
 
+async def test_spawners_are_looked_after_while_a_supervisor_that_keeps_ending_has_to_wait(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        launcher._policy = RestartPolicy(intensity=4, backoff_s=4.0, backoff_max_s=4.0)
+        for life in (1, 2, 3):
+            await eventually(lambda life=life: (process(port, "supervisor") is not None
+                                                and launcher.supervisor_incarnation == life))
+            os.kill(process(port, "supervisor"), signal.SIGKILL)
+        spawner = process(port, "spawner_b")
+        os.kill(spawner, signal.SIGKILL)
+        await eventually(lambda: process(port, "spawner_b") not in {None, spawner})
+        assert process(port, "supervisor") is None  # it still waits
+        await eventually(lambda: witness.state("supervisor") == ("running", 4), 20)
+
+
 def test_what_fails_before_the_actors_of_a_process_start_is_told(tmp_path, monkeypatch, capfd):
     def broken(*_: object) -> None:
         raise RuntimeError("no title today")

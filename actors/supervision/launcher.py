@@ -83,6 +83,7 @@ class Launcher:
         self._begun_s = self._load_s = 0.0
         self._supervisor_pid = 0
         self._supervisor_heard_s = 0.0
+        self._supervisor_due_s: float | None = None
         self._trouble = ""
         self._policy = RestartPolicy()
         self._info: socket.socket | None = None
@@ -218,6 +219,8 @@ class Launcher:
         if supervisor is None or silent:
             await self._supervisor_gone(GUARD_PERIOD_S)  # its port is free only then
             all_there &= await self._bring_supervisor_back()
+        else:
+            self._supervisor_due_s = None
         return all_there
 
     async def _bring_supervisor_back(self) -> bool:
@@ -228,10 +231,16 @@ class Launcher:
             self._report(f"the supervisor ended {policy.intensity} times within "
                          f"{policy.period_s:.0f} s: it is started less often from now on")
             return False
-        if delay_s:
-            await asyncio.sleep(delay_s)
+        if self._supervisor_due_s is None:
+            self._supervisor_due_s = time.monotonic() + delay_s
+        wait_s = self._supervisor_due_s - time.monotonic()
+        if wait_s > 0:
+            await asyncio.sleep(min(wait_s, GUARD_PERIOD_S))
+        if wait_s > GUARD_PERIOD_S:  # the spawners are looked after meanwhile
+            return False
         if not self._bring_back(SUPERVISOR):
             return False
+        self._supervisor_due_s = None
         policy.restarted(time.monotonic())
         return True
 
