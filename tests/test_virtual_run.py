@@ -90,8 +90,8 @@ def test_a_run_that_is_broken_off_has_a_recording_with_all_that_was_sent(
     assert summary.time_zero_s == -LEAD_S
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_a_run_in_order_with_its_report_and_its_recording(tmp_path, number):
+def recorded_run(tmp_path) -> subprocess.Popen[str]:
+    """Start a run in virtual time and return it once its recording has begun."""
     path = tmp_path / "run.mcap"
     launched = subprocess.Popen(
         [*HEEDS_SIGNALS, sys.executable, "launch.py", "--virtual", "--record", str(path),
@@ -100,15 +100,32 @@ def test_a_signal_ends_a_run_in_order_with_its_report_and_its_recording(tmp_path
     while not (path.exists() and path.stat().st_size > 1_000_000):
         assert launched.poll() is None, launched.communicate()
         time.sleep(0.01)
+    return launched
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_run_in_order_with_its_report_and_its_recording(tmp_path, number):
+    launched = recorded_run(tmp_path)
     launched.send_signal(number)
     out, errors = launched.communicate(timeout=30)
     assert launched.returncode == 1, errors
     result = json.loads(out.splitlines()[-1])
     assert f"ended: interrupted by {number.name}" in result["reasons"]
     assert list((tmp_path / "report").glob("*.html"))
-    summary = Summary(BagReader(path))
+    summary = Summary(BagReader(tmp_path / "run.mcap"))
     assert summary.reader.closed
     assert int(summary.end["messages"]) > 1000
+
+
+def test_a_second_signal_ends_a_run_at_once_and_its_recording_is_closed(tmp_path):
+    launched = recorded_run(tmp_path)
+    for number in (signal.SIGSTOP, signal.SIGINT, signal.SIGTERM, signal.SIGCONT):
+        launched.send_signal(number)  # so that both are there when it goes on
+    out, errors = launched.communicate(timeout=30)
+    assert (launched.returncode, out) == (1, "")
+    assert "Traceback" not in errors
+    assert not list(tmp_path.glob("report/*.html"))
+    assert Summary(BagReader(tmp_path / "run.mcap")).reader.closed
 
 
 def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():
