@@ -77,7 +77,9 @@ class Robot(Table, frozen=True):
         braking_mps2: Deceleration that is certain on wet concrete.
         stop_distance_m: The Safety Pilot stops for an obstacle this far ahead of the footprint.
         lateral_distance_m: And for one this far beside it.
-        sensing_range_m: Range of the laser.
+        sensing_range_m: The laser shows everything up to this distance ...
+        sensing_field_rad: ... in this angle, half of it on either side of straight ahead ...
+        sensing_gap_rad: ... with rays no farther apart. A sweep that covers less is not believed.
         gps_accuracy_m: Error bound of the redundant positioning device.
         corridor_clearance_m: From the footprint to the nearest prohibited area, when the robot
             is where it should be.
@@ -95,6 +97,8 @@ class Robot(Table, frozen=True):
     sensing_range_m: Positive
     gps_accuracy_m: NonNegative
     corridor_clearance_m: Positive
+    sensing_field_rad: Positive = 4.7
+    sensing_gap_rad: Positive = 0.035
 
 
 class Timing(Table, frozen=True):

@@ -74,7 +74,9 @@ def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
     Args:
         mode: one of `MODES`.
         key: of a declared topic or one member of a family, with or without `rampart/`.
-        seed: of what `restamp` and `corrupt` draw, and of the gate's chance.
+        seed: of what `restamp` and `corrupt` draw, and of the gate's chance. An even one corrupts
+            every number of a message, as a wrong sender does; an odd one only one of them, which
+            leaves whatever the others can be checked by.
 
     Raises:
         UnknownFaultError: no such mode or topic, or the two do not go together.
@@ -92,11 +94,16 @@ def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
     if reason := _senseless(mode, topic.type):
         raise UnknownFaultError(f"no fault {f'{mode}:{key}'!r}: {reason}")
     draw = Random(f"{short} {seed}")  # noqa: S311 no secret
+    title, offsets = _TITLES[mode].format(short), {}
+    if mode == "corrupt":
+        offsets = plausible_offsets(topic.type, draw)
+        if seed % 2:
+            path = draw.choice(list(offsets))
+            title, offsets = f"{path} on {short} is wrong by a constant", {path: offsets[path]}
     what = Disturbance(
-        short, mode, DELAY_S if mode == "delay" else 0.0,
-        add_fields=plausible_offsets(topic.type, draw) if mode == "corrupt" else {}, seed=seed,
+        short, mode, DELAY_S if mode == "delay" else 0.0, add_fields=offsets, seed=seed,
         stamp_s=stamp_error_s(draw) if mode == "restamp" else 0.0)
-    return Fault(f"{mode}:{short}", _TITLES[mode].format(short), (what,), (), DURATION_S, GROUP)
+    return Fault(f"{mode}:{short}", title, (what,), (), DURATION_S, GROUP)
 
 
 def systematic_faults(keys: Iterable[str], seed: int = 0) -> tuple[Fault, ...]:

@@ -9,6 +9,7 @@ import pytest
 from control_world import World
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from laser_sweeps import full_sweep
 from localization_drive import Reading, Truth, disturbed
 from virtual_loop import System, run, shipped_system
 
@@ -211,7 +212,7 @@ def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
         for i in range(250):
             odom = m.Pose(world.x_m, world.y_m, world.yaw_rad)
             robot.publish(topics.ODOMETRY, m.Odometry(odom, m.Twist(world.linear_mps, 0.0)))
-            robot.publish(topics.SCAN, m.LaserScan(0.0, 0.1, 8.0, b""))
+            robot.publish(topics.SCAN, full_sweep(number=i))
             if world.x_m < 3.0:
                 robot.publish(topics.POSE, odom)
                 lost_at_m = world.x_m

@@ -5,14 +5,17 @@ from __future__ import annotations
 import asyncio
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from laser_sweeps import full_sweep
 from virtual_loop import System, run, shipped_system
 
 from actors import messages as m
 from actors import topics
+from actors.control.laser_check import LaserReach
 from actors.control.laser_pair import LOWER, UPPER, LaserPair
 from actors.control.safety_pilot import SafetyPilot
 from actors.messages import LaserScan
@@ -20,6 +23,7 @@ from actors.runtime.actor import Actor, Context, Header, on
 
 RAYS, TOP_M, PERIOD_S = 5, 8.0, 0.05
 ANGLE_MIN = -0.2
+REACH = LaserReach(range_m=5.0, field_rad=0.4, gap_rad=0.1)
 
 
 def sweep(ranges, reference_m=0.1):
@@ -38,7 +42,7 @@ class Bench:
     """Feeds a pair sweep by sweep and keeps the view that is in force."""
 
     def __init__(self):
-        self.pair, self.view, self.changes = LaserPair(), None, 0
+        self.pair, self.view, self.changes = LaserPair(REACH), None, 0
 
     def feed(self, laser, message, stamp_s, now_s=None):
         view = self.pair.take(laser, message, stamp_s, stamp_s if now_s is None else now_s)
@@ -157,12 +161,65 @@ def test_one_that_comes_back_is_used_again():
     assert distances(bench.view) == [2.0]
 
 
-def test_lasers_that_differ_in_their_rays_are_not_mixed_ray_by_ray():
+@pytest.mark.parametrize("other", [
+    LaserScan(-0.3, 0.1, TOP_M, np.full(7, 4, "<f4").tobytes(), 0.1001),
+    LaserScan(-0.2, 0.05, TOP_M, np.full(9, 4, "<f4").tobytes(), 0.1001),
+    LaserScan(-0.2, 0.1, 6.0, np.full(5, 4, "<f4").tobytes(), 0.1001)])
+@pytest.mark.parametrize("first", [LOWER, UPPER])
+def test_of_lasers_that_differ_in_their_rays_all_echoes_count(first, other):
     bench = Bench()
-    other = LaserScan(-1.0, 0.5, TOP_M, np.array([4, 4, 4], "<f4").tobytes(), 0.1001)
-    bench.feed(UPPER, other, 0.0)
+    bench.feed(first, other, 0.0)
+    bench.feed(1 - first, healthy(1), 0.0)
+    bench.feed(first, msgspec.structs.replace(other, reference_m=0.1002), PERIOD_S)
+    assert set(distances(bench.view)) == {3.0, 4.0}
+    assert len(bench.view.points) == 1 + len(other.ranges_f32) // 4
+
+
+def lacking(way, i):
+    """Return a sweep that shows less than it should and looks like free space."""
+    sound = healthy(i, (8, 8, 8, 8, 8))
+    return msgspec.structs.replace(sound, **{
+        "empty": {"ranges_f32": b""}, "torn": {"ranges_f32": sound.ranges_f32[:-1]},
+        "few rays": {"ranges_f32": sound.ranges_f32[:8]},
+        "near": {"range_max_m": 0.3}, "no range": {"range_max_m": math.nan},
+        "endless": {"range_max_m": math.inf},
+        "turned": {"angle_min_rad": ANGLE_MIN + math.pi / 2},
+        "turned a little": {"angle_min_rad": ANGLE_MIN + 0.06},
+        "nowhere": {"angle_min_rad": math.nan}, "behind": {"angle_min_rad": ANGLE_MIN - math.tau},
+        "narrow": {"angle_increment_rad": 0.01}, "wide": {"angle_increment_rad": 0.2},
+        "backwards": {"angle_increment_rad": -0.1}, "on the spot": {"angle_increment_rad": 0.0},
+    }[way])
+
+
+WAYS = ["empty", "torn", "few rays", "near", "no range", "endless", "turned", "turned a little",
+        "nowhere", "behind", "narrow", "wide", "backwards", "on the spot"]
+
+
+@pytest.mark.parametrize("bad", [LOWER, UPPER])
+@pytest.mark.parametrize("way", WAYS)
+def test_a_sweep_that_shows_less_than_it_should_hides_nothing_that_the_other_sees(way, bad):
+    bench = Bench()
+    for i in range(20):
+        bench.feed(bad, lacking(way, i) if i >= 5 else healthy(i + 100), i * PERIOD_S)
+        bench.feed(1 - bad, healthy(i), i * PERIOD_S)
+        assert (bench.view.stamp_s, bench.view.fault) == (i * PERIOD_S, "")
+        assert distances(bench.view)[0] == 3.0
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_robot_with_one_laser_does_not_take_for_free_what_that_does_not_show(way):
+    bench = Bench()
+    bench.feed(LOWER, lacking(way, 1), 0.0)
+    assert "laser" in bench.view.fault
+    bench.feed(LOWER, healthy(2), PERIOD_S)
+    assert (bench.view.fault, distances(bench.view)) == ("", [3.0])
+
+
+def test_a_laser_that_proved_itself_and_does_so_no_more_is_not_believed():
+    bench = Bench()
     bench.feed(LOWER, healthy(1), 0.0)
-    assert distances(bench.view) == [3.0]
+    bench.feed(LOWER, sweep((8, 8, 8, 8, 8), -1.0), PERIOD_S)
+    assert "reference" in bench.view.fault
 
 
 def test_a_number_that_is_none_hides_no_echo_of_the_other():
@@ -196,7 +253,7 @@ def test_one_sweep_from_the_future_neither_blinds_the_safety_pilot_nor_stops_it_
             for i in range(80):
                 rest.publish(topics.MANAGER_STATUS, m.ManagerStatus((), (), (), (), "", 0))
                 rest.publish(topics.COMMAND, m.Twist(0.8, 0.0))
-                rest.publish(topics.SCAN, healthy(i, (8,) * 5 if i < 60 else (0.6,) * 5),
+                rest.publish(topics.SCAN, full_sweep(8.0 if i < 60 else 0.6, i),
                              stamp=stamp_s if i == 30 else None)
                 await asyncio.sleep(PERIOD_S)
                 if i == 58:

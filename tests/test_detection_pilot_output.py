@@ -10,6 +10,7 @@ import pytest
 from detection_timeline import Ear
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from laser_sweeps import full_sweep
 from virtual_loop import System, run
 
 import systems
@@ -203,7 +204,7 @@ def test_a_sound_pilot_is_not_accused_when_both_computers_of_the_command_fall_si
             told = m.ManagerStatus((), (), (), (), "safety-first", 0)
             for i in range(round((3.0 + silent_s) * 20)):
                 rest.publish(topics.MANAGER_STATUS, told)
-                rest.publish(topics.SCAN, m.LaserScan(0.0, 0.1, 8.0, b""))
+                rest.publish(topics.SCAN, full_sweep(number=i))
                 if i < 40 or i >= 40 + silent_s * 20:
                     rest.publish(topics.COMMAND, m.Twist(0.8, 0.1))
                     rest.publish(topics.STANDBY_COMMAND, m.Twist(0.8, 0.1))

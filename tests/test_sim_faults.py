@@ -180,7 +180,17 @@ def test_the_numbers_of_a_corruption_come_from_its_seed():
             != find_fault("corrupt:plan/route", seed=4).disturbances[0].add_fields)
 
 
-@pytest.mark.parametrize("seed", range(20))
+def test_an_odd_seed_corrupts_one_number_and_all_have_their_turn():
+    every = set(topic_fault("corrupt", "summit_xl/scan").disturbances[0].add_fields)
+    alone = [topic_fault("corrupt", "summit_xl/scan", seed) for seed in range(1, 200, 2)]
+    assert every == {path for fault in alone for path in fault.disturbances[0].add_fields}
+    assert "ranges_f32" in every
+    for fault in alone:
+        (path,) = fault.disturbances[0].add_fields
+        assert fault.title == f"{path} on summit_xl/scan is wrong by a constant"
+
+
+@pytest.mark.parametrize("seed", range(0, 40, 2))
 def test_offsets_stay_within_what_their_unit_makes_plausible(seed):
     offsets = topic_fault("corrupt", "mission/status", seed).disturbances[0].add_fields
     assert offsets["step"] in (1, 2, 3)

@@ -36,7 +36,7 @@ _EPILOG = """examples:
   rampart inject gps-dropout --on 1 --off 4 --duration 30
                                                   intermittent: 1 s without GPS, 4 s with
   rampart inject drop:localization/pose           any mode on any topic ...
-  rampart inject corrupt:plan/route --seed 7      ... here with other wrong numbers
+  rampart inject corrupt:plan/route --seed 7      ... here one of its numbers: odd seeds, one each
   rampart inject drop:control/command --share 0.3 three messages in ten are lost
 your own:
   rampart inject --topic localization/pose --mode delay --delay 0.8

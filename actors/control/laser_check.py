@@ -1,10 +1,15 @@
-"""Is the laser telling the truth? Its reference measurement says so, once a sweep. Pure.
+"""Is the laser telling the truth, and the whole truth? Pure.
+
+Its reference measurement says whether it measures right, once a sweep.
 
 A safety laser measures, besides the world, a target inside its own housing at a known distance,
 and real light never gives the same number twice. So a device that repeats itself repeats the
 reference to the last bit, also where there is no echo in which one could see it; and one whose
 time base or receiver has an error shows it in the reference. (Self-monitoring of this kind is what
 IEC 61496-3 asks of such devices; here it is done by who depends on it.)
+
+A sweep that covers less than the robot's spec says is not believed either: where it does not look,
+or not that far, it shows nothing, and nothing looks like free space.
 """
 
 from __future__ import annotations
@@ -12,8 +17,40 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from actors.messages import LaserScan
+
 NO_REFERENCE_M = -1.0
 """What a device reports that has no reference target."""
+
+
+@dataclass(frozen=True, slots=True)
+class LaserReach:
+    """What a sweep covers at least.
+
+    Args:
+        range_m: It shows everything up to this distance.
+        field_rad: In this angle, half of it on either side of straight ahead.
+        gap_rad: With rays no farther apart.
+    """
+
+    range_m: float
+    field_rad: float
+    gap_rad: float
+
+    def lack(self, sweep: LaserScan) -> str:
+        """Return what a sweep does not cover, or an empty text."""
+        count, odd = divmod(len(sweep.ranges_f32), 4)
+        first_rad, step_rad = sweep.angle_min_rad, sweep.angle_increment_rad
+        last_rad = first_rad + (count - 1) * step_rad
+        edge_rad = (self.field_rad - self.gap_rad) / 2
+        if odd or not 0 < step_rad <= self.gap_rad:
+            return f"the laser's rays are {step_rad:.3g} rad apart, not up to {self.gap_rad:.3g}"
+        if not (-math.pi <= first_rad <= -edge_rad and edge_rad <= last_rad <= math.pi):
+            return (f"the laser sweeps from {first_rad:.2f} to {last_rad:.2f} rad, not "
+                    f"{self.field_rad:.2f} rad around straight ahead")
+        if not self.range_m <= sweep.range_max_m < math.inf:
+            return f"the laser sees {sweep.range_max_m:.2f} m far, not {self.range_m:.2f} m"
+        return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +86,10 @@ class LaserCheck:
 
         Args:
             reference_m: Its reference measurement; `NO_REFERENCE_M` for a device that makes none,
-                which is believed.
+                which is believed unless it once made some.
             stamp_s: When it was made, simulated seconds.
         """
-        if reference_m == NO_REFERENCE_M:
+        if reference_m == NO_REFERENCE_M and math.isnan(self._last_m):
             return ""
         limits = self._limits
         self._equal = self._equal + 1 if reference_m == self._last_m else 1

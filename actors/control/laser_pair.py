@@ -1,8 +1,9 @@
 """Two lasers, one view: what either sees counts, and one that is wrong or silent is left out. Pure.
 
-Each device is judged by its own reference measurement (`LaserCheck`) and by its age. While both can
-be believed, a ray is as short as the shorter of the two: an obstacle that one of them misses is
-there all the same. Only when neither can be believed is there no view.
+Each device is judged by its own reference measurement (`LaserCheck`), by what its sweeps cover
+(`LaserReach`) and by its age. While both can be believed, an obstacle that one of them misses is
+there all the same: where their rays are alike the shorter range counts, else all echoes do. Only
+when neither can be believed is there no view.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 import msgspec
 import numpy as np
 
-from actors.control.laser_check import LaserCheck
+from actors.control.laser_check import LaserCheck, LaserReach
 from actors.control.plausible import is_possible
 from actors.control.polyline import NO_POINTS, Array, scan_points
 from actors.messages import LaserScan
@@ -38,9 +39,14 @@ class LaserView(msgspec.Struct, frozen=True):
 
 
 class LaserPair:
-    """Takes sweeps of either laser, gives the view. A robot with one laser gives only `LOWER`."""
+    """Takes sweeps of either laser, gives the view. A robot with one laser gives only `LOWER`.
 
-    def __init__(self) -> None:
+    Args:
+        reach: What each sweep has to cover.
+    """
+
+    def __init__(self, reach: LaserReach) -> None:
+        self._reach = reach
         self._checks = (LaserCheck(), LaserCheck())
         self._sweeps: list[LaserScan | None] = [None, None]
         self._stamps_s = [-math.inf, -math.inf]
@@ -63,7 +69,8 @@ class LaserPair:
         other = 1 - laser
         self._sweeps[laser] = sweep
         self._stamps_s[laser] = stamp_s
-        self._faults[laser] = self._checks[laser].fault(sweep.reference_m, stamp_s)
+        untrue = self._checks[laser].fault(sweep.reference_m, stamp_s)
+        self._faults[laser] = untrue or self._reach.lack(sweep)
         partner = self._partner(other, stamp_s)
         if self._faults[laser]:
             # The other one gives the view, as it did; it will be heard as soon as this one.
@@ -81,15 +88,21 @@ class LaserPair:
 
 
 def _echoes(sweep: LaserScan, partner: LaserScan | None) -> Array:
-    ranges = sweep.ranges_f32
-    if partner is not None and ranges != partner.ranges_f32 and _same_rays(sweep, partner):
-        nearest = np.fmin(np.frombuffer(ranges, "<f4"), np.frombuffer(partner.ranges_f32, "<f4"))
-        ranges = nearest.tobytes()
+    if partner is None or (sweep.ranges_f32 == partner.ranges_f32 and _same_rays(sweep, partner)):
+        return _points(sweep)
+    if not _same_rays(sweep, partner):
+        return np.concatenate((_points(sweep), _points(partner)))
+    nearest = np.fmin(np.frombuffer(sweep.ranges_f32, "<f4"),
+                      np.frombuffer(partner.ranges_f32, "<f4"))
+    return _points(sweep, nearest.tobytes())
+
+
+def _points(sweep: LaserScan, ranges_f32: bytes | None = None) -> Array:
     return scan_points(
-        ranges, sweep.angle_min_rad, sweep.angle_increment_rad, sweep.range_max_m)
+        sweep.ranges_f32 if ranges_f32 is None else ranges_f32, sweep.angle_min_rad,
+        sweep.angle_increment_rad, sweep.range_max_m)
 
 
 def _same_rays(a: LaserScan, b: LaserScan) -> bool:
-    return len(a.ranges_f32) % 4 == 0 and (
-        len(a.ranges_f32), a.angle_min_rad, a.angle_increment_rad, a.range_max_m) == (
+    return (len(a.ranges_f32), a.angle_min_rad, a.angle_increment_rad, a.range_max_m) == (
         len(b.ranges_f32), b.angle_min_rad, b.angle_increment_rad, b.range_max_m)

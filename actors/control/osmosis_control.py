@@ -22,7 +22,7 @@ from actors.control.light_row import LightRow, RowLimits
 from actors.control.motion_loop import MotionLoop
 from actors.control.path_follower import Motion, PathFollower
 from actors.control.polyline import Array, Polyline
-from actors.control.settings import hull_of, motion_of
+from actors.control.settings import hull_of, motion_of, reach_of
 from actors.messages import (
     Blockage,
     ControlPhase,
@@ -81,7 +81,7 @@ class OsmosisControl(Actor):
         self._inspection = LightInspection(self._lights)
         self._pose: Pose | None = None
         self._points: Array | None = None
-        self._lasers = LaserPair()
+        self._lasers = LaserPair(reach_of(system))
         self._route: Route | None = None
         self._follower: PathFollower | LightRow | None = None
         self._status = ControlStatus("", 0, ControlPhase.IDLE, 0, 0.0)

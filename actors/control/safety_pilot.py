@@ -7,7 +7,7 @@ import math
 from actors import topics
 from actors.control.laser_pair import LOWER, UPPER, LaserPair
 from actors.control.safety_gate import GateOutput, SafetyGate, Stamped
-from actors.control.settings import checks_of, gate_of
+from actors.control.settings import checks_of, gate_of, reach_of
 from actors.messages import (
     BaseCommand,
     LaserScan,
@@ -35,7 +35,7 @@ class SafetyPilot(Actor):
         super().__init__(context)
         system = context.shared["system"]
         self._gate = SafetyGate(gate_of(system), checks_of(system), context.clock.now())
-        self._lasers = LaserPair()
+        self._lasers = LaserPair(reach_of(system))
         self._laser_fault = ""
         self._sent_s = -math.inf
         self._last = GateOutput(0.0, 0.0, PilotMode.AUTO, True, "just started")

@@ -5,6 +5,7 @@ What a spec does not say (gains, look-ahead distances) keeps the default of its 
 
 from __future__ import annotations
 
+from actors.control.laser_check import LaserReach
 from actors.control.path_follower import MotionLimits
 from actors.control.polyline import Hull
 from actors.control.safety_gate import Checks, GateLimits
@@ -50,6 +51,12 @@ def gate_of(system: SystemSpec) -> GateLimits:
         manager_timeout_s=timing.manager_timeout_s,
         room=room,
     )
+
+
+def reach_of(system: SystemSpec) -> LaserReach:
+    """Return what every sweep of a laser has to cover."""
+    robot = system.robot
+    return LaserReach(robot.sensing_range_m, robot.sensing_field_rad, robot.sensing_gap_rad)
 
 
 def checks_of(system: SystemSpec) -> Checks:
