@@ -38,6 +38,7 @@ from manager.arbiter import (
     build_arbiter,
 )
 from manager.arbiter_memory import Memory, objection, recall, remember
+from manager.detection_track import overdue
 from manager.recovery_track import Command, Phase
 from manager.schema import SystemSpec
 
@@ -53,7 +54,7 @@ ABSENCE_S = 0.3
 class FtmManager(Actor):
     """Hears all detection and recovery modules, commands the recovery modules."""
 
-    outputs = (topics.RECOVERY_COMMAND, topics.DECISION, topics.SHADOW,
+    outputs = (topics.RECOVERY_COMMAND, topics.DECISION, topics.SHADOW, topics.RESPAWN,
                topics.MANAGER_STATUS, topics.ADAPTATION, topics.ADAPTED_SYSTEM)
 
     def __init__(self, context: Context) -> None:
@@ -69,6 +70,7 @@ class FtmManager(Actor):
         self._ran_s = now_s
         self._shown: m.ManagerStatus | None = None
         self._remembered: tuple[int, tuple[str, ...]] | None = None
+        self._replaced: dict[str, int] = {}
 
     @classmethod
     def output_names(
@@ -101,7 +103,7 @@ class FtmManager(Actor):
         """Hear a detection module."""
         self._step(DetectionHeard(
             header.source, message.state is m.DetectionState.ACTIVE, message.reason,
-            message.nodes, message.since_s))
+            message.nodes, message.since_s, header.stamp, header.incarnation))
 
     @on(topics.RECOVERY)
     def recovery(self, message: m.RecoveryReport, header: Header) -> None:
@@ -138,6 +140,8 @@ class FtmManager(Actor):
         """Let time pass, and show that the manager lives."""
         self._step(Tick())
         self._show()
+        if self._system.layers.supervisor_respawn:
+            self._replace_the_overdue()
 
     @every(0.2)
     def repeat(self) -> None:
@@ -202,6 +206,14 @@ class FtmManager(Actor):
             self._show()
         if (self.arbiter_state.number, self.arbiter_state.latched) != self._remembered:
             self.remember()
+
+    def _replace_the_overdue(self) -> None:
+        """Ask for a new life of a detection module that is not heard, once for each life."""
+        silent = overdue(self.arbiter_state.detections, self._arbiter.rules, self.clock.now())
+        if silent is not None and self._replaced.get(silent.name) != silent.life:
+            self._replaced[silent.name] = silent.life
+            self.publish(topics.RESPAWN, m.RespawnRequest(
+                len(self._replaced), silent.name, silent.life, self.name))
 
     def _command(self, command: Command) -> None:
         self.publish(topics.RECOVERY_COMMAND, m.RecoveryCommand(

@@ -182,7 +182,7 @@ class Arbiter:
                     state.detections[self._detection[event.detection]],
                     self.rules, now,
                     active=event.active, reason=event.reason, nodes=event.nodes,
-                    since_s=event.since_s))
+                    since_s=event.since_s, stamp_s=event.stamp_s, life=event.life))
             case RecoveryHeard() if event.recovery in self._recovery:
                 state = self._hear_recovery(state, event, now)
             case ResetAsked():

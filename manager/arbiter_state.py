@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 
 from manager.decision import Decision
@@ -10,13 +12,25 @@ from manager.recovery_track import Command, Phase, RecoveryTrack
 
 
 class DetectionHeard(msgspec.Struct, frozen=True, tag=True):
-    """Input: a report of a detection module; `since_s` is when it took that state."""
+    """Input: a report of a detection module.
+
+    Attributes:
+        detection: Its name.
+        active: Its state.
+        reason: Why.
+        nodes: Failed nodes that it names.
+        since_s: When it took that state.
+        stamp_s: When the report was true; infinite for now.
+        life: Its incarnation.
+    """
 
     detection: str
     active: bool
     reason: str = ""
     nodes: tuple[str, ...] = ()
     since_s: float = 0.0
+    stamp_s: float = math.inf
+    life: int = 0
 
 
 class RecoveryHeard(msgspec.Struct, frozen=True, tag=True):

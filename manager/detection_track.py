@@ -2,9 +2,14 @@
 
 Belief differs from the last report in two ways.
 
-*Silence counts as active.* A module that has died cannot say so, hence one that was not heard for
-`silence_timeout_s` is taken for active, whatever the reason: also while it is being respawned,
-which takes a fraction of the timeout, and one that crashes again and again is not excused for ever.
+*Silence counts as active.* A module that has died cannot say so, hence one of which there is no
+report younger than `silence_timeout_s` is taken for active, whatever the reason: also while it is
+being respawned, which takes a fraction of the timeout, and one that crashes again and again is not
+excused for ever. Age is that of the report, not of its arrival: what repeats old news is silent.
+
+*One that lives and is not heard is replaced* once, well before its silence counts (`overdue`): its
+way out may be broken where its heartbeat's is not. Not while others are late as well: then it is
+the machine, or who listens, and a module that is killed for being late comes later still.
 
 *Active at once, idle after a while.* A flapping module must not thrash the arbiter: a recovery
 started and released with every flap. So it has to stay idle for a hold before it is believed. The
@@ -23,6 +28,8 @@ no hold: so it is once a repair has been done (see `Arbiter`).
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 
 
@@ -40,7 +47,8 @@ class DetectionTrack(msgspec.Struct, frozen=True):
 
     Attributes:
         name: Of the module.
-        heard_s: When it was last heard, or else when its time to report began to run.
+        heard_s: When its newest report was true, or else when its time to report began to run.
+        life: Its incarnation, as last heard; 0 before.
         ever_heard: Whether it was heard at all since the arbiter started.
         reported: What it last said: active or not.
         silent: Not heard for too long.
@@ -67,6 +75,7 @@ class DetectionTrack(msgspec.Struct, frozen=True):
     bucket_at_s: float = 0.0
     nodes: tuple[str, ...] = ()
     reason: str = ""
+    life: int = 0
 
     @property
     def asserted(self) -> bool:
@@ -78,11 +87,34 @@ class DetectionTrack(msgspec.Struct, frozen=True):
         return not self.active and now - self.heard_s <= silence_timeout_s
 
 
+OVERDUE_SHARE = 0.6
+"""Of the silence timeout: older news of a module, and it is overdue; half of that is late. Three
+reports fit in before, and a new life has time to be heard after."""
+
+
+def overdue(tracks: tuple[DetectionTrack, ...], rules: DetectionRules, now: float
+            ) -> DetectionTrack | None:
+    """Return the one module that is overdue while nobody else is late, if there is one."""
+    limit_s = OVERDUE_SHARE * rules.silence_timeout_s
+    found = None
+    for track in tracks:
+        age_s = now - track.heard_s
+        if age_s <= limit_s / 2:
+            continue
+        if found is not None or age_s <= limit_s:
+            return None
+        found = track
+    return found if found is not None and found.ever_heard and not found.silent else None
+
+
 def hear(track: DetectionTrack, rules: DetectionRules, now: float, *, active: bool, reason: str,
-         nodes: tuple[str, ...], since_s: float) -> DetectionTrack:
-    """Take in a report that arrives at `now`."""
+         nodes: tuple[str, ...], since_s: float, stamp_s: float = math.inf, life: int = 0
+         ) -> DetectionTrack:
+    """Take in a report that arrives at `now` and was true at `stamp_s`, at most now."""
+    heard_s = max(track.heard_s, min(stamp_s, now))
     heard = msgspec.structs.replace(
-        track, heard_s=now, ever_heard=True, silent=False, reported=active)
+        track, heard_s=heard_s, ever_heard=True, reported=active, life=life,
+        silent=track.silent and now - heard_s > rules.silence_timeout_s)
     if active:
         heard = msgspec.structs.replace(heard, nodes=nodes, reason=reason)
     return _follow(track, heard, rules, now, since_s)

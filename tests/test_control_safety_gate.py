@@ -212,6 +212,19 @@ def test_a_gate_just_started_waits_for_the_orders_it_may_have_missed():
     assert gate.output(10.5).linear_mps == 0.5
 
 
+def test_old_news_of_the_manager_is_no_sign_of_life():
+    gate = SafetyGate(LIMITS, Checks(), 0.0)
+    for tick in range(200):
+        now = tick * 0.05
+        gate.manager_alive(min(now, 5.0))
+        if tick % 7 == 0:
+            gate.manager_alive(1.0)  # it was overtaken
+        gate.scan(NO_POINTS, now)
+        gate.command(Stamped(0.5, 0.0, "osmosis_control", 1, tick, now), now)
+        assert (gate.output(now).linear_mps > 0) == (
+            LIMITS.settling_s <= now <= 5.0 + LIMITS.manager_timeout_s)
+
+
 def test_the_baseline_keeps_only_repetition_obstacle_stop_and_joystick():
     bench = Bench(BASELINE)
     bench.manager = bench.scanner = False

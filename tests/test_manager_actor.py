@@ -103,6 +103,12 @@ class Obedient(Actor):
         self.heard.append(message)
 
 
+class Tool(Actor):
+    """Injects faults."""
+
+    outputs = (topics.INJECT,)
+
+
 class Whole(System):
     """All modules of the shipped system, and the world around them."""
 
@@ -112,6 +118,7 @@ class Whole(System):
         super().__init__(system=shipped_system(), airport=airport)
         self.shared["world"] = self
         timing = shipped_system().timing
+        self.actors: dict[str, Actor] = {}
         self.modules: dict[str, tuple[type[Actor], dict[str, Any]]] = {
             "DM1": (ProhibitedArea, {"margin_m": 0.6}),
             "DM2": (CommandFreshness, {"timeout_s": timing.command_timeout_s}),
@@ -143,7 +150,8 @@ class Whole(System):
     def revive(self, name: str) -> Actor:
         """Start a module, or its next incarnation."""
         cls, parameters = self.modules[name]
-        return self.start(name, cls, **parameters)
+        self.actors[name] = self.start(name, cls, **parameters)
+        return self.actors[name]
 
     @property
     def status(self) -> m.ManagerStatus:
@@ -339,6 +347,54 @@ def test_a_detection_module_that_stays_away_counts_as_active():
         await asyncio.sleep(1.5)
         assert system.status.silent == ()
         assert system.pilot.mode is PilotMode.AUTO
+
+    in_whole_system(scenario)
+
+
+def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once_before_it_counts():
+    async def scenario(system: Whole) -> None:
+        system.supervisor.answer = "nothing"
+        timeout_s = system.shared["system"].timing.detection_silence_timeout_s
+        hung_s = system.clock.now()
+        hang(system.actors["DM3"])
+        await asyncio.sleep(3.0)
+        (at_s, request), = system.supervisor.requests
+        assert 0.4 * timeout_s < at_s - hung_s < 0.75 * timeout_s
+        assert (request.node, request.failed_incarnation, request.by) == ("DM3", 1, "ftm_manager")
+        assert system.status.silent == ("DM3",)
+        await system.kill("DM3")
+        system.revive("DM3")
+        await asyncio.sleep(2.0)
+        assert system.status.silent == ()
+        hang(system.actors["DM3"])
+        await asyncio.sleep(2.0)
+        assert [(r.node, r.failed_incarnation) for _, r in system.supervisor.requests] == [
+            ("DM3", 1), ("DM3", 2)]
+
+    in_whole_system(scenario)
+
+
+def test_a_detection_module_whose_reports_are_old_news_is_silent():
+    async def scenario(system: Whole) -> None:
+        system.supervisor.answer = "nothing"
+        tool = system.start("tool", Tool)
+        await system.settle()
+        tool.publish(topics.INJECT, m.Injection("i.1", "detection/DM3", "freeze", 60.0))
+        await asyncio.sleep(0.5)
+        assert system.status.silent == ()
+        await asyncio.sleep(1.0)
+        assert system.status.silent == ("DM3",)
+
+    in_whole_system(scenario)
+
+
+@pytest.mark.parametrize("late", [("DM2", "DM3"), ("DM1", "DM2", "DM3", "DM4", "DM5")])
+def test_while_several_are_late_none_is_replaced(late):
+    async def scenario(system: Whole) -> None:
+        for name in late:
+            hang(system.actors[name])
+        await asyncio.sleep(0.9)
+        assert system.supervisor.requests == []
 
     in_whole_system(scenario)
 

@@ -1,5 +1,6 @@
 """Belief in a detection module, as timelines: one character per 100 ms, report in, belief out."""
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -8,6 +9,7 @@ from manager.detection_track import (
     DetectionRules,
     DetectionTrack,
     hear,
+    overdue,
     pass_time,
     release_hold_s,
 )
@@ -50,6 +52,46 @@ def play(reports: str, rules: DetectionRules = RULES) -> str:
 ])
 def test_timeline(reports, beliefs):
     assert beliefs == play(reports)
+
+
+def heard(name: str, at_s: float, **changes) -> DetectionTrack:
+    track = hear(DetectionTrack(name, heard_s=0.0), RULES, at_s, active=False, reason="", nodes=(),
+                 since_s=0.0)
+    return msgspec.structs.replace(track, **changes)
+
+
+def test_a_report_is_as_old_as_what_it_says_not_as_its_arrival():
+    old = {"active": False, "reason": "", "nodes": (), "since_s": 0.0}
+    track = heard("DM", 10.0)
+    assert hear(track, RULES, 10.5, stamp_s=9.0, **old).heard_s == 10.0
+    assert hear(track, RULES, 10.5, stamp_s=10.2, **old).heard_s == 10.2
+    assert hear(track, RULES, 10.5, stamp_s=10.55, **old).heard_s == 10.5  # a clock that is ahead
+    silent = pass_time(track, RULES, 11.0)
+    assert silent.silent
+    assert hear(silent, RULES, 11.1, stamp_s=10.1, **old).silent
+    assert not hear(silent, RULES, 11.1, stamp_s=10.9, **old).silent
+    assert hear(silent, RULES, 11.1, stamp_s=9.0, **{**old, "active": True}).reported
+
+
+def test_old_news_that_a_fault_is_there_counts_all_the_same():
+    track = hear(heard("DM", 10.0), RULES, 12.0, stamp_s=9.0, active=True, reason="x", nodes=(),
+                 since_s=9.0)
+    assert track.active
+
+
+@pytest.mark.parametrize(("ages_s", "found"), [
+    ((0.1, 0.2, 0.1), None), ((0.1, 0.55, 0.1), None), ((0.1, 0.6, 0.1), "DM1"),
+    ((0.6, 0.6, 0.1), None), ((0.1, 0.6, 0.3), None), ((0.1, 0.3, 0.6), None),
+    ((0.2, 0.2, 0.9), "DM2"), ((0.6, 0.6, 0.6), None)])
+def test_one_is_overdue_only_if_all_others_are_in_time(ages_s, found):
+    tracks = tuple(heard(f"DM{i}", 10.0 - age_s) for i, age_s in enumerate(ages_s))
+    which = overdue(tracks, RULES, 10.0)
+    assert (which.name if which else None) == found
+
+
+def test_one_that_was_never_heard_or_counts_as_silent_is_not_overdue():
+    assert overdue((DetectionTrack("DM", heard_s=0.0),), RULES, 10.0) is None
+    assert overdue((heard("DM", 9.0, silent=True),), RULES, 10.0) is None
 
 
 def test_one_fault_is_held_for_the_plain_hold():

@@ -128,6 +128,21 @@ def test_a_second_signal_ends_a_run_at_once_and_its_recording_is_closed(tmp_path
     assert Summary(BagReader(tmp_path / "run.mcap")).reader.closed
 
 
+@pytest.mark.parametrize("fault", [
+    "drop:detection/DM1@20+inf", "freeze:detection/DM1@20+inf", "slow:DM1@20",
+    "delay:detection/DM2@20+inf"])
+def test_a_detection_module_that_lives_and_is_not_heard_costs_nothing(fault):
+    result = run_job(job(fault))
+    assert (result.success, result.safe, result.decisions) == (True, True, ())
+    assert result.effective
+
+
+def test_a_frozen_report_hides_no_fault():
+    result = run_job(job("freeze:detection/DM2@10+inf", "command-not-updated@14+inf"))
+    assert result.safe
+    assert (("FTM2",), ("RM2",)) in decisions(result)
+
+
 def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():
     stale = "command-not-updated@8+inf"
     bare, guarded = run_job(job(stale, ftm=False)), run_job(job(stale))

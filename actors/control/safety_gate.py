@@ -154,9 +154,9 @@ class SafetyGate:
         else:
             self._orders.pop(recovery, None)
 
-    def manager_alive(self, now: float) -> None:
-        """Take note of the manager's sign of life."""
-        self._manager_heard_s = now
+    def manager_alive(self, stamp_s: float) -> None:
+        """Take note of the manager's sign of life, given at `stamp_s`."""
+        self._manager_heard_s = max(self._manager_heard_s, stamp_s)
 
     def scan(self, points: Array, stamp_s: float, fault: str = "") -> None:
         """Take a scan: echoes in `base_link`, shape (n, 2), and when it was measured.

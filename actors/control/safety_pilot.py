@@ -83,9 +83,9 @@ class SafetyPilot(Actor):
             self._tell()
 
     @on(topics.MANAGER_STATUS)
-    def manager(self, _message: ManagerStatus, _header: Header) -> None:
-        """Hear that the manager lives."""
-        self._gate.manager_alive(self.clock.now())
+    def manager(self, _message: ManagerStatus, header: Header) -> None:
+        """Hear that the manager lived when it said so: old news is as good as none."""
+        self._gate.manager_alive(min(header.stamp, self.clock.now()))
 
     @every(_PERIOD_S)
     def repeat(self) -> None:
