@@ -1,9 +1,9 @@
 """When is a run over? Pure: fed with what the observer hears, asked once in a while.
 
-A run ends when the mission has ended and the robot stands, when the mission was lost (the Mission
-Manager forgot it), when nothing has progressed for the patience of the person who started it, or
-when the world is gone. A robot that drives on after its mission is looked at for a minute: it may
-be on its way into the grass.
+A run ends when the mission has ended, when it was lost (the Mission Manager forgot it), or when
+nothing has progressed for the patience of the person who started it; and then when the robot
+stands. One that drives on is looked at for a minute: it may be on its way into the grass. A run
+without a world ends at once.
 """
 
 from __future__ import annotations
@@ -89,16 +89,22 @@ class RunEnd:
 
     def ended(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
-        if self._over_at_s is not None and \
-                now_s - self._over_at_s >= (WATCH_S if self._moves else SETTLE_S):
-            return self._over
         if self._truth_at_s is not None and now_s - self._truth_at_s > WORLD_SILENT_S:
             return "the world is gone: no ground truth from the simulator"
+        why, since_s = self._outcome(now_s)
+        if not why or (self._moves and now_s - since_s < WATCH_S):
+            return None
+        return why
+
+    def _outcome(self, now_s: float) -> tuple[str, float]:
+        """Return what became of the mission, and since when that is certain; "" if it is not."""
+        if self._over_at_s is not None:
+            return (self._over if now_s - self._over_at_s >= SETTLE_S else ""), self._over_at_s
         if self._lost_at_s is not None and now_s - self._lost_at_s > LOST_AFTER_S:
-            return "mission lost: the Mission Manager came back without it"
-        begun = bool(self._mission_id) or not self.waits
-        if begun and not self._mission_id and now_s > ACCEPT_WITHIN_S:
-            return f"no mission was accepted within {ACCEPT_WITHIN_S:.0f} s"
-        if begun and self._over_at_s is None and now_s - self._progress_at_s > self.patience_s:
-            return f"no progress for {self.patience_s:.0f} s"
-        return None
+            return "mission lost: the Mission Manager came back without it", self._lost_at_s
+        if not self._mission_id and not self.waits and now_s > ACCEPT_WITHIN_S:
+            return f"no mission was accepted within {ACCEPT_WITHIN_S:.0f} s", ACCEPT_WITHIN_S
+        stuck_s = self._progress_at_s + self.patience_s
+        if (self._mission_id or not self.waits) and now_s > stuck_s:
+            return f"no progress for {self.patience_s:.0f} s", stuck_s
+        return "", now_s

@@ -53,6 +53,22 @@ def test_a_robot_that_drives_on_after_its_mission_is_watched_until_it_stands_or_
         assert end.ended(9.0 + WATCH_S) == "mission succeeded"
 
 
+def test_so_is_one_whose_mission_is_lost_was_never_taken_or_does_not_advance():
+    lost, stuck, idle = (RunEnd(10.0) for _ in range(3))
+    for end in (lost, stuck):
+        end.mission(mission(MissionPhase.RUNNING), 1.0)
+    lost.mission(mission(MissionPhase.IDLE, mission_id=""), 2.0)
+    for end, since_s, why in ((lost, 2.0, "mission lost"), (stuck, 11.0, "no progress"),
+                              (idle, ACCEPT_WITHIN_S, "no mission was accepted")):
+        for now_s in (since_s + 5.0, since_s + WATCH_S - 0.1):
+            end.truth(Twist(0.3, 0.0), now_s)
+            assert end.ended(now_s) is None
+        end.truth(STANDS, since_s + WATCH_S - 0.05)
+        assert (end.ended(since_s + WATCH_S - 0.05) or "").startswith(why)
+        end.truth(Twist(0.3, 0.0), since_s + WATCH_S)
+        assert (end.ended(since_s + WATCH_S) or "").startswith(why)
+
+
 def test_a_mission_manager_that_forgot_its_mission_ends_the_run_and_a_flicker_does_not():
     end = RunEnd(60.0)
     end.mission(mission(MissionPhase.RUNNING), 1.0)
