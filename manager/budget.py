@@ -139,7 +139,7 @@ def derive_timeouts(robot: Robot | None, timing: Timing) -> Timing:
         "manager_timeout_s": SHARE * (drift - timing.control_period_s - timing.actuation_s),
         "scan_timeout_s": SHARE * (
             time_to_obstacle_s(robot) - timing.control_period_s - timing.actuation_s),
-        "dead_man_timeout_s": SHARE * time_to_obstacle_s(robot),
+        "dead_man_timeout_s": SHARE * (time_to_obstacle_s(robot) - timing.actuation_s),
     }
     for field, value in derived.items():
         if math.isnan(getattr(timing, field)):
@@ -242,7 +242,8 @@ def _of_guards(spec: SystemSpec) -> Iterator[Budget]:
         yield Budget("blind_pilot", collision, obstacle_s, timing.scan_timeout_s,
                      timing.control_period_s, timing.actuation_s)
     if spec.layers.dead_man:
-        yield Budget("dead_man", collision, obstacle_s, timing.dead_man_timeout_s, 0.0, 0.0)
+        yield Budget("dead_man", collision, obstacle_s, timing.dead_man_timeout_s, 0.0,
+                     timing.actuation_s)
     if spec.layers.manager_watch and spec.layers.ftm:
         yield Budget("manager_watch", "the robot drifts out of the corridor", drift_s,
                      timing.manager_timeout_s, timing.control_period_s, timing.actuation_s)

@@ -21,27 +21,33 @@ from manager.arbiter import (
 )
 from manager.specification import SystemSpec, parse_specification
 
-OSMOSIS = (Path(systems.__file__).parent / "paper.toml").read_text(encoding="utf-8")
+PAPER, FULL = ((Path(systems.__file__).parent / name).read_text(encoding="utf-8")
+               for name in ("paper.toml", "osmosis.toml"))
 DMS = ("DM1", "DM2", "DM3", "DM4", "DM5", "DM6", "DM7")
 RMS = ("RM1", "RM2", "RM3", "RM4", "RM5")
 
 
 @cache
-def osmosis() -> SystemSpec:
-    return parse_specification(OSMOSIS, "systems/paper.toml")
+def paper() -> SystemSpec:
+    return parse_specification(PAPER, "systems/paper.toml")
+
+
+@cache
+def full_system() -> SystemSpec:
+    return parse_specification(FULL, "systems/osmosis.toml")
 
 
 def edited(**fields) -> SystemSpec:
     """The shipped system with recoveries changed: `RM3=dict(deadline_s=1.0)`."""
-    return msgspec.structs.replace(osmosis(), recoveries=tuple(
-        msgspec.structs.replace(r, **fields.get(r.name, {})) for r in osmosis().recoveries))
+    return msgspec.structs.replace(paper(), recoveries=tuple(
+        msgspec.structs.replace(r, **fields.get(r.name, {})) for r in paper().recoveries))
 
 
 class Bench:
     """An arbiter, a clock that moves when told, and everything the arbiter has put out."""
 
     def __init__(self, spec: SystemSpec | None = None, *, oriented: bool = True) -> None:
-        self.arbiter = build_arbiter(spec or osmosis())
+        self.arbiter = build_arbiter(spec or paper())
         self.now = 0.0
         self.state = self.arbiter.initial(0.0)
         self.log = []

@@ -1,13 +1,13 @@
 """Which mechanisms stand between causes and the top event."""
 
-from manager_bench import osmosis
+from manager_bench import paper
 
 from manager.barriers import guard, occurs_without, outlook
 from manager.fault_tree import Event, FaultTree
 
 
 def test_on_the_paper_s_tree_each_cause_has_the_barriers_above_it():
-    found = {g.events: g.barriers for g in guard(osmosis(), [
+    found = {g.events: g.barriers for g in guard(paper(), [
         ("control_node_crash",), ("localization_node_crash",), ("command_calculation_error",),
         ("actuator_failure",)])}
     assert found == {
@@ -18,7 +18,7 @@ def test_on_the_paper_s_tree_each_cause_has_the_barriers_above_it():
 
 
 def test_a_set_that_reaches_the_top_by_two_ways_is_not_barred_on_one_of_them():
-    found = guard(osmosis(), [("control_node_crash", "command_calculation_error")])
+    found = guard(paper(), [("control_node_crash", "command_calculation_error")])
     assert found[0].barriers == ("FTM1",)
 
 
@@ -32,7 +32,7 @@ def test_an_event_that_is_kept_from_occurring_does_not_spread():
 
 
 def test_when_nothing_is_active_every_single_cause_has_all_its_barriers():
-    view = outlook(osmosis(), ())
+    view = outlook(paper(), ())
     assert view.occurred == ()
     assert view.left == {}
     barriers = {g.events[0]: g.barriers for g in view.next_events}
@@ -41,7 +41,7 @@ def test_when_nothing_is_active_every_single_cause_has_all_its_barriers():
 
 
 def test_an_active_mechanism_is_a_barrier_no_more_and_its_event_has_occurred():
-    view = outlook(osmosis(), ["FTM2", "FTM4"])
+    view = outlook(paper(), ["FTM2", "FTM4"])
     assert view.occurred == ("command_not_updated", "control_node_crash")
     assert view.left == {"FTM2": ("FTM1",), "FTM4": ("FTM1",)}
     barriers = {g.events[0]: g.barriers for g in view.next_events}

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from manager_bench import OSMOSIS, osmosis
+from manager_bench import PAPER, paper
 from test_manager_actor import Whole
 from virtual_loop import run, turns
 
@@ -29,7 +29,7 @@ from manager.adaptation import (
 from manager.checks import find_nonsense
 from manager.specification import SpecificationError, SystemSpec, read_document
 
-DOCUMENT = read_document(OSMOSIS, "paper.toml")
+DOCUMENT = read_document(PAPER, "paper.toml")
 
 
 def change(action: str, name: str, /, **values: Any) -> SystemSpec:
@@ -46,14 +46,14 @@ def names(spec: SystemSpec) -> list[str]:
 @pytest.mark.parametrize(("name", "left_out"), [
     ("FTM7", {"FTM7"}), ("DM4", {"FTM4"}), ("FTM3", {"FTM3"})])
 def test_what_is_disabled_is_left_out_with_all_that_uses_it(name, left_out):
-    assert set(names(osmosis())) - set(names(change("disable", name))) == left_out
+    assert set(names(paper())) - set(names(change("disable", name))) == left_out
 
 
 def test_enabling_again_gives_back_the_same_system():
     after, _ = adapt(DOCUMENT, Change(Action.DISABLE, "FTM7"), "f")
     _, spec = adapt(after, Change(Action.ENABLE, "FTM7"), "f")
-    assert names(spec) == names(osmosis())
-    assert spec.build_ftm_tree().parents == osmosis().build_ftm_tree().parents
+    assert names(spec) == names(paper())
+    assert spec.build_ftm_tree().parents == paper().build_ftm_tree().parents
 
 
 def test_what_the_tree_closes_over_has_to_be_in_time_for_the_barrier_above():
@@ -65,9 +65,9 @@ def test_what_the_tree_closes_over_has_to_be_in_time_for_the_barrier_above():
 def test_a_parameter_is_retuned_and_only_that_module_has_to_be_started_anew():
     spec = change("retune", "DM1", margin_m=0.7)
     assert next(d for d in spec.detections if d.name == "DM1").parameters["margin_m"] == 0.7
-    assert changed_actors(osmosis(), spec) == ("DM1",)
-    assert changed_actors(osmosis(), change("retune", "RM3", deadline_s=2.5)) == ()
-    assert changed_actors(osmosis(), change(
+    assert changed_actors(paper(), spec) == ("DM1",)
+    assert changed_actors(paper(), change("retune", "RM3", deadline_s=2.5)) == ()
+    assert changed_actors(paper(), change(
         "retune", "DM3", actor="actors.stub.detection:StubDetection")) == ("DM3",)
 
 
@@ -150,7 +150,7 @@ def test_whatever_is_asked_for_gives_a_sound_system_or_a_refusal(action, name, v
         refusal = str(error)
     else:
         refusal = ""
-        assert find_nonsense(spec) is None or names(spec) != names(osmosis())
+        assert find_nonsense(spec) is None or names(spec) != names(paper())
     assert "\n" not in refusal
 
 

@@ -1,6 +1,6 @@
 """The arbiter when recoveries fail, and when the manager itself is killed, as timelines."""
 
-from manager_bench import DMS, RMS, Bench, commands, edited, osmosis
+from manager_bench import DMS, RMS, Bench, commands, edited, paper
 
 from manager.arbiter import Phase, build_arbiter
 from manager.arbiter_memory import Memory, objection, recall, remember
@@ -284,7 +284,7 @@ def test_the_wait_for_orientation_ends_with_the_grace():
 def respawned() -> Bench:
     """The arbiter of a manager that was respawned: modules run already."""
     bench = Bench(oriented=False)
-    bench.arbiter = build_arbiter(osmosis(), first_life=False)
+    bench.arbiter = build_arbiter(paper(), first_life=False)
     return bench
 
 
@@ -295,7 +295,7 @@ def test_a_respawned_manager_waits_for_a_module_no_longer_than_for_any_silent_on
     others = tuple(dm for dm in DMS if dm != "DM1")
     for dm in others:
         bench.idle(dm)
-    silence_s = osmosis().timing.detection_silence_timeout_s
+    silence_s = paper().timing.detection_silence_timeout_s
     bench.wait(silence_s - 0.1, hearing=others)
     assert bench.orders == ""
     bench.wait(0.2, hearing=others)

@@ -6,7 +6,7 @@ from unittest import mock
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from manager_bench import DMS, RMS, osmosis
+from manager_bench import DMS, RMS, paper
 
 from manager.arbiter import (
     Arbiter,
@@ -38,7 +38,7 @@ EVERYBODY = [*(DetectionHeard(name, False) for name in DMS),
 @given(st.sampled_from(STRATEGIES),
        st.lists(st.tuples(INPUTS, st.sampled_from([0.0, 0.05, 0.4, 3.0])), max_size=25))
 def test_the_short_way_leads_where_the_long_way_does(strategy, walk):
-    arbiter = build_arbiter(osmosis(), strategy)
+    arbiter = build_arbiter(paper(), strategy)
     state, now = arbiter.initial(0.0), 0.0
     for event, wait_s in [*((event, 0.0) for event in EVERYBODY), *walk]:
         now += wait_s
@@ -49,7 +49,7 @@ def test_the_short_way_leads_where_the_long_way_does(strategy, walk):
 
 
 def test_the_short_way_is_taken_while_all_is_well():
-    arbiter = build_arbiter(osmosis())
+    arbiter = build_arbiter(paper())
     state = arbiter.initial(0.0)
     for event in EVERYBODY:
         state, _ = arbiter.step(state, event, 0.1)

@@ -2,7 +2,7 @@
 
 import msgspec
 import pytest
-from manager_bench import Bench, commands, osmosis
+from manager_bench import Bench, commands, paper
 
 from manager.arbiter import Phase, ShadowDiffered
 
@@ -15,7 +15,7 @@ def system(*, mechanisms=None, recoveries=None, **fields):
         return tuple(msgspec.structs.replace(t, **(changes or {}).get(t.name, {}))
                      for t in tables)
 
-    spec = osmosis()
+    spec = paper()
     return msgspec.structs.replace(
         spec, mechanisms=edit(spec.mechanisms, mechanisms),
         recoveries=edit(spec.recoveries, recoveries), **fields)
@@ -399,7 +399,7 @@ def test_a_patient_shadow_is_told_who_is_late():
 
 def test_who_waited_for_a_deeper_one_has_its_whole_patience_when_its_turn_comes():
     """A respawn that succeeds must not end in the stop of the barrier two steps up."""
-    bench = Bench(msgspec.structs.replace(osmosis(), strategy="mission-first"))
+    bench = Bench(msgspec.structs.replace(paper(), strategy="mission-first"))
     bench.active("DM4", "osmosis_control")
     bench.active("DM2")
     bench.report("RM3", Phase.ACTING)

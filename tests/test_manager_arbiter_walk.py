@@ -2,12 +2,12 @@
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from manager_bench import DMS, RMS, Bench, osmosis
+from manager_bench import DMS, RMS, Bench, paper
 
 from manager.arbiter import Command, DecisionMade, Phase
 
-MECHANISMS = osmosis().build_mechanisms()
-ORDER = osmosis().build_order()
+MECHANISMS = paper().build_mechanisms()
+ORDER = paper().build_order()
 FINISHED = (Phase.DONE, Phase.DEGRADED)
 
 

@@ -5,12 +5,12 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from manager_bench import osmosis
+from manager_bench import paper
 
 from manager.order import CycleError, PartialOrder, Tree, UnknownElementError, find_cycle
 
-RM_ORDER = osmosis().build_order()
-FTM_TREE = osmosis().build_ftm_tree()
+RM_ORDER = paper().build_order()
+FTM_TREE = paper().build_ftm_tree()
 
 
 @pytest.mark.parametrize(("names", "greatest"), [

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from manager_bench import OSMOSIS, osmosis
+from manager_bench import PAPER, paper
 from stub_actors import ROOT
 
 import manager
@@ -22,7 +22,7 @@ FILE = "systems/paper.toml"
 
 
 def edit(*changes: tuple[str, str]) -> str:
-    text = OSMOSIS
+    text = PAPER
     for old, new in changes:
         assert text.count(old) == 1, f"{old!r} occurs {text.count(old)} times"
         text = text.replace(old, new)
@@ -39,7 +39,7 @@ def refusal(text: str) -> str:
 
 
 def test_the_shipped_system_is_the_papers():
-    spec = osmosis()
+    spec = paper()
     assert {m.name: (m.detect, m.recover) for m in spec.mechanisms} == {
         "FTM1": ("DM1", "RM1"), "FTM2": ("DM2", "RM2"), "FTM3": ("DM3", "RM2"),
         "FTM4": ("DM4", "RM3"), "FTM5": ("DM5", "RM4"), "FTM6": ("DM6", "RM5"),
@@ -50,9 +50,9 @@ def test_the_shipped_system_is_the_papers():
 
 
 def test_each_actor_has_a_process_of_its_own_unless_told_otherwise():
-    assert dict.fromkeys(osmosis().processes(), 1) == {
-        name: len(actors) for name, actors in osmosis().processes().items()}
-    assert len(osmosis().actors()) == 9 + 7 + 5
+    assert dict.fromkeys(paper().processes(), 1) == {
+        name: len(actors) for name, actors in paper().processes().items()}
+    assert len(paper().actors()) == 9 + 7 + 5
     shared = parse_specification(edit((
         'actor = "actors.operator.hmi:Hmi"', 'actor = "actors.operator.hmi:Hmi"\nprocess = "desk"'),
         ('name = "teleoperation"', 'name = "teleoperation"\nprocess = "desk"')), FILE)
@@ -67,7 +67,7 @@ def test_the_unprotected_baseline_has_no_fault_tolerance_actors():
 
 
 def test_parameters_may_name_a_timing_value():
-    spec = osmosis()
+    spec = paper()
     dm2 = next(d for d in spec.detections if d.name == "DM2")
     dm3 = next(d for d in spec.detections if d.name == "DM3")
     assert dm2.parameters["timeout_s"] == spec.timing.command_timeout_s == dm2.latency_s
@@ -78,7 +78,7 @@ def test_a_timing_value_that_is_given_is_kept():
     spec = parse_specification(edit((
         "arbitration_s = 0.05 ", "command_timeout_s = 1.05\narbitration_s = 0.05 ")), FILE)
     assert spec.timing.command_timeout_s == 1.05
-    assert spec.timing.localization_timeout_s == osmosis().timing.localization_timeout_s
+    assert spec.timing.localization_timeout_s == paper().timing.localization_timeout_s
 
 
 def test_gates_can_be_and_or_at_least():
@@ -96,7 +96,7 @@ def test_gates_can_be_and_or_at_least():
     (50.0, 0.64, 50.0, 0.64), (0.1, 0.64, 0.64, 0.1)])
 def test_of_two_latencies_the_longer_counts_and_the_shorter_for_the_mechanism_below(
         within_s, timeout_s, longest, soonest):
-    crash = next(d for d in osmosis().detections if d.name == "DM2")
+    crash = next(d for d in paper().detections if d.name == "DM2")
     crash = msgspec.structs.replace(crash, within_s=within_s, parameters={"timeout_s": timeout_s})
     assert (crash.latency_s, crash.soonest_s) == (longest, soonest)
 
@@ -368,13 +368,13 @@ def test_without_a_robot_timeouts_have_to_be_stated():
 
 
 def test_recoveries_without_any_mechanism_are_refused():
-    head, _, rest = OSMOSIS.partition('[[mechanism]]\nname = "FTM1"')
+    head, _, rest = PAPER.partition('[[mechanism]]\nname = "FTM1"')
     text = head + rest[rest.index("# ---- Fault tree"):]
     assert "$.mechanism: missing" in refusal(text)
 
 
 def test_no_event_at_all_is_refused():
-    head, _, rest = OSMOSIS.partition('[[event]]\nname = "moving_inside_prohibited_area"')
+    head, _, rest = PAPER.partition('[[event]]\nname = "moving_inside_prohibited_area"')
     text = head + rest[rest.index("# ---- Orders"):]
     assert "unknown event; known: none" in refusal(text)
 
@@ -387,7 +387,7 @@ def test_the_error_carries_its_parts():
 
 
 def test_a_spec_is_plain_data_that_can_be_sent_to_another_process():
-    spec = osmosis()
+    spec = paper()
     assert spec == msgspec.json.decode(msgspec.json.encode(spec), type=type(spec))
 
 

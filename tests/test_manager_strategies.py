@@ -3,7 +3,7 @@
 from itertools import combinations, pairwise
 
 import pytest
-from manager_bench import osmosis
+from manager_bench import paper
 
 from manager.order import UnknownElementError
 from manager.safety_first import SafetyFirst
@@ -15,7 +15,7 @@ from manager.strategies import (
     register,
 )
 
-SPEC = osmosis()
+SPEC = paper()
 MECHANISMS, TREE, ORDER = SPEC.build_mechanisms(), SPEC.build_ftm_tree(), SPEC.build_order()
 
 # The paper's figure 8 and its list of FTMs, once more by hand: the oracle reads no TOML.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from manager_bench import osmosis
+from manager_bench import paper
 
 from manager.arrangement import Arrangement
 from manager.guarded_repair import GuardedRepair
@@ -311,9 +311,9 @@ def test_one_more_late_mechanism_never_takes_mission_first_down_the_tree(questio
         assert not any(o != ftm and system.dominates(o, ftm) for o in before)
 
 
-OSMOSIS = Arrangement(
-    osmosis().build_mechanisms(), osmosis().build_ftm_tree(), osmosis().build_order())
-ALL_SETS = [c for n in range(1, 8) for c in combinations(OSMOSIS.mechanisms.names, n)]
+PAPER = Arrangement(
+    paper().build_mechanisms(), paper().build_ftm_tree(), paper().build_order())
+ALL_SETS = [c for n in range(1, 8) for c in combinations(PAPER.mechanisms.names, n)]
 
 
 @pytest.mark.parametrize(("active", "late", "rule", "executed"), [
@@ -339,7 +339,7 @@ ALL_SETS = [c for n in range(1, 8) for c in combinations(OSMOSIS.mechanisms.name
     ("FTM1 FTM4", "FTM4", 3, "RM1"),
 ])
 def test_mission_first_climbs_the_papers_tree(active, late, rule, executed):
-    decision = MissionFirst().choose(tuple(active.split()), OSMOSIS, frozenset(late.split()))
+    decision = MissionFirst().choose(tuple(active.split()), PAPER, frozenset(late.split()))
     assert (decision.rule, sorted(decision.recoveries)) == (rule, executed.split())
 
 
@@ -347,11 +347,11 @@ def test_mission_first_climbs_the_papers_tree(active, late, rule, executed):
 
 
 def latched(recoveries) -> bool:
-    return any(OSMOSIS.mechanisms.contracts[r].latched for r in recoveries)
+    return any(PAPER.mechanisms.contracts[r].latched for r in recoveries)
 
 
 def test_guarded_repair_stops_for_good_in_no_more_sets_than_safety_first():
-    chosen = {name: [STRATEGIES[name].choose(a, OSMOSIS, NOBODY).recoveries for a in ALL_SETS]
+    chosen = {name: [STRATEGIES[name].choose(a, PAPER, NOBODY).recoveries for a in ALL_SETS]
               for name in ("safety-first", "guarded-repair")}
     assert [sum(map(latched, sets)) for sets in chosen.values()] == [90, 88]
     differing = {active: (theirs, ours[0]) for active, theirs, ours in zip(
@@ -363,8 +363,8 @@ def test_guarded_repair_stops_for_good_in_no_more_sets_than_safety_first():
 def test_guarded_repair_repairs_whatever_safety_first_does_and_more():
     more = 0
     for active in ALL_SETS:
-        theirs, ours = ({r for r in STRATEGIES[name].choose(active, OSMOSIS, NOBODY).recoveries
-                         if OSMOSIS.mechanisms.contracts[r].kind.repairs}
+        theirs, ours = ({r for r in STRATEGIES[name].choose(active, PAPER, NOBODY).recoveries
+                         if PAPER.mechanisms.contracts[r].kind.repairs}
                         for name in ("safety-first", "guarded-repair"))
         assert theirs <= ours
         more += ours > theirs
@@ -381,7 +381,7 @@ def test_guarded_repair_repairs_whatever_safety_first_does_and_more():
     ("FTM1 FTM4 FTM7", "guarded-repair", "RM1 RM3 RM4"),
 ])
 def test_what_runs_together_on_the_papers_system(active, strategy, executed):
-    decision = STRATEGIES[strategy].choose(tuple(active.split()), OSMOSIS, NOBODY)
+    decision = STRATEGIES[strategy].choose(tuple(active.split()), PAPER, NOBODY)
     assert sorted(decision.recoveries) == executed.split()
 
 
@@ -462,7 +462,7 @@ def test_a_single_criterion_is_itself():
     ("FTM7", "FTM7", "FTM7"),
 ])
 def test_dom_and_low_com_dom_on_the_papers_tree(ftms, dom, low_com_dom):
-    tree = OSMOSIS.tree
+    tree = PAPER.tree
     assert (dom, low_com_dom) == (
         tree.greatest(ftms.split()), tree.lowest_common_dominant(ftms.split()))
 
@@ -471,4 +471,4 @@ def test_dom_and_low_com_dom_on_the_papers_tree(ftms, dom, low_com_dom):
     ("RM1 RM5", "RM1"), ("RM2 RM3", "RM2"), ("RM2 RM5 RM4", None), ("RM5 RM3 RM4", "RM5"),
     ("RM3 RM4", None)])
 def test_dom_on_the_papers_recoveries(rms, dom):
-    assert dom == OSMOSIS.order.greatest(rms.split())
+    assert dom == PAPER.order.greatest(rms.split())

@@ -6,7 +6,7 @@ from itertools import combinations
 
 import msgspec
 import pytest
-from manager_bench import Bench, edited, osmosis
+from manager_bench import Bench, edited, paper
 
 from manager import active_sets, transitions
 from manager.active_sets import ActiveSets, order_agrees_with_tree
@@ -21,7 +21,7 @@ from manager.transitions import Transitions, explore
 from manager.verification import MEANING, Report, TooLargeError, _askable, verify
 from toolbox.main import main
 
-SPEC = osmosis()
+SPEC = paper()
 ARRANGEMENT = Arrangement(SPEC.build_mechanisms(), SPEC.build_ftm_tree(), SPEC.build_order())
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from manager_bench import osmosis
+from manager_bench import paper
 from stub_actors import ROOT
 
 from manager.cut_sets import CutSets
@@ -188,7 +188,7 @@ def test_what_is_exported_comes_back_the_same(system):
 
 
 def test_titles_and_barriers_are_exported_as_labels_and_attributes():
-    text = write_open_psa(osmosis())
+    text = write_open_psa(paper())
     assert "<label>Moving inside a prohibited area</label>" in text
     assert '<attribute name="barrier" value="FTM1" />' in text
 
