@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import random
 
+import msgspec
 import pytest
 
 from actors.control.laser_check import LaserCheck
 from sim.campaign.job import Job, run_job
 from sim.scenario import parse_fault
+from sim.topic_faults import topic_fault
 
 
 def judge(references, period_s=0.05):
@@ -59,4 +61,15 @@ def test_a_robot_that_cannot_trust_its_laser_stands(fault):
 def test_once_the_laser_is_right_again_the_mission_goes_on():
     result = run_job(Job(row="x", system="paper", mission="A",
                          faults=(parse_fault("laser-stuck@26+3"),)))
+    assert (result.safe, result.success) == (True, True)
+
+
+@pytest.mark.parametrize("field", ["angle_min_rad", "angle_increment_rad", "ranges_f32"])
+def test_one_wrong_number_of_one_laser_hides_no_obstacle_from_a_robot_with_two(field):
+    seed = next(seed for seed in range(1, 999, 2) for offsets in [
+        topic_fault("corrupt", "summit_xl/scan", seed).disturbances[0].add_fields]
+        if offsets.get(field, 0) > 0)
+    wrong = msgspec.structs.replace(parse_fault("corrupt:summit_xl/scan@13+inf"), seed=seed)
+    result = run_job(Job(row="x", mission="A", seed=1,
+                         faults=(wrong, parse_fault("obstacle-ahead:4@14.1"))))
     assert (result.safe, result.success) == (True, True)
