@@ -15,7 +15,13 @@ from stub_actors import ROOT
 from virtual_loop import run, turns, until
 
 from actors import topics
-from actors.messages import AdaptedSystem, Heartbeat, NodeState, RespawnRequest
+from actors.messages import (
+    AdaptedSystem,
+    Heartbeat,
+    ManagerStatus,
+    NodeState,
+    RespawnRequest,
+)
 from actors.runtime.actor import Context
 from actors.runtime.clock import Clock
 from actors.runtime.envelope import decode, pack
@@ -165,10 +171,11 @@ class World:
         return self.supervisor, self.task
 
     def say(self, topic: Topic, body: msgspec.Struct, source: str = "tester", life: int = 1,
-            key: str = "") -> None:
+            *, key: str = "", stamp_s: float | None = None) -> None:
         self._sequence += 1
-        self.bus.publish(topic, key or topic.at(), pack(
-            (source, life, self._sequence, self.clock.now(), body)))
+        self.bus.publish(topic, key or topic.at(), pack((
+            source, life, self._sequence, self.clock.now() if stamp_s is None else stamp_s,
+            body)))
 
     def see(self, _now_s: float, _source: str, key: str, payload: bytes) -> None:
         if key == topics.PROCESS_EVENT.at():
@@ -178,7 +185,7 @@ class World:
     def beat(self, process: Process) -> None:
         for name in process.names:
             self.say(topics.HEARTBEAT, Heartbeat(process.pid, 0, 0.1, 0, 0), name,
-                     process.incarnation, topics.HEARTBEAT.at(name))
+                     process.incarnation, key=topics.HEARTBEAT.at(name))
 
     async def beats(self) -> None:
         while True:
@@ -264,11 +271,42 @@ def test_a_heartbeat_of_a_node_that_it_does_not_start_is_nothing_to_it():
     async def scenario() -> None:
         async with running() as world:
             world.say(topics.HEARTBEAT, Heartbeat(1, 1, 0.1, 0, 0), "stranger", 1,
-                      topics.HEARTBEAT.at("hmi"))
+                      key=topics.HEARTBEAT.at("hmi"))
             await turns()
             assert not world.task.done()
 
     run(scenario)
+
+
+@pytest.mark.parametrize("way", ["silent", "repeats old news"])
+def test_a_manager_that_beats_and_whose_status_is_not_heard_is_replaced(way):
+    async def scenario() -> None:
+        async with running() as world:
+            _, life, pid = world.row("ftm_manager")
+            for _ in range(20):
+                status(world, life)
+                await asyncio.sleep(0.1)
+            assert world.row("ftm_manager") == ("running", life, pid)
+            heard_s = world.clock.now()
+            for _ in range(10):
+                if way == "repeats old news":
+                    status(world, life, heard_s)
+                await asyncio.sleep(0.1)
+            assert world.row("ftm_manager")[:2] == ("running", life + 1)
+            assert ("ftm_manager", "wedged", life) in world.events
+            # Its next life is given the time that it needs.
+            await asyncio.sleep(2.0)
+            assert world.row("ftm_manager")[:2] == ("running", life + 1)
+            status(world, life)  # nor does its old life speak for it
+            await asyncio.sleep(2.0)
+            assert world.row("ftm_manager")[:2] == ("running", life + 1)
+
+    run(scenario)
+
+
+def status(world: World, life: int, stamp_s: float | None = None) -> None:
+    world.say(topics.MANAGER_STATUS, ManagerStatus((), (), (), (), "safety-first", 0),
+              "ftm_manager", life, stamp_s=stamp_s)
 
 
 def test_a_process_that_no_descriptor_is_left_for_is_held_as_soon_as_there_is_one():

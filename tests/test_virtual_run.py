@@ -130,8 +130,8 @@ def test_a_second_signal_ends_a_run_at_once_and_its_recording_is_closed(tmp_path
 
 @pytest.mark.parametrize("fault", [
     "drop:detection/DM1@20+inf", "freeze:detection/DM1@20+inf", "slow:DM1@20",
-    "delay:detection/DM2@20+inf"])
-def test_a_detection_module_that_lives_and_is_not_heard_costs_nothing(fault):
+    "delay:detection/DM2@20+inf", "drop:manager/status@20+inf", "freeze:manager/status@20+inf"])
+def test_a_detection_module_or_manager_that_lives_and_is_not_heard_costs_nothing(fault):
     result = run_job(job(fault))
     assert (result.success, result.safe, result.decisions) == (True, True, ())
     assert result.effective

@@ -3,7 +3,8 @@
 * *Crashed*: the process's pidfd becomes readable, at once; this works for processes that are
   not children, so a restarted supervisor adopts the living ones it finds in /proc.
 * *Stopped*: no heartbeat, and the kernel says the process is stopped (SIGSTOP).
-* *Wedged*: no heartbeat although the process runs: its event loop turns no more.
+* *Wedged*: no heartbeat although the process runs: its event loop turns no more. Of the manager,
+  whose silence stops the robot, the status counts as much as the heartbeat.
 
 What a recovery module owns (RM3, RM4) is respawned on that module's request, so that the FTM
 Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order,
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,6 +29,7 @@ from actors.messages import (
     Heartbeat,
     Injection,
     InjectionReport,
+    ManagerStatus,
     NodeInfo,
     NodeState,
     NodeTable,
@@ -56,6 +59,9 @@ START_TIMEOUT_S = 3.0
 
 _CHECK_S = 0.1
 """Simulated seconds between two looks at who is silent."""
+
+_STATUS = "fresh status of the manager"
+"""Stands among the names of a process' nodes for what the Safety Pilot lives on."""
 
 _RETRY_S = 0.05
 _DEAD = (NodeState.CRASHED, NodeState.GIVEN_UP)
@@ -174,6 +180,17 @@ class Supervisor(Actor):
             self._event(process, "resumed" if resumed else "running", self.name)
             self._publish_table()
 
+    @on(topics.MANAGER_STATUS)
+    def manager(self, _status: ManagerStatus, header: Header) -> None:
+        """Note that the manager is heard, or was when it said so: old news is no sign of life."""
+        process = self._processes.get(self._layout.unit_of.get(header.source, ""))
+        if process is None or header.incarnation != process.incarnation or (
+                process.next_step is not None):
+            return
+        age_s = max(0.0, self.clock.now() - header.stamp) / self._plan.rate
+        process.heard_s[_STATUS] = max(
+            process.heard_s.get(_STATUS, -math.inf), self._loop.time() - age_s)
+
     @on(topics.DIAGNOSTIC)
     def diagnostic(self, message: Diagnostic, _header: Header) -> None:
         """Pass a node's error report on to whoever shows it."""
@@ -261,7 +278,8 @@ class Supervisor(Actor):
     def _silent(self, process: _Process, nodes: list[str]) -> None:
         stopped = process.handle is not None and process.handle.stopped()
         state = NodeState.STOPPED if stopped else NodeState.WEDGED
-        self._event(process, state.value, self.name, f"no heartbeat from {', '.join(nodes)}")
+        self._event(process, state.value, self.name, f"no {_STATUS}" if nodes == [_STATUS] else (
+            f"no heartbeat from {', '.join(name for name in nodes if name != _STATUS)}"))
         self._lost(process, state)
 
     def _lost(self, process: _Process, state: NodeState) -> None:
