@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import lru_cache
 from itertools import chain, combinations
 
@@ -75,6 +75,14 @@ class Gate(msgspec.Struct, frozen=True):
     def alternatives(self) -> Iterator[tuple[str, ...]]:
         """Yield the sets of names that satisfy a gate without negation, preferred ones first."""
         if self.name:
+    def said_with(self, words: Mapping[str, str]) -> str:
+        """Return the gate in text, with names replaced by words for those that have some."""
+        return str(self._renamed(words))
+
+    def _renamed(self, words: Mapping[str, str]) -> Gate:
+        return Gate(words.get(self.name) or self.name, self.negated, self.required,
+                    tuple(gate._renamed(words) for gate in self.inputs))
+
             yield (self.name,)
             return
         for chosen in combinations(self.inputs, self.required):
