@@ -101,6 +101,9 @@ def test_a_gate_and_an_order_and_a_strategy_are_changed():
     ("retune", "DM2", {"timeout_s": 5.0},
      "paper.toml: $.timing: the time budget does not fit: FTM2 needs 5.150 s (detection 5.000 + "
      "arbitration 0.050 + actuation 0.100) of 1.250 s before the robot drifts out of the corridor"),
+    ("retune", "DM4", {"timeout_s": 0.01},
+     "paper.toml: $.detection[3].parameters.timeout_s = 0.01: would raise false alarms; at least "
+     "0.420 s, 3 periods of heartbeat_period_s = 0.140 s, is right"),
     ("retune", "DM1", {"hold_s": -1},
      "paper.toml: $.detection[0].parameters.hold_s = -1: expected a number, 0 or more"),
     ("retune", "DM3", {"hold": 1},
@@ -119,13 +122,6 @@ def test_refused_in_one_line(action, name, values, message):
     with pytest.raises((ChangeError, SpecificationError)) as caught:
         change(action, name, **values)
     assert str(caught.value) == message
-
-
-def test_a_name_that_stands_in_two_tables_is_ambiguous():
-    document = copy.deepcopy(DOCUMENT)
-    document["mechanism"][0]["name"] = "DM1"
-    with pytest.raises(ChangeError, match="'DM1' is the name of a detection and of a mechanism"):
-        adapt(document, Change(Action.DISABLE, "DM1"), "f")
 
 
 JSON = st.recursive(
