@@ -273,6 +273,10 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
         answer = await engineer.ask("disable", "FTM7")
         assert not answer.accepted
         assert answer.reason == ("not in the middle of a recovery: RM2; try again when it is over")
+        answer = await engineer.ask("retune", "DM99", '{"margin_m": 0.7}')
+        assert answer.reason.startswith("unknown detection module, recovery module or mechanism")
+        answer = await engineer.ask("retune", "DM4", '{"timeout_s": 0.01}')
+        assert "would raise false alarms" in answer.reason
         system.robot.silent.clear()
         await asyncio.sleep(2.0)
         assert (await engineer.ask("disable", "FTM7")).accepted
@@ -286,6 +290,10 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
     ("disable", "FTM7", "{", "Input data was truncated"),
     ("disable", "FTM1", "{}", "the FTMTree has 3 roots"),
     ("retune", "DM1", '{"actor": "actors.detection.bounds:Nobody"}', "no such actor class"),
+    ("retune", "DM3", '{"actor": "actors.stub.recovery:StubRecovery"}',
+     "it does not publish detection/{name}, as the modules of this table do"),
+    ("retune", "RM5", '{"actor": "actors.stub.node:StubNode"}',
+     "it does not publish recovery/{name}/state, as the modules of this table do"),
 ])
 def test_what_is_refused_changes_nothing(action, name, values, words):
     async def scenario(system: Whole, engineer: Engineer) -> None:
