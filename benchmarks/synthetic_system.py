@@ -26,6 +26,11 @@ lateral_distance_m = 0.3
 sensing_range_m = 5.0
 gps_accuracy_m = 0.05
 corridor_clearance_m = 1.5
+
+[[node]]
+name = "manager"
+actor = "manager.actor:FtmManager"
+kind = "manager"
 '''
 
 

@@ -198,7 +198,7 @@ class ActiveSets:
         for one in case.decision.recoveries:
             for other in case.decision.recoveries:
                 harmed = self.arrangement.mechanisms.harms(one, other)
-                if one != other and harmed:
+                if harmed:
                     return (case.describe(), f"{one} disables {', '.join(sorted(harmed))}, which "
                                              f"{other} needs")
         return None

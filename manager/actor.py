@@ -160,14 +160,16 @@ class FtmManager(Actor):
 
     def _change(self, change: Change, by: str) -> str:
         """Make a change at once and whole; return why not, or ""."""
-        busy = self.arbiter_state.busy
-        if busy:
-            return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"
         if not self._document:
             return "this manager was started without a system file"
         document, system = adapt(self._document, change, f"{self._system.name}.toml")
-        for actor in (*(d.actor for d in system.detections), *(r.actor for r in system.recoveries)):
-            load_class(actor)
+        busy = self.arbiter_state.busy
+        if busy:
+            return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"
+        for detection in system.detections:
+            load_class(detection.actor, topics.DETECTION)
+        for recovery in system.recoveries:
+            load_class(recovery.actor, topics.RECOVERY)
         arbiter = build_arbiter(system)
         self.arbiter_state = arbiter.take_over(self.arbiter_state, self.clock.now())
         self._arbiter, self._document, self._system = arbiter, document, system

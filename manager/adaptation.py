@@ -130,9 +130,6 @@ def _find(document: Document, name: str) -> tuple[str, dict[str, Any]]:
         known = [row.get("name") for table in TABLES for row in document.get(table, ())]
         raise ChangeError(f"unknown detection module, recovery module or mechanism {name!r}; "
                           f"known: {', '.join(map(str, known))}")
-    if len(found) > 1:
-        raise ChangeError(f"{name!r} is the name of a {found[0][0]} and of a {found[1][0]}; give "
-                          "them different names in the spec to change one of them")
     return found[0]
 
 

@@ -174,12 +174,20 @@ def find_false_alarms(spec: SystemSpec) -> Iterator[tuple[str, float, str]]:
             ("dead_man_timeout_s", "control_period_s"),
             ("manager_timeout_s", "manager_period_s"),
             ("detection_silence_timeout_s", "detection_period_s")):
-        value, period = getattr(timing, field), getattr(timing, period_field)
-        least = PERIODS_TO_MISS * period
-        if value < least - 1e-9:
-            yield (f"$.timing.{field}", value,
-                   f"would raise false alarms; at least {least:.3f} s, {PERIODS_TO_MISS} periods "
-                   f"of {period_field} = {period:.3f} s, is right")
+        value = getattr(timing, field)
+        problem = find_false_alarm(timing, value, period_field)
+        if problem:
+            yield f"$.timing.{field}", value, problem
+
+
+def find_false_alarm(timing: Timing, timeout_s: float, period_field: str) -> str:
+    """Say what is wrong with a timeout on what comes with a period of `[timing]`; "" if nothing."""
+    period_s = getattr(timing, period_field)
+    least_s = PERIODS_TO_MISS * period_s
+    if timeout_s >= least_s - 1e-9:
+        return ""
+    return (f"would raise false alarms; at least {least_s:.3f} s, {PERIODS_TO_MISS} periods of "
+            f"{period_field} = {period_s:.3f} s, is right")
 
 
 class _Modules:

@@ -7,22 +7,30 @@ sequence and the first finding is the one reported, so a validator may rely on t
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from itertools import permutations, product
 from typing import Any, NamedTuple
 
 import msgspec
 
-from manager.budget import braking_distance_m, check, find_false_alarms
+from manager.budget import braking_distance_m, check, find_false_alarm, find_false_alarms
 from manager.fault_tree import FaultTreeError
-from manager.gates import GateError, detection_gate, recovery_gate
+from manager.gates import WORDS, GateError, detection_gate, recovery_gate
 from manager.order import CycleError, PartialOrder, find_cycle
-from manager.parameters import find_wrong
-from manager.schema import DetectionSpec, Hazard, Kind, RecoverySpec, Robot, SystemSpec
+from manager.parameters import TAKES, TIMES_OUT_ON, find_wrong
+from manager.schema import (
+    NODE_KINDS,
+    DetectionSpec,
+    Hazard,
+    Kind,
+    RecoverySpec,
+    Robot,
+    SystemSpec,
+)
 from manager.strategies import STRATEGIES
 
 SUPERVISOR = "supervisor"
+MANAGER_CLASS = "manager.actor:FtmManager"
 RESERVED = frozenset({
     SUPERVISOR, "spawner", "spawner_a", "spawner_b", "launch", "observer", "injector"})
 
@@ -63,22 +71,35 @@ def _unknown(path: str, value: str, what: str, known: Sequence[str]) -> Finding:
     return Finding(path, f"unknown {what}; known: {', '.join(known) or 'none'}", (value,))
 
 
+def _modules(spec: SystemSpec) -> Iterator[tuple[str, str, str, str]]:
+    """Yield path, name, process and respawner of all nodes, detection and recovery modules."""
+    for i, node in enumerate(spec.nodes):
+        yield f"$.node[{i}]", node.name, node.process, node.respawn
+    for i, detection in enumerate(spec.detections):
+        yield f"$.detection[{i}]", detection.name, detection.process, SUPERVISOR
+    for i, recovery in enumerate(spec.recoveries):
+        yield f"$.recovery[{i}]", recovery.name, recovery.process, SUPERVISOR
+
+
 def _names(spec: SystemSpec) -> Iterator[Finding]:
     taken = dict.fromkeys(RESERVED, "reserved")
-    modules = [(f"$.node[{i}]", node.name, node.process) for i, node in enumerate(spec.nodes)]
-    modules += [(f"$.detection[{i}]", d.name, d.process) for i, d in enumerate(spec.detections)]
-    modules += [(f"$.recovery[{i}]", r.name, r.process) for i, r in enumerate(spec.recoveries)]
-    for path, name, process in modules:
+    named = [(path, name, process) for path, name, process, _ in _modules(spec)]
+    named += [(f"$.mechanism[{i}]", m.name, "") for i, m in enumerate(spec.mechanisms)]
+    for path, name, process in named:
+        if name in WORDS:
+            yield Finding(f"{path}.name", "a word of gates, no name", (name,))
         if name in taken:
             yield Finding(f"{path}.name", f"duplicate name, {taken[name]}; nodes, detection and "
-                                          "recovery modules share one namespace", (name,))
+                          "recovery modules and mechanisms share one namespace", (name,))
         taken[name] = f"already at {path}.name"
         if process in RESERVED:
             yield Finding(f"{path}.process", "reserved; nothing else can live in it", (process,))
-    count = Counter(mechanism.name for mechanism in spec.mechanisms)
-    for index, mechanism in enumerate(spec.mechanisms):
-        if count[mechanism.name] > 1:
-            yield Finding(f"$.mechanism[{index}].name", "duplicate mechanism", (mechanism.name,))
+    events: dict[str, int] = {}
+    for index, event in enumerate(spec.events):
+        if event.name in events:
+            yield Finding(f"$.event[{index}].name", "duplicate name, already at "
+                          f"$.event[{events[event.name]}].name", (event.name,))
+        events[event.name] = index
 
 
 def _nodes(spec: SystemSpec) -> Iterator[Finding]:
@@ -87,11 +108,51 @@ def _nodes(spec: SystemSpec) -> Iterator[Finding]:
         path = f"$.node[{index}]"
         if node.kind in {Kind.DETECTION, Kind.RECOVERY}:
             yield Finding(f"{path}.kind", f"belongs into [[{node.kind.value}]]", (node.kind.value,))
+        if node.kind not in NODE_KINDS:
+            yield _unknown(f"{path}.kind", node.kind.value, "kind", NODE_KINDS)
+        if node.actor == MANAGER_CLASS and node.kind is not Kind.MANAGER:
+            yield Finding(f"{path}.kind", f"{node.actor} has to be of kind 'manager'",
+                          (node.kind.value,))
         if node.respawn not in respawners:
             yield _unknown(f"{path}.respawn", node.respawn, "recovery module", respawners)
         if node.kind is Kind.MANAGER and node.respawn != SUPERVISOR:
             yield Finding(f"{path}.respawn", "the manager cannot command its own recovery; only "
                                              f"{SUPERVISOR!r} is right", (node.respawn,))
+    yield from _sole_nodes(spec)
+
+
+def _sole_nodes(spec: SystemSpec) -> Iterator[Finding]:
+    for kind in (Kind.MANAGER, Kind.PILOT):
+        found = [(index, node.name) for index, node in enumerate(spec.nodes) if node.kind is kind]
+        if len(found) > 1:
+            yield Finding(f"$.node[{found[1][0]}].kind", f"{found[0][1]} is of this kind already; "
+                          f"a system has one {kind.value} at most", (kind.value,))
+        if kind is Kind.MANAGER and not found and spec.mechanisms and spec.layers.ftm:
+            yield Finding("$.node", "no node is of kind 'manager', so no mechanism would act; add "
+                          f"one with actor = {MANAGER_CLASS!r}, or say ftm = false in [layers]")
+
+
+def _processes(spec: SystemSpec) -> Iterator[Finding]:
+    """Actors of one process come back together: all by the same hand, and none by its own."""
+    lives_in = {name: process or name for _, name, process, _ in _modules(spec)}
+    first: dict[str, tuple[str, str]] = {}
+    for path, name, _, respawn in _modules(spec):
+        other, by = first.setdefault(lives_in[name], (name, respawn))
+        if respawn != by:
+            yield Finding(f"{path}.process", f"{other} lives there too and is brought back by {by},"
+                          f" {name} by {respawn}; who shares a process is brought back by the same",
+                          (lives_in[name],))
+    managers = {lives_in[node.name] for node in spec.nodes if node.kind is Kind.MANAGER}
+    for index, recovery in enumerate(spec.recoveries):
+        if "nodes" not in TAKES.get(recovery.actor, {}):
+            continue
+        for place, name in enumerate(recovery.parameters.get("nodes", ())):
+            if lives_in[name] in managers:
+                yield Finding(f"$.recovery[{index}].parameters.nodes[{place}]", "the manager lives "
+                              "in its process, and cannot command its own recovery", (name,))
+            if lives_in[name] == lives_in[recovery.name]:
+                yield Finding(f"$.recovery[{index}].parameters.nodes[{place}]", f"{recovery.name} "
+                              "lives in its process, and would end itself", (name,))
 
 
 def _detections(spec: SystemSpec) -> Iterator[Finding]:
@@ -108,12 +169,19 @@ def _detections(spec: SystemSpec) -> Iterator[Finding]:
             for place, name in enumerate(watch):
                 if name not in nodes:
                     yield _unknown(f"{path}.parameters.watch[{place}]", name, "node", nodes)
+                if name in watch[:place]:
+                    yield Finding(f"{path}.parameters.watch[{place}]", "listed twice", (name,))
         for key in ("timeout_s", "margin_m"):
             value = parameters.get(key, 1.0)
             if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
                 yield Finding(f"{path}.parameters.{key}", "expected a number > 0", (value,))
                 return
         yield from _parameters(path, detection, nodes)
+        if detection.actor in TIMES_OUT_ON and "timeout_s" in parameters:
+            problem = find_false_alarm(
+                spec.timing, parameters["timeout_s"], TIMES_OUT_ON[detection.actor])
+            if problem:
+                yield Finding(f"{path}.parameters.timeout_s", problem, (parameters["timeout_s"],))
         if not detection.latency_s > 0:
             yield Finding(f"{path}.within_s", "missing; say within how many seconds the module "
                                               "detects, here or as parameters.timeout_s")
@@ -151,7 +219,18 @@ def _mechanisms(spec: SystemSpec) -> Iterator[Finding]:
 
 def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
     names = [recovery.name for recovery in spec.recoveries]
+    there = {node.name for node in spec.nodes}.union(
+        *(recovery.claims | recovery.disables for recovery in spec.recoveries))
     for index, recovery in enumerate(spec.recoveries):
+        for need in sorted(recovery.needs):
+            if need not in there:
+                yield Finding(f"$.recovery[{index}].needs", f"{need!r} is neither a node nor a "
+                              "resource that a recovery claims or disables; known: "
+                              f"{', '.join(sorted(there))}", (sorted(recovery.needs),))
+            if need in recovery.disables:
+                yield Finding(f"$.recovery[{index}].disables", f"{recovery.name} itself needs "
+                              f"{need!r}; leave it out of one of the two",
+                              (sorted(recovery.disables),))
         if recovery.escalate_to and recovery.escalate_to not in names:
             yield _unknown(f"$.recovery[{index}].escalate_to", recovery.escalate_to,
                            "recovery module", names)
@@ -337,6 +416,9 @@ def _room(robot: Robot) -> Iterator[Finding]:
         if room_m <= braking_m:
             yield Finding(f"$.robot.{field}", f"too little to brake in; from top_speed_mps the "
                           f"robot takes {braking_m:.3f} m", (room_m,))
+    if robot.hardware_speed_mps < robot.top_speed_mps:
+        yield Finding("$.robot.hardware_speed_mps", "the drive cannot be slower than top_speed_mps "
+                      f"= {robot.top_speed_mps}", (robot.hardware_speed_mps,))
     if robot.sensing_range_m <= robot.stop_distance_m:
         yield Finding("$.robot.sensing_range_m", "obstacles must be seen before they are nearer "
                       f"than stop_distance_m = {robot.stop_distance_m}", (robot.sensing_range_m,))
@@ -344,10 +426,13 @@ def _room(robot: Robot) -> Iterator[Finding]:
 
 def _budget(spec: SystemSpec) -> Iterator[Finding]:
     root = spec.build_ftm_tree().root if spec.mechanisms else ""
-    of_robots = {Hazard.DRIFT, Hazard.RUNAWAY, Hazard.INTRUSION}
     detections = {detection.name: detection for detection in spec.detections}
     for index, mechanism in enumerate(spec.mechanisms):
-        if spec.mobile is None and mechanism.against in of_robots:
+        if spec.mobile is None and mechanism.against is Hazard.DRIFT:
+            yield Finding(f"$.mechanism[{index}].against", "'drift', which it is if left out, "
+                          "needs a [robot]; 'parent' or { within_s = ..., hazard = '...' } is "
+                          "right")
+        if spec.mobile is None and mechanism.against in {Hazard.RUNAWAY, Hazard.INTRUSION}:
             yield Finding(f"$.mechanism[{index}].against", "needs a [robot]; 'parent' or "
                           "{ within_s = ..., hazard = '...' } is right", (mechanism.against.value,))
         if mechanism.against is Hazard.PARENT and mechanism.name == root:
@@ -371,5 +456,5 @@ def _budget(spec: SystemSpec) -> Iterator[Finding]:
 
 
 VALIDATORS: tuple[Callable[[SystemSpec], Iterator[Finding]], ...] = (
-    _timing, _names, _nodes, _detections, _recoveries, _mechanisms, _reachability, _fault_tree,
-    _policy, _orders, _criteria, _compounds, _order_against_tree, _budget)
+    _timing, _names, _nodes, _detections, _recoveries, _processes, _mechanisms, _reachability,
+    _fault_tree, _policy, _orders, _criteria, _compounds, _order_against_tree, _budget)

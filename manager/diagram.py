@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import msgspec
 
+from manager.gates import detection_gate, recovery_gate
 from manager.order import PartialOrder
 from manager.schema import EventSpec, MechanismSpec, SystemSpec
 from manager.words import decision_in_words
@@ -177,12 +178,12 @@ def _gate(event: EventSpec) -> str:
 
 def _ftm_tree(spec: SystemSpec, situation: Situation) -> _Parts:
     asked = _is_asked_for(spec, situation)
-    titles = {d.name: d.title for d in spec.detections}
-    titles |= {r.name: r.title for r in spec.recoveries}
+    titles = {d.name: clean(d.title) for d in spec.detections}
+    titles |= {r.name: clean(r.title) for r in spec.recoveries}
     boxes = []
     for mechanism in spec.mechanisms:
-        detects, recovers = (" + ".join(clean(titles.get(n, "")) or n for n in names)
-                             for names in (mechanism.detections, mechanism.recoveries))
+        detects, recovers = (gate.said_with(titles) for gate in (
+            detection_gate(mechanism.detect), recovery_gate(mechanism.recover)))
         boxes.append(_bar(Box(mechanism.name, f"{detects} → {recovers}"), mechanism, situation,
                           asked))
     if not boxes:

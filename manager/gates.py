@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import lru_cache
 from itertools import chain, combinations
 
@@ -28,6 +28,9 @@ MAX_NAMES = 16
 """A gate over more modules than these is a fault tree; it belongs there."""
 
 MAX_DEPTH = 50
+
+WORDS = frozenset({"and", "or", "not", "of"})
+"""Of the language; no module can be called so."""
 
 MAX_WAYS = 64
 """Alternatives of a recovery gate: `(A or B) and (C or D)` has four. Each is tried in turn."""
@@ -71,6 +74,14 @@ class Gate(msgspec.Struct, frozen=True):
                 return self.name not in active or self.name in silent
             return self.name in active
         return sum(gate.holds(active, silent) for gate in self.inputs) >= self.required
+
+    def said_with(self, words: Mapping[str, str]) -> str:
+        """Return the gate in text, with names replaced by words for those that have some."""
+        return str(self._renamed(words))
+
+    def _renamed(self, words: Mapping[str, str]) -> Gate:
+        return Gate(words.get(self.name) or self.name, self.negated, self.required,
+                    tuple(gate._renamed(words) for gate in self.inputs))
 
     def alternatives(self) -> Iterator[tuple[str, ...]]:
         """Yield the sets of names that satisfy a gate without negation, preferred ones first."""
@@ -160,7 +171,6 @@ def _product(parts: list[tuple[tuple[str, ...], ...]]) -> Iterator[tuple[str, ..
 
 _TOKEN = re.compile(r"\s*([A-Za-z][A-Za-z0-9_]*|[0-9]+|[(),])")
 _MAX_DIGITS = 9
-_WORDS = frozenset({"and", "or", "not", "of"})
 
 
 class _Parser:
@@ -232,7 +242,7 @@ class _Parser:
                 raise GateError(f"{token[:_MAX_DIGITS]}... of: between 1 and the number of inputs "
                                 "is right")
             return self._at_least(int(token))
-        if not token or token in _WORDS or not token[0].isalpha():
+        if not token or token in WORDS or not token[0].isalpha():
             raise GateError(f"expected a name, got {token or 'the end'!r}")
         return Gate(name=token)
 

@@ -97,6 +97,14 @@ NEEDS = {"actors.detection.watchdog:Watchdog": "watch", "actors.recovery.respawn
          "actors.recovery.respawn_braked:RespawnBraked": "nodes"}
 """Without this one the module does not start."""
 
+TIMES_OUT_ON = {
+    "actors.detection.freshness:CommandFreshness": "control_period_s",
+    "actors.detection.freshness:LocalizationFreshness": "control_period_s",
+    "actors.detection.pilot_output:PilotOutput": "control_period_s",
+    "actors.detection.watchdog:Watchdog": "heartbeat_period_s",
+}
+"""The period of `[timing]` with which comes what a module's `timeout_s` waits for."""
+
 
 def find_wrong(actor: str, parameters: Mapping[str, Any], nodes: Collection[str],
                derived: Collection[str] = ()) -> Iterator[tuple[str, str]]:

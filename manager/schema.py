@@ -178,6 +178,10 @@ class Kind(StrEnum):
     RECOVERY = "recovery"
 
 
+NODE_KINDS = (Kind.CONTROL, Kind.NON_CONTROL, Kind.PILOT, Kind.MANAGER, Kind.WORLD)
+"""What a `[[node]]` can be; the others are the supervisor, and what has a table of its own."""
+
+
 class NodeSpec(Table, frozen=True):
     """A node: one actor.
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from enum import Enum
 from typing import Any
 
@@ -26,6 +26,7 @@ from manager.budget import derive_timeouts
 from manager.checks import find_nonsense, find_nonsense_of_rest
 from manager.mechanisms import RecoveryKind
 from manager.schema import (
+    NODE_KINDS,
     AtLeast,
     DetectionSpec,
     EventSpec,
@@ -57,8 +58,9 @@ TABLES: dict[str, type[Table]] = {
 
 _TOO_DEEP = "nested too deeply; a spec needs three levels"
 
-ENUMS: dict[tuple[str, str], type[Enum]] = {
-    ("node", "kind"): Kind, ("recovery", "kind"): RecoveryKind, ("mechanism", "against"): Hazard,
+ENUMS: dict[tuple[str, str], Iterable[Enum]] = {
+    ("node", "kind"): NODE_KINDS, ("recovery", "kind"): RecoveryKind,
+    ("mechanism", "against"): Hazard,
 }
 
 LARGEST, SMALLEST = 1e9, 1e-9
@@ -90,13 +92,13 @@ def parse_specification(text: str, file: str) -> SystemSpec:
 
 
 def read_document(text: str, file: str) -> dict[str, Any]:
-    """Read TOML, unchecked.
+    """Read TOML, unchecked; a byte order mark at its beginning is no part of it.
 
     Raises:
         SpecificationError: The text is no TOML.
     """
     try:
-        return tomllib.loads(text)
+        return tomllib.loads(text.removeprefix("\ufeff"))
     except tomllib.TOMLDecodeError as error:
         raise SpecificationError(file, "$", f"not valid TOML: {error}") from None
     except ValueError:
@@ -238,6 +240,8 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any],
     if (table, field) in ENUMS:
         known = [member.value for member in ENUMS[table, field]]
         problem = f"unknown {field}; known: {', '.join(known)}"
+        if field == "against":
+            problem += ", or { within_s = ..., hazard = '...' }"
     elif field == "gate":
         problem = "unknown gate; known: 'or', 'and', { at_least = k }"
     elif "regex" in problem and field == "actor":

@@ -31,7 +31,7 @@ MEANING = {
     "recovery-ends": "every recovery that was started ends or escalates",
     "none-cut-off": "no recovery is released half-way",
     "monotone": "one more active mechanism never leads to a less safe recovery",
-    "no-harm": "no recovery disables what another one needs",
+    "no-harm": "no recovery disables what it or another one needs",
     "repairs-run": "a repair that is needed is run some time, unless the last resort latches",
     "order-agrees-with-tree": "no mechanism is safer than one above it",
 }

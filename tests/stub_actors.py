@@ -24,9 +24,9 @@ _BASES = iter(range(10_000 + os.getpid() % 250 * 40, 32_000, 40))
 
 
 class Idler(Actor):
-    """Beats its heart and does nothing else."""
+    """Beats its heart and does nothing else; it may stand in every table of a spec."""
 
-    outputs = (topics.POSE,)
+    outputs = (topics.POSE, topics.DETECTION, topics.RECOVERY)
 
 
 def write_stub_system(directory: Path) -> Path:

@@ -101,6 +101,9 @@ def test_a_gate_and_an_order_and_a_strategy_are_changed():
     ("retune", "DM2", {"timeout_s": 5.0},
      "paper.toml: $.timing: the time budget does not fit: FTM2 needs 5.150 s (detection 5.000 + "
      "arbitration 0.050 + actuation 0.100) of 1.250 s before the robot drifts out of the corridor"),
+    ("retune", "DM4", {"timeout_s": 0.01},
+     "paper.toml: $.detection[3].parameters.timeout_s = 0.01: would raise false alarms; at least "
+     "0.420 s, 3 periods of heartbeat_period_s = 0.140 s, is right"),
     ("retune", "DM1", {"hold_s": -1},
      "paper.toml: $.detection[0].parameters.hold_s = -1: expected a number, 0 or more"),
     ("retune", "DM3", {"hold": 1},
@@ -119,13 +122,6 @@ def test_refused_in_one_line(action, name, values, message):
     with pytest.raises((ChangeError, SpecificationError)) as caught:
         change(action, name, **values)
     assert str(caught.value) == message
-
-
-def test_a_name_that_stands_in_two_tables_is_ambiguous():
-    document = copy.deepcopy(DOCUMENT)
-    document["mechanism"][0]["name"] = "DM1"
-    with pytest.raises(ChangeError, match="'DM1' is the name of a detection and of a mechanism"):
-        adapt(document, Change(Action.DISABLE, "DM1"), "f")
 
 
 JSON = st.recursive(
@@ -277,6 +273,10 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
         answer = await engineer.ask("disable", "FTM7")
         assert not answer.accepted
         assert answer.reason == ("not in the middle of a recovery: RM2; try again when it is over")
+        answer = await engineer.ask("retune", "DM99", '{"margin_m": 0.7}')
+        assert answer.reason.startswith("unknown detection module, recovery module or mechanism")
+        answer = await engineer.ask("retune", "DM4", '{"timeout_s": 0.01}')
+        assert "would raise false alarms" in answer.reason
         system.robot.silent.clear()
         await asyncio.sleep(2.0)
         assert (await engineer.ask("disable", "FTM7")).accepted
@@ -290,6 +290,10 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
     ("disable", "FTM7", "{", "Input data was truncated"),
     ("disable", "FTM1", "{}", "the FTMTree has 3 roots"),
     ("retune", "DM1", '{"actor": "actors.detection.bounds:Nobody"}', "no such actor class"),
+    ("retune", "DM3", '{"actor": "actors.stub.recovery:StubRecovery"}',
+     "it does not publish detection/{name}, as the modules of this table do"),
+    ("retune", "RM5", '{"actor": "actors.stub.node:StubNode"}',
+     "it does not publish recovery/{name}/state, as the modules of this table do"),
 ])
 def test_what_is_refused_changes_nothing(action, name, values, words):
     async def scenario(system: Whole, engineer: Engineer) -> None:

@@ -116,6 +116,13 @@ def test_modules_of_other_people_take_what_they_like():
 
 FTM2 = 'name = "FTM2"\ndetect = "DM2"\nrecover = "RM2"\nevent = "command_not_updated"\n'
 HMI = 'name = "hmi"\nactor = "actors.operator.hmi:Hmi"\nkind = "non-control"\nrespawn = "RM4"'
+RM4 = 'claims = ["other_nodes"]'
+MANAGER = """[[node]]
+name = "ftm_manager"
+actor = "manager.actor:FtmManager"
+kind = "manager"
+respawn = "supervisor"
+"""
 PROHIBITED = 'of = ["erroneous_graph", "erroneous_command", "actuator_failure"]'
 STALE = 'gate = "or"\nof = ["control_node_crash", "non_control_node_crash"]'
 
@@ -142,11 +149,19 @@ REFUSED = {
     "nan in a list": ([('watch = ["localization"]', "watch = [nan]")],
                       ["$.detection[6].parameters.watch[0] = nan"]),
     "unknown node kind": ([(HMI, HMI.replace("non-control", "operator"))],
-                          ["$.node[4].kind = 'operator': unknown kind; known: control, non-con"]),
+                          ["$.node[4].kind = 'operator': unknown kind; known: control, "
+                           "non-control, pilot, manager, world"]),
+    "a node that is the supervisor": ([(HMI, HMI.replace("non-control", "supervision"))],
+                                      ["$.node[4].kind = 'supervision': unknown kind; known: "
+                                       "control, non-control, pilot, manager, world"]),
     "unknown recovery kind": ([('kind = "masking"', 'kind = "sideways"')],
                               ["$.recovery[3].kind = 'sideways'", "forward, backward, masking"]),
     "unknown hazard": ([('against = "runaway"', 'against = "boredom"')],
-                       ["$.mechanism[2].against = 'boredom'", "drift, runaway"]),
+                       ["$.mechanism[2].against = 'boredom'", "drift, runaway, intrusion, parent, "
+                        "or { within_s = ..., hazard = '...' }"]),
+    "a hazard that is a number": ([('against = "runaway"', "against = 0.6")],
+                                  ["$.mechanism[2].against = 0.6: unknown against; known: drift, ",
+                                   "or { within_s = ..., hazard = '...' }"]),
     "unknown gate": ([(STALE, STALE.replace('"or"', '"xor"'))],
                      ["$.event[8].gate = 'xor': unknown gate; known: 'or', 'and', { at_least"]),
     "actor without class": ([('"actors.operator.hmi:Hmi"', '"actors.operator.hmi"')],
@@ -212,10 +227,25 @@ REFUSED = {
     "reserved process": ([('name = "hmi"', 'name = "hmi"\nprocess = "spawner"')],
                          ["$.node[4].process = 'spawner': reserved"]),
     "duplicate mechanism": ([('name = "FTM2"', 'name = "FTM1"')],
-                            ["$.mechanism[0].name = 'FTM1': duplicate mechanism"]),
+                            ["$.mechanism[1].name = 'FTM1': duplicate name, already at "
+                             "$.mechanism[0].name; nodes, detection and recovery modules and "
+                             "mechanisms share one namespace"]),
     "duplicate event": ([('name = "actuator_failure"', 'name = "erroneous_graph"'),
                          (PROHIBITED, PROHIBITED.replace(', "actuator_failure"', ""))],
-                        ["$.event[2] = 'erroneous_graph': duplicate event"]),
+                        ["$.event[2].name = 'erroneous_graph': duplicate name, already at "
+                         "$.event[1].name"]),
+    "duplicate event that leaves a name dangling": (
+        [('name = "actuator_failure"', 'name = "erroneous_graph"')],
+        ["$.event[2].name = 'erroneous_graph': duplicate name, already at $.event[1].name"]),
+    "mechanism named like a detection module": (
+        [('name = "FTM2"', 'name = "DM2"')],
+        ["$.mechanism[1].name = 'DM2': duplicate name, already at $.detection[1].name"]),
+    "mechanism named like a word of gates": (
+        [('name = "FTM2"', 'name = "and"')],
+        ["$.mechanism[1].name = 'and': a word of gates, no name"]),
+    "detection module that no gate can name": (
+        [('name = "DM2"', 'name = "of"'), ('detect = "DM2"', 'detect = "of"')],
+        ["$.detection[1].name = 'of': a word of gates, no name"]),
     "unknown detection module": ([('detect = "DM3"', 'detect = "DM9"')],
                                  ["$.mechanism[2].detect = 'DM9': unknown detection module; "
                                   "known: DM1, DM2"]),
@@ -228,6 +258,8 @@ REFUSED = {
                              ["$.detection[4].parameters.watch[1] = 'telly': unknown node; known"]),
     "watching nobody": ([('watch = ["localization"]', "watch = []")],
                         ["$.detection[6].parameters.watch = []: expected a list of node names"]),
+    "watching a node twice": ([('watch = ["hmi", "teleoperation"]', 'watch = ["hmi", "hmi"]')],
+                              ["$.detection[4].parameters.watch[1] = 'hmi': listed twice"]),
     "unknown respawner": ([(HMI, HMI.replace("RM4", "RM8"))],
                           ["$.node[4].respawn = 'RM8': unknown recovery module; known: supervi"]),
     "unknown escalation": ([('escalate_to = "RM2"', 'escalate_to = "RM7"')],
@@ -267,12 +299,64 @@ REFUSED = {
     "manager respawned by its own recovery": (
         [('kind = "manager"\nrespawn = "supervisor"', 'kind = "manager"\nrespawn = "RM4"')],
         ["$.node[7].respawn = 'RM4': the manager cannot command its own recovery"]),
+    "manager in the process of a node that it recovers": (
+        [('kind = "manager"', 'kind = "manager"\nprocess = "hmi"')],
+        ["$.node[7].process = 'hmi': hmi lives there too and is brought back by RM4, ftm_manager "
+         "by supervisor; who shares a process is brought back by the same"]),
+    "node in the process of the manager": (
+        [('name = "hmi"', 'name = "hmi"\nprocess = "ftm_manager"')],
+        ["$.node[7].process = 'ftm_manager': hmi lives there too and is brought back by RM4"]),
+    "nodes of one process with different recoveries": (
+        [('name = "hmi"', 'name = "hmi"\nprocess = "graph_planner"')],
+        ["$.node[4].process = 'graph_planner': graph_planner lives there too and is brought back "
+         "by RM3, hmi by RM4"]),
+    "recovery module in a process that it ends": (
+        [(RM4, RM4 + '\nprocess = "hmi"')],
+        ["$.recovery[3].process = 'hmi': hmi lives there too and is brought back by RM4, RM4 by "
+         "supervisor"]),
+    "recovery module told to respawn the manager's process": (
+        [('name = "safety_pilot"', 'name = "safety_pilot"\nprocess = "ftm_manager"'),
+         (RM4, RM4 + '\nparameters = { nodes = ["hmi", "safety_pilot"] }')],
+        ["$.recovery[3].parameters.nodes[1] = 'safety_pilot': the manager lives in its process, "
+         "and cannot command its own recovery"]),
+    "recovery module told to respawn its own process": (
+        [('name = "safety_pilot"', 'name = "safety_pilot"\nprocess = "RM4"'),
+         (RM4, RM4 + '\nparameters = { nodes = ["safety_pilot"] }')],
+        ["$.recovery[3].parameters.nodes[0] = 'safety_pilot': RM4 lives in its process, and would "
+         "end itself"]),
+    "no manager": ([(MANAGER, "")],
+                   ["$.node: no node is of kind 'manager', so no mechanism would act; add one with "
+                    "actor = 'manager.actor:FtmManager', or say ftm = false in [layers]"]),
+    "two managers": ([(MANAGER, MANAGER + MANAGER.replace("ftm_manager", "another"))],
+                     ["$.node[8].kind = 'manager': ftm_manager is of this kind already; a system "
+                      "has one manager at most"]),
+    "a manager of another kind": ([('kind = "manager"', 'kind = "control"')],
+                                  ["$.node[7].kind = 'control': manager.actor:FtmManager has to be "
+                                   "of kind 'manager'"]),
+    "two pilots": ([('kind = "world"', 'kind = "pilot"')],
+                   ["$.node[8].kind = 'pilot': safety_pilot is of this kind already"]),
     "unreachable node": ([('watch = ["hmi", "teleoperation"]', 'watch = ["teleoperation"]')],
                          ["$.node[4].respawn = 'RM4': node 'hmi' is unreachable for RM4"]),
     "unreachable detection module": ([('detect = "DM3"', 'detect = "DM2"')],
                                      ["$.detection[2].name = 'DM3': unreachable"]),
     "unreachable recovery module": ([('recover = "RM5"', 'recover = "RM2"')],
                                     ["$.recovery[4].name = 'RM5': unreachable"]),
+    # recoveries
+    "a need that nothing meets": ([('needs = ["safety_pilot", "motion"]',
+                                    'needs = ["safety_pilto", "motion"]')],
+                                  ["$.recovery[4].needs = ['motion', 'safety_pilto']: "
+                                   "'safety_pilto' is neither a node nor a resource that a recov",
+                                   "known: actuation, brakes, ", "motion, "]),
+    "a need that nobody can take away": ([('disables = ["motion"]', 'disables = ["motoin"]')],
+                                         ["$.recovery[4].needs = ['motion', 'safety_pilot']: "
+                                          "'motion' is neither", "motoin"]),
+    "a need that is a detection module": ([('needs = ["safety_pilot", "motion"]',
+                                            'needs = ["DM3"]')],
+                                          ["$.recovery[4].needs = ['DM3']: 'DM3' is neither"]),
+    "a recovery that disables what it needs": (
+        [('needs = ["safety_pilot", "motion"]',
+          'needs = ["safety_pilot", "motion"]\ndisables = ["motion"]')],
+        ["$.recovery[4].disables = ['motion']: RM5 itself needs 'motion'; leave it out of one"]),
     # fault tree
     "unknown input": ([(PROHIBITED, PROHIBITED.replace("erroneous_graph", "bad_luck"))],
                       ["$.event[0].of[0] = 'bad_luck': unknown event; known: moving"]),
@@ -336,6 +420,17 @@ REFUSED = {
     "a heartbeat timeout that trips": (
         [("arbitration_s = 0.05 ", "heartbeat_timeout_s = 0.2\narbitration_s = 0.05 ")],
         ["$.timing.heartbeat_timeout_s = 0.2: would raise false alarms; at least 0.420 s"]),
+    "a watchdog's own timeout that trips": (
+        [('["localization"], timeout_s = "heartbeat_timeout_s"',
+          '["localization"], timeout_s = 0.2')],
+        ["$.detection[6].parameters.timeout_s = 0.2: would raise false alarms; at least 0.420 s, 3 "
+         "periods of heartbeat_period_s = 0.140 s, is right"]),
+    "a freshness timeout of its own that trips": (
+        [('timeout_s = "command_timeout_s"', "timeout_s = 0.1")],
+        ["$.detection[1].parameters.timeout_s = 0.1: would raise false alarms; at least 0.150 s"]),
+    "a drive slower than its commands": (
+        [("hardware_speed_mps = 3.0", "hardware_speed_mps = 0.3")],
+        ["$.robot.hardware_speed_mps = 0.3: the drive cannot be slower than top_speed_mps = 1.0"]),
     "a respawn that is too slow": ([("respawn_s = 0.4", "respawn_s = 0.6")],
                                    ["$.timing.heartbeat_timeout_s", "would raise false alarms"]),
     "a robot that is too fast": (
@@ -360,6 +455,21 @@ def test_refused(case):
     message = refusal(edit(*changes))
     for fragment in fragments:
         assert fragment in message
+
+
+def test_a_system_without_fault_tolerance_needs_no_manager():
+    spec = parse_specification(edit((MANAGER, ""), ("ftm = true", "ftm = false")), FILE)
+    assert not [node for node in spec.nodes if node.kind is Kind.MANAGER]
+
+
+def test_the_manager_may_share_a_process_with_what_the_supervisor_brings_back():
+    spec = parse_specification(
+        edit(('kind = "manager"', 'kind = "manager"\nprocess = "DM3"')), FILE)
+    assert [node.name for node in spec.processes()["DM3"]] == ["ftm_manager", "DM3"]
+
+
+def test_a_byte_order_mark_is_no_part_of_the_text():
+    assert parse_specification("\ufeff" + PAPER, FILE) == paper()
 
 
 def test_without_a_robot_timeouts_have_to_be_stated():

@@ -321,6 +321,13 @@ def test_a_strategy_that_disables_what_it_needs_is_found_out():
                                 "RM1 disables motion, which RM5 needs")
 
 
+def test_a_recovery_that_disables_what_it_needs_itself_is_found_out():
+    spec = edited(RM5={"disables": frozenset({"motion"})})
+    arrangement = Arrangement(spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order())
+    assert found_in(SafetyFirst(), arrangement)["no-harm"] == (
+        "FTM6 active: runs RM5 (rule 1)", "RM5 disables motion, which RM5 needs")
+
+
 def test_a_strategy_that_does_less_than_is_asked_for_is_found_out():
     found = found_in(Mutant(lambda d: ("RM3",) if d.active == ("FTM2", "FTM4") else None))
     assert found["safe-enough"] == (

@@ -6,6 +6,7 @@ import ast
 import asyncio
 import inspect
 import math
+import re
 import socket
 import textwrap
 from collections.abc import AsyncIterator, Callable
@@ -305,6 +306,28 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
                              and not name.startswith("__")}
     taken = {cls.__name__: names for cls in classes if (names := assigned(cls) & own)}
     assert taken == {}
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("actors.operator.hmi:Hmi", "actors.operator.hmi:Hm",
+     "$.node[4].actor = 'actors.operator.hmi:Hm': no such actor class; known: Hmi"),
+    ("actors.operator.hmi:Hmi", "actors.operator.himi:Hmi",
+     "$.node[4].actor = 'actors.operator.himi:Hmi': No module named 'actors.operator.himi'"),
+    ("actors.detection.bounds:Bounds", "actors.stub.node:StubNode",
+     "$.detection[2].actor = 'actors.stub.node:StubNode': it does not publish detection/{name}, as "
+     "the modules of this table do"),
+    ("actors.detection.bounds:Bounds", "actors.stub.recovery:StubRecovery",
+     "$.detection[2].actor = 'actors.stub.recovery:StubRecovery': it does not publish detection/"),
+    ("actors.recovery.controlled_stop:ControlledStop", "actors.stub.detection:StubDetection",
+     "$.recovery[1].actor = 'actors.stub.detection:StubDetection': it does not publish recovery/"),
+])
+def test_a_class_that_is_not_there_or_of_another_table_is_named_with_its_place(
+        tmp_path, old, new, message):
+    file = tmp_path / "other.toml"
+    file.write_text((systems.SHIPPED / "paper.toml").read_text().replace(old, new))
+    plan = RunPlan("run", 7450, 1.0, 1, str(file), "", "vallombre", "A", 0, ftm=True, hmi_port=0)
+    with pytest.raises(ValueError, match=re.escape(f"{file}: {message}")):
+        Layout(plan, load_system(plan))
 
 
 async def test_the_heart_beats_at_the_period_that_the_system_states():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -37,6 +38,62 @@ def test_every_field_is_described(table):
     missing = [f.encode_name for f in msgspec.structs.fields(table)
                if not re.search(rf"[`\[ ]{f.encode_name}\b", DOCUMENT)]
     assert missing == []
+
+
+def toml(value: object) -> str:
+    """A default as the document writes it; "" if it is none, or derived."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:g}"
+    if isinstance(value, str):
+        return json.dumps(value)
+    return "" if value is None else "{}" if value == {} else "[]"
+
+
+@pytest.mark.parametrize(("heading", "table", "also"), [
+    ("Top level", SystemSpec, set()), ("`[robot]`", Robot, set()),
+    ("`[timing]`", Timing, {f.name for f in msgspec.structs.fields(Timing)
+                            if f.name.endswith("timeout_s")}),
+    ("`[layers]`", Layers, set()), ("`[[node]]`", NodeSpec, set()),
+    ("`[[detection]]`", DetectionSpec, {"within_s"}), ("`[[recovery]]`", RecoverySpec, set()),
+    ("`[[mechanism]]`", MechanismSpec, set()), ("`[[event]]`", EventSpec, {"gate"})])
+def test_what_is_required_and_what_is_the_default_are_as_in_the_code(heading, table, also):
+    section = DOCUMENT.partition("### What has to be there\n")[2].partition("\n### ")[0]
+    text = " ".join(re.findall(rf"^- {re.escape(heading)}: (.*?)(?=^- |\Z)", section,
+                               re.DOTALL | re.MULTILINE)[0].split())
+    required, _, other = text.partition(" Else: ")
+    fields = {f.encode_name: f for f in msgspec.structs.fields(table)}
+    assert set(re.findall(r"`(\w+)`", required)) - {"of"} == {
+        name for name, field in fields.items() if field.required} | also
+    for name in fields.keys() - also:
+        field = fields[name]
+        if field.required:
+            continue
+        default = field.default_factory() if field.default is msgspec.NODEFAULT else field.default
+        written = "" if isinstance(default, msgspec.Struct) else toml(default)
+        listed = isinstance(default, tuple | dict) and table is SystemSpec  # arrays of tables
+        assert (f"`{name}`" if listed or not written else f"`{name} = {written}`") in other
+
+
+def test_the_least_that_is_a_system_is_what_the_document_says():
+    timeouts = "".join(f"{f.name} = 1.0\n" for f in msgspec.structs.fields(Timing)
+                       if f.name.endswith("timeout_s"))
+    text = f"""name = "x"\ntitle = "x"\n[timing]\n{timeouts}
+[[node]]\nname = "m"\nactor = "manager.actor:FtmManager"\nkind = "manager"
+[[detection]]\nname = "D"\ntitle = "D"\nactor = "a.b:C"\nwithin_s = 0.1
+[[recovery]]\nname = "R"\ntitle = "R"\nactor = "a.b:C"\nkind = "forward"
+[[mechanism]]\nname = "M"\ndetect = "D"\nrecover = "R"\nevent = "e"
+against = {{ within_s = 5.0, hazard = "h" }}
+[[event]]\nname = "e"
+[orders.safer]\n"""
+    parse_specification(text, "x.toml")
+    for table in ("node", "event"):
+        without = re.sub(rf"(?m)^\[\[{table}\]\]\n(\w.*\n)*", "", text)
+        with pytest.raises(SpecificationError):
+            parse_specification(without, "x.toml")
+    with pytest.raises(SpecificationError, match="unknown order"):
+        parse_specification(text.replace("[orders.safer]\n", ""), "x.toml")
 
 
 def test_every_strategy_is_named():

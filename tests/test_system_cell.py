@@ -75,7 +75,14 @@ def test_no_name_of_the_first_system_is_in_the_engine_s_code(room):
      "system has none"),
     ('against = { within_s = 0.45, hazard = "a hand is within the arm\'s reach" }',
      'against = "drift"',
-     "cell.toml: $.mechanism[0].against = 'drift': needs a [robot]; 'parent' or "
+     "cell.toml: $.mechanism[0].against: 'drift', which it is if left out, needs a [robot]; "
+     "'parent' or { within_s = ..., hazard = '...' } is right"),
+    ('against = { within_s = 0.45, hazard = "a hand is within the arm\'s reach" }', "",
+     "cell.toml: $.mechanism[0].against: 'drift', which it is if left out, needs a [robot]; "
+     "'parent' or { within_s = ..., hazard = '...' } is right"),
+    ('against = { within_s = 0.45, hazard = "a hand is within the arm\'s reach" }',
+     'against = "runaway"',
+     "cell.toml: $.mechanism[0].against = 'runaway': needs a [robot]; 'parent' or "
      "{ within_s = ..., hazard = '...' } is right"),
     ("within_s = 0.45", "within_s = 0.1",
      "cell.toml: $.timing: the time budget does not fit: M_CURTAIN needs 0.180 s (detection 0.030 "

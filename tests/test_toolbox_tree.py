@@ -279,6 +279,15 @@ def test_the_hasse_diagram_holds_neighbours_only_and_says_as_much_as_the_order(p
     assert len(found) == len(expected)
 
 
+def test_the_box_of_a_mechanism_keeps_the_logic_of_its_gates(capsys):
+    assert main(["tree", "--what", "ftm-tree", "--system", "cell"]) == 0
+    shown = told(capsys)
+    assert "Part not where it should be and not Force at the wrist too high → Retract" in shown
+    assert "along the last path or Hold position under control" in shown
+    assert "2 of (Joint encoder A disagrees with the model, Joint encoder B" in shown
+    assert "too high and Part not where it should be → Hold position under control and Op" in shown
+
+
 HOSTILE = '</text><script>alert("1")</script> & "quoted" \\N \\" \x1b[31m \u202e \x00 ]]> -->\n|{}'
 
 

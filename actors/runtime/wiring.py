@@ -75,17 +75,28 @@ def topics_of(actor: type[Actor]) -> tuple[tuple[Topic[Any], ...], tuple[Topic[A
     )
 
 
-def load_class(path: str) -> type[Actor]:
+def load_class(path: str, reports_on: Topic[Any] | None = None) -> type[Actor]:
     """Return the actor class named `module:Class`.
 
+    Args:
+        path: name of the class.
+        reports_on: topic that it has to publish, by which a kind of module is known.
+
     Raises:
-        ValueError: there is no such class, or it is no actor.
+        ValueError: there is no such class, it is no actor, or one of another kind.
     """
     module, _, name = path.partition(":")
     try:
-        found = getattr(importlib.import_module(module), name, None)
+        imported = importlib.import_module(module)
     except ImportError as error:
         raise ValueError(f"actor = {path!r}: {error}") from None
+    found = getattr(imported, name, None)
     if not (isinstance(found, type) and issubclass(found, Actor)):
-        raise ValueError(f"actor = {path!r}: no such actor class")
+        known = [key for key, value in vars(imported).items() if isinstance(value, type)
+                 and issubclass(value, Actor) and value.__module__ == module]
+        raise ValueError(f"actor = {path!r}: no such actor class; known: "
+                         f"{', '.join(known) or 'none'}")
+    if reports_on is not None and reports_on not in found.outputs:
+        raise ValueError(f"actor = {path!r}: it does not publish {reports_on.key}, as the modules "
+                         "of this table do")
     return found

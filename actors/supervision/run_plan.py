@@ -13,7 +13,10 @@ from typing import Any
 
 import msgspec
 
+from actors import topics
 from actors.messages import AdaptedSystem, NamedFault
+from actors.runtime.actor import Actor
+from actors.runtime.topic import Topic
 from actors.runtime.web_access import page_url
 from actors.runtime.wiring import Member, load_class, partners
 from actors.runtime.zenoh_bus import endpoint
@@ -162,11 +165,28 @@ def actor_parameters(plan: RunPlan, spec: SystemSpec, node: NodeSpec) -> dict[st
     return {**derived, **node.parameters}
 
 
+REPORTS_ON: Mapping[Kind, Topic[Any]] = {
+    Kind.DETECTION: topics.DETECTION, Kind.RECOVERY: topics.RECOVERY}
+"""What modules of the tables `[[detection]]` and `[[recovery]]` publish."""
+
+
+def _class_of(plan: RunPlan, spec: SystemSpec, node: NodeSpec) -> type[Actor]:
+    try:
+        return load_class(node.actor, REPORTS_ON.get(node.kind))
+    except ValueError as error:
+        names = {"node": [n.name for n in spec.nodes],
+                 "detection": [d.name for d in spec.detections],
+                 "recovery": [r.name for r in spec.recoveries]}
+        path = next(f"$.{table}[{among.index(node.name)}]" for table, among in names.items()
+                    if node.name in among)
+        raise ValueError(f"{plan.system_file}: {path}.{error}") from None
+
+
 class Layout:
     """Everything derived from plan and spec: units, ports, partners.
 
     Raises:
-        ValueError: an actor class named in the spec does not exist.
+        ValueError: an actor class named in the spec does not exist, or belongs into another table.
     """
 
     def __init__(self, plan: RunPlan, spec: SystemSpec) -> None:
@@ -182,7 +202,7 @@ class Layout:
         ]
         self.members: dict[str, Member] = {
             m.name: m for m in (*own, *(
-                Member(n.name, load_class(n.actor), actor_parameters(plan, spec, n))
+                Member(n.name, _class_of(plan, spec, n), actor_parameters(plan, spec, n))
                 for n in spec.actors()))}
         self.port_of: dict[str, int] = {
             name: plan.base_port + i for i, name in enumerate(self.members)}
