@@ -23,6 +23,7 @@ from actors.recording.virtual import VirtualRecording
 from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
 from actors.supervision.launcher import Launcher, LaunchError
 from actors.supervision.run_plan import DEFAULT_PORT, Layout, RunPlan, load_system
+from actors.supervision.system_topics import system_topics
 from airport.formats import load_airport, load_mission
 from manager.specification import SystemSpec
 from manager.strategies import STRATEGIES
@@ -154,8 +155,8 @@ class Run:
             raise UsageError(f"--obstacles {options.obstacles}: {airport.name} has places for "
                              f"{len(airport.obstacles)}")
         self._scenario = [parse_fault(text) for text in options.fault]
-        for i, planned in enumerate(self._scenario):
-            action_of(planned, f"f{i}", can_be_hit(spec))  # refused now rather than in mid-run
+        for i, planned in enumerate(self._scenario):  # refused now rather than in mid-run
+            action_of(planned, f"f{i}", can_be_hit(spec), system_topics(spec))
         self._directory = Path(options.report) if options.report else new_directory(
             ROOT / "reports", mission.name)
         self._directory.mkdir(parents=True, exist_ok=True)

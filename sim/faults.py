@@ -6,9 +6,11 @@ Crashes are not here: to crash a node, kill it (`kill-node`).
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from actors import topics
+from actors.runtime.topic import Topic
 from sim.disturbance import Disturbance, Fault, UnknownFaultError
 from sim.sensor_faults import LEFT_OUT, sensor_faults
 from sim.topic_faults import topic_fault
@@ -50,12 +52,13 @@ CATALOGUE: Mapping[str, Fault] = {**PAPER_FAULTS, **SENSOR_FAULTS}
 """All faults with a name of their own; `MODE:TOPIC` comes on top (`sim.topic_faults`)."""
 
 
-def find_fault(name: str, seed: int = 0) -> Fault:
+def find_fault(name: str, seed: int = 0, known: Sequence[Topic[Any]] = topics.ALL) -> Fault:
     """Return a fault by name: one of the catalogue, or `MODE:TOPIC`.
 
     Args:
         name: e.g. `command-not-updated`, `laser-dropout`, `drop:localization/pose`.
         seed: of all that is random in it.
+        known: all topics of the system, see `system_topics`.
 
     Raises:
         UnknownFaultError: there is none of this name.
@@ -64,7 +67,7 @@ def find_fault(name: str, seed: int = 0) -> Fault:
         return CATALOGUE[name].varied(seed=seed)
     mode, colon, key = name.partition(":")
     if colon:
-        return topic_fault(mode, key, seed)
+        return topic_fault(mode, key, seed, known)
     if name in LEFT_OUT:
         raise UnknownFaultError(f"no fault {name!r}: {LEFT_OUT[name]}")
     near = difflib.get_close_matches(name, CATALOGUE, 1)

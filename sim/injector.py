@@ -85,7 +85,8 @@ class _Planned:
 class Injector(Actor):
     """Carries out `context.shared["scenario"]` with the help of `context.shared["hand"]`.
 
-    Shared: `scenario`, planned faults; `hand`, a `Hand`; `nodes`, names that may be hit.
+    Shared: `scenario`, planned faults; `hand`, a `Hand`; `nodes`, names that may be hit; `topics`,
+    all of the system.
 
     Raises:
         ScenarioError: a planned fault makes no sense in this system.
@@ -98,7 +99,8 @@ class Injector(Actor):
         self._hand: Hand = context.shared["hand"]
         scenario: Sequence[PlannedFault] = context.shared["scenario"]
         self._planned = [
-            _Planned(planned, action_of(planned, f"f{i}", context.shared["nodes"]))
+            _Planned(planned, action_of(planned, f"f{i}", context.shared["nodes"],
+                                        context.shared["topics"]))
             for i, planned in enumerate(scenario, start=1)]
         self._begun = 0
         self._pose: Pose | None = None

@@ -16,6 +16,7 @@ from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher
 from actors.supervision.process_hand import ProcessHand
 from actors.supervision.run_plan import OBSERVER
+from actors.supervision.system_topics import system_topics
 from manager.schema import SystemSpec
 from sim.injector import INJECTOR, Injector, can_be_hit
 from sim.mission_run import MissionRun
@@ -79,7 +80,7 @@ class ProcessRun:
         injector = None
         if self._scenario:
             shared = {"scenario": self._scenario, "hand": ProcessHand(plan.base_port),
-                      "nodes": can_be_hit(self._spec)}
+                      "nodes": can_be_hit(self._spec), "topics": system_topics(self._spec)}
             injector = Injector(Context(
                 INJECTOR, 1, clock, SharedBus(bus), {}, shared))
             actors.append(injector)

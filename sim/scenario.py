@@ -16,10 +16,13 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 
+from actors import topics
 from actors.messages import ActuatorFault, ActuatorFaultKind, Injection
+from actors.runtime.topic import Topic
 from sim.disturbance import Fault
 from sim.faults import find_fault
 from sim.robot import WHEEL_NAMES
@@ -144,13 +147,15 @@ def _seconds(text: str, value: str, what: str, *, infinite: bool = False) -> flo
     return seconds
 
 
-def action_of(planned: PlannedFault, injection: str, nodes: Collection[str]) -> Action:
+def action_of(planned: PlannedFault, injection: str, nodes: Collection[str],
+              known: Sequence[Topic[Any]] = topics.ALL) -> Action:
     """Return what is to be done.
 
     Args:
         planned: The fault.
         injection: Id under which its effect is reported.
         nodes: Names of all nodes with a process that a fault may hit.
+        known: All topics of the system, see `system_topics`.
 
     Raises:
         ScenarioError: There is no such node, wheel or strength.
@@ -159,7 +164,7 @@ def action_of(planned: PlannedFault, injection: str, nodes: Collection[str]) -> 
     kind, *details = planned.fault.split(":")
     lasts_s = planned.duration_s
     if kind not in _LASTS_S:
-        fault: Fault = find_fault(planned.fault, planned.seed).varied(
+        fault: Fault = find_fault(planned.fault, planned.seed, known).varied(
             share=planned.share, on_s=planned.on_s, off_s=planned.off_s)
         return OnTopics(fault.orders(injection, lasts_s))
     lasts_s = _LASTS_S[kind] if lasts_s is None else lasts_s

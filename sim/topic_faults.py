@@ -17,7 +17,7 @@ falsify the verdict, and so are those that carry the injections themselves.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from random import Random
 from typing import Any
 
@@ -27,9 +27,7 @@ from actors import topics
 from actors.runtime.corruption import is_array
 from actors.runtime.injection import MODES, UNTOUCHED
 from actors.runtime.topic import ROOT, Topic
-from actors.runtime.wiring import heard, published
-from actors.supervision.run_plan import DEFAULT_PORT, OBSERVER, Layout, RunPlan
-from manager.specification import SystemSpec
+from actors.supervision.system_topics import find_topic
 from sim.disturbance import Disturbance, Fault, UnknownFaultError
 
 GROUP = "topic"
@@ -53,10 +51,6 @@ STAMPS_S = (0.02, 5.0)
 """Least and greatest error of a stamp: from one that nobody need notice to one beyond every
 freshness timeout. Drawn by its logarithm, so that the small ones are as frequent as the large."""
 
-_ANY_RUN = RunPlan("", DEFAULT_PORT, rate=1.0, seed=0, system_file="", strategy="", airport="",
-                   mission="", obstacles=0, ftm=True, hmi_port=0)
-"""Which keys a system publishes follows from its spec; nothing in the plan of a run matters."""
-
 _TITLES = {
     "drop": "nothing on {} arrives",
     "freeze": "{} repeats its last message, old stamp included",
@@ -68,7 +62,8 @@ _TITLES = {
 }
 
 
-def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
+def topic_fault(mode: str, key: str, seed: int = 0,
+                known: Sequence[Topic[Any]] = topics.ALL) -> Fault:
     """Return the fault `MODE:TOPIC`.
 
     Args:
@@ -77,6 +72,7 @@ def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
         seed: of what `restamp` and `corrupt` draw, and of the gate's chance. An even one corrupts
             every number of a message, as a wrong sender does; an odd one only one of them, which
             leaves whatever the others can be checked by.
+        known: all topics of the system, see `system_topics`.
 
     Raises:
         UnknownFaultError: no such mode or topic, or the two do not go together.
@@ -85,7 +81,7 @@ def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
     if mode not in MODES:
         raise UnknownFaultError(f"unknown fault {f'{mode}:{key}'!r}: the mode must be one of "
                                 f"{', '.join(MODES)}")
-    topic = _declared(short)
+    topic = find_topic(short, known)
     if topic is None:
         raise UnknownFaultError(f"unknown fault {f'{mode}:{key}'!r}: no topic has this key; "
                                 "see `rampart topic list`")
@@ -106,53 +102,35 @@ def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
     return Fault(f"{mode}:{short}", title, (what,), (), DURATION_S, GROUP)
 
 
-def systematic_faults(keys: Iterable[str], seed: int = 0) -> tuple[Fault, ...]:
+def systematic_faults(keys: Iterable[str], seed: int = 0,
+                      known: Sequence[Topic[Any]] = topics.ALL) -> tuple[Fault, ...]:
     """Return every fault `MODE:TOPIC` of the given topics.
 
     Args:
-        keys: of single topics, e.g. those that `published_keys` finds; those that must not be
-            disturbed are passed over, and so are modes that make no sense on a topic.
+        keys: of single topics, e.g. those that `published_keys` of a system gives; those that must
+            not be disturbed are passed over, and so are modes that make no sense on a topic.
         seed: see `topic_fault`.
+        known: likewise.
 
     Raises:
         UnknownFaultError: a key is none.
     """
-    return tuple(topic_fault(mode, key, seed) for key in keys for mode in modes_of(key))
+    return tuple(topic_fault(mode, key, seed, known)
+                 for key in keys for mode in modes_of(key, known))
 
 
-def modes_of(key: str) -> tuple[str, ...]:
+def modes_of(key: str, known: Sequence[Topic[Any]] = topics.ALL) -> tuple[str, ...]:
     """Return the modes in which a topic can fail; none for one that must not be disturbed.
 
     Raises:
         UnknownFaultError: there is no such topic.
     """
-    topic = _declared(key)
+    topic = find_topic(key, known)
     if topic is None:
         raise UnknownFaultError(f"no topic has the key {key!r}; see `rampart topic list`")
     if _closed(key):
         return ()
     return tuple(mode for mode in MODES if not _senseless(mode, topic.type))
-
-
-def published_keys(spec: SystemSpec) -> tuple[str, ...]:
-    """Return the keys that the nodes of a system and its supervisor publish, families spelt out.
-
-    Raises:
-        ValueError: the spec names an actor class that does not exist.
-    """
-    members = [m for m in Layout(_ANY_RUN, spec).members.values() if m.name != OBSERVER]
-    wanted: dict[str, dict[str, None]] = {}
-    for member in members:
-        for key, names in heard(member).items():
-            wanted.setdefault(key, {}).update(dict.fromkeys(names or ()))
-    found: dict[str, None] = {}
-    for member in members:
-        for key, names in published(member).items():
-            # A node that may publish any member of a family publishes those that somebody hears.
-            chosen = wanted.get(key, {}) if names is None else names
-            spelt = [key.replace("{name}", n) for n in chosen] if "{name}" in key else [key]
-            found.update(dict.fromkeys(spelt))
-    return tuple(sorted(found))
 
 
 def plausible_offsets(kind: type[msgspec.Struct], draw: Random) -> dict[str, float]:
@@ -186,22 +164,10 @@ def _numbers(kind: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, kind
 
 
-def _declared(key: str) -> Topic[Any] | None:
-    """Return the topic of a concrete key."""
-    for topic in topics.ALL:
-        if not topic.is_family:
-            if key == topic.key:
-                return topic
-            continue
-        head, tail = topic.key.split("{name}")
-        member = key[len(head):len(key) - len(tail)]
-        if key == f"{head}{member}{tail}" and member and not set("/*{}") & set(member):
-            return topic
-    return None
-
-
 def _senseless(mode: str, kind: type[msgspec.Struct]) -> str:
     """Return why a message type cannot fail in a mode, or an empty text."""
+    if mode == "corrupt" and kind.__struct_config__.array_like:
+        return f"{kind.__name__} is array_like: its fields have no names on the way"
     if mode == "corrupt" and next(_numbers(kind), None) is None:
         return f"there is no number to corrupt in a {kind.__name__}"
     if mode == "stuck" and not msgspec.structs.fields(kind):

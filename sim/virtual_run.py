@@ -24,6 +24,7 @@ from actors.runtime.topic import Topic
 from actors.runtime.virtual_bus import Hub, Tap, VirtualBus
 from actors.runtime.virtual_loop import VirtualClock, VirtualLoop
 from actors.supervision.run_plan import OBSERVER, Layout, RunPlan, load_shared
+from actors.supervision.system_topics import system_topics
 from manager.schema import SystemSpec
 from sim.injector import INJECTOR, Injector, can_be_hit
 from sim.judge import Verdict
@@ -182,7 +183,8 @@ class VirtualRun:
         if self._scenario:
             injector = Injector(Context(
                 INJECTOR, 1, clock, VirtualBus(hub, INJECTOR), {},
-                {"scenario": self._scenario, "hand": machine, "nodes": self._nodes},
+                {"scenario": self._scenario, "hand": machine, "nodes": self._nodes,
+                 "topics": system_topics(self._spec)},
                 pid=1))
             actors.append(injector)
         watching = [asyncio.create_task(actor.run()) for actor in actors]

@@ -16,6 +16,7 @@ from collections import Counter
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from porter_actors import write_porter_system
 from stub_actors import ROOT
 
 from sim.campaign import execute as execution
@@ -473,6 +474,17 @@ def test_patterns_choose_faults_by_name(capsys):
                            ([], fault_groups(systems.load("osmosis")))):
         assert rampart(["campaign", "--list", "--json", *chosen]) == 0
         assert json.loads(capsys.readouterr().out) == {k: list(v) for k, v in groups.items()}
+
+
+def test_a_robot_s_own_topics_can_fail_like_all_others(tmp_path, capsys):
+    own = ["campaign", "--system", str(write_porter_system(tmp_path))]
+    assert rampart([*own, "--list", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)["topic"]
+    assert {"drop:porter/load", "stuck:porter/axle/rear"} <= set(listed)
+    assert rampart([*own, "--fault", "drop:porter/*@2+1", "--obstacles", "0", "--jobs", "1",
+                    "--out", str(tmp_path / "out"), "--json"]) == 0
+    assert {row["fault"]: row["ineffective"] for row in json.loads(capsys.readouterr().out)} == {
+        "drop:porter/load": 0, "drop:porter/axle/front": 1, "drop:porter/axle/rear": 1}
 
 
 @pytest.fixture

@@ -14,7 +14,9 @@ from actors import topics
 from actors.detection.freshness import CommandFreshness, LocalizationFreshness
 from actors.detection.freshness_monitor import FreshnessMonitor
 from actors.detection.module import EXCUSE_S, DetectionModule, IllegalTransitionError
+from actors.runtime.actor import Header, on
 from actors.runtime.wiring import Member, heard
+from actors.stub.detection import StubDetection
 
 # f fresh sample, o the first sample once more, d delayed by 1 s, + stamped 100 s ahead,
 # i infinitely far ahead, n no number
@@ -219,6 +221,58 @@ def test_an_illegal_transition_names_both_states():
             module.activate("two faults", ("a", "b"))
             module.clear()
             assert module.state is m.DetectionState.IDLE
+
+    run(scenario)
+
+
+class TooFast(DetectionModule):
+    """A module without a monitor, as somebody might write it."""
+
+    @on(topics.COMMAND)
+    def command(self, message: m.Twist, _header: Header) -> None:
+        if message.linear_mps > 1.0:
+            self.activate("too fast")
+        else:
+            self.know_idle()
+
+
+def test_a_respawned_module_without_a_monitor_is_silent_until_it_says_that_it_knows():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            source = system.start("source", Source)
+            system.start("D_FAST", TooFast)
+            await asyncio.sleep(0.3)
+            await system.kill("D_FAST")
+            ear.heard.clear()
+            system.start("D_FAST", TooFast)
+            await asyncio.sleep(1.0)
+            assert ear.heard == []
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            await asyncio.sleep(1.0)
+            assert ear.states == ["idle"]
+            assert len(ear.heard) == pytest.approx(5, abs=1)
+            source.publish(topics.COMMAND, m.Twist(1.5, 0.0))
+            await system.settle()
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            await system.settle()
+            assert ear.states == ["idle", "active", "idle"]
+
+    run(scenario)
+
+
+def test_a_respawned_stand_in_is_idle_and_not_silent_for_ever():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            system.start("D_LEVEL", StubDetection)
+            await asyncio.sleep(0.3)
+            await system.kill("D_LEVEL")
+            ear.heard.clear()
+            system.start("D_LEVEL", StubDetection)
+            await asyncio.sleep(1.0)
+            assert ear.states == ["idle"]
+            assert len(ear.heard) >= 4
 
     run(scenario)
 

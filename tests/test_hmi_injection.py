@@ -8,6 +8,7 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from porter_actors import write_porter_system
 
 from actors import messages as m
 from actors import topics
@@ -21,10 +22,12 @@ from actors.operator.hmi_injection import (
     Injections,
     places,
 )
+from actors.operator.hmi_operating import places_of
 from actors.runtime.envelope import AHEAD_S
 from actors.runtime.injection import MODES, flaw
 from sim.offered_faults import offered_faults
 from sim.topic_faults import modes_of
+from toolbox import systems
 
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 OFFERED = offered_faults()
@@ -192,6 +195,15 @@ def test_no_place_is_offered_that_must_not_be_disturbed():
                          "heartbeat/localization"}
     assert all(modes_of(key) for key in KEYS)
     assert set(injections().choice()["modes"]) < set(MODES)
+
+
+def test_the_topics_of_the_robot_s_own_are_offered_after_the_common_ones(tmp_path):
+    shipped = places_of(systems.load("osmosis"))
+    own = places_of(systems.load(str(write_porter_system(tmp_path))))
+    assert set(own) - set(shipped) == {
+        "heartbeat/platform", "heartbeat/display", "porter/load", "porter/axle/front",
+        "porter/axle/rear"}
+    assert not [key for key in shipped if key.startswith("porter/")]
 
 
 def test_every_mode_that_is_offered_can_be_ordered_as_it_stands():

@@ -245,6 +245,19 @@ def test_what_is_missing_shows_in_the_numbers(from_start, heard, lost):
 # ---- torn, damaged, foreign -----------------------------------------------------------------
 
 
+def test_topics_that_only_the_robot_knows_are_neither_garbage_nor_lost(tmp_path):
+    with (tmp_path / "run.mcap").open("wb") as file:
+        writer = BagWriter(file, documents(), from_start=True)
+        for number in range(1, 11):
+            key = "rampart/heartbeat/driver" if number % 5 == 0 else "rampart/porter/speed/driver"
+            body = m.Heartbeat(1, 2, 0.1, 0, 0) if number % 5 == 0 else m.Twist(0.5, 0.0)
+            writer.take(number / 10, key, encode(Header("driver", 1, number, number / 10), body))
+        writer.take(2.0, "rampart/porter/speed/driver", b"\xc1")
+        writer.close()
+    told = Summary(BagReader(tmp_path / "run.mcap")).end
+    assert (told["messages"], told["garbage"], told["lost"]) == ("11", "1", "{}")
+
+
 def test_a_file_cut_off_anywhere_is_read_as_far_as_it_goes(tmp_path):
     path = tmp_path / "run.mcap"
     sent = sample()

@@ -69,6 +69,24 @@ def test_any_message_of_any_topic_comes_back_to_the_byte(topic):
 
 
 @settings(max_examples=60, deadline=None, database=None)
+@given(HEADS, ANYTHING)
+def test_a_message_of_a_topic_that_only_the_robot_knows_has_its_header_and_comes_back(head, body):
+    form = form_of("rampart/porter/speed/driver")
+    payload = encode(head, body)
+    text, header, _ = form.recorded(payload)
+    assert (header.source, header.sequence) == (head.source, head.sequence)
+    assert "error" not in json.loads(text)
+    assert form.payload(text) == payload
+
+
+def test_a_message_of_a_topic_that_only_the_robot_knows_is_legible():
+    payload = pack(("driver", 1, 7, 3.25, {"speed_mps": 0.5}))
+    assert json.loads(form_of("rampart/porter/speed/driver").recorded(payload)[0]) == {
+        "source": "driver", "incarnation": 1, "sequence": 7, "stamp": 3.25,
+        "body": {"speed_mps": 0.5}}
+
+
+@settings(max_examples=60, deadline=None, database=None)
 @given(st.binary(max_size=40) | ANYTHING.map(msgspec.msgpack.encode))
 def test_garbage_comes_back_to_the_byte_and_says_that_it_is_none(payload):
     form = MessageForm(topics.COMMAND)

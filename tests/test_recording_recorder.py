@@ -20,6 +20,7 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
+from porter_actors import write_porter_system
 from real_run import HEEDS_SIGNALS, RealRun
 from recording_samples import AnsweringLauncher, pose
 from stub_actors import ROOT, free_base_port
@@ -31,6 +32,7 @@ from actors.recording.process import Order, RecorderProcess
 from actors.recording.recorder import FLUSH_S, PERIOD_S, Recorder
 from actors.runtime import tap as taps
 from actors.runtime.tap import Tap, frame, parse_frame
+from actors.supervision.run_info import RunInfo
 from toolbox.main import main
 
 
@@ -374,6 +376,17 @@ def test_a_wish_that_makes_no_sense_is_refused(port, tmp_path, capsys, arguments
     assert code == 2
     assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_topics_of_the_robot_s_own_can_be_wished_for(port, tmp_path, monkeypatch, capsys):
+    own = RunInfo(1, port, 1.0, 0.0, str(write_porter_system(tmp_path)), {}, "r1", 0, "porter")
+    monkeypatch.setattr("toolbox.record_verbs.find_run", lambda _port: own)
+    taken = tmp_path / "x.mcap"
+    taken.touch()
+    assert main(["record", str(taken), "--topics", "porter/*", "plan/route"]) == 2
+    assert "exists already" in capsys.readouterr().err  # the next thing that is checked
+    assert main(["record", str(taken), "--topics", "porter/*", "nothing/like/it"]) == 2
+    assert "--topics nothing/like/it: matches no topic" in capsys.readouterr().err
 
 
 def test_a_message_too_long_for_a_recording_is_left_out_and_those_after_it_are_not(recording):

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from porter_actors import AXLE, LOAD
 from virtual_loop import shipped_system
 
 from actors import messages as m
@@ -15,6 +16,7 @@ from actors import topics
 from actors.runtime.envelope import Header, decode, encode
 from actors.runtime.injection import MODES, FaultGate, flaw
 from actors.runtime.topic import ROOT, Topic
+from actors.supervision.system_topics import published_keys
 from sim.faults import (
     CATALOGUE,
     PAPER_FAULTS,
@@ -26,7 +28,7 @@ from sim.faults import (
 )
 from sim.sensor_faults import LEFT_OUT, SENSORS
 from sim.sensors import Gps
-from sim.topic_faults import DELAY_S, modes_of, published_keys, systematic_faults, topic_fault
+from sim.topic_faults import DELAY_S, modes_of, systematic_faults, topic_fault
 from toolbox.topic_catalogue import resolve, uses
 
 KEYS = published_keys(shipped_system())
@@ -342,3 +344,22 @@ def test_an_order_survives_the_wire_also_a_permanent_one():
         for order in fault.orders("i", math.inf):
             payload = encode(Header("tool", 1, 1, 0.0), order)
             assert decode(topics.INJECT, payload)[1] == order
+
+
+def test_a_topic_of_the_robot_s_own_fails_like_any_other():
+    known = (*topics.ALL, LOAD, AXLE)
+    assert modes_of("porter/load", known) == MODES
+    assert find_fault("drop:porter/axle/front", known=known).disturbances[0].topic == (
+        "porter/axle/front")
+    (disturbance,) = find_fault("corrupt:porter/load", 3, known).disturbances
+    assert set(disturbance.add_fields) == {"mass_kg"}
+    with pytest.raises(UnknownFaultError, match="no topic has this key"):
+        find_fault("drop:porter/load")
+
+
+def test_numbers_that_travel_without_their_names_cannot_be_corrupted():
+    known = (*topics.ALL, AXLE)
+    assert modes_of("porter/axle/front", known) == tuple(
+        mode for mode in MODES if mode != "corrupt")
+    with pytest.raises(UnknownFaultError, match="Axle is array_like"):
+        find_fault("corrupt:porter/axle/front", known=known)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import re
@@ -11,7 +12,12 @@ import sys
 import msgspec
 import pytest
 from stub_actors import ROOT
+from virtual_loop import System, run
 
+from actors import topics
+from actors.messages import DetectionState
+from actors.runtime.wiring import load_class
+from actors.supervision.system_topics import system_topics
 from manager.gates import GateError, detection_gate
 from manager.schema import (
     DetectionSpec,
@@ -30,6 +36,7 @@ from manager.strategies import STRATEGIES
 
 DOCUMENT = (ROOT / "docs" / "specification.md").read_text(encoding="utf-8")
 EXAMPLE = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)[0]
+MODULES = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 
 
 @pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, NodeSpec, DetectionSpec,
@@ -110,6 +117,29 @@ def test_the_worked_example_is_a_sound_system(tmp_path):
         capture_output=True, text=True, check=True, timeout=30)
     assert [row["rm"] for row in json.loads(done.stdout)] == [
         ["R_SHUT"], ["R_RESTART"], ["R_SHUT", "R_RESTART"]]
+
+
+def test_the_modules_of_one_s_own_that_it_shows_work(tmp_path, monkeypatch):
+    (tmp_path / "tank_actors.py").write_text(MODULES, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    text = EXAMPLE.replace("actors.stub.node:StubNode", "tank_actors:Gauge").replace(
+        "actors.stub.detection:StubDetection", "tank_actors:LevelTooHigh")
+    spec = parse_specification(text, "tank.toml")
+    assert [topic.key for topic in system_topics(spec)][len(topics.ALL):] == ["tank/level"]
+
+    async def scenario():
+        async with System() as system:
+            gauge = system.start("gauge", load_class("tank_actors:Gauge"))
+            module = system.start("D_LEVEL", load_class("tank_actors:LevelTooHigh"))
+            (level,) = gauge.outputs
+            await system.settle()
+            gauge.publish(level, level.type(2.5))
+            await system.settle()
+            assert module.state is DetectionState.ACTIVE
+            await asyncio.sleep(0.2)
+            assert module.state is DetectionState.IDLE
+
+    run(scenario)
 
 
 @pytest.mark.parametrize("text", ["DM1 and DM3", "DM1 or (DM2 and not DM3)",

@@ -8,6 +8,7 @@ import socket
 from contextlib import AsyncExitStack
 
 import pytest
+from porter_actors import AXLE, LOAD, Axle, Load, write_porter_system
 
 from actors import messages as m
 from actors import topics
@@ -25,7 +26,7 @@ class Everything(Actor):
     """Publishes what verbs look at; one node that plays them all."""
 
     outputs = (topics.POSE, topics.ROUTE, topics.MISSION_STATUS, topics.PILOT_STATUS,
-               topics.MANAGER_STATUS, topics.NODES, topics.OBSTACLES, topics.DETECTION)
+               topics.MANAGER_STATUS, topics.NODES, topics.OBSTACLES, topics.DETECTION, LOAD, AXLE)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -40,6 +41,9 @@ class Everything(Actor):
     def states(self) -> None:
         self.time_s += 0.1
         self.publish(topics.POSE, m.Pose(1.0, self.time_s, 0.0))
+        self.publish(LOAD, Load(20.0))
+        for axle in ("simulator", "front"):  # one is the name of the node
+            self.publish(AXLE, Axle(3.0), name=axle)
         self.publish(topics.MISSION_STATUS, m.MissionStatus(
             "1", "AB", m.MissionPhase.RUNNING, 0, (m.Goal(0.0, 0.0, m.Mode.TAXI),), (), (), ""))
         self.publish(topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.STOP, True, "RM2", 0))
@@ -204,6 +208,24 @@ async def test_a_member_of_a_family_that_is_no_node_is_unknown(run, capsys):
     code, _, err = await run.call(capsys, "topic", "echo", "detection/DM9")
     assert code == 2
     assert err == "rampart: unknown node 'DM9'; known: simulator, DM1\n"
+
+
+async def test_topics_of_the_robot_s_own_are_heard_measured_and_disturbed(
+        run, capsys, monkeypatch, tmp_path):
+    own = RunInfo(1, 7450, RATE, 0.0, str(write_porter_system(tmp_path)), {}, "r1", 0, "porter")
+    monkeypatch.setattr("toolbox.topic_catalogue.find_run", lambda _port: own)
+    code, out, _ = await run.call(capsys, "topic", "echo", "porter/axle/front", "-n", "1")
+    assert (code, out.split()[1:]) == (0, ["simulator#1", "porter/axle/front", "[3.0]"])
+    code, out, _ = await run.call(capsys, "topic", "echo", "porter/axle/*", "-n", "4")
+    assert (code, {line.split()[2] for line in out.splitlines()}) == (
+        0, {"porter/axle/front", "porter/axle/simulator"})
+    code, out, _ = await run.call(
+        capsys, "topic", "hz", "porter/load", "--duration", "0.5", "--json")
+    assert (code, json.loads(out)[0]["nominal_hz"]) == (0, 10)
+    for fault in (["corrupt:porter/load"], ["drop:porter/axle/simulator"],
+                  ["--topic", "porter/load", "--mode", "corrupt", "--set", "mass_kg=0"]):
+        code, out, _ = await run.call(capsys, "inject", *fault, "--duration", "1", "--json")
+        assert (code, json.loads(out)["effective"]) == (0, True)
 
 
 async def test_an_injection_acts_and_tells_how_many_messages_it_affected(run, capsys):

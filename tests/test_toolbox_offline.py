@@ -7,9 +7,11 @@ import io
 import json
 
 import pytest
+from porter_actors import write_porter_system
 
 from actors import messages as m
 from actors import topics
+from actors.supervision.run_info import RunInfo
 from sim.faults import find_fault
 from toolbox import systems
 from toolbox.inject_verbs import choose
@@ -120,6 +122,7 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     (["inject", "drop:inject/report"], ["injections themselves"]),
     (["inject", "drop:detection/{name}"], ["no topic"]),
     (["inject", "wrong-graph", "--add", "x_m=1"], ["--add", "--topic"]),
+    (["inject", "wrong-graph", "--system", "cell"], ["--system cell: goes with --list"]),
     (["inject", "wrong-graph", "--share", "0"], ["--share 0"]),
     (["inject", "wrong-graph", "--share", "1.5"], ["--share 1.5"]),
     (["inject", "wrong-graph", "--share", "nan"], ["--share nan"]),
@@ -159,6 +162,7 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
 ])
 def test_nonsense_is_refused_in_one_line_that_names_it(capsys, monkeypatch, arguments, words):
     monkeypatch.setattr("toolbox.session.find_run", lambda _port: pytest.fail("looked for a run"))
+    monkeypatch.setattr("actors.supervision.run_info.find_runs", list)
     assert main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -276,6 +280,41 @@ def test_topic_info_names_publishers_and_readers(capsys):
     info = json.loads(told(capsys))
     assert info["publishers"] == ["localization"]
     assert {"hmi", "DM6", "osmosis_control"} <= set(info["readers"])
+
+
+def test_topics_of_a_robot_s_own_actors_are_listed_and_described(capsys, tmp_path):
+    own = ["--system", str(write_porter_system(tmp_path))]
+    assert main(["topic", "list", "--json", *own]) == 0
+    assert [topic["key"] for topic in json.loads(told(capsys))][-2:] == [
+        "porter/load", "porter/axle/{name}"]
+    assert main(["topic", "list", "--markdown", *own]) == 0
+    assert "### Axle" in told(capsys)
+    assert main(["topic", "info", "porter/axle/front", "--json", *own]) == 0
+    info = json.loads(told(capsys))
+    assert (info["publishers"], info["readers"]) == (["platform"], ["display"])
+    assert main(["inject", "--list", *own]) == 0
+    lines = {line.split()[0]: line for line in told(capsys).splitlines() if line}
+    assert lines["porter/load"].endswith("all")
+    assert lines["porter/axle/{name}"].endswith("all but corrupt")
+
+
+def test_an_actor_that_cannot_be_loaded_is_one_line_and_needed_for_its_own_topics_only(
+        capsys, monkeypatch, tmp_path):
+    file = write_porter_system(tmp_path)
+    file.write_text(file.read_text().replace("porter_actors:", "no_actors:"))
+    run = RunInfo(1, 7450, 1.0, 0.0, str(file), {}, "r1", 0, "test run")
+    monkeypatch.setattr("toolbox.topic_catalogue.find_run", lambda _port: run)
+    monkeypatch.setattr("actors.supervision.run_info.find_runs", list)
+    for arguments in (["topic", "list", "--system", str(file)],
+                      ["topic", "echo", "porter/load"], ["inject", "drop:porter/load"],
+                      ["campaign", "--list", "--system", str(file)],
+                      ["campaign", "--fault", "drop:porter/load", "--system", str(file)]):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert "No module named 'no_actors'" in error
+        assert error.count("\n") == 1
+    assert main(["topic", "echo", "plan/route"]) == 2
+    assert "no run found" in capsys.readouterr().err
 
 
 def verbs(parser, path=()):

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
+import porter_actors
+import pytest
+from porter_actors import AXLE, LOAD, write_porter_system
+
 from actors import topics
+from actors.supervision.system_topics import published_keys, system_topics
 from toolbox import systems
 from toolbox.topic_catalogue import markdown, uses
 
@@ -26,3 +32,30 @@ def test_every_topic_that_a_node_reads_is_published_by_somebody():
 def test_ground_truth_is_read_by_no_node_of_the_controller():
     truth = next(u for u in uses(systems.load(None)) if u.topic is topics.TRUTH)
     assert truth.readers == ("observer",)
+
+
+@pytest.mark.parametrize("name", ["paper", "osmosis", "cell"])
+def test_the_shipped_systems_have_the_common_topics_and_no_other(name):
+    assert system_topics(systems.load(name)) == topics.ALL
+
+
+def test_the_topics_of_a_robot_s_own_actors_follow_the_common_ones(tmp_path):
+    spec = systems.load(str(write_porter_system(tmp_path)))
+    assert system_topics(spec) == (*topics.ALL, LOAD, AXLE)
+    assert set(published_keys(spec)) >= {"porter/load", "porter/axle/front", "porter/axle/rear"}
+    used = {use.topic.key: (use.publishers, use.readers) for use in uses(spec)}
+    assert used["porter/load"] == (("platform",), ())
+    assert used["porter/axle/{name}"] == (("platform",), ("display",))
+
+
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"type": dict}, "topic 'porter/load': type = <class 'dict'>: must be derived from "),
+    ({"key": "a/{name}/{name}"}, "topic 'a/{name}/{name}': one {name} at most is right"),
+])
+def test_a_topic_that_makes_no_sense_is_refused_by_actor_and_key(tmp_path, monkeypatch, changes,
+                                                                 words):
+    spec = systems.load(str(write_porter_system(tmp_path)))
+    monkeypatch.setattr(porter_actors.Platform, "outputs", (dataclasses.replace(LOAD, **changes),))
+    with pytest.raises(ValueError, match=r"^actor = 'porter_actors:Platform': ") as caught:
+        system_topics(spec)
+    assert words in str(caught.value)

@@ -147,13 +147,13 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
         together = f"-{options.together}" if options.together > 1 else ""
         return f"sample{together}", sample(
             jobs, groups, options.runs, seed=options.seed, together=options.together)
-    faults = list(_planned(options.fault, spec, fault_groups(spec)))
+    faults = list(_planned(options.fault, spec, _all_groups(spec)))
     return "faults", cross(jobs, faults, range(options.seed, options.seed + options.seeds))
 
 
 def _groups(options: argparse.Namespace, spec: SystemSpec) -> dict[str, tuple[str, ...]]:
     """Return the faults to draw from: of the kinds asked for, or all."""
-    groups = fault_groups(spec)
+    groups = _all_groups(spec)
     if not options.kinds:
         return groups
     wanted = options.kinds.split(",")
@@ -163,10 +163,17 @@ def _groups(options: argparse.Namespace, spec: SystemSpec) -> dict[str, tuple[st
     return {kind: groups[kind] for kind in wanted}
 
 
+def _all_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
+    try:
+        return fault_groups(spec)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
+
 def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str, ...]]
              ) -> Iterable[PlannedFault | None]:
     every = [name for names in groups.values() for name in names]
-    nodes = can_be_hit(spec)
+    nodes, known = can_be_hit(spec), systems.topics_of(spec)
     for text in texts:
         if text == "none":
             yield None
@@ -175,7 +182,7 @@ def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str
             planned = parse_fault(text)
             found = fnmatch.filter(every, planned.fault)
             if not found:
-                action_of(planned, "f1", nodes)
+                action_of(planned, "f1", nodes, known)
                 found = [planned.fault]
         except (ScenarioError, UnknownFaultError) as error:
             raise UsageError(f"--fault {text}: {error}") from None
@@ -380,7 +387,7 @@ def _full_verdicts(runs: Sequence[Run]) -> dict[tuple[str, int], dict[str, str]]
 
 
 def _list(spec: SystemSpec, *, as_json: bool) -> int:
-    groups = fault_groups(spec)
+    groups = _all_groups(spec)
     if as_json:
         print_json(groups)
         return 0

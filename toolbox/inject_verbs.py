@@ -12,6 +12,8 @@ from actors import topics
 from actors.runtime.corruption import InjectionError, field_type, is_array
 from actors.runtime.injection import MODES, flaw
 from actors.runtime.topic import ROOT, Topic
+from actors.supervision.system_topics import published_keys
+from manager.specification import SystemSpec
 from sim.faults import (
     PAPER_FAULTS,
     SENSOR_FAULTS,
@@ -20,11 +22,11 @@ from sim.faults import (
     UnknownFaultError,
     find_fault,
 )
-from sim.topic_faults import modes_of, published_keys, systematic_faults
+from sim.topic_faults import modes_of, systematic_faults
 from toolbox import systems
 from toolbox.injecting import run_fault
 from toolbox.output import UsageError, print_json, print_table, say
-from toolbox.topic_catalogue import resolve
+from toolbox.topic_catalogue import resolve, topics_for
 
 _DEFAULT_DURATION_S = 5.0
 
@@ -62,6 +64,8 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
     parser.add_argument("fault", nargs="?", metavar="FAULT",
                         help="a name from --list, or MODE:TOPIC")
     parser.add_argument("--list", action="store_true", help="list the catalogue (needs no run)")
+    parser.add_argument("--system", metavar="FILE",
+                        help="for --list: system spec; default the shipped one")
     parser.add_argument("--duration", type=float, metavar="S",
                         help="simulated seconds, inf for permanent; default the fault's own, "
                              f"else {_DEFAULT_DURATION_S:g}")
@@ -98,8 +102,11 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
 def inject(options: argparse.Namespace) -> int:
     """List the catalogue, or inject a fault."""
     if options.list:
-        _print_catalogue(as_json=options.json)
+        _print_catalogue(systems.load(options.system), as_json=options.json)
         return 0
+    if options.system is not None:
+        raise UsageError(f"--system {options.system}: goes with --list; a fault is injected into "
+                         "the run that there is")
     fault = choose(options)
     if options.duration is not None and not options.duration > 0:
         raise UsageError(f"--duration {options.duration:g}: must be seconds above 0, or inf")
@@ -133,13 +140,15 @@ def _known_fault(options: argparse.Namespace) -> Fault:
             raise UsageError(f"--{name.replace('_', '-')} goes with --topic, not with a "
                              "FAULT of the catalogue")
     try:
-        return find_fault(options.fault, options.seed or 0)
+        _, colon, key = options.fault.partition(":")
+        known = topics_for(key, options.port) if colon else topics.ALL
+        return find_fault(options.fault, options.seed or 0, known)
     except UnknownFaultError as error:
         raise UsageError(str(error)) from None
 
 
 def _own_fault(options: argparse.Namespace) -> Fault:
-    topic, key = resolve(options.topic)
+    topic, key = resolve(options.topic, topics_for(options.topic, options.port))
     if "*" in key:
         raise UsageError(f"--topic {options.topic}: name one member of the family, "
                          f"e.g. {topic.key.replace('{name}', 'DM1')}")
@@ -205,10 +214,12 @@ def _amount(option: str, text: str, topic: Topic[Any]) -> tuple[str, float]:
         raise UsageError(f"{option} {text}: must be FIELD=NUMBER") from None
 
 
-def _print_catalogue(*, as_json: bool) -> None:
-    keys = published_keys(systems.load(None))
+def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
+    known = systems.topics_of(spec)
+    keys = published_keys(spec)
     if as_json:
-        everything = (*PAPER_FAULTS.values(), *SENSOR_FAULTS.values(), *systematic_faults(keys))
+        everything = (*PAPER_FAULTS.values(), *SENSOR_FAULTS.values(),
+                      *systematic_faults(keys, known=known))
         print_json([{"name": f.name, "title": f.title, "group": f.group,
                      "detected_by": f.detected_by, "duration_s": f.duration_s,
                      "topics": [d.topic for d in f.disturbances]} for f in everything])
@@ -220,17 +231,17 @@ def _print_catalogue(*, as_json: bool) -> None:
                      for f in faults.values()])
         say()
     say(f"any topic, as MODE:TOPIC; MODE is one of {', '.join(MODES)}:")
-    print_table(("topic", "modes"), list(_modes_by_topic(keys).items()))
+    print_table(("topic", "modes"), list(_modes_by_topic(keys, known).items()))
     say()
     say("crashes: kill-node NODE, or kill -9 PID")
 
 
-def _modes_by_topic(keys: tuple[str, ...]) -> dict[str, str]:
+def _modes_by_topic(keys: tuple[str, ...], known: tuple[Topic[Any], ...]) -> dict[str, str]:
     """Return key of each declared topic → its modes in words; a family counts once."""
     rows: dict[str, str] = {}
     for key in keys:
-        modes = modes_of(key)
+        modes = modes_of(key, known)
         if modes:
             missing = [mode for mode in MODES if mode not in modes]
-            rows[resolve(key)[0].key] = f"all but {', '.join(missing)}" if missing else "all"
-    return {topic.key: rows[topic.key] for topic in topics.ALL if topic.key in rows}
+            rows[resolve(key, known)[0].key] = f"all but {', '.join(missing)}" if missing else "all"
+    return {topic.key: rows[topic.key] for topic in known if topic.key in rows}

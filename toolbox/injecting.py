@@ -12,10 +12,10 @@ import msgspec
 from actors import topics
 from actors.messages import Injection, InjectionReport
 from actors.runtime.envelope import Header
+from actors.supervision.system_topics import find_topic
 from sim.faults import Fault
 from toolbox.output import NoEffectError, print_json, say, unknown
 from toolbox.session import Session, connect
-from toolbox.topic_catalogue import resolve
 
 _TAKE_HOLD_S = 1.5
 """Real seconds within which a publisher answers, even when it is just being respawned."""
@@ -172,8 +172,8 @@ def _print_result(fault: Fault, watches: list[_Watch], *, at_once: bool) -> None
 
 
 def _check_publisher(session: Session, key: str) -> None:
-    topic, _ = resolve(key)
-    if topic.is_family:
+    topic = find_topic(key, topics.ALL)
+    if topic is not None and topic.is_family:
         head, tail = topic.key.split("{name}")
         member = key[len(head):len(key) - len(tail)]
         if member not in session.run.nodes:

@@ -14,8 +14,9 @@ from actors import topics
 from actors.recording.bag_writer import BagError, check_target
 from actors.recording.process import stop_pipe, told
 from actors.recording.recorder import Recorder
-from actors.runtime.topic import ROOT
+from actors.runtime.topic import ROOT, Topic
 from actors.supervision.run_info import NoRunError, RunInfo, find_run
+from toolbox import systems
 from toolbox.following import stopped_by_signals
 from toolbox.output import NoEffectError, UsageError, say
 from toolbox.replaying import DEFAULT_PORT, Replay
@@ -74,7 +75,7 @@ def record(options: argparse.Namespace) -> int:
         run = find_run(options.port)
     except NoRunError as error:
         raise UsageError(str(error)) from None
-    wants = matcher(options.topics, keys_of(run))
+    wants = _wishes(options.topics, run)
     path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
     try:
         check_target(path, overwrite=options.overwrite)
@@ -142,9 +143,17 @@ def matcher(globs: list[str], known: Iterable[str]) -> Callable[[str], bool]:
         fnmatch.fnmatchcase(key.removeprefix(f"{ROOT}/"), pattern) for pattern in patterns)
 
 
-def keys_of(run: RunInfo) -> list[str]:
-    """Return all full keys that may be used in a run."""
-    return [key for topic in topics.ALL
+def _wishes(globs: list[str], run: RunInfo) -> Callable[[str], bool]:
+    """Return the wish for topics; the robot's own count where those that ship do not do."""
+    try:
+        return matcher(globs, keys_of(run, topics.ALL))
+    except UsageError:
+        return matcher(globs, keys_of(run, systems.topics_of(systems.load(run.system_file))))
+
+
+def keys_of(run: RunInfo, known: Iterable[Topic[Any]]) -> list[str]:
+    """Return all full keys that may be used in a run, of the known topics."""
+    return [key for topic in known
             for key in ([topic.at(n) for n in run.nodes] if topic.is_family else [topic.at()])]
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import systems
+from actors.runtime.topic import Topic
+from actors.supervision.system_topics import system_topics
 from manager.specification import SpecificationError, SystemSpec, parse_specification
 from toolbox.output import UsageError
 
@@ -31,4 +34,16 @@ def load(file: str | None) -> SystemSpec:
     except UnicodeDecodeError:
         raise UsageError(f"--system {path}: not UTF-8 text") from None
     except SpecificationError as error:
+        raise UsageError(str(error)) from None
+
+
+def topics_of(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return all topics of a system.
+
+    Raises:
+        UsageError: an actor class that the spec names cannot be had, or declares what is no topic.
+    """
+    try:
+        return system_topics(spec)
+    except ValueError as error:
         raise UsageError(str(error)) from None

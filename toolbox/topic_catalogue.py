@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import Enum
 from typing import Any
 
 import msgspec
 
 from actors import topics
-from actors.messages import Message
 from actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from actors.runtime.topic import ROOT, Qos, Topic
 from actors.runtime.wiring import topics_of
+from actors.supervision.run_info import NoRunError, find_run
 from actors.supervision.run_plan import (
     OBSERVER,
     OBSERVER_CLASS,
@@ -21,7 +21,9 @@ from actors.supervision.run_plan import (
     SUPERVISOR_CLASS,
     load_class,
 )
+from actors.supervision.system_topics import find_topic
 from manager.specification import SystemSpec
+from toolbox import systems
 from toolbox.output import UsageError, unknown
 
 MAILBOX = {
@@ -45,7 +47,8 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
     """Return all topics with their publishers and readers in a system.
 
     Raises:
-        UsageError: the spec names an actor class that does not exist.
+        UsageError: the spec names an actor class that does not exist, or one of them declares a
+            topic that makes no sense.
     """
     members = [(SUPERVISOR, SUPERVISOR_CLASS), (OBSERVER, OBSERVER_CLASS),
                *((node.name, node.actor) for node in spec.actors())]
@@ -54,31 +57,56 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
         inputs, outputs = topics_of(_class(name, path))
         wired.append((name, inputs, outputs))
     return [TopicUse(topic, _publishers(topic, wired), _readers(topic, wired))
-            for topic in topics.ALL]
+            for topic in systems.topics_of(spec)]
 
 
-def resolve(key: str) -> tuple[Topic[Any], str]:
+def resolve(key: str, known: Sequence[Topic[Any]] = topics.ALL) -> tuple[Topic[Any], str]:
     """Return topic and full key expression for a key as a user types it.
 
     A family may be given as `detection/DM1`, `detection/{name}` or `detection/*`; the leading
     `rampart/` may be left out.
 
+    Args:
+        key: as typed.
+        known: all topics of the system.
+
     Raises:
         UsageError: no topic has this key.
     """
+    found = _match(key, known)
+    if found is None:
+        raise unknown("topic", key, (topic.key for topic in known))
+    return found
+
+
+def topics_for(key: str, port: int | None) -> tuple[Topic[Any], ...]:
+    """Return the topics among which to look for a key: where it is none that ships, the run's.
+
+    So a run of which the actors cannot be loaded here is no obstacle to what is known without.
+
+    Args:
+        key: as typed.
+        port: base port of the run, if there are several; without a run only what ships is known.
+
+    Raises:
+        UsageError: the system of the run, or one of its actors, cannot be loaded.
+    """
+    if _match(key, topics.ALL) is not None:
+        return topics.ALL
+    try:
+        run = find_run(port)
+    except NoRunError:
+        return topics.ALL
+    return systems.topics_of(systems.load(run.system_file))
+
+
+def _match(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str] | None:
     short = key.removeprefix("/").removeprefix(f"{ROOT}/")
-    for topic in topics.ALL:
-        if not topic.is_family:
-            if short == topic.key:
-                return topic, topic.at()
-            continue
-        head, tail = topic.key.split("{name}")
-        member = short[len(head):len(short) - len(tail)]
-        if short == f"{head}{member}{tail}" and member and "/" not in member:
-            if member in ("{name}", "*"):
-                return topic, topic.pattern
-            return topic, topic.at(member)
-    raise unknown("topic", key, (topic.key for topic in topics.ALL))
+    topic = find_topic(short, known)
+    if topic is not None:
+        return topic, f"{ROOT}/{short}"
+    return next(((topic, topic.pattern) for topic in known if topic.is_family
+                 and short in (topic.key, topic.key.replace("{name}", "*"))), None)
 
 
 def fields(kind: type[msgspec.Struct]) -> list[tuple[str, str]]:
@@ -155,7 +183,7 @@ def _messages(used: Iterable[Topic[Any]]) -> list[type[msgspec.Struct]]:
     found: dict[type[msgspec.Struct], None] = {}
 
     def visit(kind: Any) -> None:
-        if isinstance(kind, type) and issubclass(kind, Message):
+        if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
             if kind not in found:
                 found[kind] = None
                 for f in msgspec.structs.fields(kind):

@@ -12,12 +12,13 @@ from typing import Any
 
 import msgspec
 
+from actors import topics
 from actors.runtime.envelope import Header
 from actors.runtime.topic import Topic
 from toolbox import systems
 from toolbox.output import NoEffectError, UsageError, print_json, print_table, say, unknown
 from toolbox.session import Session, connect
-from toolbox.topic_catalogue import MAILBOX, fields, markdown, resolve, uses
+from toolbox.topic_catalogue import MAILBOX, fields, markdown, resolve, topics_for, uses
 
 _WINDOW = 500
 _SHOWN_BYTES = 24
@@ -99,8 +100,8 @@ def topic_list(options: argparse.Namespace) -> int:
 
 def topic_info(options: argparse.Namespace) -> int:
     """Print the contract of one topic."""
-    topic, _ = resolve(options.key)
     spec = systems.load(options.system)
+    topic, _ = resolve(options.key, systems.topics_of(spec))
     use = next(u for u in uses(spec) if u.topic is topic)
     if options.json:
         print_json({**_describe(topic, use.publishers, use.readers),
@@ -121,7 +122,7 @@ def topic_info(options: argparse.Namespace) -> int:
 
 async def topic_echo(options: argparse.Namespace) -> int:
     """Print messages as they come."""
-    topic, key = resolve(options.key)
+    topic, key = resolve(options.key, topics_for(options.key, options.port))
     _positive("--count", options.count)
     _positive("--duration", options.duration)
     done = asyncio.Event()
@@ -166,7 +167,7 @@ async def topic_echo(options: argparse.Namespace) -> int:
 
 async def topic_hz(options: argparse.Namespace) -> int:
     """Measure rates."""
-    topic, key = resolve(options.key)
+    topic, key = resolve(options.key, topics_for(options.key, options.port))
     _positive("--duration", options.duration)
     arrivals: dict[str, deque[float]] = {}
     duration_s = options.duration
@@ -235,8 +236,8 @@ def _print_rate(key: str, rate: dict[str, Any]) -> None:
 
 
 def _check_member(session: Session, topic: Topic[Any], key: str) -> None:
-    if not topic.is_family or key == topic.pattern:
-        return
+    if not topic.is_family or key == topic.pattern or topic not in topics.ALL:
+        return  # the members of a robot's own families need not be nodes
     head, tail = topic.at("\0").split("\0")
     member = key[len(head):len(key) - len(tail)]
     if member not in session.run.nodes:

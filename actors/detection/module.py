@@ -80,8 +80,10 @@ class Monitor(Protocol):
 class DetectionModule(Actor):
     """Base of DM1 to DM7.
 
-    A subclass either calls `activate` and `clear` itself, or has a `Monitor`, hands it what it
-    hears, and calls `follow(monitor)` after each event.
+    A subclass either calls `activate` and `know_idle` itself, or has a `Monitor`, hands it what it
+    hears, and calls `follow(monitor)` after each event. One that calls them itself calls
+    `know_idle` whenever what it hears proves that the fault is not there, idle or not: from its
+    second life on it is silent, and counts as active, until it has called one of the two.
     """
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.DETECTION,)
@@ -125,6 +127,13 @@ class DetectionModule(Actor):
         self._enter(DetectionState.IDLE)
         self._tell(DetectionReport(self.state, "", (), self.clock.now()))
 
+    def know_idle(self) -> None:
+        """Say that the fault is known not to be there: go to idle, or stay. Report what is new."""
+        if self.state is DetectionState.ACTIVE:
+            self.clear()
+        elif not self._told:
+            self._tell(self._report)
+
     def _enter(self, state: DetectionState) -> None:
         if state not in TRANSITIONS[self.state]:
             raise IllegalTransitionError(
@@ -151,10 +160,8 @@ class DetectionModule(Actor):
         self._note_absence()
         if monitor.active:
             self.activate(monitor.reason, monitor.nodes)
-        elif self.state is DetectionState.ACTIVE:
-            self.clear()
-        elif monitor.known and not self._told:
-            self._tell(self._report)
+        elif monitor.known or self.state is DetectionState.ACTIVE:
+            self.know_idle()
         self._sleep_until(monitor.due_s)
 
     def _sleep_until(self, due_s: float) -> None:

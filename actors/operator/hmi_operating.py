@@ -26,6 +26,7 @@ from actors.operator.hmi_wishes import (
 )
 from actors.supervision.kill_node import SIGNALS, SignalError
 from actors.supervision.process_title import RunProcess
+from actors.supervision.system_topics import find_topic, published_keys
 from manager.schema import SystemSpec
 from manager.strategies import STRATEGIES
 
@@ -76,7 +77,7 @@ class Operating:
         overhead_s = OVERHEAD_S * actor.clock.rate
         self._choice = StrategyChoice(f"{prefix}.s", "operator", tuple(STRATEGIES), overhead_s)
         self._injections = Injections(f"{prefix}.f", shared.get("faults", ()),
-                                      _places(shared.get("system")), overhead_s)
+                                      places_of(shared.get("system")), overhead_s)
         self._signal: Callable[[str, str], RunProcess] | None = shared.get("signal_node")
         self._pilot: m.PilotStatus | None = None
         self._pilot_heard_s = -math.inf
@@ -303,8 +304,11 @@ class Operating:
         return self._actor.clock.now()
 
 
-def _places(system: SystemSpec | None) -> tuple[str, ...]:
+def places_of(system: SystemSpec | None) -> tuple[str, ...]:
+    """Return the keys at which the page offers to inject: the common ones, then the robot's own."""
     if system is None:
         return places(topics.ALL, (), (), ())
-    return places(topics.ALL, [n.name for n in system.nodes],
-                  [d.name for d in system.detections], [r.name for r in system.recoveries])
+    common = places(topics.ALL, [n.name for n in system.nodes],
+                    [d.name for d in system.detections], [r.name for r in system.recoveries])
+    own = [key for key in published_keys(system) if find_topic(key, topics.ALL) is None]
+    return (*common, *own)

@@ -49,10 +49,11 @@ _raw_only = msgspec.json.Decoder(Recorded[msgspec.Raw])
 
 
 class MessageForm:
-    """The form of one topic's messages; None stands for keys that no topic has.
+    """The form of one topic's messages.
 
     Args:
-        topic: the contract of the key.
+        topic: the contract of the key; None for a key of the robot's own, or of nobody: whatever
+            has a header is a message there.
     """
 
     def __init__(self, topic: Topic[Any] | None) -> None:
@@ -63,12 +64,16 @@ class MessageForm:
 
     def recorded(self, payload: bytes) -> tuple[bytes, Header | None, Any]:
         """Return JSON, header and body of a payload; for garbage the latter are None."""
-        if self.topic is None:
-            return _garbage(payload, "no topic has this key"), None, None
+        header: Header
         try:
-            header, body = decode(self.topic, payload)
+            if self.topic is None:
+                envelope = _of_anything.decode(payload)
+                header, body = envelope, envelope.body
+            else:
+                header, body = decode(self.topic, payload)
         except UNREADABLE as error:
-            return _garbage(payload, f"not a {self.topic.type.__name__}: {error}"), None, None
+            name = self.topic.type.__name__ if self.topic else "message"
+            return _garbage(payload, f"not a {name}: {error}"), None, None
         parts = (header.source, header.incarnation, header.sequence, header.stamp)
         try:
             text = _encode(Recorded(*parts, body))
@@ -132,6 +137,7 @@ def header_of(payload: bytes) -> Header | None:
 
 
 _any_message = msgspec.msgpack.Decoder(Envelope[msgspec.Raw])
+_of_anything = msgspec.msgpack.Decoder(Envelope[Any])
 _encode_msgpack = msgspec.msgpack.Encoder().encode
 
 

@@ -5,12 +5,19 @@ from __future__ import annotations
 from actors import messages as m
 from actors import topics
 from actors.detection.module import DetectionModule
-from actors.messages import DetectionState
 from actors.runtime.actor import Header, on
 
 
 class StubDetection(DetectionModule):
-    """Active while somebody says so on `stub/trigger` (`rampart trigger NAME`)."""
+    """Active while somebody says so on `stub/trigger` (`rampart trigger NAME`).
+
+    What it was told dies with it: in a new life it is idle from the start.
+    """
+
+    def on_start(self) -> None:
+        """In a new life, say at once that nobody has said anything yet."""
+        if not self.first_life:
+            self.know_idle()
 
     @on(topics.STUB_TRIGGER)
     def trigger(self, message: m.StubTrigger, _header: Header) -> None:
@@ -19,5 +26,5 @@ class StubDetection(DetectionModule):
             return
         if message.active:
             self.activate(message.reason or "triggered by hand")
-        elif self.state is DetectionState.ACTIVE:
-            self.clear()
+        else:
+            self.know_idle()

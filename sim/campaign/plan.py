@@ -8,13 +8,14 @@ from collections.abc import Iterable, Sequence
 from itertools import product
 
 from actors.runtime.topic import ROOT
+from actors.supervision.system_topics import published_keys, system_topics
 from manager.schema import SystemSpec
 from sim.campaign.job import Job
 from sim.faults import PAPER_FAULTS, SENSOR_FAULTS
 from sim.injector import can_be_hit
 from sim.robot import WHEEL_NAMES
 from sim.scenario import OBSTACLE, PROCESS_FAULTS, PlannedFault
-from sim.topic_faults import published_keys, systematic_faults
+from sim.topic_faults import systematic_faults
 
 EARLIEST_S, LATEST_S = 2.0, 120.0
 """Random faults are injected between these simulated times."""
@@ -32,6 +33,9 @@ def fault_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
 
     Topics on which a fault cannot matter to the robot (error reports, greetings, what tools and
     adaptations say) are left out.
+
+    Raises:
+        ValueError: the spec names an actor class that does not exist, or topics that make no sense.
     """
     nodes = can_be_hit(spec)
     keys = [key for key in published_keys(spec)
@@ -40,7 +44,8 @@ def fault_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
     return {
         "paper": tuple(PAPER_FAULTS),
         "sensor": tuple(SENSOR_FAULTS),
-        "topic": tuple(fault.name for fault in systematic_faults(keys)),
+        "topic": tuple(fault.name for fault in systematic_faults(
+            keys, known=system_topics(spec))),
         "process": tuple(f"{what}:{node}" for what, node in product(PROCESS_FAULTS, nodes)),
         "actuator": (*(f"stuck-wheel:{wheel}" for wheel in wheels),
                      *(f"weak-wheel:{wheel}:0.2" for wheel in wheels),

@@ -1,0 +1,84 @@
+"""All topics of a system: those of `actors/topics.py`, and what its actors declare besides."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+
+from actors import topics
+from actors.runtime.topic import Topic
+from actors.runtime.wiring import heard, load_class, published, topics_of
+from actors.supervision.run_plan import DEFAULT_PORT, OBSERVER, Layout, RunPlan
+from manager.specification import SystemSpec
+
+_ANY_RUN = RunPlan("", DEFAULT_PORT, rate=1.0, seed=0, system_file="", strategy="", airport="",
+                   mission="", obstacles=0, ftm=True, hmi_port=0)
+"""Which keys a system publishes follows from its spec; nothing in the plan of a run matters."""
+
+
+def system_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return every topic of a system once: the common ones first, then the robot's own.
+
+    The own ones are in the order of the spec. A key of `actors/topics.py` keeps its contract.
+
+    Raises:
+        ValueError: the spec names an actor class that does not exist, or one of them declares a
+            topic that makes no sense.
+    """
+    found = {topic.key: topic for topic in topics.ALL}
+    paths = (*(node.actor for node in spec.nodes), *(d.actor for d in spec.detections),
+             *(r.actor for r in spec.recoveries))
+    for path in dict.fromkeys(paths):
+        inputs, outputs = topics_of(load_class(path))
+        for topic in (*inputs, *outputs):
+            if topic.key not in found:
+                if reason := _flaw(topic):
+                    raise ValueError(f"actor = {path!r}: topic {topic.key!r}: {reason}")
+                found[topic.key] = topic
+    return tuple(found.values())
+
+
+def published_keys(spec: SystemSpec) -> tuple[str, ...]:
+    """Return the keys that the nodes of a system and its supervisor publish, families spelt out.
+
+    Raises:
+        ValueError: the spec names an actor class that does not exist.
+    """
+    members = [m for m in Layout(_ANY_RUN, spec).members.values() if m.name != OBSERVER]
+    wanted: dict[str, dict[str, None]] = {}
+    for member in members:
+        for key, names in heard(member).items():
+            wanted.setdefault(key, {}).update(dict.fromkeys(names or ()))
+    found: dict[str, None] = {}
+    for member in members:
+        for key, names in published(member).items():
+            # A node that may publish any member of a family publishes those that somebody hears.
+            chosen = wanted.get(key, {}) if names is None else names
+            spelt = [key.replace("{name}", n) for n in chosen] if "{name}" in key else [key]
+            found.update(dict.fromkeys(spelt))
+    return tuple(sorted(found))
+
+
+def find_topic(key: str, known: Iterable[Topic[Any]]) -> Topic[Any] | None:
+    """Return the topic of a key below the root, one member's if it is a family, or None."""
+    for topic in known:
+        if not topic.is_family:
+            if key == topic.key:
+                return topic
+            continue
+        head, tail = topic.key.split("{name}")
+        member = key[len(head):len(key) - len(tail)]
+        if key == f"{head}{member}{tail}" and member and not set("/*{}") & set(member):
+            return topic
+    return None
+
+
+def _flaw(topic: Topic[Any]) -> str:
+    """Return what is wrong with a topic, or an empty text."""
+    if topic.key.count("{name}") > 1:
+        return "one {name} at most is right"
+    if not (isinstance(topic.type, type) and issubclass(topic.type, msgspec.Struct)):
+        return f"type = {topic.type!r}: must be derived from actors.messages.Message"
+    return ""

@@ -1,0 +1,62 @@
+"""A robot with topics of its own: the shipped one that carries something, in a spec and actors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+from stub_actors import ROOT
+
+from actors.messages import Message
+from actors.runtime.actor import Actor, Header, every, on
+from actors.runtime.topic import Qos, Topic
+
+
+class Load(Message, frozen=True):
+    """What it carries."""
+
+    mass_kg: float
+
+
+class Axle(msgspec.Struct, array_like=True):
+    """One axle, on the way without the names of its fields."""
+
+    speed_radps: float
+
+
+LOAD = Topic("porter/load", Load, Qos.SENSOR, 10, "base_link", "Mass on the platform.")
+AXLE = Topic("porter/axle/{name}", Axle, Qos.STATE, 2, "base_link", "Speed of axle {name}.")
+
+
+class Platform(Actor):
+    """Weighs, and turns."""
+
+    outputs = (LOAD, AXLE)
+
+    @classmethod
+    def output_names(cls, *_: object) -> tuple[str, ...]:
+        """Name the axles."""
+        return ("front", "rear")
+
+    @every(0.1)
+    def weigh(self) -> None:
+        self.publish(LOAD, Load(20.0))
+
+
+class Display(Actor):
+    """Shows the axles."""
+
+    @on(AXLE)
+    def axle(self, message: Axle, _header: Header) -> None:
+        pass
+
+
+def write_porter_system(directory: Path) -> Path:
+    """Write the shipped system with two more nodes."""
+    text = (ROOT / "systems" / "osmosis.toml").read_text(encoding="utf-8")
+    for name, actor in (("platform", "Platform"), ("display", "Display")):
+        text += (f'\n[[node]]\nname = "{name}"\nactor = "porter_actors:{actor}"\n'
+                 'kind = "non-control"\n')
+    file = directory / "porter.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
