@@ -40,7 +40,7 @@ from sim.watched_run import WatchedRun, new_directory
 
 ROOT = Path(__file__).resolve().parent
 LAST_PORT = 32_000
-EXIT_SUCCESS, EXIT_FAILED, EXIT_USAGE, EXIT_UNSAFE = 0, 1, 2, 3
+EXIT_SUCCESS, EXIT_FAILED, EXIT_USAGE, EXIT_UNSAFE, EXIT_NOT_KNOWN = 0, 1, 2, 3, 4
 
 EPILOG = """\
 examples:
@@ -60,7 +60,8 @@ while it runs, from another shell:
   kill-node osmosis_control                         kill a node and watch it come back
   rampart inject localization-not-updated           inject one of the paper's faults
   rampart status                                    what the robot and its nodes are doing
-exit code: 0 success and safe, 1 mission failed but safe, 2 bad usage or spec, 3 unsafe
+exit code: 0 success and safe, 1 mission failed but safe, 2 bad usage or spec, 3 unsafe,
+4 safety not known: no ground truth ever came
 """
 
 
@@ -221,7 +222,7 @@ class Run:
             print(json.dumps(summary(record, report=str(html), record=str(data), **more)),
                   flush=True)
         if record.safety != "safe":
-            return EXIT_UNSAFE
+            return EXIT_UNSAFE if record.safety == "unsafe" else EXIT_NOT_KNOWN
         return EXIT_SUCCESS if record.mission == "success" else EXIT_FAILED
 
 
