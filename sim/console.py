@@ -21,10 +21,14 @@ from actors.messages import (
 )
 from actors.runtime.actor import Header
 from actors.runtime.topic import Topic
-from actors.supervision.run_plan import RunPlan
+from actors.supervision.run_plan import SUPERVISOR, RunPlan
 from airport.model import Mission
+from manager.schema import SystemSpec
 from sim.report import headline
 from sim.report_record import RunRecord
+
+_EXAMPLE = "osmosis_control"
+"""Of a node to kill; a system that has it not offers its first that a recovery brings back."""
 
 _QUIET_EVENTS = frozenset({"started", "running", "adopted"})
 
@@ -45,14 +49,18 @@ class Console:
         self._last_live_s = 0.0
         self._unsafe = (0, False)
 
-    def banner(self, airport: str, mission: Mission, plan: RunPlan, strategy: str) -> None:
+    def banner(self, airport: str, mission: Mission, plan: RunPlan, spec: SystemSpec) -> None:
         """Say what is about to run and how to disturb it."""
+        strategy = spec.strategy
         mode = strategy if plan.ftm else "no fault tolerance"
         self._print(f"Rampart: mission {mission.name} ({len(mission.goals)} goals) on {airport}, "
                     f"{mode}, rate {plan.rate:g}")
         if plan.hmi_port:
             self._print(f"Operator's page: {plan.hmi_page}")
-        self._print("Try from another shell: kill-node osmosis_control")
+        comes_back = [node.name for node in spec.nodes if node.respawn != SUPERVISOR]
+        if comes_back:
+            example = _EXAMPLE if _EXAMPLE in comes_back else comes_back[0]
+            self._print(f"Try from another shell: kill-node {example}")
 
     def virtual_banner(
         self, airport: str, mission: Mission, plan: RunPlan, strategy: str

@@ -12,6 +12,7 @@ import gc
 import hashlib
 import struct
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -54,6 +55,7 @@ class VirtualResult:
         messages: How many were sent.
         wall_s: How long it took, without loading.
         failures: Actors that ended by an error, with the error's text.
+        tracebacks: Of these, as text.
     """
 
     record: RunRecord
@@ -63,6 +65,7 @@ class VirtualResult:
     messages: int
     wall_s: float
     failures: tuple[tuple[str, str], ...]
+    tracebacks: str
 
     @property
     def speed(self) -> float:
@@ -117,6 +120,9 @@ class VirtualRun:
         shared: What actors share, as `run_plan.load_shared` gives it, perhaps for another seed or
             number of obstacles; loaded if None.
 
+    Raises:
+        ValueError: an actor class named in the spec cannot be had.
+
     Attributes:
         interrupted: Whoever sets it, perhaps from a signal handler, ends the run for this reason.
     """
@@ -131,7 +137,7 @@ class VirtualRun:
             plan, run_id=f"virtual-{plan.seed}", rate=1.0, hmi_port=0, launcher_pid=1)
         self.mission = mission
         self.interrupted: str | None = None
-        self._spec = spec
+        self._layout = Layout(self.plan, spec)
         self._network = network or NETWORKS["measured"]
         self._scenario = tuple(scenario)
         self._taps = tuple(taps)
@@ -166,8 +172,7 @@ class VirtualRun:
         trace = Trace()
         hub.taps.append(trace)
         hub.taps += [_tap(take, loop.time() + LEAD_S) for take in self._taps]
-        layout = Layout(self.plan, self._spec)
-        machine = VirtualMachine(layout, self._shared, hub, clock, seed=self.plan.seed)
+        machine = VirtualMachine(self._layout, self._shared, hub, clock, seed=self.plan.seed)
         machine.on_restart = lambda name: self.mission.brought_back(name, clock.now())
 
         def to_machine(_topic: Topic[Any], message: Any, _header: Header) -> None:
@@ -201,4 +206,6 @@ class VirtualRun:
         return VirtualResult(
             record, self.mission.verdict(), why or "ended", trace.digest(), trace.messages,
             time.perf_counter() - begun_s,
-            tuple((name, f"{type(error).__name__}: {error}") for name, error in machine.failures))
+            tuple((name, f"{type(error).__name__}: {error}") for name, error in machine.failures),
+            "".join(f"--- {name}\n{''.join(traceback.format_exception(error))}"
+                    for name, error in machine.failures))

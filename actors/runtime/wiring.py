@@ -8,6 +8,7 @@ process of the system.
 from __future__ import annotations
 
 import importlib
+import traceback
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -79,13 +80,18 @@ def load_class(path: str) -> type[Actor]:
     """Return the actor class named `module:Class`.
 
     Raises:
-        ValueError: there is no such class, or it is no actor.
+        ValueError: there is no such class, it is no actor, or its module cannot be imported.
     """
     module, _, name = path.partition(":")
     try:
         found = getattr(importlib.import_module(module), name, None)
     except ImportError as error:
         raise ValueError(f"actor = {path!r}: {error}") from None
+    except Exception as error:  # a module of the user's own may raise anything
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        where = "" if isinstance(error, SyntaxError) else f" ({at.filename}, line {at.lineno})"
+        raise ValueError(f"actor = {path!r}: {module} cannot be imported: "
+                         f"{type(error).__name__}: {error}{where}") from None
     if not (isinstance(found, type) and issubclass(found, Actor)):
         raise ValueError(f"actor = {path!r}: no such actor class")
     return found

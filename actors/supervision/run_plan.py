@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from actors.messages import AdaptedSystem, NamedFault
+from actors.runtime.actor import Actor
 from actors.runtime.web_access import page_url
 from actors.runtime.wiring import Member, load_class, partners
 from actors.runtime.zenoh_bus import endpoint
@@ -22,6 +23,7 @@ from manager.specification import (
     Kind,
     Layers,
     NodeSpec,
+    SpecificationError,
     SystemSpec,
     check_document,
     read_document,
@@ -127,11 +129,14 @@ def load_document(plan: RunPlan) -> dict[str, Any]:
     """Read the plan's system spec as TOML, with the plan's choice of strategies.
 
     Raises:
-        SpecificationError: it is no TOML.
+        SpecificationError: it is no TOML, or no text at all.
         OSError: it cannot be read.
     """
-    document = read_document(
-        Path(plan.system_file).read_text(encoding="utf-8"), plan.system_file)
+    try:
+        text = Path(plan.system_file).read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise SpecificationError(plan.system_file, "$", "not UTF-8 text") from None
+    document = read_document(text, plan.system_file)
     chosen = {"strategy": plan.strategy, "shadow": plan.shadow}
     return {**document, **{key: name for key, name in chosen.items() if name}}
 
@@ -162,11 +167,23 @@ def actor_parameters(plan: RunPlan, spec: SystemSpec, node: NodeSpec) -> dict[st
     return {**derived, **node.parameters}
 
 
+def _class_of(plan: RunPlan, spec: SystemSpec, node: NodeSpec) -> type[Actor]:
+    try:
+        return load_class(node.actor)
+    except ValueError as error:
+        names = {"node": [n.name for n in spec.nodes],
+                 "detection": [d.name for d in spec.detections],
+                 "recovery": [r.name for r in spec.recoveries]}
+        path = next(f"$.{table}[{among.index(node.name)}]" for table, among in names.items()
+                    if node.name in among)
+        raise ValueError(f"{plan.system_file}: {path}.{error}") from None
+
+
 class Layout:
     """Everything derived from plan and spec: units, ports, partners.
 
     Raises:
-        ValueError: an actor class named in the spec does not exist.
+        ValueError: an actor class named in the spec does not exist or cannot be imported.
     """
 
     def __init__(self, plan: RunPlan, spec: SystemSpec) -> None:
@@ -182,7 +199,7 @@ class Layout:
         ]
         self.members: dict[str, Member] = {
             m.name: m for m in (*own, *(
-                Member(n.name, load_class(n.actor), actor_parameters(plan, spec, n))
+                Member(n.name, _class_of(plan, spec, n), actor_parameters(plan, spec, n))
                 for n in spec.actors()))}
         self.port_of: dict[str, int] = {
             name: plan.base_port + i for i, name in enumerate(self.members)}
