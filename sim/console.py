@@ -13,6 +13,7 @@ from actors.messages import (
     Diagnostic,
     GroundTruth,
     LightVerdict,
+    ManagerStatus,
     MissionPhase,
     MissionStatus,
     PilotStatus,
@@ -44,6 +45,7 @@ class Console:
         self._phase: MissionPhase | None = None
         self._lights: dict[str, LightVerdict] = {}
         self._detections: dict[str, DetectionState] = {}
+        self._silent: tuple[str, ...] = ()
         self._mission: MissionStatus | None = None
         self._pilot = ""
         self._last_live_s = 0.0
@@ -86,6 +88,8 @@ class Console:
                           f"{message.incarnation}{detail}")
         elif isinstance(message, DetectionReport):
             self._take_detection(message, header)
+        elif isinstance(message, ManagerStatus):
+            self._take_silence(message.silent, at)
         elif isinstance(message, DecisionRecord):
             what = " and ".join(message.recoveries) or "nothing to recover"
             word = "block" if message.strategy == "safety-first" else "rule"  # figure 7's word
@@ -145,6 +149,15 @@ class Console:
         if report.state is not before:
             what = report.reason if report.state is DetectionState.ACTIVE else "clear"
             self.line(header.stamp, f"{header.source}: {what}")
+
+    def _take_silence(self, silent: tuple[str, ...], at: float) -> None:
+        for name in silent:
+            if name not in self._silent:
+                self.line(at, f"{name} silent: it counts as active")
+        for name in self._silent:
+            if name not in silent:
+                self.line(at, f"{name}: no longer silent")
+        self._silent = silent
 
     def _show_live(self, truth: GroundTruth, at: float) -> None:
         unsafe = (truth.collisions, truth.prohibited_s > 0)
