@@ -38,7 +38,7 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
         "list", formatter_class=formatter, help="all topics (needs no run)",
         description="List all topics with message, QoS and nominal rate.",
         epilog="examples:\n  rampart topic list\n  rampart topic list --markdown > topics.md")
-    parser.add_argument("--system", metavar="FILE", help="system spec; default the shipped one")
+    systems.add_arguments(parser)
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print JSON")
     how.add_argument("--markdown", action="store_true", help="print topics.md")

@@ -38,10 +38,11 @@ def add(verbs: Any, formatter: Any) -> None:
         "tree", formatter_class=formatter, help="draw fault tree, FTMTree and order of recoveries",
         description="Draw the fault tree with the mechanisms as barriers (‖), the FTMTree that\n"
                     "follows from it, and the order of the recoveries, the safer above.",
-        epilog="examples:\n  rampart tree\n  rampart tree --what ftm-tree --active FTM3 FTM4\n"
+        epilog="examples:\n  rampart tree\n  rampart tree my_system.toml\n"
+               "  rampart tree --what ftm-tree --active FTM3 FTM4\n"
                "  rampart tree --what fault-tree --output fault_tree.svg\n"
                "  rampart tree --what order --format dot | dot -Tpdf > order.pdf")
-    parser.add_argument("--system", metavar="FILE", help="system spec; default the shipped one")
+    systems.add_arguments(parser)
     parser.add_argument("--what", choices=(*WHATS, "all"), default="all", help="default all")
     parser.add_argument("--format", choices=tuple(FORMATS),
                         help="default by the ending of --output, else text")
