@@ -422,6 +422,7 @@ def test_each_kind_of_gate_has_its_symbol(gate, words, qualifier):
 
 @pytest.mark.parametrize(("name", "start"), [
     ("x.svg", "<svg "), ("x.gv", "digraph"), ("x.dot", "digraph"), ("x.json", "["), ("x", "Fault"),
+    ("x.txt", "Fault"),
 ])
 def test_a_file_gets_the_format_of_its_ending(capsys, tmp_path, name, start):
     file = tmp_path / name
@@ -447,6 +448,7 @@ def test_two_orders_are_refined_and_shown_by_name(capsys, tmp_path):
     (["--active", "FTM1", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
     (["--strategy", "bravely"], ["'bravely'", "safety-first"]),
     (["--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
+    (["--output", "x.pdf"], ["--output x.pdf: unknown ending", ".svg, .dot, .gv, .json, .txt"]),
     (["--output", "/no/such/tree.svg"], ["--output /no/such/tree.svg", "No such file"]),
 ])
 def test_nonsense_is_refused_in_one_line_that_names_it(capsys, arguments, words):

@@ -29,7 +29,7 @@ def to_json(diagrams: Sequence[Diagram]) -> str:
 FORMATS: dict[str, Callable[[Sequence[Diagram]], str]] = {
     "text": to_text, "svg": to_svg, "dot": to_dot, "json": to_json,
 }
-_ENDINGS = {".svg": "svg", ".dot": "dot", ".gv": "dot", ".json": "json"}
+_ENDINGS = {".svg": "svg", ".dot": "dot", ".gv": "dot", ".json": "json", ".txt": "text"}
 
 
 def add(verbs: Any, formatter: Any) -> None:
@@ -61,6 +61,9 @@ def add(verbs: Any, formatter: Any) -> None:
 def show_tree(options: argparse.Namespace) -> int:
     """Print or write the diagrams."""
     ending = Path(options.output).suffix.lower() if options.output else ""
+    if ending and not options.format and ending not in _ENDINGS:
+        raise UsageError(f"--output {options.output}: unknown ending; one of "
+                         f"{', '.join(_ENDINGS)} is right, or say --format")
     form = options.format or _ENDINGS.get(ending, "text")
     spec = systems.load(options.system)
     diagrams = _draw(spec, WHATS if options.what == "all" else (options.what,), options)
