@@ -6,11 +6,13 @@ The boxes carry what is active and what was decided, so that a picture shows a s
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Sequence
 
 import msgspec
 
+from manager.gates import detection_gate, recovery_gate
 from manager.order import PartialOrder
 from manager.schema import EventSpec, MechanismSpec, SystemSpec
 from manager.words import decision_in_words
@@ -18,6 +20,7 @@ from manager.words import decision_in_words
 WHATS = ("fault-tree", "ftm-tree", "order")
 """What can be drawn."""
 
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _DIRECTION = {*"\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"}
 
 
@@ -181,8 +184,10 @@ def _ftm_tree(spec: SystemSpec, situation: Situation) -> _Parts:
     titles |= {r.name: r.title for r in spec.recoveries}
     boxes = []
     for mechanism in spec.mechanisms:
-        detects, recovers = (" + ".join(clean(titles.get(n, "")) or n for n in names)
-                             for names in (mechanism.detections, mechanism.recoveries))
+        detects, recovers = (_NAME.sub(lambda found: clean(titles.get(found[0], "")) or found[0],
+                                       str(gate))
+                             for gate in (detection_gate(mechanism.detect),
+                                          recovery_gate(mechanism.recover)))
         boxes.append(_bar(Box(mechanism.name, f"{detects} → {recovers}"), mechanism, situation,
                           asked))
     if not boxes:
