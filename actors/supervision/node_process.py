@@ -84,7 +84,8 @@ def node_main(
         signal.signal(signal.SIGUSR2, wedge)
         asyncio.run(_live(layout, names, incarnation, shared, tell))
     except BusError as error:
-        _complain(f"{'+'.join(names)}: {error}")
+        if error not in told:
+            _complain(f"{'+'.join(names)}: {error}")
         return EXIT_BUS
     except Exception as error:  # the last stop before the exit code: nothing may pass unseen
         if error not in told:
