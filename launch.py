@@ -11,6 +11,8 @@ import os
 import signal
 import socket
 import sys
+import tempfile
+import time
 import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,6 +23,7 @@ from actors.recording.bag_writer import BagError, check_target
 from actors.recording.process import Order, RecorderProcess
 from actors.recording.virtual import VirtualRecording
 from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
+from actors.runtime.wiring import load_class
 from actors.supervision.launcher import Launcher, LaunchError
 from actors.supervision.run_plan import DEFAULT_PORT, Layout, RunPlan, load_system
 from actors.supervision.system_topics import system_topics
@@ -37,11 +40,14 @@ from sim.report import write_report
 from sim.report_record import RunRecord
 from sim.scenario import action_of, parse_fault
 from sim.virtual_run import LEAD_S, VirtualRun
-from sim.watched_run import WatchedRun, new_directory
+from sim.watched_run import WatchedRun
 
 ROOT = Path(__file__).resolve().parent
 LAST_PORT = 32_000
-EXIT_SUCCESS, EXIT_FAILED, EXIT_USAGE, EXIT_UNSAFE = 0, 1, 2, 3
+ERROR_LOG = "errors.log"
+HMI = "actors.operator.hmi:Hmi"
+TELEOPERATION = "actors.operator.teleoperation:Teleoperation"
+EXIT_SUCCESS, EXIT_FAILED, EXIT_USAGE, EXIT_UNSAFE, EXIT_NOT_KNOWN = 0, 1, 2, 3, 4
 
 EPILOG = """\
 examples:
@@ -61,7 +67,8 @@ while it runs, from another shell:
   kill-node osmosis_control                         kill a node and watch it come back
   rampart inject localization-not-updated           inject one of the paper's faults
   rampart status                                    what the robot and its nodes are doing
-exit code: 0 success and safe, 1 mission failed but safe, 2 bad usage or spec, 3 unsafe
+exit code: 0 success and safe, 1 mission failed but safe, 2 bad usage or spec, 3 unsafe,
+4 safety not known: no ground truth ever came
 """
 
 
@@ -116,17 +123,18 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--record", metavar="FILE", help="keep everything that is sent in an MCAP file, "
                    "for `rampart bag info`, `rampart replay` and Foxglove-compatible viewers")
     p.add_argument("--overwrite", action="store_true", help="--record may replace an existing file")
-    p.add_argument("--report", metavar="DIR", help="where the report goes (default: "
-                   "reports/TIME-MISSION)")
+    p.add_argument("--report", metavar="DIR", help="where the report goes, checkpoints, and in "
+                   f"{ERROR_LOG} the tracebacks of nodes that failed (default: "
+                   "reports/TIME-MISSION, without a mission reports/TIME-SYSTEM)")
     p.add_argument("--virtual", action="store_true",
-                   help="run in virtual time: all actors in this process, many times faster than "
-                   "real; the same --seed gives the same run, to the byte")
+                   help="run a mission in virtual time: all actors in this process, many times "
+                   "faster than real; the same --seed gives the same run, to the byte")
     p.add_argument("--network", metavar="NAME", default="measured",
                    help=f"with --virtual, what lies between the nodes: {', '.join(NETWORKS)} "
                    "(default: measured)")
     p.add_argument("--fault", metavar="FAULT[@WHEN][+S]", action="append", default=[],
-                   help="a fault to inject (repeatable): one of `rampart inject --list`, "
-                   "MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE, slow:NODE, stuck-wheel, "
+                   help="a fault to inject into a mission (repeatable): one of `rampart inject "
+                   "--list`, MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE, slow:NODE, stuck-wheel, "
                    "weak-wheel, brake-failure, obstacle-ahead; WHEN is simulated seconds or goalN "
                    "(default: 10), S how long it lasts")
     p.add_argument("--json", action="store_true",
@@ -147,6 +155,9 @@ class Run:
         if options.duration is not None:
             raise UsageError(f"--duration {options.duration:g}: a mission ends by itself; "
                              "--patience S ends one that makes no progress")
+        for name in ("airport", "mission"):
+            if not (getattr(options, name) or getattr(spec, name)):
+                raise UsageError(f"--{name}: missing; {spec.name} names none")
         airport_name = _existing_path(options.airport or spec.airport)
         mission_name = _existing_path(options.mission or spec.mission)
         airport = load_airport(airport_name)
@@ -155,14 +166,16 @@ class Run:
             raise UsageError(f"--obstacles {options.obstacles}: {airport.name} has places for "
                              f"{len(airport.obstacles)}")
         self._scenario = [parse_fault(text) for text in options.fault]
-        for i, planned in enumerate(self._scenario):  # refused now rather than in mid-run
-            action_of(planned, f"f{i}", can_be_hit(spec), system_topics(spec))
-        self._directory = Path(options.report) if options.report else new_directory(
-            ROOT / "reports", mission.name)
-        self._directory.mkdir(parents=True, exist_ok=True)
+        known = system_topics(spec)
+        for i, planned in enumerate(self._scenario):
+            action_of(planned, f"f{i}", can_be_hit(spec), known)  # refused now, not in mid-run
+            if planned.goal > len(mission.goals):
+                raise UsageError(f"--fault {planned.text()}: mission {mission.name} has "
+                                 f"{len(mission.goals)} goals")
+        self._directory = _directory(options, mission.name)
         self._plan = msgspec.structs.replace(
             plan, airport=airport_name, mission=mission_name,
-            error_log=str(self._directory.resolve() / "errors.log"),
+            error_log=str(self._directory.resolve() / ERROR_LOG),
             checkpoints=str(self._directory.resolve() / "checkpoints"))
         self._console = Console(sys.stderr)
         self._mission = MissionRun(
@@ -180,13 +193,17 @@ class Run:
     async def _on_processes(self) -> int:
         title = f"{self._mission.mission.name} on {self._mission.airport.name}"
         run = ProcessRun(Launcher(self._plan, title), self._spec, self._mission, self._scenario)
-        with _recorded(self._options):
+        with _kept(self._directory), _recorded(self._options):
             _interruptible(run)
             record = await run.run()
-        return self._conclude(record)
+            return self._conclude(record)
 
     def in_virtual_time(self) -> int:
         """Run the mission in virtual time and return the exit code."""
+        with _kept(self._directory):
+            return self._in_virtual_time()
+
+    def _in_virtual_time(self) -> int:
         recording = None
         if self._options.record:
             title = f"{self._mission.mission.name} on {self._mission.airport.name}"
@@ -209,6 +226,9 @@ class Run:
         self._console.speed(result.speed, result.messages, result.trace)
         for name, error in result.failures:
             print(f"launch.py: {name} failed: {error}", file=sys.stderr)
+        if result.tracebacks:
+            with Path(self._plan.error_log).open("a", encoding="utf-8") as log:
+                log.write(result.tracebacks)
         return self._conclude(result.record, trace=result.trace)
 
     def _conclude(self, record: RunRecord, **more: str) -> int:
@@ -222,8 +242,34 @@ class Run:
             print(json.dumps(summary(record, report=str(html), record=str(data), **more)),
                   flush=True)
         if record.safety != "safe":
-            return EXIT_UNSAFE
+            return EXIT_UNSAFE if record.safety == "unsafe" else EXIT_NOT_KNOWN
         return EXIT_SUCCESS if record.mission == "success" else EXIT_FAILED
+
+
+@contextlib.contextmanager
+def _kept(directory: Path) -> Iterator[None]:
+    """Have a directory for what is kept of a run: say if there are tracebacks, leave none empty.
+
+    Raises:
+        UsageError: it cannot be made, or not be written.
+    """
+    log = directory / ERROR_LOG
+    made = not directory.exists()
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=directory).close()
+    except OSError as error:
+        raise UsageError(f"--report {directory}: no directory that can be written "
+                         f"({error.strerror})") from None
+    before = log.stat().st_size if log.exists() else 0
+    try:
+        yield
+    finally:
+        if log.exists() and log.stat().st_size > before:
+            print(f"launch.py: tracebacks of what failed: {log}", file=sys.stderr)
+        if made:
+            with contextlib.suppress(OSError):  # there is something in it
+                directory.rmdir()
 
 
 @contextlib.contextmanager
@@ -283,7 +329,10 @@ def _plan(options: argparse.Namespace) -> tuple[RunPlan, SystemSpec]:
     if not system_file.is_file() and shipped.is_file():
         system_file = shipped
     if not system_file.is_file():
-        raise UsageError(f"--system {options.system}: no such file")
+        what = "is a directory" if system_file.is_dir() else "no such file"
+        names = ", ".join(sorted(file.stem for file in (ROOT / "systems").glob("*.toml")))
+        raise UsageError(f"--system {options.system}: {what}; a spec is right, or the name of a "
+                         f"shipped one: {names}")
     plan = RunPlan(
         run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
@@ -291,26 +340,73 @@ def _plan(options: argparse.Namespace) -> tuple[RunPlan, SystemSpec]:
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
         joystick=_joystick(options), hmi_host=options.hmi_host, hmi_token=_token(options),
         faults=() if options.no_hmi else offered_faults(), waits=options.wait)
-    return plan, load_system(plan)
+    spec = load_system(plan)
+    return _fitting(options, plan, spec), spec
+
+
+def _fitting(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> RunPlan:
+    """Return the plan without a page that nobody serves.
+
+    Raises:
+        UsageError: an option needs a node that the system has not.
+    """
+    if not _has_actor(plan, spec, HMI):
+        _refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token"),
+                f"no node of {spec.name} serves an operator's page")
+        plan = msgspec.structs.replace(plan, hmi_port=0)
+    if options.joystick and not _has_actor(plan, spec, TELEOPERATION):
+        _refuse(options, ("joystick",), f"no node of {spec.name} reads it")
+    return plan
+
+
+def _has_actor(plan: RunPlan, spec: SystemSpec, actor: str) -> bool:
+    """Tell whether a node of the system is of this class, or of one that is derived from it."""
+    return any(node.actor == actor for node in spec.nodes) or any(
+        issubclass(member.actor, load_class(actor))
+        for member in Layout(plan, spec).members.values())
+
+
+def _refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
+    """Refuse options that would have no effect, each by its name and value as it is typed."""
+    for name in names:
+        value = getattr(options, name)
+        if value == parser().get_default(name):
+            continue
+        shown = value[0] if isinstance(value, list) else value
+        text = "" if value is True else f" {shown:g}" if isinstance(shown, float) else f" {shown}"
+        raise UsageError(f"--{name.replace('_', '-')}{text}: {why}")
+
+
+def _has_mission(options: argparse.Namespace, spec: SystemSpec) -> bool:
+    """Whether there is something to drive, and somebody who says where or what for."""
+    return spec.mobile is not None and any(
+        (options.airport, options.mission, spec.airport, spec.mission))
 
 
 async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> int:
-    """Run a system that drives nowhere, until its time is over or somebody ends it."""
-    for option in ("mission", "airport", "obstacles", "fault", "virtual"):
-        if getattr(options, option):
-            raise UsageError(f"--{option} {getattr(options, option)}: {spec.name} has no [robot] "
-                             "and drives nowhere")
-    directory = Path(options.report) if options.report else new_directory(
-        ROOT / "reports", spec.name)
-    directory.mkdir(parents=True, exist_ok=True)
-    run = WatchedRun(plan, spec, options.duration, directory, sys.stderr)
+    """Run a system without a mission, until its time is over or somebody ends it."""
+    _refuse(options, ("mission", "airport", "obstacles", "fault", "virtual", "wait", "patience"),
+            f"{spec.name} has no [robot] and drives nowhere" if spec.mobile is None else
+            f"{spec.name} has no mission; --airport and --mission give it one")
+    directory = _directory(options, spec.name)
+    plan = msgspec.structs.replace(
+        plan, error_log=str(directory.resolve() / ERROR_LOG),
+        checkpoints=str(directory.resolve() / "checkpoints"))
+    run = WatchedRun(plan, spec, options.duration, sys.stderr)
 
-    with _recorded(options):
+    with _kept(directory), _recorded(options):
         _interruptible(run)
         await run.run()
     if options.json:
         print(json.dumps(run.summary()), flush=True)
     return EXIT_SUCCESS
+
+
+def _directory(options: argparse.Namespace, name: str) -> Path:
+    """Return where the report of a run goes; it is made when the run starts."""
+    if options.report:
+        return Path(options.report)
+    return ROOT / "reports" / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -390,10 +486,12 @@ def _existing_path(name: str) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line, run, and return the exit code."""
     options = parser().parse_args(arguments)
+    if "" not in sys.path:
+        sys.path.append("")  # actors of one's own are found here, as by the processes of a run
     try:
         _check(options)
         plan, spec = _plan(options)
-        if spec.mobile is None:
+        if not _has_mission(options, spec):
             return asyncio.run(_watch(options, plan, spec))
         run = Run(options, plan, spec)
         return run.in_virtual_time() if options.virtual else run.on_processes()

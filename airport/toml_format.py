@@ -38,6 +38,7 @@ _CHOICES = {
     "shape": get_args(ObstacleShape),
 }
 _KEY = re.compile(r"\[[^]]*\]|[^.[]+")
+_UNKNOWN = re.compile(r"Object contains unknown field `(.*)`")
 _TYPE_NAMES = {
     str: "str", int: "int", float: "float", bool: "bool", list: "array", dict: "object"
 }  # fmt: skip
@@ -171,6 +172,11 @@ def _convert(path: Path, kind: Any) -> Any:
         choices = _CHOICES.get(where.rpartition(".")[2])
         if choices and message.startswith("Invalid enum value"):
             remedy = f"must be one of {', '.join(choices)}"
+        unknown = _UNKNOWN.fullmatch(message)
+        if unknown:
+            known = ", ".join(field.name for field in msgspec.structs.fields(kind))
+            remedy = "unknown field" + ("" if where else f"; known: {known}")
+            where = f"{where}.{unknown[1]}".lstrip(".")
         where, value = _locate(table, where, message)
         raise AirportError(f"{path}: {where}: {value}: {remedy}") from None
 

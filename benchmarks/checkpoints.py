@@ -9,6 +9,7 @@ memory.
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 import time
@@ -55,7 +56,10 @@ def percentiles(times_s: list[float]) -> str:
 
 def main() -> int:
     """Measure and print."""
-    chosen = sys.argv[1] if len(sys.argv) > 1 else "."
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("directory", nargs="?", default=".", metavar="DIRECTORY",
+                        help="on the disk that is meant (default: the working directory)")
+    chosen = parser.parse_args().directory
     print(f"{'us':<34}{'bytes':>6}    median       99 %       max")
     with tempfile.TemporaryDirectory(dir=chosen) as directory:
         for name, form, make in (("mission_manager", MISSION_STATE, mission),

@@ -7,6 +7,7 @@ largest consumers, and the result. Example: `python -m benchmarks.processor_time
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
@@ -23,7 +24,9 @@ PORT = 8450
 
 def main() -> int:
     """Run, sample, print."""
-    arguments = sys.argv[sys.argv.index("--") + 1:] if "--" in sys.argv else []
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("arguments", nargs="*", metavar="ARGUMENT", help="of launch.py, after --")
+    arguments = parser.parse_args().arguments
     run = subprocess.Popen(
         [sys.executable, str(ROOT / "launch.py"), "--no-hmi", "--json", "--port", str(PORT),
          *arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)

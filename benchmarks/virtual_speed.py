@@ -7,8 +7,8 @@ it, messages and trace. A first run of each, which also imports and loads, is le
 
 from __future__ import annotations
 
+import argparse
 import statistics
-import sys
 import time
 
 from sim.campaign.job import Job, run_virtually
@@ -19,7 +19,10 @@ SYSTEMS = ("paper", "osmosis")
 
 def main() -> None:
     """Measure and print."""
-    runs = int(sys.argv[1]) if len(sys.argv) > 1 else RUNS
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", nargs="?", type=int, default=RUNS, metavar="RUNS",
+                        help=f"of each system (default: {RUNS})")
+    runs = parser.parse_args().runs
     jobs = {name: Job(row="none", system=name, mission="A", seed=1) for name in SYSTEMS}
     speeds: dict[str, list[float]] = {name: [] for name in SYSTEMS}
     for job in jobs.values():

@@ -13,6 +13,7 @@ from actors.messages import (
     Diagnostic,
     GroundTruth,
     LightVerdict,
+    ManagerStatus,
     MissionPhase,
     MissionStatus,
     PilotStatus,
@@ -21,10 +22,14 @@ from actors.messages import (
 )
 from actors.runtime.actor import Header
 from actors.runtime.topic import Topic
-from actors.supervision.run_plan import RunPlan
+from actors.supervision.run_plan import SUPERVISOR, RunPlan
 from airport.model import Mission
+from manager.schema import SystemSpec
 from sim.report import headline
 from sim.report_record import RunRecord
+
+_EXAMPLE = "osmosis_control"
+"""Of a node to kill; a system that has it not offers its first that a recovery brings back."""
 
 _QUIET_EVENTS = frozenset({"started", "running", "adopted"})
 
@@ -40,19 +45,24 @@ class Console:
         self._phase: MissionPhase | None = None
         self._lights: dict[str, LightVerdict] = {}
         self._detections: dict[str, DetectionState] = {}
+        self._silent: tuple[str, ...] = ()
         self._mission: MissionStatus | None = None
         self._pilot = ""
         self._last_live_s = 0.0
         self._unsafe = (0, False)
 
-    def banner(self, airport: str, mission: Mission, plan: RunPlan, strategy: str) -> None:
+    def banner(self, airport: str, mission: Mission, plan: RunPlan, spec: SystemSpec) -> None:
         """Say what is about to run and how to disturb it."""
+        strategy = spec.strategy
         mode = strategy if plan.ftm else "no fault tolerance"
         self._print(f"Rampart: mission {mission.name} ({len(mission.goals)} goals) on {airport}, "
                     f"{mode}, rate {plan.rate:g}")
         if plan.hmi_port:
             self._print(f"Operator's page: {plan.hmi_page}")
-        self._print("Try from another shell: kill-node osmosis_control")
+        comes_back = [node.name for node in spec.nodes if node.respawn != SUPERVISOR]
+        if comes_back:
+            example = _EXAMPLE if _EXAMPLE in comes_back else comes_back[0]
+            self._print(f"Try from another shell: kill-node {example}")
 
     def virtual_banner(
         self, airport: str, mission: Mission, plan: RunPlan, strategy: str
@@ -78,6 +88,8 @@ class Console:
                           f"{message.incarnation}{detail}")
         elif isinstance(message, DetectionReport):
             self._take_detection(message, header)
+        elif isinstance(message, ManagerStatus):
+            self._take_silence(message.silent, at)
         elif isinstance(message, DecisionRecord):
             what = " and ".join(message.recoveries) or "nothing to recover"
             word = "block" if message.strategy == "safety-first" else "rule"  # figure 7's word
@@ -137,6 +149,15 @@ class Console:
         if report.state is not before:
             what = report.reason if report.state is DetectionState.ACTIVE else "clear"
             self.line(header.stamp, f"{header.source}: {what}")
+
+    def _take_silence(self, silent: tuple[str, ...], at: float) -> None:
+        for name in silent:
+            if name not in self._silent:
+                self.line(at, f"{name} silent: it counts as active")
+        for name in self._silent:
+            if name not in silent:
+                self.line(at, f"{name}: no longer silent")
+        self._silent = silent
 
     def _show_live(self, truth: GroundTruth, at: float) -> None:
         unsafe = (truth.collisions, truth.prohibited_s > 0)

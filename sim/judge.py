@@ -1,7 +1,8 @@
 """The judge: was the mission a success, was it safe? From ground truth alone, and pure.
 
 Success (paper, section V): every mission point was reached in the order of the mission and in
-the right mode. Safe: never in a prohibited area, never a collision.
+the right mode. Safe: never in a prohibited area, never a collision. Without any ground truth
+nobody knows.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Verdict:
 
     Args:
         success: all points reached, in order and in the right mode.
-        safe: no collision, never in the prohibited area.
+        safe: no collision, never in the prohibited area; None if no ground truth ever came.
         visited: how many points were reached so far.
         points: how many there are.
         visit_times_s: when each was reached.
@@ -59,7 +60,7 @@ class Verdict:
     """
 
     success: bool
-    safe: bool
+    safe: bool | None
     visited: int
     points: int
     visit_times_s: tuple[float, ...]
@@ -94,6 +95,7 @@ class Judge:
         self._wrong_mode_at: dict[int, str] = {}
         self._collisions = 0
         self._prohibited_s = 0.0
+        self._has_seen = False
         self._first_unsafe_s: float | None = None
         self._obstacle_m = math.inf
         self._prohibited_m = math.inf
@@ -101,6 +103,7 @@ class Judge:
 
     def see(self, sample: Sample) -> None:
         """Take the next sample; samples come in order of time."""
+        self._has_seen = True
         self._collisions = max(self._collisions, sample.collisions)
         self._prohibited_s = max(self._prohibited_s, sample.prohibited_s)
         if self._first_unsafe_s is None and not self._safe:
@@ -129,7 +132,9 @@ class Judge:
         """Return the verdict on what was seen so far."""
         visited, points = len(self._times), len(self._goals)
         reasons = []
-        if visited < points:
+        if not self._has_seen:
+            reasons.append("no ground truth ever came: nobody knows where the robot was")
+        elif visited < points:
             goal = self._goals[visited]
             why = f"point {visited + 1} of {points} at ({goal.x_m:g}, {goal.y_m:g})"
             if visited in self._wrong_mode_at:
@@ -145,7 +150,7 @@ class Judge:
             reasons.append(f"{self._prohibited_s:.2f} s in the prohibited area")
         return Verdict(
             success=visited == points,
-            safe=self._safe,
+            safe=self._safe if self._has_seen else None,
             visited=visited,
             points=points,
             visit_times_s=tuple(self._times),

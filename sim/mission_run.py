@@ -20,11 +20,13 @@ from airport.model import Airport, Mission
 from sim.console import Console
 from sim.judge import Judge, Verdict
 from sim.observer import JudgeSink, Sink
-from sim.report_record import RunRecord, RunRecorder
+from sim.report_record import RunRecord, RunRecorder, Safety
 from sim.run_end import RunEnd
 from sim.scenario import FaultOutcome
 
 LAUNCHER = "launch.py"
+
+_SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not known"}
 
 
 class MissionRun:
@@ -86,7 +88,7 @@ class MissionRun:
         verdict = self.verdict()
         reasons = () if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}")
         record = self._recorder.record(
-            "success" if verdict.success else "fail", "safe" if verdict.safe else "unsafe",
+            "success" if verdict.success else "fail", _SAFETY[verdict.safe],
             reasons, now_s)
         return msgspec.structs.replace(record, faults=faults)
 

@@ -87,7 +87,7 @@ class ProcessRun:
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         if mission.console:
             mission.console.banner(
-                mission.airport.name, mission.mission, plan, self._spec.strategy)
+                mission.airport.name, mission.mission, plan, self._spec)
         try:
             why = None
             while why is None and not self.interrupted and not any(t.done() for t in tasks):

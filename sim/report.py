@@ -104,6 +104,8 @@ def headline(run: RunRecord) -> str:
     missing = sum(light.verdict == "not measured" for light in run.lights)
     if run.safety == "unsafe":
         return "The robot was not safe in this run."
+    if run.safety == "not known":
+        return "No ground truth ever came: neither mission nor safety can be judged."
     if run.mission == "fail":
         return "The mission was not completed; the robot stayed safe."
     if not run.lights:

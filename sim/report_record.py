@@ -20,6 +20,8 @@ from sim.scenario import FaultOutcome
 TRACK_STEP_M = 0.2
 """A track point is kept when the robot has moved this far."""
 
+Safety = Literal["safe", "unsafe", "not known"]
+
 _CRASHES = ("crashed", "stopped", "wedged", "given up")
 _RECOVERED = ("respawned", "resumed", "adopted")
 
@@ -104,8 +106,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
         airport: its geometry.
         mission_name: of the mission.
         mission: success or fail (paper, section V: every point in order and in its mode).
-        safety: safe or unsafe, by ground truth.
-        reasons: why the mission failed or the run was unsafe; empty if all is well.
+        safety: safe or unsafe, by ground truth; not known if none ever came.
+        reasons: why the mission failed or the run was not safe; empty if all is well.
         duration_s: length of the run.
         distance_m: length of the way really driven.
         track: (t, x, y) of the way really driven.
@@ -132,7 +134,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     airport: AirportDrawing
     mission_name: str
     mission: Literal["success", "fail"]
-    safety: Literal["safe", "unsafe"]
+    safety: Safety
     reasons: tuple[str, ...]
     duration_s: float
     distance_m: float
@@ -217,7 +219,7 @@ class RunRecorder:
         if take is not None:
             take(message, header)
 
-    def record(self, mission: Literal["success", "fail"], safety: Literal["safe", "unsafe"],
+    def record(self, mission: Literal["success", "fail"], safety: Safety,
                reasons: Sequence[str], duration_s: float) -> RunRecord:
         """Return the record of the run so far, with the judge's verdict."""
         still = [Interval(lane, name, from_s, max(from_s, duration_s), reason)

@@ -12,6 +12,7 @@ import gc
 import hashlib
 import struct
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -55,6 +56,7 @@ class VirtualResult:
         messages: How many were sent.
         wall_s: How long it took, without loading.
         failures: Actors that ended by an error, with the error's text.
+        tracebacks: Of these, as text.
     """
 
     record: RunRecord
@@ -64,6 +66,7 @@ class VirtualResult:
     messages: int
     wall_s: float
     failures: tuple[tuple[str, str], ...]
+    tracebacks: str
 
     @property
     def speed(self) -> float:
@@ -118,6 +121,9 @@ class VirtualRun:
         shared: What actors share, as `run_plan.load_shared` gives it, perhaps for another seed or
             number of obstacles; loaded if None.
 
+    Raises:
+        ValueError: an actor class named in the spec cannot be had.
+
     Attributes:
         interrupted: Whoever sets it, perhaps from a signal handler, ends the run for this reason.
     """
@@ -132,7 +138,7 @@ class VirtualRun:
             plan, run_id=f"virtual-{plan.seed}", rate=1.0, hmi_port=0, launcher_pid=1)
         self.mission = mission
         self.interrupted: str | None = None
-        self._spec = spec
+        self._layout = Layout(self.plan, spec)
         self._network = network or NETWORKS["measured"]
         self._scenario = tuple(scenario)
         self._taps = tuple(taps)
@@ -167,8 +173,7 @@ class VirtualRun:
         trace = Trace()
         hub.taps.append(trace)
         hub.taps += [_tap(take, loop.time() + LEAD_S) for take in self._taps]
-        layout = Layout(self.plan, self._spec)
-        machine = VirtualMachine(layout, self._shared, hub, clock, seed=self.plan.seed)
+        machine = VirtualMachine(self._layout, self._shared, hub, clock, seed=self.plan.seed)
         machine.on_restart = lambda name: self.mission.brought_back(name, clock.now())
 
         def to_machine(_topic: Topic[Any], message: Any, _header: Header) -> None:
@@ -184,7 +189,7 @@ class VirtualRun:
             injector = Injector(Context(
                 INJECTOR, 1, clock, VirtualBus(hub, INJECTOR), {},
                 {"scenario": self._scenario, "hand": machine, "nodes": self._nodes,
-                 "topics": system_topics(self._spec)},
+                 "topics": system_topics(self._layout.spec)},
                 pid=1))
             actors.append(injector)
         watching = [asyncio.create_task(actor.run()) for actor in actors]
@@ -203,4 +208,6 @@ class VirtualRun:
         return VirtualResult(
             record, self.mission.verdict(), why or "ended", trace.digest(), trace.messages,
             time.perf_counter() - begun_s,
-            tuple((name, f"{type(error).__name__}: {error}") for name, error in machine.failures))
+            tuple((name, f"{type(error).__name__}: {error}") for name, error in machine.failures),
+            "".join(f"--- {name}\n{''.join(traceback.format_exception(error))}"
+                    for name, error in machine.failures))

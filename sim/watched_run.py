@@ -1,4 +1,4 @@
-"""A run of a system that drives nowhere: no world, no mission, no judge, but an end.
+"""A run of a system without a mission: no world, no judge, but an end.
 
 For systems that are being specified, and for those whose world is not simulated here.
 """
@@ -6,8 +6,6 @@ For systems that are being specified, and for those whose world is not simulated
 from __future__ import annotations
 
 import asyncio
-import time
-from pathlib import Path
 from typing import Any, TextIO
 
 import msgspec
@@ -33,15 +31,12 @@ class WatchedRun:
         plan: What to run.
         spec: The system.
         duration_s: Simulated seconds after which it ends; None for when it is interrupted.
-        directory: For tracebacks of failed nodes.
         stream: For the story.
     """
 
-    def __init__(self, plan: RunPlan, spec: SystemSpec, duration_s: float | None, directory: Path,
+    def __init__(self, plan: RunPlan, spec: SystemSpec, duration_s: float | None,
                  stream: TextIO) -> None:
-        self.launcher = Launcher(msgspec.structs.replace(
-            plan, error_log=str(directory.resolve() / "errors.log"),
-            checkpoints=str(directory.resolve() / "checkpoints")), spec.title)
+        self.launcher = Launcher(plan, spec.title)
         self.interrupted = ""
         self._spec = spec
         self._duration_s = duration_s
@@ -85,6 +80,8 @@ class WatchedRun:
         task = asyncio.create_task(observer.run())
         self._console.line(clock.now(), f"{self._spec.title} ({self._spec.name}), "
                            f"{self._spec.strategy}, rate {plan.rate:g}; ctrl-C ends it")
+        if plan.hmi_port:
+            self._console.line(clock.now(), f"operator's page: {plan.hmi_page}")
         try:
             while not (self.interrupted or task.done()  # noqa: ASYNC110 three kinds of end
                        or self._is_over(clock.now())):
@@ -108,10 +105,3 @@ class WatchedRun:
         elif isinstance(message, ProcessEvent) and message.event == "respawned" \
                 and message.detail != "already":
             self._restarts[message.node] = self._restarts.get(message.node, 0) + 1
-
-
-def new_directory(root: Path, name: str) -> Path:
-    """Make the directory of a run and return it."""
-    directory = root / (time.strftime("%Y%m%d-%H%M%S-") + name)
-    directory.mkdir(parents=True, exist_ok=True)
-    return directory

@@ -204,6 +204,12 @@ BAD_USAGE = [
     (["--obstacles", "99"], "99"),
     (["--port", "80"], "--port 80"),
     (["--patience", "nan"], "nan"),
+    (["--report", "/proc/x"], "--report /proc/x: no directory that can be written (No such file"),
+    (["--report", __file__], f"--report {__file__}: no directory that can be written (File exists"),
+    (["--system", "/tmp"], "--system /tmp: is a directory; a spec is right, or the name of a"),
+    (["--system", sys.executable], f"{Path(sys.executable).resolve()}: $: not UTF-8 text"),
+    (["--airport", str(ROOT / "systems" / "cell.toml")], "cell.toml: title: 'Pick and place behi"),
+    (["--fault", "gps-bias@goal99"], "--fault gps-bias@goal99: mission AB has 5 goals"),
 ]
 
 

@@ -113,6 +113,12 @@ def test_the_closest_approaches_are_kept():
     assert found.closest_point_m == 8
 
 
+def test_without_ground_truth_nobody_knows_whether_it_was_safe():
+    found = Judge(GOALS).verdict()
+    assert (found.success, found.safe) == (False, None)
+    assert found.reasons == ("no ground truth ever came: nobody knows where the robot was",)
+
+
 def test_a_judge_without_goals_or_radius_is_refused():
     with pytest.raises(ValueError, match="goals: empty"):
         Judge(())

@@ -84,8 +84,9 @@ class Bystander(Actor):
 class Run:
     """Calls the toolbox in a thread, as the shell would in a process."""
 
-    def __init__(self, node: Everything, bus: ZenohBus) -> None:
+    def __init__(self, node: Everything, bus: ZenohBus, info: RunInfo) -> None:
         self.node = node
+        self.info = info
         self.bus = bus
 
     async def call(self, capsys, *arguments: str) -> tuple[int, str, str]:
@@ -108,7 +109,7 @@ async def run(monkeypatch):
     clock = Clock(loop.time(), RATE, loop.time)
     ports = dict(zip(("simulator", "DM1"), free_ports(2), strict=True))
     info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), ports, "r1", 0,
-                   "test run")
+                   "test run", plan={"mission": "AB"})
     monkeypatch.setattr("toolbox.session.find_run", lambda _port: info)
     async with AsyncExitStack() as stack:
         nodes = []
@@ -121,7 +122,7 @@ async def run(monkeypatch):
             stack.callback(node.stop)
             nodes.append((node, bus))
         await asyncio.sleep(0.1)
-        yield Run(*nodes[0])
+        yield Run(*nodes[0], info)
 
 
 async def test_status_shows_the_run_at_a_glance(run, capsys):
@@ -132,6 +133,21 @@ async def test_status_shows_the_run_at_a_glance(run, capsys):
     assert "pilot     stop, STOPPED: RM2" in out
     assert "manager   safety-first, decision 1; ACTIVE FTM1; recovery RM1; latched RM1" in out
     assert "nodes     1 of 2 running, 2 restarts; hmi crashed" in out
+
+
+async def test_status_shows_nothing_that_the_system_has_not(run, capsys, monkeypatch):
+    publish = run.node.publish
+    monkeypatch.setattr(run.node, "publish", lambda topic, *rest, **more: None if topic in (
+        topics.MISSION_STATUS, topics.PILOT_STATUS, topics.MANAGER_STATUS
+        ) else publish(topic, *rest, **more))
+    run.info.plan["mission"] = ""
+    _, out, _ = await run.call(capsys, "status")
+    assert "nodes     1 of 2 running" in out
+    for word in ("mission", "pilot", "manager", "silent"):
+        assert word not in out
+    run.info.plan["mission"] = "AB"
+    _, out, _ = await run.call(capsys, "status")
+    assert "mission   silent" in out
 
 
 async def test_status_as_json_holds_the_same(run, capsys):
@@ -192,6 +208,16 @@ async def test_a_silent_topic_is_said_to_be_silent(run, capsys):
     assert err == "rampart: nothing came on plan/route within 0.2 s\n"
     code, _, _ = await run.call(capsys, "topic", "hz", "plan/route", "--duration", "0.2", "--json")
     assert code == 1
+
+
+@pytest.mark.parametrize("verb", ["echo", "hz"])
+async def test_echo_and_hz_end_with_the_run(run, capsys, monkeypatch, verb):
+    looks = iter([False, False])
+    monkeypatch.setattr("toolbox.topic_verbs.is_over", lambda _run: next(looks, True))
+    code, out, err = await run.call(capsys, "topic", verb, "localization/pose")
+    assert code == 0
+    assert "localization/pose" in out
+    assert err == "rampart: the run has ended: test run (port 7450)\n"
 
 
 async def test_hz_measures_in_simulated_time(run, capsys):

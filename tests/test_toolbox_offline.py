@@ -97,6 +97,15 @@ def test_only_the_sets_in_which_strategies_differ_can_be_shown(capsys):
     assert compared(capsys, "--differing").endswith(f"\n{len(some)} of 127 sets differ\n")
 
 
+@pytest.mark.parametrize("verb", ["verify", "cut-sets", "table", "tree", "topic list"])
+def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
+    shown = []
+    for spec in (["cell"], ["--system", "cell"], []):
+        assert main([*verb.split(), *spec, "--json"]) == 0
+        shown.append(told(capsys))
+    assert shown[0] == shown[1] != shown[2]
+
+
 def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     text = systems.DEFAULT.read_text().replace('"FTM7"', '"FTM70"')
     file = tmp_path / "mine.toml"
@@ -112,6 +121,7 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     (["table", "--differing"], ["--differing", "--strategy"]),
     (["table", "--strategy", "safety-first", "--strategy", "bravely"], ["'bravely'"]),
     (["table", "--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
+    (["verify", "no.toml"], ["rampart: no.toml: No such file", "name of a shipped one: cell, os"]),
     (["inject", "gremlins"], ["'gremlins'", "`rampart inject --list`"]),
     (["inject", "laser-dropuot"], ["did you mean laser-dropout?"]),
     (["inject", "laser-drift"], ["'laser-drift'", "quartz"]),

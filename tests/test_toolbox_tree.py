@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manager.diagram import Box, Diagram, clean, covers
+from manager.diagram import Box, Diagram, Situation, clean, covers, draw
 from manager.layered import arrange_in_layers, crossings
 from manager.order import PartialOrder
 from manager.placing import _isotonic, place
@@ -431,12 +431,29 @@ def test_each_kind_of_gate_has_its_symbol(gate, words, qualifier):
 
 @pytest.mark.parametrize(("name", "start"), [
     ("x.svg", "<svg "), ("x.gv", "digraph"), ("x.dot", "digraph"), ("x.json", "["), ("x", "Fault"),
+    ("x.txt", "Fault"),
 ])
 def test_a_file_gets_the_format_of_its_ending(capsys, tmp_path, name, start):
     file = tmp_path / name
     assert main(["tree", "--output", str(file)]) == 0
     assert file.read_text(encoding="utf-8").startswith(start)
     assert f"{file}: fault-tree, 12 boxes" in told(capsys)
+
+
+@pytest.mark.parametrize(("detect", "title"), [
+    ("DM3", "Wrong command value"),
+    ("DM3 and not (DM1 or DM6)",
+     "Wrong command value and (not Prohibited area and not Localization not updated)"),
+    ("2 of (DM2, DM3, DM6)",
+     "2 of (Command not updated, Wrong command value, Localization not updated)"),
+])
+def test_a_mechanism_is_titled_with_the_logic_of_its_gate(detect, title):
+    spec = systems.load("paper")
+    mechanisms = tuple(msgspec.structs.replace(m, detect=detect) if m.name == "FTM3" else m
+                       for m in spec.mechanisms)
+    diagram = draw(msgspec.structs.replace(spec, mechanisms=mechanisms), "ftm-tree",
+                   spec.build_order(), spec.criteria, Situation())
+    assert next(b.title for b in diagram.boxes if b.name == "FTM3") == f"{title} → Controlled stop"
 
 
 def test_two_orders_are_refined_and_shown_by_name(capsys, tmp_path):
@@ -456,6 +473,7 @@ def test_two_orders_are_refined_and_shown_by_name(capsys, tmp_path):
     (["--active", "FTM1", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
     (["--strategy", "bravely"], ["'bravely'", "safety-first"]),
     (["--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
+    (["--output", "x.pdf"], ["--output x.pdf: unknown ending", ".svg, .dot, .gv, .json, .txt"]),
     (["--output", "/no/such/tree.svg"], ["--output /no/such/tree.svg", "No such file"]),
 ])
 def test_nonsense_is_refused_in_one_line_that_names_it(capsys, arguments, words):

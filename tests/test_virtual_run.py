@@ -117,7 +117,7 @@ def test_a_signal_ends_a_run_in_order_with_its_report_and_its_recording(tmp_path
     assert int(summary.end["messages"]) > 1000
 
 
-def test_a_second_signal_ends_a_run_at_once_and_its_recording_is_closed(tmp_path):
+def test_a_second_signal_ends_a_run_at_once_and_what_was_recorded_can_be_read(tmp_path):
     launched = recorded_run(tmp_path)
     for number in (signal.SIGSTOP, signal.SIGINT, signal.SIGTERM, signal.SIGCONT):
         launched.send_signal(number)  # so that both are there when it goes on
@@ -125,7 +125,8 @@ def test_a_second_signal_ends_a_run_at_once_and_its_recording_is_closed(tmp_path
     assert (launched.returncode, out) == (1, "")
     assert "Traceback" not in errors
     assert not list(tmp_path.glob("report/*.html"))
-    assert Summary(BagReader(tmp_path / "run.mcap")).reader.closed
+    # Wherever it hit, in the middle of a write perhaps.
+    assert sum(1 for _ in BagReader(tmp_path / "run.mcap").messages()) > 1000
 
 
 @pytest.mark.parametrize("fault", [

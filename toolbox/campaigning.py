@@ -124,6 +124,9 @@ def _try_world(jobs: Sequence[Job]) -> None:
     from airport.formats import load_airport, load_mission  # noqa: PLC0415 heavy
     job = jobs[0]
     spec = systems.load(job.system)
+    for name in ("airport", "mission"):
+        if not (getattr(job, name) or getattr(spec, name)):
+            raise UsageError(f"--{name}: missing; {spec.name} names none")
     try:
         airport = load_airport(job.airport or spec.airport)
         load_mission(job.mission or spec.mission, airport)

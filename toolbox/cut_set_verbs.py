@@ -41,8 +41,7 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
                "  rampart cut-sets --active FTM2                what is left if DM2 is active\n"
                "  rampart cut-sets --live                       what is left in the run, now\n"
                "  rampart cut-sets --export osmosis.xml         for other tools")
-    parser.add_argument("file", nargs="?", metavar="FILE",
-                        help="system spec, name of a shipped system, or Open-PSA .xml")
+    systems.add_arguments(parser, what=", or Open-PSA .xml", dest="file")
     parser.add_argument("--count", action="store_true", help="only count")
     parser.add_argument("--top", metavar="GATE", default="", help="top gate of an Open-PSA file")
     parser.add_argument("--max-order", type=int, metavar="K", help="no sets with more events")

@@ -29,7 +29,8 @@ def add(verbs: Any, formatter: Any) -> None:
     parser.add_argument("ftm", nargs="+", metavar="FTM", help="active mechanisms, e.g. FTM3")
     parser.add_argument("--strategy", metavar="NAME", help="default the spec's")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    _common(parser)
+    parser.add_argument("--system", metavar="SPEC",
+                        help="file, or name of a shipped system; default the shipped one")
     parser.set_defaults(run=show_decision)
 
     parser = verbs.add_parser(
@@ -47,12 +48,8 @@ def add(verbs: Any, formatter: Any) -> None:
                         help="default table")
     parser.add_argument("--json", action="store_const", dest="format", const="json",
                         help="the same as --format json")
-    _common(parser)
+    systems.add_arguments(parser)
     parser.set_defaults(run=show_table)
-
-
-def _common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--system", metavar="FILE", help="system spec; default the shipped one")
 
 
 def show_decision(options: argparse.Namespace) -> int:

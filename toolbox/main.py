@@ -84,6 +84,8 @@ def build_parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code."""
     options = build_parser().parse_args(arguments)
+    if "" not in sys.path:
+        sys.path.append("")  # actors of one's own are found here, as by the processes of a run
     try:
         return int(options.run(options))
     except UsageError as error:

@@ -22,7 +22,7 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
     parser = verbs.add_parser(
         "status", parents=[common], formatter_class=formatter, help="the run at a glance",
         description="Show mission, Safety Pilot, FTM Manager and nodes of the run.\n"
-                    "Whatever does not answer is shown as silent.",
+                    "Whatever the system has and does not answer is shown as silent.",
         epilog="examples:\n  rampart status\n  rampart status --json")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=lambda options: asyncio.run(status(options)))
@@ -77,9 +77,13 @@ async def status(options: argparse.Namespace) -> int:
             "nodes": nodes.nodes if nodes else None})
         return 0
     _print_run(session, time_s)
-    say(f"mission   {mission_in_words(mission)}")
-    say(f"pilot     {pilot_in_words(pilot)}")
-    say(f"manager   {manager_in_words(manager)}")
+    kinds = {n.kind for n in nodes.nodes} if nodes else {"pilot", "manager"}
+    if mission is not None or session.run.plan.get("mission", True):
+        say(f"mission   {mission_in_words(mission)}")
+    if pilot is not None or "pilot" in kinds:
+        say(f"pilot     {pilot_in_words(pilot)}")
+    if manager is not None or "manager" in kinds:
+        say(f"manager   {manager_in_words(manager)}")
     say(f"nodes     {_nodes(nodes)}")
     return 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,20 @@ from toolbox.output import UsageError
 
 SHIPPED = Path(systems.__file__).parent
 DEFAULT = SHIPPED / "osmosis.toml"
+
+
+def add_arguments(parser: argparse.ArgumentParser, *, what: str = "", dest: str = "system") -> None:
+    """Let a verb be told its system with or without `--system`.
+
+    Args:
+        parser: Of the verb; it takes nothing else without an option.
+        what: It takes besides a system.
+        dest: Where the choice is found in the options; None if there is none.
+    """
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument(dest, nargs="?", metavar="SPEC", default=argparse.SUPPRESS,
+                     help=f"file, or name of a shipped system{what}; default the shipped one")
+    how.add_argument("--system", dest=dest, metavar="SPEC", help="the same")
 
 
 def load(file: str | None) -> SystemSpec:
@@ -30,9 +45,11 @@ def load(file: str | None) -> SystemSpec:
     try:
         return parse_specification(path.read_text(encoding="utf-8"), str(path))
     except OSError as error:
-        raise UsageError(f"--system {path}: {error.strerror}") from None
+        names = ", ".join(sorted(shipped.stem for shipped in SHIPPED.glob("*.toml")))
+        raise UsageError(f"{path}: {error.strerror}; a spec is right, or the name of a shipped "
+                         f"one: {names}") from None
     except UnicodeDecodeError:
-        raise UsageError(f"--system {path}: not UTF-8 text") from None
+        raise UsageError(f"{path}: not UTF-8 text") from None
     except SpecificationError as error:
         raise UsageError(str(error)) from None
 

@@ -178,10 +178,14 @@ def _manager(status: m.ManagerStatus | None) -> tuple[str, str]:
 
 def _detections(picture: RunPicture) -> tuple[str, str]:
     found = sorted(picture.detections.items())
-    active = [f"{name} {report.reason}" for name, report in found
-              if report.state is m.DetectionState.ACTIVE]
+    manager: m.ManagerStatus | None = picture.latest(topics.MANAGER_STATUS)
+    silent = manager.silent if manager else ()
+    active = [f"{name} silent" for name in silent]
+    active += [f"{name} {report.reason}" for name, report in found
+               if report.state is m.DetectionState.ACTIVE and name not in silent]
     if active:
-        return f"{len(active)} of {len(found)}: {'; '.join(active)}", "yellow"
+        modules = len({*silent, *picture.detections})
+        return f"{len(active)} of {modules}: {'; '.join(active)}", "yellow"
     return (f"none of {len(found)} modules detects anything" if found else "no module heard", "")
 
 

@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import contextlib
 import itertools
+import math
 import statistics
 from collections import deque
 from typing import Any
@@ -16,7 +17,8 @@ from actors import topics
 from actors.runtime.envelope import Header
 from actors.runtime.topic import Topic
 from toolbox import systems
-from toolbox.output import NoEffectError, UsageError, print_json, print_table, say, unknown
+from toolbox.following import LOOK_S, is_over
+from toolbox.output import NoEffectError, UsageError, print_json, print_table, say, unknown, warn
 from toolbox.session import Session, connect
 from toolbox.topic_catalogue import MAILBOX, fields, markdown, resolve, topics_for, uses
 
@@ -39,7 +41,7 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
         "list", formatter_class=formatter, help="all topics (needs no run)",
         description="List all topics with message, QoS and nominal rate.",
         epilog="examples:\n  rampart topic list\n  rampart topic list --markdown > topics.md")
-    parser.add_argument("--system", metavar="FILE", help="system spec; default the shipped one")
+    systems.add_arguments(parser)
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print JSON")
     how.add_argument("--markdown", action="store_true", help="print topics.md")
@@ -71,7 +73,7 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
     parser = subverbs.add_parser(
         "hz", parents=[common], formatter_class=formatter, help="measure the rate of a topic",
         description="Measure how often messages arrive, in simulated time like the nominal rate,\n"
-                    "each second over a window of the last 500, until interrupted.",
+                    "each second over a window of the last 500, until interrupted or the run ends.",
         epilog="examples:\n  rampart topic hz control/command\n"
                "  rampart topic hz 'heartbeat/*' --duration 3 --json")
     parser.add_argument("key", metavar="KEY")
@@ -158,10 +160,14 @@ async def topic_echo(options: argparse.Namespace) -> int:
     async with connect(options.port) as session:
         _check_member(session, topic, key)
         session.listen(topic, key, heard, garbage)
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(done.wait(), options.duration)
+        loop = asyncio.get_running_loop()
+        end = math.inf if options.duration is None else loop.time() + options.duration
+        while not (done.is_set() or is_over(session.run)) and (left := end - loop.time()) > 0:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(done.wait(), min(LOOK_S, left))
+        _tell_end(session)
     if not seen:
-        raise NoEffectError(f"nothing came on {options.key} within {options.duration:g} s")
+        raise _nothing_came(options.key, options.duration)
     return 0
 
 
@@ -181,20 +187,20 @@ async def topic_hz(options: argparse.Namespace) -> int:
 
         session.listen(topic, key, heard)
         loop = asyncio.get_running_loop()
-        end = None if duration_s is None else loop.time() + duration_s
-        while end is None or loop.time() < end:
-            left = _HZ_REPORT_S if end is None else min(_HZ_REPORT_S, end - loop.time())
-            await asyncio.sleep(max(0.0, left))
+        end = math.inf if duration_s is None else loop.time() + duration_s
+        while (left := end - loop.time()) > 0 and not is_over(session.run):
+            await asyncio.sleep(min(_HZ_REPORT_S, left))
             if not options.json:
                 for short in sorted(arrivals):
                     _print_rate(short, rate_of(list(arrivals[short])))
                 if not arrivals:
                     say(f"nothing on {options.key} yet")
+        _tell_end(session)
     if options.json:
         print_json([{"key": short, "nominal_hz": topic.rate_hz, **rate_of(list(times))}
                     for short, times in sorted(arrivals.items())])
     if not arrivals:
-        raise NoEffectError(f"nothing came on {options.key} within {duration_s:g} s")
+        raise _nothing_came(options.key, duration_s)
     return 0
 
 
@@ -233,6 +239,16 @@ def _print_rate(key: str, rate: dict[str, Any]) -> None:
         return
     say(f"{key}: average rate: {rate['rate_hz']:.3f} min: {rate['min_s']:.3f}s "
         f"max: {rate['max_s']:.3f}s std dev: {rate['std_dev_s']:.5f}s window: {rate['window']}")
+
+
+def _tell_end(session: Session) -> None:
+    if is_over(session.run):
+        warn(f"the run has ended: {session.run.title} (port {session.run.base_port})")
+
+
+def _nothing_came(key: str, duration_s: float | None) -> NoEffectError:
+    when = "before the run ended" if duration_s is None else f"within {duration_s:g} s"
+    return NoEffectError(f"nothing came on {key} {when}")
 
 
 def _check_member(session: Session, topic: Topic[Any], key: str) -> None:

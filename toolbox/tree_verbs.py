@@ -29,7 +29,7 @@ def to_json(diagrams: Sequence[Diagram]) -> str:
 FORMATS: dict[str, Callable[[Sequence[Diagram]], str]] = {
     "text": to_text, "svg": to_svg, "dot": to_dot, "json": to_json,
 }
-_ENDINGS = {".svg": "svg", ".dot": "dot", ".gv": "dot", ".json": "json"}
+_ENDINGS = {".svg": "svg", ".dot": "dot", ".gv": "dot", ".json": "json", ".txt": "text"}
 
 
 def add(verbs: Any, formatter: Any) -> None:
@@ -38,10 +38,11 @@ def add(verbs: Any, formatter: Any) -> None:
         "tree", formatter_class=formatter, help="draw fault tree, FTMTree and order of recoveries",
         description="Draw the fault tree with the mechanisms as barriers (‖), the FTMTree that\n"
                     "follows from it, and the order of the recoveries, the safer above.",
-        epilog="examples:\n  rampart tree\n  rampart tree --what ftm-tree --active FTM3 FTM4\n"
+        epilog="examples:\n  rampart tree\n  rampart tree my_system.toml\n"
+               "  rampart tree --what ftm-tree --active FTM3 FTM4\n"
                "  rampart tree --what fault-tree --output fault_tree.svg\n"
                "  rampart tree --what order --format dot | dot -Tpdf > order.pdf")
-    parser.add_argument("--system", metavar="FILE", help="system spec; default the shipped one")
+    systems.add_arguments(parser)
     parser.add_argument("--what", choices=(*WHATS, "all"), default="all", help="default all")
     parser.add_argument("--format", choices=tuple(FORMATS),
                         help="default by the ending of --output, else text")
@@ -60,6 +61,9 @@ def add(verbs: Any, formatter: Any) -> None:
 def show_tree(options: argparse.Namespace) -> int:
     """Print or write the diagrams."""
     ending = Path(options.output).suffix.lower() if options.output else ""
+    if ending and not options.format and ending not in _ENDINGS:
+        raise UsageError(f"--output {options.output}: unknown ending; one of "
+                         f"{', '.join(_ENDINGS)} is right, or say --format")
     form = options.format or _ENDINGS.get(ending, "text")
     spec = systems.load(options.system)
     diagrams = _draw(spec, WHATS if options.what == "all" else (options.what,), options)

@@ -29,8 +29,7 @@ def add(verbs: Any, formatter: Any) -> None:
                "  rampart verify --strict && python launch.py     only if all holds\n\n"
                "exit code: 0 verified, whatever was found; with --strict 1 if a property of the\n"
                "system's strategy (or of one given by --strategy) fails; 2 bad usage or bad spec")
-    parser.add_argument("system", nargs="?", metavar="SPEC",
-                        help="file, or name of a shipped system; default the shipped one")
+    systems.add_arguments(parser)
     parser.add_argument("--strategy", action="append", default=[], metavar="NAME",
                         help="only this strategy; repeat for several (default: all)")
     parser.add_argument("--together", type=int, default=2, metavar="K",

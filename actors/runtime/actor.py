@@ -71,6 +71,7 @@ class Context:
         pid: number of the process that it lives in.
         checkpoints: where this node's state is kept.
         heartbeat_period_s: simulated seconds between two heartbeats.
+        failed: told of the error that ends the actor, while its peers still believe that it lives.
     """
 
     name: str
@@ -82,6 +83,7 @@ class Context:
     pid: int = field(default_factory=os.getpid)
     checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
     heartbeat_period_s: float = 0.1
+    failed: Callable[[Exception], None] = lambda _error: None
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:
@@ -429,6 +431,7 @@ class Actor:
             self.on_failure(error)
         except Exception as second:  # the first error is the one that counts
             error.add_note(f"and while reporting it: {second!r}")
+        self.context.failed(error)
 
     # -- mail -----------------------------------------------------------------------------------
 

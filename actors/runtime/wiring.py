@@ -8,6 +8,7 @@ process of the system.
 from __future__ import annotations
 
 import importlib
+import traceback
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -83,13 +84,19 @@ def load_class(path: str, reports_on: Topic[Any] | None = None) -> type[Actor]:
         reports_on: topic that it has to publish, by which a kind of module is known.
 
     Raises:
-        ValueError: there is no such class, it is no actor, or one of another kind.
+        ValueError: there is no such class, it is no actor, or one of another kind, or its module
+            cannot be imported.
     """
     module, _, name = path.partition(":")
     try:
         imported = importlib.import_module(module)
     except ImportError as error:
         raise ValueError(f"actor = {path!r}: {error}") from None
+    except Exception as error:  # a module of the user's own may raise anything
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        where = "" if isinstance(error, SyntaxError) else f" ({at.filename}, line {at.lineno})"
+        raise ValueError(f"actor = {path!r}: {module} cannot be imported: "
+                         f"{type(error).__name__}: {error}{where}") from None
     found = getattr(imported, name, None)
     if not (isinstance(found, type) and issubclass(found, Actor)):
         known = [key for key, value in vars(imported).items() if isinstance(value, type)

@@ -13,7 +13,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +39,9 @@ EXIT_BUS = 3
 
 def make_actor(
     layout: Layout, name: str, incarnation: int, shared: Mapping[str, Any],
-    loop: asyncio.AbstractEventLoop,
+    loop: asyncio.AbstractEventLoop, *, failed: Callable[[Exception], None] = lambda _error: None,
 ) -> Actor:
-    """Build one actor of the system with its bus, not yet running."""
+    """Build one actor of the system with its bus, not yet running; `failed` is told its error."""
     member = layout.members[name]
     clock = Clock(layout.plan.origin_s, layout.plan.rate, loop.time)
     bus = ZenohBus(name, incarnation, layout.listen(name), layout.dial(name),
@@ -49,7 +49,7 @@ def make_actor(
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, shared,
         checkpoints=make_store(layout, name, incarnation),
-        heartbeat_period_s=layout.spec.timing.heartbeat_period_s))
+        heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed))
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
@@ -66,6 +66,13 @@ def node_main(
     lifeline: int,
 ) -> int:
     """Run the actors of one process to their end and return the exit code."""
+    told: list[Exception] = []
+
+    def tell(error: Exception) -> None:  # at once: whoever replaces this process may kill it
+        told.append(error)
+        _complain(f"{'+'.join(names)} #{incarnation} failed: {type(error).__name__}: {error}")
+        _log_traceback(layout, names, incarnation, error)
+
     try:
         launcher = layout.plan.launcher_pid
         set_title(layout.plan.base_port, launcher, names, incarnation)
@@ -75,22 +82,24 @@ def node_main(
             lifeline, (lambda: kill_leftovers(launcher)) if SUPERVISOR in names else None)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is the launcher's to handle
         signal.signal(signal.SIGUSR2, wedge)
-        asyncio.run(_live(layout, names, incarnation, shared))
+        asyncio.run(_live(layout, names, incarnation, shared, tell))
     except BusError as error:
-        _complain(f"{'+'.join(names)}: {error}")
+        if error not in told:
+            _complain(f"{'+'.join(names)}: {error}")
         return EXIT_BUS
     except Exception as error:  # the last stop before the exit code: nothing may pass unseen
-        _complain(f"{'+'.join(names)} #{incarnation} failed: {type(error).__name__}: {error}")
-        _log_traceback(layout, names, incarnation)
+        if error not in told:
+            tell(error)
         return EXIT_FAILED
     return EXIT_OK
 
 
 async def _live(
-    layout: Layout, names: tuple[str, ...], incarnation: int, shared: Mapping[str, Any]
+    layout: Layout, names: tuple[str, ...], incarnation: int, shared: Mapping[str, Any],
+    failed: Callable[[Exception], None],
 ) -> None:
     loop = asyncio.get_running_loop()
-    actors = [make_actor(layout, name, incarnation, shared, loop) for name in names]
+    actors = [make_actor(layout, name, incarnation, shared, loop, failed=failed) for name in names]
 
     def stop_all() -> None:
         for actor in actors:
@@ -126,12 +135,13 @@ def _complain(line: str) -> None:
     print("rampart: " + " ".join(line.split()), file=sys.stderr, flush=True)
 
 
-def _log_traceback(layout: Layout, names: tuple[str, ...], incarnation: int) -> None:
+def _log_traceback(layout: Layout, names: tuple[str, ...], incarnation: int,
+                   failed: Exception) -> None:
     if not layout.plan.error_log:
         return
     try:
         with Path(layout.plan.error_log).open("a", encoding="utf-8") as log:
             log.write(f"--- {'+'.join(names)} #{incarnation} pid {os.getpid()}\n")
-            traceback.print_exc(file=log)
+            traceback.print_exception(failed, file=log)
     except OSError as error:
         _complain(f"cannot write {layout.plan.error_log}: {error}")

@@ -25,6 +25,7 @@ from manager.specification import (
     Kind,
     Layers,
     NodeSpec,
+    SpecificationError,
     SystemSpec,
     check_document,
     read_document,
@@ -130,11 +131,14 @@ def load_document(plan: RunPlan) -> dict[str, Any]:
     """Read the plan's system spec as TOML, with the plan's choice of strategies.
 
     Raises:
-        SpecificationError: it is no TOML.
+        SpecificationError: it is no TOML, or no text at all.
         OSError: it cannot be read.
     """
-    document = read_document(
-        Path(plan.system_file).read_text(encoding="utf-8"), plan.system_file)
+    try:
+        text = Path(plan.system_file).read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise SpecificationError(plan.system_file, "$", "not UTF-8 text") from None
+    document = read_document(text, plan.system_file)
     chosen = {"strategy": plan.strategy, "shadow": plan.shadow}
     return {**document, **{key: name for key, name in chosen.items() if name}}
 
@@ -186,7 +190,8 @@ class Layout:
     """Everything derived from plan and spec: units, ports, partners.
 
     Raises:
-        ValueError: an actor class named in the spec does not exist, or belongs into another table.
+        ValueError: an actor class named in the spec does not exist, cannot be imported, or belongs
+            into another table.
     """
 
     def __init__(self, plan: RunPlan, spec: SystemSpec) -> None:

@@ -84,7 +84,7 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         success: Every point of the mission in order and in its mode.
-        safe: Never in a prohibited area, never a collision.
+        safe: Never in a prohibited area, never a collision, and ground truth to know it by.
         reasons: Why not.
         duration_s: Length of the run.
         collisions: By ground truth.
@@ -157,7 +157,7 @@ def run_job(job: Job) -> RunResult:
     if effective:
         injected_s = min(effective)
     return RunResult(
-        success=verdict.success, safe=verdict.safe, reasons=record.reasons,
+        success=verdict.success, safe=bool(verdict.safe), reasons=record.reasons,
         duration_s=round(record.duration_s, 2), collisions=record.collisions,
         prohibited_s=round(record.prohibited_s, 3),
         obstacle_m=_metres(verdict.closest_obstacle_m),
