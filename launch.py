@@ -166,7 +166,7 @@ class Run:
             raise UsageError(f"--obstacles {options.obstacles}: {airport.name} has places for "
                              f"{len(airport.obstacles)}")
         self._scenario = [parse_fault(text) for text in options.fault]
-        known = system_topics(spec)
+        known = system_topics(spec) if self._scenario else ()
         for i, planned in enumerate(self._scenario):
             action_of(planned, f"f{i}", can_be_hit(spec), known)  # refused now, not in mid-run
             if planned.goal > len(mission.goals):
