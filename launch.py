@@ -16,12 +16,14 @@ import time
 import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from actors.recording.bag_writer import BagError, check_target
 from actors.recording.process import Order, RecorderProcess
 from actors.recording.virtual import VirtualRecording
+from actors.runtime.topic import Topic
 from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
 from actors.runtime.wiring import load_class
 from actors.supervision.launcher import Launcher, LaunchError
@@ -166,7 +168,10 @@ class Run:
             raise UsageError(f"--obstacles {options.obstacles}: {airport.name} has places for "
                              f"{len(airport.obstacles)}")
         self._scenario = [parse_fault(text) for text in options.fault]
-        known = system_topics(spec) if self._scenario else ()
+        known: Sequence[Topic[Any]] = ()
+        if self._scenario:
+            Layout(plan, spec)  # names file and path of an actor that cannot be had
+            known = system_topics(spec)
         for i, planned in enumerate(self._scenario):
             action_of(planned, f"f{i}", can_be_hit(spec), known)  # refused now, not in mid-run
             if planned.goal > len(mission.goals):

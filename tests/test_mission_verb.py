@@ -49,7 +49,7 @@ async def run(monkeypatch):
         tasks.append(asyncio.create_task(node.run()))
         nodes.append((node, bus))
     await asyncio.sleep(0.1)
-    yield Run(*nodes[0])
+    yield Run(*nodes[0], info)
     for node, _ in nodes:
         node.stop()
     for task in tasks:

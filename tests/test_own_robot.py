@@ -73,7 +73,7 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("how", ["--rate=4", "--virtual"])
+@pytest.mark.parametrize("how", ["--rate=4", "--virtual", "--fault=drop:localization/pose"])
 @pytest.mark.parametrize("what", BROKEN)
 def test_a_module_of_one_s_own_that_cannot_be_imported_is_one_line_with_file_path_and_cause(
         tmp_path, what, how):
