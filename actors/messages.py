@@ -522,7 +522,7 @@ class NodeTable(Message, frozen=True):
 
 
 class RespawnRequest(Message, frozen=True):
-    """A recovery module's wish to have a node's process killed, if it still is, and restarted."""
+    """A wish of a recovery module or the manager: kill a process, if it lives, and restart it."""
 
     request: int
     node: str

@@ -71,6 +71,7 @@ class FtmManager(Actor):
         self._shown: m.ManagerStatus | None = None
         self._remembered: tuple[int, tuple[str, ...]] | None = None
         self._replaced: dict[str, int] = {}
+        self._request = 0
 
     @classmethod
     def output_names(
@@ -214,8 +215,9 @@ class FtmManager(Actor):
         silent = overdue(self.arbiter_state.detections, self._arbiter.rules, self.clock.now())
         if silent is not None and self._replaced.get(silent.name) != silent.life:
             self._replaced[silent.name] = silent.life
+            self._request += 1
             self.publish(topics.RESPAWN, m.RespawnRequest(
-                len(self._replaced), silent.name, silent.life, self.name))
+                self._request, silent.name, silent.life, self.name))
 
     def _command(self, command: Command) -> None:
         self.publish(topics.RECOVERY_COMMAND, m.RecoveryCommand(

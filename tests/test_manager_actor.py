@@ -368,8 +368,8 @@ def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once_before_
         assert system.status.silent == ()
         hang(system.actors["DM3"])
         await asyncio.sleep(2.0)
-        assert [(r.node, r.failed_incarnation) for _, r in system.supervisor.requests] == [
-            ("DM3", 1), ("DM3", 2)]
+        assert [(r.request, r.node, r.failed_incarnation)
+                for _, r in system.supervisor.requests] == [(1, "DM3", 1), (2, "DM3", 2)]
 
     in_whole_system(scenario)
 
