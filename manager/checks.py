@@ -242,6 +242,16 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
                       f"cycle {' > '.join(cycle)}; escalation must come to an end", (cycle[1],))
 
 
+def _disabling(spec: SystemSpec) -> Iterator[Finding]:
+    used = {node.name for node in spec.nodes}.union(
+        *(recovery.claims | recovery.needs for recovery in spec.recoveries))
+    for index, recovery in enumerate(spec.recoveries):
+        for name in sorted(recovery.disables - used):
+            yield Finding(f"$.recovery[{index}].disables", f"{name!r} is neither a node nor a "
+                          "resource that a recovery claims or needs, so nothing is disabled; "
+                          f"known: {', '.join(sorted(used))}", (sorted(recovery.disables),))
+
+
 def _reachability(spec: SystemSpec) -> Iterator[Finding]:
     detecting = {name for mechanism in spec.mechanisms for name in mechanism.detections}
     recovering = {name for mechanism in spec.mechanisms for name in mechanism.recoveries} | {
@@ -456,5 +466,6 @@ def _budget(spec: SystemSpec) -> Iterator[Finding]:
 
 
 VALIDATORS: tuple[Callable[[SystemSpec], Iterator[Finding]], ...] = (
-    _timing, _names, _nodes, _detections, _recoveries, _processes, _mechanisms, _reachability,
-    _fault_tree, _policy, _orders, _criteria, _compounds, _order_against_tree, _budget)
+    _timing, _names, _nodes, _detections, _recoveries, _disabling, _processes, _mechanisms,
+    _reachability, _fault_tree, _policy, _orders, _criteria, _compounds, _order_against_tree,
+    _budget)

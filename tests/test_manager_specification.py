@@ -350,6 +350,9 @@ REFUSED = {
     "a need that nobody can take away": ([('disables = ["motion"]', 'disables = ["motoin"]')],
                                          ["$.recovery[4].needs = ['motion', 'safety_pilot']: "
                                           "'motion' is neither", "motoin"]),
+    "disabling what nobody uses": ([('disables = ["motion"]', 'disables = ["motion", "motoin"]')],
+                                   ["$.recovery[0].disables = ['motion', 'motoin']: 'motoin' is "
+                                    "neither", "nothing is disabled; known: ", "motion, "]),
     "a need that is a detection module": ([('needs = ["safety_pilot", "motion"]',
                                             'needs = ["DM3"]')],
                                           ["$.recovery[4].needs = ['DM3']: 'DM3' is neither"]),

@@ -7,6 +7,7 @@ import json
 import socket
 from contextlib import AsyncExitStack
 
+import msgspec
 import pytest
 from porter_actors import AXLE, LOAD, Axle, Load, write_porter_system
 
@@ -17,7 +18,10 @@ from actors.runtime.clock import Clock
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.run_info import RunInfo
 from toolbox import systems
+from toolbox.following import draw
 from toolbox.main import main
+from toolbox.run_picture import RunPicture
+from toolbox.session import connect
 
 RATE = 5.0
 
@@ -252,6 +256,40 @@ async def test_topics_of_the_robot_s_own_are_heard_measured_and_disturbed(
                   ["--topic", "porter/load", "--mode", "corrupt", "--set", "mass_kg=0"]):
         code, out, _ = await run.call(capsys, "inject", *fault, "--duration", "1", "--json")
         assert (code, json.loads(out)["effective"]) == (0, True)
+
+
+async def pictured(run, monkeypatch, system) -> RunPicture:
+    """What `rampart top` and `rampart metrics` have of a run of some system."""
+    of = msgspec.structs.replace(run.info, system_file=str(system))
+    monkeypatch.setattr("toolbox.session.find_run", lambda _port: of)
+    picture = RunPicture()
+    async with connect() as session:
+        draw(session, picture)
+        for _ in range(8):
+            picture.sample(session.clock.now())
+            await asyncio.sleep(0.1)
+    return picture
+
+
+async def test_the_robot_s_own_topics_are_counted_like_all_others(
+        run, capsys, tmp_path, monkeypatch):
+    rates_hz = (await pictured(run, monkeypatch, write_porter_system(tmp_path))).rates()
+    assert rates_hz[LOAD.key] == pytest.approx(rates_hz[topics.POSE.key], rel=0.3)
+    assert rates_hz[AXLE.key] == pytest.approx(2 * rates_hz[LOAD.key], rel=0.3)
+    assert capsys.readouterr().err == ""
+
+
+async def test_a_run_whose_actors_are_not_here_is_shown_all_the_same(
+        run, capsys, tmp_path, monkeypatch):
+    spec = write_porter_system(tmp_path)
+    spec.write_text(spec.read_text().replace("porter_actors:", "elsewhere.porter:"))
+    picture = await pictured(run, monkeypatch, spec)
+    assert picture.latest(topics.POSE) is not None
+    assert picture.rates()[topics.POSE.key] > 0
+    err = capsys.readouterr().err
+    assert "elsewhere.porter" in err
+    assert err.endswith("; topics of its own are not counted\n")
+    assert len(err.splitlines()) == 1
 
 
 async def test_an_injection_acts_and_tells_how_many_messages_it_affected(run, capsys):

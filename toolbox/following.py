@@ -11,7 +11,8 @@ from typing import Any
 from actors.runtime.topic import Topic
 from actors.supervision.process_title import process_state
 from actors.supervision.run_info import RunInfo, find_runs
-from toolbox.output import UsageError
+from toolbox import systems
+from toolbox.output import UsageError, warn
 from toolbox.run_picture import COUNTED, DECODED, RunPicture
 from toolbox.session import Session, connect
 
@@ -79,7 +80,7 @@ def stopped_by_signals(stop: asyncio.Event) -> Iterator[None]:
 
 
 def draw(session: Session, picture: RunPicture) -> None:
-    """Have everything that a session hears drawn into a picture."""
+    """Have everything that a session hears drawn into a picture, a robot's own topics too."""
     clock = session.clock
 
     def read(topic: Topic[Any]) -> None:
@@ -92,4 +93,11 @@ def draw(session: Session, picture: RunPicture) -> None:
     for topic in DECODED:
         read(topic)
     for topic in COUNTED:
+        count(topic)
+    try:
+        own = systems.own_topics_of(systems.load(session.run.system_file))
+    except UsageError as error:  # of a run from elsewhere, say: the common topics are enough
+        warn(f"{error}; topics of its own are not counted")
+        return
+    for topic in own:
         count(topic)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import systems
 from actors.runtime.topic import Topic
-from actors.supervision.system_topics import system_topics
+from actors.supervision.system_topics import own_topics, system_topics
 from manager.specification import SpecificationError, SystemSpec, parse_specification
 from toolbox.output import UsageError
 
@@ -60,7 +61,22 @@ def topics_of(spec: SystemSpec) -> tuple[Topic[Any], ...]:
     Raises:
         UsageError: an actor class that the spec names cannot be had, or declares what is no topic.
     """
+    return _usable(system_topics, spec)
+
+
+def own_topics_of(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return the topics that a system has beyond the common ones.
+
+    Raises:
+        UsageError: as `topics_of`.
+    """
+    return _usable(own_topics, spec)
+
+
+def _usable(
+    of: Callable[[SystemSpec], tuple[Topic[Any], ...]], spec: SystemSpec
+) -> tuple[Topic[Any], ...]:
     try:
-        return system_topics(spec)
+        return of(spec)
     except ValueError as error:
         raise UsageError(str(error)) from None

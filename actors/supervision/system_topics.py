@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import msgspec
 
+import actors
 from actors import topics
 from actors.runtime.topic import Topic
 from actors.runtime.wiring import heard, load_class, published, topics_of
@@ -27,17 +28,20 @@ def system_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
         ValueError: the spec names an actor class that does not exist, or one of them declares a
             topic that makes no sense.
     """
-    found = {topic.key: topic for topic in topics.ALL}
-    paths = (*(node.actor for node in spec.nodes), *(d.actor for d in spec.detections),
-             *(r.actor for r in spec.recoveries))
-    for path in dict.fromkeys(paths):
-        inputs, outputs = topics_of(load_class(path))
-        for topic in (*inputs, *outputs):
-            if topic.key not in found:
-                if reason := _flaw(topic):
-                    raise ValueError(f"actor = {path!r}: topic {topic.key!r}: {reason}")
-                found[topic.key] = topic
-    return tuple(found.values())
+    return (*topics.ALL, *_beyond_the_common(_actors(spec)))
+
+
+def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return the topics that a system has beyond the common ones.
+
+    Only actors that do not ship are loaded, for those that do declare none of their own: a tool
+    that looks at a run need not wait for the whole controller to be imported.
+
+    Raises:
+        ValueError: as `system_topics`, of the actors that do not ship.
+    """
+    return _beyond_the_common(
+        path for path in _actors(spec) if not path.startswith(f"{actors.__name__}."))
 
 
 def published_keys(spec: SystemSpec) -> tuple[str, ...]:
@@ -73,6 +77,28 @@ def find_topic(key: str, known: Iterable[Topic[Any]]) -> Topic[Any] | None:
         if key == f"{head}{member}{tail}" and member and not set("/*{}") & set(member):
             return topic
     return None
+
+
+def _actors(spec: SystemSpec) -> Iterator[str]:
+    """Yield the paths of all actor classes of a system."""
+    for part in (spec.nodes, spec.detections, spec.recoveries):
+        for one in part:
+            yield one.actor
+
+
+def _beyond_the_common(paths: Iterable[str]) -> tuple[Topic[Any], ...]:
+    """Return what actors declare that is not in `actors/topics.py`, each key once."""
+    common = {topic.key for topic in topics.ALL}
+    found: dict[str, Topic[Any]] = {}
+    for path in dict.fromkeys(paths):
+        inputs, outputs = topics_of(load_class(path))
+        for topic in (*inputs, *outputs):
+            if topic.key in common or topic.key in found:
+                continue
+            if reason := _flaw(topic):
+                raise ValueError(f"actor = {path!r}: topic {topic.key!r}: {reason}")
+            found[topic.key] = topic
+    return tuple(found.values())
 
 
 def _flaw(topic: Topic[Any]) -> str:
