@@ -20,6 +20,7 @@ from typing import Any
 
 import msgspec
 
+import systems
 from actors.recording.bag_writer import BagError, check_target
 from actors.recording.process import Order, RecorderProcess
 from actors.recording.virtual import VirtualRecording
@@ -85,8 +86,8 @@ def parser() -> argparse.ArgumentParser:
                    help="let the operator start the mission from the page")
     p.add_argument("--airport", metavar="NAME|FILE", help="shipped airport, a .toml, or a .graph "
                    "with its image beside it (default: the system's)")
-    p.add_argument("--system", metavar="FILE", default=str(ROOT / "systems" / "osmosis.toml"),
-                   help="system spec, or name of a shipped one: osmosis, paper, cell "
+    p.add_argument("--system", metavar="FILE", default=str(systems.DEFAULT),
+                   help=f"system spec, or name of a shipped one: {systems.names()} "
                    "(default: osmosis)")
     p.add_argument("--strategy", metavar="NAME", default="",
                    help=f"one of {', '.join(STRATEGIES)} (default: the system's)")
@@ -329,15 +330,11 @@ def _interruptible_between_bytecodes(run: VirtualRun) -> Iterator[None]:
 
 def _plan(options: argparse.Namespace) -> tuple[RunPlan, SystemSpec]:
     """Return the plan that the options ask for, and the system they name."""
-    system_file = Path(options.system)
-    shipped = ROOT / "systems" / f"{options.system}.toml"
-    if not system_file.is_file() and shipped.is_file():
-        system_file = shipped
+    system_file = systems.find(options.system)
     if not system_file.is_file():
         what = "is a directory" if system_file.is_dir() else "no such file"
-        names = ", ".join(sorted(file.stem for file in (ROOT / "systems").glob("*.toml")))
         raise UsageError(f"--system {options.system}: {what}; a spec is right, or the name of a "
-                         f"shipped one: {names}")
+                         f"shipped one: {systems.names()}")
     plan = RunPlan(
         run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,

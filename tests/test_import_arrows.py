@@ -27,7 +27,7 @@ ALLOWED: dict[str, set[str]] = {
     "toolbox": {"actors.runtime", "actors", "actors.supervision", "actors.operator",
                 "actors.recording", "airport", "manager", "sim", "systems"},
     "launch": {"actors.runtime", "actors", "actors.supervision", "actors.recording", "airport",
-               "manager", "sim"},
+               "manager", "sim", "systems"},
 }
 """What each room may import, besides itself and third parties."""
 

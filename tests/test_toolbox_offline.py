@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import json
+from pathlib import Path
 
 import pytest
 from porter_actors import write_porter_system
 
+import systems as shipped
 from actors import messages as m
 from actors import topics
 from actors.supervision.run_info import RunInfo
@@ -341,3 +343,12 @@ def test_the_help_of_each_verb_teaches_with_examples(path, parser):
     text = parser.format_help()
     assert f"rampart {path[0]}" in text.partition("examples:")[2]
     assert parser.description
+
+
+def test_a_file_comes_before_a_system_that_ships_for_all_who_look_for_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cell").mkdir()
+    (tmp_path / "osmosis").write_text("")
+    assert [shipped.find(name) for name in ("paper", "cell", "osmosis", "nowhere")] == [
+        shipped.SHIPPED / "paper.toml", shipped.SHIPPED / "cell.toml", Path("osmosis"),
+        Path("nowhere")]

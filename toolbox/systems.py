@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import systems
@@ -13,8 +12,8 @@ from actors.supervision.system_topics import own_topics, system_topics
 from manager.specification import SpecificationError, SystemSpec, parse_specification
 from toolbox.output import UsageError
 
-SHIPPED = Path(systems.__file__).parent
-DEFAULT = SHIPPED / "osmosis.toml"
+SHIPPED = systems.SHIPPED
+DEFAULT = systems.DEFAULT
 
 
 def add_arguments(parser: argparse.ArgumentParser, *, what: str = "", dest: str = "system") -> None:
@@ -40,15 +39,12 @@ def load(file: str | None) -> SystemSpec:
     Raises:
         UsageError: it cannot be read, or makes no sense.
     """
-    path = DEFAULT if file is None else Path(file)
-    if file is not None and not path.exists() and (SHIPPED / f"{file}.toml").exists():
-        path = SHIPPED / f"{file}.toml"
+    path = DEFAULT if file is None else systems.find(file)
     try:
         return parse_specification(path.read_text(encoding="utf-8"), str(path))
     except OSError as error:
-        names = ", ".join(sorted(shipped.stem for shipped in SHIPPED.glob("*.toml")))
         raise UsageError(f"{path}: {error.strerror}; a spec is right, or the name of a shipped "
-                         f"one: {names}") from None
+                         f"one: {systems.names()}") from None
     except UnicodeDecodeError:
         raise UsageError(f"{path}: not UTF-8 text") from None
     except SpecificationError as error:

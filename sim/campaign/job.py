@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Mapping
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -219,8 +218,7 @@ def _metres(value: float) -> float | None:
 @lru_cache(maxsize=8)
 def _document(system: str) -> tuple[str, dict[str, Any]]:
     """Return path and document of a system spec."""
-    shipped = Path(systems.__file__).parent / f"{system}.toml"
-    file = shipped if shipped.is_file() else Path(system)
+    file = systems.find(system)
     return str(file), read_document(file.read_text(encoding="utf-8"), str(file))
 
 
