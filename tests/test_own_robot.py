@@ -118,7 +118,7 @@ def test_actors_beside_the_caller_are_found_by_the_toolbox(tmp_path):
     (tmp_path / "own.py").write_text(OWN_ACTOR)
     (tmp_path / "own.toml").write_text(changed(TANK, ("actors.stub.node:StubNode", "own:Own")))
     done = subprocess.run(
-        [sys.executable, str(ROOT / "toolbox" / "main.py"), "topic", "list", "--system",
+        [str(Path(sys.executable).with_name("rampart")), "topic", "list", "--system",
          "own.toml"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 0, done.stderr
