@@ -13,7 +13,6 @@ import random
 import statistics
 import time
 from itertools import combinations
-from pathlib import Path
 
 import pytest
 
@@ -26,7 +25,7 @@ from manager.specification import parse_specification
 from manager.strategies import STRATEGIES, Decider, find_strategy
 from manager.verification import verify
 
-OSMOSIS = (Path(systems.__file__).parent / "paper.toml").read_text(encoding="utf-8")
+OSMOSIS = (systems.SHIPPED / "paper.toml").read_text(encoding="utf-8")
 NAMES = sorted(STRATEGIES)
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os.path
 from pathlib import Path
 
 SHIPPED = Path(__file__).resolve().parent
@@ -21,5 +22,6 @@ def find(text: str) -> Path:
 
     A file that is there comes first; nobody has looked whether what is returned is one.
     """
-    path, shipped = Path(text), SHIPPED / f"{text}.toml"
-    return shipped if not path.is_file() and shipped.is_file() else path
+    shipped = SHIPPED / f"{text}.toml"
+    there = os.path.isfile(text)  # noqa: PTH113 a name that no file can have is no error here
+    return shipped if not there and os.path.isfile(shipped) else Path(text)  # noqa: PTH113

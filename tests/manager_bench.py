@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import msgspec
 
@@ -21,7 +20,7 @@ from manager.arbiter import (
 )
 from manager.specification import SystemSpec, parse_specification
 
-PAPER, FULL = ((Path(systems.__file__).parent / name).read_text(encoding="utf-8")
+PAPER, FULL = ((systems.SHIPPED / name).read_text(encoding="utf-8")
                for name in ("paper.toml", "osmosis.toml"))
 DMS = ("DM1", "DM2", "DM3", "DM4", "DM5", "DM6", "DM7")
 RMS = ("RM1", "RM2", "RM3", "RM4", "RM5")

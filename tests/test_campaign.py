@@ -458,7 +458,7 @@ def test_bad_usage_is_one_line_and_exit_code_2(capsys, arguments, words):
 
 
 def test_a_campaign_takes_a_mission(tmp_path, capsys):
-    text = (systems.SHIPPED / "paper.toml").read_text(encoding="utf-8")
+    text = systems.DEFAULT.with_name("paper.toml").read_text(encoding="utf-8")
     robot = tmp_path / "robot.toml"
     robot.write_text(text.replace('airport = "vallombre"\nmission = "AB"\n', ""))
     assert rampart(["campaign", "--system", str(robot), "--fault", "none"]) == 2

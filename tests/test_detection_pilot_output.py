@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from pathlib import Path
 
 import pytest
 from detection_timeline import Ear
@@ -25,7 +24,7 @@ from manager.specification import parse_specification
 PERIOD_S = 0.05
 HELD_S = 0.99
 OSMOSIS = parse_specification(
-    (Path(systems.__file__).parent / "osmosis.toml").read_text(encoding="utf-8"), "osmosis.toml")
+    (systems.SHIPPED / "osmosis.toml").read_text(encoding="utf-8"), "osmosis.toml")
 
 
 class Bench:

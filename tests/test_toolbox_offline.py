@@ -14,6 +14,7 @@ import systems as shipped
 from actors import messages as m
 from actors import topics
 from actors.supervision.run_info import RunInfo
+from sim.campaign.job import _document
 from sim.faults import find_fault
 from toolbox import systems
 from toolbox.inject_verbs import choose
@@ -26,7 +27,7 @@ from toolbox.topic_verbs import in_line, rate_of
 @pytest.fixture(autouse=True)
 def _the_papers_system(monkeypatch):
     """Its decisions are known by heart; the full system's are judged elsewhere."""
-    monkeypatch.setattr(systems, "DEFAULT", systems.SHIPPED / "paper.toml")
+    monkeypatch.setattr(systems, "DEFAULT", systems.DEFAULT.with_name("paper.toml"))
 
 
 def told(capsys) -> str:
@@ -349,6 +350,16 @@ def test_a_file_comes_before_a_system_that_ships_for_all_who_look_for_one(tmp_pa
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cell").mkdir()
     (tmp_path / "osmosis").write_text("")
-    assert [shipped.find(name) for name in ("paper", "cell", "osmosis", "nowhere")] == [
+    asked = ("paper", "cell", "osmosis", "nowhere", "x" * 300)
+    assert [shipped.find(name) for name in asked] == [
         shipped.SHIPPED / "paper.toml", shipped.SHIPPED / "cell.toml", Path("osmosis"),
-        Path("nowhere")]
+        Path("nowhere"), Path("x" * 300)]
+    with pytest.raises(UsageError, match="name too long; a spec is right"):
+        systems.load("x" * 300)
+    assert systems.load("cell").name == "cell"
+    (tmp_path / "cell").rmdir()
+    (tmp_path / "cell").write_bytes(shipped.DEFAULT.read_bytes())
+    assert systems.load("cell").name == "osmosis"
+    _document.cache_clear()  # what a campaign's job runs is what was checked
+    assert _document("cell")[1]["name"] == "osmosis"
+    _document.cache_clear()

@@ -68,7 +68,7 @@ RM1  Emergency stop
 @pytest.fixture(autouse=True)
 def _the_papers_system(monkeypatch):
     """Its decisions are known by heart; the full system's are judged elsewhere."""
-    monkeypatch.setattr(systems, "DEFAULT", systems.SHIPPED / "paper.toml")
+    monkeypatch.setattr(systems, "DEFAULT", systems.DEFAULT.with_name("paper.toml"))
 
 
 def told(capsys) -> str:

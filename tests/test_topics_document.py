@@ -10,7 +10,8 @@ import pytest
 from porter_actors import AXLE, LOAD, write_porter_system
 
 from actors import topics
-from actors.supervision.system_topics import published_keys, system_topics
+from actors.runtime.wiring import load_class
+from actors.supervision.system_topics import own_topics, published_keys, system_topics
 from toolbox import systems
 from toolbox.topic_catalogue import markdown, uses
 
@@ -37,6 +38,15 @@ def test_ground_truth_is_read_by_no_node_of_the_controller():
 @pytest.mark.parametrize("name", ["paper", "osmosis", "cell"])
 def test_the_shipped_systems_have_the_common_topics_and_no_other(name):
     assert system_topics(systems.load(name)) == topics.ALL
+
+
+def test_who_asks_only_for_a_robot_s_own_topics_loads_no_actor_that_ships(tmp_path, monkeypatch):
+    loaded = []
+    monkeypatch.setattr("actors.supervision.system_topics.load_class",
+                        lambda path: loaded.append(path) or load_class(path))
+    assert [own_topics(systems.load(name)) for name in ("paper", "osmosis", "cell")] == [()] * 3
+    assert loaded == []
+    assert own_topics(systems.load(str(write_porter_system(tmp_path)))) == (LOAD, AXLE)
 
 
 def test_the_topics_of_a_robot_s_own_actors_follow_the_common_ones(tmp_path):

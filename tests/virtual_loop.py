@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Coroutine
 from functools import cache
-from pathlib import Path
 from typing import Any, TypeVar
 
 import systems
@@ -30,7 +29,7 @@ def run(scenario: Callable[[], Coroutine[Any, Any, T]]) -> T:
 @cache
 def shipped_system() -> SystemSpec:
     """Return the spec of the shipped system."""
-    path = Path(systems.__file__).parent / "paper.toml"
+    path = systems.SHIPPED / "paper.toml"
     return parse_specification(path.read_text(), path.name)
 
 

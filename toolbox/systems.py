@@ -12,7 +12,6 @@ from actors.supervision.system_topics import own_topics, system_topics
 from manager.specification import SpecificationError, SystemSpec, parse_specification
 from toolbox.output import UsageError
 
-SHIPPED = systems.SHIPPED
 DEFAULT = systems.DEFAULT
 
 

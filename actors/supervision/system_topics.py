@@ -7,7 +7,6 @@ from typing import Any
 
 import msgspec
 
-import actors
 from actors import topics
 from actors.runtime.topic import Topic
 from actors.runtime.wiring import heard, load_class, published, topics_of
@@ -17,6 +16,9 @@ from manager.specification import SystemSpec
 _ANY_RUN = RunPlan("", DEFAULT_PORT, rate=1.0, seed=0, system_file="", strategy="", airport="",
                    mission="", obstacles=0, ftm=True, hmi_port=0)
 """Which keys a system publishes follows from its spec; nothing in the plan of a run matters."""
+
+_SHIPPED = ("actors.", "manager.", "sim.")
+"""Where the actors that ship are; that their topics are common is a test's business."""
 
 
 def system_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
@@ -34,14 +36,14 @@ def system_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
 def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
     """Return the topics that a system has beyond the common ones.
 
-    Only actors that do not ship are loaded, for those that do declare none of their own: a tool
-    that looks at a run need not wait for the whole controller to be imported.
+    Only actors that do not ship are loaded, for those that do declare common topics only: a tool
+    that looks at a run need not wait for controller and simulator to be imported.
 
     Raises:
         ValueError: as `system_topics`, of the actors that do not ship.
     """
     return _beyond_the_common(
-        path for path in _actors(spec) if not path.startswith(f"{actors.__name__}."))
+        path for path in _actors(spec) if not path.startswith(_SHIPPED))
 
 
 def published_keys(spec: SystemSpec) -> tuple[str, ...]:
