@@ -5,22 +5,36 @@ from __future__ import annotations
 import os
 import re
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
+from itertools import cycle, islice
 from pathlib import Path
 
 import msgspec
 
 from actors import topics
 from actors.runtime.actor import Actor
+from actors.supervision import run_info
 from actors.supervision.launcher import Launcher
 from actors.supervision.run_plan import RunPlan
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-_BASES = iter(range(10_000 + os.getpid() % 250 * 40, 32_000, 40))
-"""Each base is given out once per process, so that two runs of one test differ."""
+def _bases() -> Iterator[int]:
+    """Yield bases that no other worker of this test run takes, below the ephemeral ports.
+
+    Two workers with the same bases meet between the look for a free one and its use.
+    """
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    of_this_worker = range(10_000 + worker * 40, 32_000, workers * 40)
+    test_run = os.getppid() if workers > 1 else os.getpid()  # two runs of one test differ
+    start = test_run % len(of_this_worker)
+    return cycle((*of_this_worker[start:], *of_this_worker[:start]))
+
+
+_BASES = _bases()
 
 
 class Idler(Actor):
@@ -39,9 +53,11 @@ def write_stub_system(directory: Path) -> Path:
 
 
 def free_base_port(count: int = 40) -> int:
-    """Return the first of consecutive free ports, below the ephemeral ones."""
-    for base in _BASES:
+    """Return the first of consecutive free ports whose launcher's name is free as well."""
+    for base in islice(_BASES, 1000):
         try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+                probe.bind(run_info.address(base))
             for port in range(base, base + count):
                 with socket.socket() as probe:
                     probe.bind(("127.0.0.1", port))
