@@ -15,13 +15,13 @@ import msgspec
 from actors import topics
 from actors.runtime.actor import Actor
 from actors.supervision import run_info
-from actors.supervision.launcher import Launcher
+from actors.supervision.launcher import Launcher, LaunchError, check_ports
 from actors.supervision.run_plan import RunPlan
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def _bases() -> Iterator[int]:
+def bases() -> Iterator[int]:
     """Yield bases that no other worker of this test run takes, below the ephemeral ports.
 
     Two workers with the same bases meet between the look for a free one and its use.
@@ -34,7 +34,7 @@ def _bases() -> Iterator[int]:
     return cycle((*of_this_worker[start:], *of_this_worker[:start]))
 
 
-_BASES = _bases()
+_BASES = bases()
 
 
 class Idler(Actor):
@@ -58,10 +58,8 @@ def free_base_port(count: int = 40) -> int:
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
                 probe.bind(run_info.address(base))
-            for port in range(base, base + count):
-                with socket.socket() as probe:
-                    probe.bind(("127.0.0.1", port))
-        except OSError:
+            check_ports(base, count)
+        except (OSError, LaunchError):
             continue
         return base
     raise RuntimeError("no free ports")

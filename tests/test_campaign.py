@@ -39,6 +39,7 @@ from sim.campaign.search import Space, margin, search, shrink
 from sim.campaign.statistics import badness, rate, spread, table, total, worst
 from sim.campaign.store import Run, Store, StoreError
 from sim.scenario import FaultOutcome, PlannedFault
+from systems import SHIPPED
 from toolbox import campaigning, systems
 from toolbox.campaigning import ProgressLog
 from toolbox.main import main as rampart
@@ -458,7 +459,7 @@ def test_bad_usage_is_one_line_and_exit_code_2(capsys, arguments, words):
 
 
 def test_a_campaign_takes_a_mission(tmp_path, capsys):
-    text = systems.DEFAULT.with_name("paper.toml").read_text(encoding="utf-8")
+    text = (SHIPPED / "paper.toml").read_text(encoding="utf-8")
     robot = tmp_path / "robot.toml"
     robot.write_text(text.replace('airport = "vallombre"\nmission = "AB"\n', ""))
     assert rampart(["campaign", "--system", str(robot), "--fault", "none"]) == 2

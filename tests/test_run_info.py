@@ -8,10 +8,11 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 
 import msgspec
 import pytest
-from stub_actors import free_base_port
+from stub_actors import bases, free_base_port
 
 from actors.supervision import run_info
 
@@ -60,3 +61,21 @@ def test_somebodys_socket_whose_name_is_no_text_does_not_matter():
           socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stranger):
         stranger.bind(b"\0caf\xe9." + str(os.getpid()).encode())
         assert INFO in run_info.find_runs(), port
+
+
+def test_the_workers_of_a_test_run_take_different_ports(monkeypatch):
+    monkeypatch.setenv("PYTEST_XDIST_WORKER_COUNT", "3")
+    taken = []
+    for worker in range(3):
+        monkeypatch.setenv("PYTEST_XDIST_WORKER", f"gw{worker}")
+        taken.extend(islice(bases(), 100))
+    assert len(set(taken)) == 300
+    assert not any(base % 40 for base in taken)
+
+
+def test_a_base_whose_launcher_s_name_is_taken_is_not_free(monkeypatch):
+    free, other = free_base_port(), free_base_port()
+    monkeypatch.setattr("stub_actors._BASES", iter((free, other)))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as launcher:
+        launcher.bind(run_info.address(free))
+        assert free_base_port() == other

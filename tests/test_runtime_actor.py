@@ -32,6 +32,7 @@ from actors.supervision.run_plan import (
     RunPlan,
     load_system,
 )
+from systems import SHIPPED
 from toolbox import systems
 
 
@@ -325,7 +326,7 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
 def test_a_class_that_is_not_there_or_of_another_table_is_named_with_its_place(
         tmp_path, old, new, message):
     file = tmp_path / "other.toml"
-    file.write_text(systems.DEFAULT.with_name("paper.toml").read_text().replace(old, new))
+    file.write_text((SHIPPED / "paper.toml").read_text().replace(old, new))
     plan = RunPlan("run", 7450, 1.0, 1, str(file), "", "vallombre", "A", 0, ftm=True, hmi_port=0)
     with pytest.raises(ValueError, match=re.escape(f"{file}: {message}")):
         Layout(plan, load_system(plan))
@@ -345,7 +346,7 @@ async def test_the_heart_beats_at_the_period_that_the_system_states():
 
 
 def test_a_process_is_given_the_heartbeat_period_of_the_spec():
-    file = systems.DEFAULT.with_name("paper.toml")
+    file = SHIPPED / "paper.toml"
     plan = RunPlan("run", 7450, 1.0, 1, str(file), "", "vallombre", "A", 0, ftm=True, hmi_port=0)
     spec = load_system(plan)
     timing = msgspec.structs.replace(spec.timing, heartbeat_period_s=0.123)

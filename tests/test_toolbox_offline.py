@@ -27,7 +27,7 @@ from toolbox.topic_verbs import in_line, rate_of
 @pytest.fixture(autouse=True)
 def _the_papers_system(monkeypatch):
     """Its decisions are known by heart; the full system's are judged elsewhere."""
-    monkeypatch.setattr(systems, "DEFAULT", systems.DEFAULT.with_name("paper.toml"))
+    monkeypatch.setattr(systems, "DEFAULT", shipped.SHIPPED / "paper.toml")
 
 
 def told(capsys) -> str:

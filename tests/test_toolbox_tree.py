@@ -22,6 +22,7 @@ from manager.diagram import Box, Diagram, Situation, clean, covers, draw
 from manager.layered import arrange_in_layers, crossings
 from manager.order import PartialOrder
 from manager.placing import _isotonic, place
+from systems import SHIPPED
 from toolbox import systems
 from toolbox.main import main
 from toolbox.tree_dot import quote, to_dot
@@ -68,7 +69,7 @@ RM1  Emergency stop
 @pytest.fixture(autouse=True)
 def _the_papers_system(monkeypatch):
     """Its decisions are known by heart; the full system's are judged elsewhere."""
-    monkeypatch.setattr(systems, "DEFAULT", systems.DEFAULT.with_name("paper.toml"))
+    monkeypatch.setattr(systems, "DEFAULT", SHIPPED / "paper.toml")
 
 
 def told(capsys) -> str:
