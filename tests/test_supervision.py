@@ -23,8 +23,8 @@ from actors import topics
 from actors.messages import Diagnostic, NodeTable, ProcessEvent, RespawnRequest
 from actors.runtime.actor import Actor, Context, Header, on
 from actors.runtime.clock import Clock
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
-from actors.supervision import node_process
+from actors.runtime.run_folder import socket_path
+from actors.supervision import node_process, run_info
 from actors.supervision.kill_node import main as kill_node
 from actors.supervision.launcher import Launcher, LaunchError
 from actors.supervision.process_title import find_processes
@@ -76,8 +76,7 @@ class Witness(Actor):
 @asynccontextmanager
 async def running(tmp_path, **changes) -> AsyncIterator[tuple[Launcher, Witness]]:
     async with launched(stub_plan(write_stub_system(tmp_path), **changes)) as launcher:
-        port = launcher.ports.pop("observer")  # the place of the launcher's own observer
-        bus = ZenohBus("observer", 1, endpoint(port), map(endpoint, launcher.ports.values()))
+        bus = launcher.observers_bus()
         clock = Clock(launcher.plan.origin_s)
         witness = Witness(Context("observer", 1, clock, bus, {}, {"launcher": launcher}))
         task = asyncio.create_task(witness.run())
@@ -112,6 +111,34 @@ async def test_a_process_that_dies_stops_or_wedges_is_told_apart_and_comes_back(
             os.kill(witness.pid(node), number)
             await eventually(lambda n=node: witness.state(n) == ("running", 2))
             assert witness.saw(node, event)
+
+
+async def test_a_stopped_process_and_a_dead_supervisor_do_not_end_repair(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        os.kill(witness.pid("DM5"), signal.SIGSTOP)
+        os.kill(process(port, "supervisor"), signal.SIGKILL)
+        await eventually(lambda: witness.state("supervisor") == ("running", 2))
+        os.kill(witness.pid("RM1"), signal.SIGKILL)
+        await eventually(lambda: witness.state("RM1") == ("running", 2))
+        await eventually(lambda: witness.state("DM5") == ("running", 2))
+        assert launcher.supervisor_incarnation == 2
+
+
+async def test_a_node_is_back_while_who_hears_it_is_stopped(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        stopped = [process(port, name) for name in ("DM1", "DM2", "DM3", "DM4", "RM2")]
+        supervisor = process(port, "supervisor")
+        os.kill(supervisor, signal.SIGSTOP)  # it would have them replaced
+        for pid in stopped:
+            os.kill(pid, signal.SIGSTOP)
+        os.kill(process(port, "ftm_manager"), signal.SIGKILL)
+        await eventually(lambda: process(port, "ftm_manager") is None)
+        os.kill(supervisor, signal.SIGCONT)
+        await eventually(lambda: witness.state("ftm_manager")[0] == "running"
+                         and witness.state("ftm_manager")[1] > 1)
+        assert witness.state("ftm_manager")[1] == 2
 
 
 async def test_a_node_of_a_recovery_module_waits_for_its_request(tmp_path):
@@ -232,10 +259,10 @@ async def test_a_process_that_nobody_holds_does_not_keep_its_node_down(tmp_path)
         os.kill(supervisor, signal.SIGSTOP)
         os.kill(victim, signal.SIGKILL)
         await eventually(lambda: process(port, "DM1") is None)
-        client = SpawnerClient(port)
+        client = SpawnerClient(launcher.plan.folder)
         orphan = client.fork(("DM1",), 1)  # it has the port, and is too old to be heard
         client.close()
-        await eventually(lambda: listens(launcher.ports["DM1"]))
+        await eventually(lambda: listens(launcher.plan.folder, "DM1"))
         os.kill(supervisor, signal.SIGCONT)
         await eventually(lambda: witness.state("DM1")[0] == "running"
                          and witness.pid("DM1") not in {victim, orphan})
@@ -244,18 +271,18 @@ async def test_a_process_that_nobody_holds_does_not_keep_its_node_down(tmp_path)
         assert sum(e.node == "DM1" and e.event == "respawned" for e in witness.events) < 5
 
 
-def listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+def listens(folder: str, name: str) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        return probe.connect_ex(socket_path(folder, name)) == 0
 
 
 _MUTE_SPAWNER = """
 import os, socket, sys, time
 from actors.supervision.process_title import set_title
 from actors.supervision.spawner import address
-port, how = int(sys.argv[1]), sys.argv[2]
+port, how, folder = int(sys.argv[1]), sys.argv[2], sys.argv[4]
 listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-listener.bind(address(port, "a"))
+listener.bind(address(folder, "a"))
 listener.listen()
 print("ready", flush=True)
 connection, _ = listener.accept()
@@ -274,12 +301,12 @@ os._exit(1)
 
 
 @pytest.mark.parametrize("how", ["dies", "hangs", "stranger"])
-def test_the_child_of_a_spawner_that_forked_and_did_not_answer_is_found(how):
+def test_the_child_of_a_spawner_that_forked_and_did_not_answer_is_found(how, sockets):
     port = free_base_port()
     spawner = subprocess.Popen(
-        [sys.executable, "-c", _MUTE_SPAWNER, str(port), how, str(os.getpid())],
+        [sys.executable, "-c", _MUTE_SPAWNER, str(port), how, str(os.getpid()), sockets],
         stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-    machine, child = OsProcesses(port, os.getpid()), 0
+    machine, child = OsProcesses(port, os.getpid(), sockets), 0
     try:
         assert spawner.stdout.readline() == "ready\n"
         if how == "stranger":  # of another run: not this one's child
@@ -298,12 +325,6 @@ def test_the_child_of_a_spawner_that_forked_and_did_not_answer_is_found(how):
         spawner.stdout.close()
         if child:
             os.kill(child, signal.SIGKILL)
-
-
-@pytest.mark.parametrize("pid", [-1, 0, 1 << 22, 1 << 40])
-async def test_a_process_with_a_number_that_no_process_can_have_is_gone(pid):
-    with pytest.raises(ProcessLookupError):
-        OsProcesses(1, 1).hold(pid, lambda: None)
 
 
 async def test_the_launcher_turns_while_supervisor_and_both_spawners_are_dead(tmp_path):
@@ -429,16 +450,12 @@ async def test_a_killed_launcher_leaves_nothing_within_two_seconds(tmp_path):
     assert not [r for r in find_runs() if r.base_port == plan.base_port]
 
 
-async def test_a_port_in_use_is_refused_before_anything_starts(tmp_path):
+def test_the_number_of_another_run_is_refused_before_anything_starts(tmp_path):
     plan = stub_plan(write_stub_system(tmp_path))
-    with socket.socket() as squatter:
-        squatter.bind(("127.0.0.1", plan.base_port + 3))
-        squatter.listen()
-        launcher = Launcher(plan, "test")
-        launcher.begin()
-        with pytest.raises(LaunchError, match=f"port {plan.base_port + 3} is in use"):
-            await launcher.load()
-        await launcher.end()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
+        other.bind(run_info.address(plan.base_port))
+        with pytest.raises(LaunchError, match=f"--port {plan.base_port}: in use by another run"):
+            Launcher(plan, "test").begin()
     assert find_processes(plan.base_port) == []
 
 

@@ -22,12 +22,15 @@ from pathlib import Path
 import msgspec
 
 from actors.messages import NodeTable
+from actors.runtime import run_folder
+from actors.runtime.tap import Tap
 from actors.runtime.unix_peer import is_same_user
+from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision import run_info
 from actors.supervision.lifeline import kill_leftovers
 from actors.supervision.process_title import find_processes
 from actors.supervision.restart_policy import RestartPolicy
-from actors.supervision.run_plan import SUPERVISOR, RunPlan
+from actors.supervision.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from actors.supervision.spawner import NAMES
 from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
@@ -49,35 +52,17 @@ class LaunchError(Exception):
     """The run cannot be started; the text is one line for the user."""
 
 
-def check_ports(first: int, count: int) -> None:
-    """Make sure that the run's ports are free on loopback.
-
-    Raises:
-        LaunchError: one is in use; the message names it.
-    """
-    for port in range(first, first + count):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError as error:
-                raise LaunchError(f"--port {first}: port {port} is in use ({error.strerror}); the "
-                                  f"run needs {first} to {first + count - 1}; choose another "
-                                  "--port") from None
-
-
 class Launcher:
     """One run's processes. Use: `load`, then `start` on a running event loop, then `end`."""
 
     def __init__(self, plan: RunPlan, title: str) -> None:
         self.plan = msgspec.structs.replace(plan, launcher_pid=os.getpid())
-        self.ports: dict[str, int] = {}
+        self.names: tuple[str, ...] = ()
         self.supervisor_incarnation = 0
-        self.known_incarnations: dict[str, int] = {}
         self.on_restart: Callable[[str], None] = lambda _name: None
         self.on_trouble: Callable[[str], None] = lambda _text: None
         self._title = title
-        self._spawners = SpawnerClient(plan.base_port)
+        self._spawners = SpawnerClient("")
         self._lifeline: tuple[int, int] = (-1, -1)
         self._first: subprocess.Popen[bytes] | None = None
         self._begun_s = self._load_s = 0.0
@@ -95,7 +80,7 @@ class Launcher:
         """Claim the base port and start the first spawner, which then loads in the background.
 
         Raises:
-            LaunchError: another run has the base port.
+            LaunchError: another run has the base port, or there is no place for the run's sockets.
         """
         self._info = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
@@ -105,6 +90,15 @@ class Launcher:
             self._info = None
             raise LaunchError(f"--port {self.plan.base_port}: in use by another run; "
                               "choose another --port") from None
+        try:
+            folder = run_folder.make(self.plan.base_port, os.getpid())
+            run_folder.issue(folder, (OBSERVER,), 1)
+        except OSError as error:
+            self._info.close()
+            self._info = None
+            raise LaunchError(f"no folder for the run's sockets: {error}") from None
+        self.plan = msgspec.structs.replace(self.plan, folder=folder)
+        self._spawners = SpawnerClient(folder)
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         self._lifeline = os.pipe()
         self._begun_s = time.monotonic()
@@ -115,7 +109,7 @@ class Launcher:
         environment["PYTHONPATH"] = os.pathsep.join(
             [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         self._first = subprocess.Popen(  # noqa: S603 our own interpreter and module
-            [sys.executable, "-m", "actors.supervision.spawner", str(self._lifeline[0])],
+            [sys.executable, "-P", "-m", "actors.supervision.spawner", str(self._lifeline[0])],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[self._lifeline[0]],
             env=environment)
         assert self._first.stdin is not None  # noqa: S101 for the type checker
@@ -124,10 +118,10 @@ class Launcher:
             self._first.stdin.close()
 
     async def load(self) -> None:
-        """Wait until the first spawner has loaded the plan and check the ports.
+        """Wait until the first spawner has loaded the plan.
 
         Raises:
-            LaunchError: spec, airport or mission are unsound, or a port is in use.
+            LaunchError: spec, airport or mission are unsound.
         """
         assert self._first is not None  # noqa: S101
         assert self._first.stdout is not None  # noqa: S101
@@ -140,10 +134,9 @@ class Launcher:
         text = line.decode().strip()
         if text.startswith("error: "):
             raise LaunchError(text.removeprefix("error: "))
-        if not text.startswith("{"):
+        if not text.startswith("["):
             raise LaunchError("the spawner ended while it loaded")
-        self.ports = msgspec.json.decode(text, type=dict[str, int])
-        check_ports(self.plan.base_port, len(self.ports))
+        self.names = msgspec.json.decode(text, type=tuple[str, ...])
 
     async def start(self) -> None:
         """Set simulated time 0 and start the second spawner and the supervisor.
@@ -166,19 +159,15 @@ class Launcher:
 
     def _start_supervisor(self) -> None:
         incarnation = self.supervisor_incarnation + 1
-        self._supervisor_pid = self._spawners.fork(
-            (SUPERVISOR,), incarnation, self.known_incarnations)
+        self._supervisor_pid = self._spawners.fork((SUPERVISOR,), incarnation)
         self.supervisor_incarnation = incarnation
         self._supervisor_heard_s = time.monotonic()
 
     # -- guard ----------------------------------------------------------------------------------
 
-    def supervisor_heard(self, table: NodeTable) -> None:
-        """Note that the supervisor lives, and which incarnations it has reached."""
+    def supervisor_heard(self, _table: NodeTable) -> None:
+        """Note that the supervisor lives."""
         self._supervisor_heard_s = time.monotonic()
-        for row in table.nodes:
-            known = self.known_incarnations.get(row.name, 0)
-            self.known_incarnations[row.name] = max(known, row.incarnation)
 
     async def _keep_guards(self) -> None:
         # The pidfd wakes the guard the moment the supervisor dies; the period serves the rest.
@@ -300,6 +289,13 @@ class Launcher:
             while os.waitpid(-1, os.WNOHANG)[0]:
                 pass
 
+    def observers_bus(self) -> ZenohBus:
+        """Return the bus of an observer in this process, which hears everybody; not yet open."""
+        folder = self.plan.folder
+        others = [endpoint(folder, name) for name in self.names if name != OBSERVER]
+        return ZenohBus(OBSERVER, 1, endpoint(folder, OBSERVER), others,
+                        Tap(self.plan.base_port))
+
     # -- tools ----------------------------------------------------------------------------------
 
     def _answer_tools(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -322,8 +318,8 @@ class Launcher:
         """Return what tools need to know of this run."""
         return run_info.RunInfo(
             os.getpid(), self.plan.base_port, self.plan.rate, self.plan.origin_s,
-            self.plan.system_file, self.ports, self.plan.run_id, self.plan.hmi_port, self._title,
-            self.plan.hmi_page, self.plan.description)
+            self.plan.system_file, self.plan.folder, self.names, self.plan.run_id,
+            self.plan.hmi_port, self._title, self.plan.hmi_page, self.plan.description)
 
     # -- end ------------------------------------------------------------------------------------
 
@@ -357,4 +353,5 @@ class Launcher:
         deadline = time.monotonic() + 1.0
         while kill_leftovers(self.plan.launcher_pid) and time.monotonic() < deadline:
             time.sleep(0.01)
+        run_folder.remove(self.plan.folder)
         self._reap()

@@ -22,6 +22,7 @@ from actors.runtime.bus import BusError
 from actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from actors.runtime.checkpoint_store import SqliteCheckpoints
 from actors.runtime.clock import Clock
+from actors.runtime.run_folder import register_of, remove
 from actors.runtime.tap import Tap
 from actors.runtime.zenoh_bus import ZenohBus
 from actors.supervision.lifeline import exit_with_launcher, kill_leftovers
@@ -48,6 +49,7 @@ def make_actor(
                    Tap(layout.plan.base_port))
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, shared,
+        register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed))
 
@@ -74,12 +76,17 @@ def node_main(
         _log_traceback(layout, names, incarnation, error)
 
     try:
-        launcher = layout.plan.launcher_pid
+        launcher, folder = layout.plan.launcher_pid, layout.plan.folder
+
+        def clean_up() -> None:
+            kill_leftovers(launcher)
+            remove(folder)
+
         set_title(layout.plan.base_port, launcher, names, incarnation)
         if any(node.kind is Kind.WORLD for node in layout.spec.nodes if node.name in names):
             go_first()
         exit_with_launcher(
-            lifeline, (lambda: kill_leftovers(launcher)) if SUPERVISOR in names else None)
+            lifeline, clean_up if SUPERVISOR in names else None)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is the launcher's to handle
         signal.signal(signal.SIGUSR2, wedge)
         asyncio.run(_live(layout, names, incarnation, shared, tell))

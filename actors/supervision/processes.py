@@ -22,10 +22,6 @@ from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableE
 __all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerUnavailableError"]
 
 
-_PID_LIMIT = 1 << 22
-"""No process of Linux has a higher number."""
-
-
 class Living(NamedTuple):
     """A process of the run that is there already."""
 
@@ -132,12 +128,13 @@ class OsProcesses:
     Args:
         port: base port of the run.
         launcher: pid of its launcher.
+        folder: of its sockets.
     """
 
-    def __init__(self, port: int, launcher: int) -> None:
+    def __init__(self, port: int, launcher: int, folder: str) -> None:
         self._port = port
         self._launcher = launcher
-        self._spawner = SpawnerClient(port)
+        self._spawner = SpawnerClient(folder)
 
     def living(self) -> list[Living]:
         """Return the processes of this run, found in /proc."""
@@ -151,8 +148,6 @@ class OsProcesses:
 
     def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
         """Open a pidfd; raises ProcessLookupError if there is no such process."""
-        if not 0 < pid < _PID_LIMIT:  # as a heartbeat may claim; no lack of descriptors
-            raise ProcessLookupError(pid)
         return _OsHandle(pid, ended)
 
     def adapt(self, adapted: AdaptedSystem) -> None:

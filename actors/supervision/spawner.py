@@ -1,8 +1,8 @@
 """The spawner: a process that has imported everything and opened nothing, and forks nodes.
 
 A fork of it is a node in about a millisecond instead of the second that the imports take. It
-holds no thread and no Zenoh session (neither survives a fork). It listens on an abstract unix
-socket, which leaves no file; any process of the same user that knows the run may ask it to fork.
+holds no thread and no Zenoh session (neither survives a fork). It listens on a unix socket in the
+folder of the run, where only the run's user gets in, and issues the incarnation of what it forks.
 There are two of them, `a` and `b`: if one dies, the other forks nodes and its own new sibling.
 
 Requests and replies are one JSON datagram each way on a sequenced-packet socket.
@@ -11,7 +11,6 @@ Requests and replies are one JSON datagram each way on a sequenced-packet socket
 from __future__ import annotations
 
 import contextlib
-import errno
 import gc
 import os
 import selectors
@@ -19,11 +18,14 @@ import signal
 import socket
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NoReturn
 
 import msgspec
 
 from actors.messages import AdaptedSystem
+from actors.runtime import working_folder
+from actors.runtime.run_folder import issue, issued, remove, socket_path
 from actors.runtime.unix_peer import is_same_user
 from actors.supervision.lifeline import kill_leftovers
 from actors.supervision.node_process import node_main, wedge
@@ -42,15 +44,10 @@ MAX_DATAGRAM = 160_000
 
 
 class ForkRequest(msgspec.Struct, frozen=True, tag="fork"):
-    """Fork a process for these actors, or (names = spawner_a / spawner_b) another spawner.
-
-    `known` tells a restarted supervisor the highest incarnation heard of each node, so that a
-    node that died together with its supervisor does not come back under an old number.
-    """
+    """Fork a process for these actors, or (names = spawner_a / spawner_b) another spawner."""
 
     names: tuple[str, ...]
     incarnation: int
-    known: dict[str, int] = {}
 
 
 class Ping(msgspec.Struct, frozen=True, tag="ping"):
@@ -80,9 +77,9 @@ class Reply(msgspec.Struct, frozen=True):
 Request = ForkRequest | Ping | SetOrigin | Adapt
 
 
-def address(port: int, name: str) -> str:
-    """Return the abstract socket address of a spawner of the run on a base port."""
-    return f"\0rampart.{port}.spawner.{name}"
+def address(folder: str, name: str) -> str:
+    """Return the path of the socket of a spawner in the folder of a run."""
+    return socket_path(folder, f"spawner_{name}")
 
 
 class Spawner:
@@ -101,11 +98,11 @@ class Spawner:
         """Take the name and the address.
 
         Raises:
-            OSError: another run has the address.
+            OSError: there is no folder to listen in.
         """
         plan = self._layout.plan
         set_title(plan.base_port, plan.launcher_pid, (f"spawner_{self.name}",), 1)
-        self._listen(address(plan.base_port, self.name))
+        self._listen(address(plan.folder, self.name))
 
     def serve(self) -> NoReturn:
         """Serve until the launcher ends."""
@@ -120,6 +117,8 @@ class Spawner:
 
     def _listen(self, where: str) -> None:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with contextlib.suppress(FileNotFoundError):  # of the one that this replaces
+            Path(where).unlink()
         self._listener.bind(where)
         self._listener.listen(16)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
@@ -161,6 +160,7 @@ class Spawner:
         for name in request.names:
             if name not in self._layout.members and name not in {f"spawner_{n}" for n in NAMES}:
                 return Reply(os.getpid(), error=f"unknown node {name!r}")
+        issue(self._layout.plan.folder, request.names, request.incarnation)
         child = os.fork()
         if child == 0:
             self._become(request)
@@ -185,7 +185,7 @@ class Spawner:
                 sibling.serve()
             code = node_main(
                 self._layout, request.names, request.incarnation,
-                {**self._shared, "known_incarnations": request.known}, lifeline)
+                {**self._shared, "known_incarnations": issued(self._layout.plan.folder)}, lifeline)
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
@@ -211,16 +211,18 @@ class Spawner:
         if os.read(lifeline, 1):
             return
         kill_leftovers(self._layout.plan.launcher_pid)
+        remove(self._layout.plan.folder)
         os._exit(0)
 
 
 def main() -> int:
     """Entry of the first spawner: `python -m actors.supervision.spawner LIFELINE_FD` < plan.
 
-    Prints one line on stdout: a JSON object of all actors' ports when it is ready to fork, or
+    Prints one line on stdout: a JSON list of all actors' names when it is ready to fork, or
     `error: …` if the plan cannot be run.
     """
     lifeline = int(sys.argv[1])
+    working_folder.admit()
     plan = msgspec.json.decode(sys.stdin.buffer.read(), type=RunPlan)
     try:
         spec = load_system(plan)
@@ -234,16 +236,12 @@ def main() -> int:
     spawner = Spawner(NAMES[0], layout, shared, lifeline)
     try:
         spawner.open()
-        print(msgspec.json.encode(layout.port_of).decode(), flush=True)
+        print(msgspec.json.encode(tuple(layout.members)).decode(), flush=True)
         os.dup2(2, 1)  # nobody reads the pipe from here on
         spawner.serve()
     except BrokenPipeError:  # the launcher ended while this was loading: nobody to tell
         os._exit(2)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            print(f"error: port in use: another run has base port {plan.base_port}", flush=True)
-            return 2
-        raise
+    return 0
 
 
 if __name__ == "__main__":

@@ -38,24 +38,22 @@ class SpawnerUnavailableError(Exception):
 
 
 class SpawnerClient:
-    """Talks to the spawners of the run on one base port. Blocking, a millisecond or so."""
+    """Talks to the spawners of the run in one folder. Blocking, a millisecond or so."""
 
-    def __init__(self, port: int) -> None:
-        self._port = port
+    def __init__(self, folder: str) -> None:
+        self._folder = folder
         self._connections: dict[str, socket.socket] = {}
         self._adapt: Adapt | None = None
         self._unanswered = False
 
     def fork(
-        self, names: tuple[str, ...], incarnation: int, known: dict[str, int] | None = None,
-        orphan: Callable[[], int] = lambda: 0,
+        self, names: tuple[str, ...], incarnation: int, orphan: Callable[[], int] = lambda: 0,
     ) -> int:
         """Fork a process for the named actors and return its pid.
 
         Args:
             names: of the actors.
             incarnation: of the process.
-            known: see `ForkRequest`.
             orphan: returns the pid of that process if it is there already, else 0; asked when a
                 spawner heard the request and did not answer.
 
@@ -66,7 +64,7 @@ class SpawnerClient:
         for name in NAMES:
             if names == (f"spawner_{name}",):
                 continue
-            reply = self.ask(name, ForkRequest(names, incarnation, known or {}))
+            reply = self.ask(name, ForkRequest(names, incarnation))
             if reply is not None and reply.child:
                 return reply.child
             if self._unanswered and (child := orphan()):
@@ -132,7 +130,7 @@ class SpawnerClient:
             return None
         connection.settimeout(ANSWER_TIMEOUT_S)
         try:
-            connection.connect(address(self._port, name))
+            connection.connect(address(self._folder, name))
         except OSError:
             connection.close()
             return None
