@@ -24,6 +24,7 @@ from sim.report_record import RunRecord
 from sim.scenario import PlannedFault
 
 _LOOK_S = 0.05
+_STALL_S = 0.5
 
 
 class ProcessRun:
@@ -89,7 +90,11 @@ class ProcessRun:
         try:
             why = None
             while why is None and not self.interrupted and not any(t.done() for t in tasks):
+                looked_s = clock.now()
                 await asyncio.sleep(_LOOK_S)
+                stall_s = clock.now() - looked_s - _LOOK_S * plan.rate
+                if stall_s > _STALL_S * plan.rate:  # ctrl-Z; what was sent meanwhile comes now
+                    mission.excuse(stall_s)
                 why = mission.over(clock.now())
             for task in tasks:
                 if task.done():
