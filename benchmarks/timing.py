@@ -82,7 +82,7 @@ async def measure(port: int, kills: int) -> dict[str, list[float]]:
     try:
         await launcher.load()
         await launcher.start()
-        launcher.on_restart = lambda _name: back.append(time.monotonic())
+        launcher.guard.on_restart = lambda _name: back.append(time.monotonic())
         ports = dict(launcher.ports)
         bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()))
         clock = Clock(launcher.plan.origin_s)

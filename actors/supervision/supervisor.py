@@ -44,6 +44,7 @@ from actors.supervision.processes import (
     OsProcesses,
     Processes,
     ProcessHandle,
+    SpawnerBusyError,
     SpawnerUnavailableError,
 )
 from actors.supervision.restart_policy import RestartPolicy
@@ -64,6 +65,7 @@ _STATUS = "fresh status of the manager"
 """Stands among the names of a process' nodes for what the Safety Pilot lives on."""
 
 _RETRY_S = 0.05
+_ASK_AGAIN_S = 0.01
 _DEAD = (NodeState.CRASHED, NodeState.GIVEN_UP)
 _HEALTHY = (NodeState.RUNNING, NodeState.STARTING)
 
@@ -350,6 +352,9 @@ class Supervisor(Actor):
         incarnation = process.highest + 1
         try:
             pid = self._machine.fork(process.names, incarnation)
+        except SpawnerBusyError:
+            self._go_on(process, _ASK_AGAIN_S, lambda: self._spawn(process, by))
+            return
         except (SpawnerUnavailableError, OSError) as error:
             self.report_diagnostic("fork", str(error), process.unit.name)
             self._go_on(process, _RETRY_S, lambda: self._spawn(process, by))
