@@ -24,6 +24,7 @@ import systems
 from actors.recording.bag_writer import BagError, check_target
 from actors.recording.process import Order, RecorderProcess
 from actors.recording.virtual import VirtualRecording
+from actors.runtime import working_folder
 from actors.runtime.topic import Topic
 from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
 from actors.runtime.wiring import load_class
@@ -488,8 +489,7 @@ def _existing_path(name: str) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line, run, and return the exit code."""
     options = parser().parse_args(arguments)
-    if "" not in sys.path:
-        sys.path.append("")  # actors of one's own are found here, as by the processes of a run
+    working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
         _check(options)
         plan, spec = _plan(options)

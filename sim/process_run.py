@@ -9,10 +9,9 @@ from typing import Any
 from actors.messages import NodeTable
 from actors.runtime.actor import Actor, Context, Header
 from actors.runtime.clock import Clock
+from actors.runtime.run_folder import register_of
 from actors.runtime.shared_bus import SharedBus
-from actors.runtime.tap import Tap
 from actors.runtime.topic import Topic
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher
 from actors.supervision.process_hand import ProcessHand
 from actors.supervision.run_plan import OBSERVER
@@ -72,18 +71,17 @@ class ProcessRun:
             if isinstance(message, NodeTable):
                 launcher.supervisor_heard(message)
 
-        ports = dict(launcher.ports)
-        own = ports.pop(OBSERVER)
-        others = [endpoint(port) for port in ports.values()]
-        bus = ZenohBus(OBSERVER, 1, endpoint(own), others, Tap(plan.base_port))
+        bus = launcher.observers_bus()
         sinks: list[Sink] = [to_launcher, *mission.sinks(clock)]
-        actors: list[Actor] = [Observer(Context(OBSERVER, 1, clock, bus, {}, {"sinks": sinks}))]
+        register = register_of(plan.folder)
+        actors: list[Actor] = [Observer(Context(
+            OBSERVER, 1, clock, bus, {}, {"sinks": sinks}, register=register))]
         injector = None
         if self._scenario:
             shared = {"scenario": self._scenario, "hand": ProcessHand(plan.base_port),
                       "nodes": can_be_hit(self._spec), "topics": system_topics(self._spec)}
             injector = Injector(Context(
-                INJECTOR, 1, clock, SharedBus(bus), {}, shared))
+                INJECTOR, 1, clock, SharedBus(bus), {}, shared, register=register))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         for task, actor in zip(tasks, actors, strict=True):

@@ -14,9 +14,8 @@ from actors import topics
 from actors.messages import DecisionRecord, NodeTable, ProcessEvent
 from actors.runtime.actor import Context, Header
 from actors.runtime.clock import Clock
-from actors.runtime.tap import Tap
+from actors.runtime.run_folder import register_of
 from actors.runtime.topic import Topic
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher
 from actors.supervision.run_plan import OBSERVER, RunPlan
 from actors.supervision.unseen import watch
@@ -73,11 +72,10 @@ class WatchedRun:
         self.launcher.guard.on_restart = lambda name: self._console.line(
             clock.now(), f"{name} brought back")
         self.launcher.guard.report = lambda text: self._console.line(clock.now(), text)
-        ports = dict(self.launcher.ports)
-        bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()),
-                       Tap(plan.base_port))
         observer = Observer(Context(
-            OBSERVER, 1, clock, bus, {}, {"sinks": [self._take, self._console.take]}))
+            OBSERVER, 1, clock, self.launcher.observers_bus(), {},
+            {"sinks": [self._take, self._console.take]},
+            register=register_of(plan.folder)))
         task = asyncio.create_task(observer.run())
         watch(task, "the launcher's observer", self.launcher.failed)
         self._console.line(clock.now(), f"{self._spec.title} ({self._spec.name}), "

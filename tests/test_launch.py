@@ -155,9 +155,9 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
     script = (
         "import sys, zenoh, time\n"
         "from actors import topics\n"
-        "from actors.runtime.zenoh_bus import session_config, endpoint\n"
-        "ports = map(int, sys.argv[1:])\n"
-        "s = zenoh.open(session_config(None, [endpoint(p) for p in ports]))\n"
+        "from actors.runtime.zenoh_bus import session_config\n"
+        "s = zenoh.open(session_config(None, sys.argv[1:]))\n"
+        "time.sleep(1)\n"
         "names = ['DM1', 'RM1', 'osmosis_control', 'no/such', 'x']\n"
         "for _ in range(3):\n"
         "    for t in topics.ALL:\n"
@@ -170,9 +170,8 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
     with RealRun(tmp_path, "--mission", "A", "--rate", "2") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(5)
-        ports = [str(p) for p in run.info.nodes.values()]
-        done = subprocess.run([sys.executable, "-c", script, *ports], cwd=ROOT, timeout=60,
-                              check=False, capture_output=True, text=True)
+        done = subprocess.run([sys.executable, "-c", script, *run.info.endpoints], cwd=ROOT,
+                              timeout=60, check=False, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         run.wait_for("goal 2/3", 60)
         assert "payload rejected" in run.story

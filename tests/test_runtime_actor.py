@@ -7,7 +7,6 @@ import asyncio
 import inspect
 import math
 import re
-import socket
 import textwrap
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -73,29 +72,18 @@ class Listener(Actor):
         self.peers.append((node, incarnation, alive))
 
 
-def free_ports(count: int) -> list[int]:
-    sockets = [socket.socket() for _ in range(count)]
-    for s in sockets:
-        s.bind(("127.0.0.1", 0))
-    ports = [s.getsockname()[1] for s in sockets]
-    for s in sockets:
-        s.close()
-    return ports
-
-
 MakeBus = Callable[[str, int], Bus]
 
 
 @pytest.fixture(params=["virtual", "zenoh"])
-def make_bus(request: pytest.FixtureRequest) -> MakeBus:
+def make_bus(request: pytest.FixtureRequest, sockets: str) -> MakeBus:
     if request.param == "virtual":
         hub = Hub()
         return lambda name, incarnation: VirtualBus(hub, name, incarnation)
     names = ("talker", "listener", "impostor", "third")
-    ports = dict(zip(names, free_ports(4), strict=True))
     return lambda name, incarnation: ZenohBus(
-        name, incarnation, endpoint(ports[name]),
-        [endpoint(p) for n, p in ports.items() if n != name])
+        name, incarnation, endpoint(sockets, name),
+        [endpoint(sockets, n) for n in names if n != name])
 
 
 @asynccontextmanager
@@ -223,13 +211,12 @@ async def test_timers_run_at_the_rate_of_simulated_time(make_bus):
         assert ticked == pytest.approx(elapsed / 0.02, rel=0.5)
 
 
-async def test_a_port_in_use_is_one_clear_line():
-    (port,) = free_ports(1)
-    first = ZenohBus("talker", 1, endpoint(port), [])
+async def test_a_socket_in_use_is_one_clear_line(sockets):
+    first = ZenohBus("talker", 1, endpoint(sockets, "talker"), [])
     await first.open()
     try:
-        with pytest.raises(BusError, match=f"port in use: tcp/127.0.0.1:{port}"):
-            await ZenohBus("talker", 2, endpoint(port), []).open()
+        with pytest.raises(BusError, match=f"{sockets}/talker is in use by another process"):
+            await ZenohBus("talker", 2, endpoint(sockets, "talker"), []).open()
     finally:
         await first.close()
 

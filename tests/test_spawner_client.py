@@ -47,10 +47,10 @@ time.sleep(60)
 class FakeSpawner:
     """Listens under a spawner's name, and does what the test says."""
 
-    def __init__(self, port: int, name: str) -> None:
+    def __init__(self, folder: str, port: int, name: str) -> None:
         self._port = port
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._listener.bind(address(port, name))
+        self._listener.bind(address(folder, name))
         self._listener.listen()
         self._listener.settimeout(10)
         self.connections: list[socket.socket] = []
@@ -89,10 +89,11 @@ class FakeSpawner:
 
 
 class Stage:
-    def __init__(self, names: str = "ab") -> None:
-        self.port = free_base_port()
-        self.spawners = {name: FakeSpawner(self.port, name) for name in names}
-        self.client = SpawnerClient(self.port, os.getpid())
+    def __init__(self, folder: str, names: str) -> None:
+        self.folder = folder
+        port = free_base_port()
+        self.spawners = {name: FakeSpawner(folder, port, name) for name in names}
+        self.client = SpawnerClient(folder, port, os.getpid())
 
     def fork(self, incarnation: int = 2) -> int:
         return self.client.fork(DM1, incarnation)
@@ -112,13 +113,13 @@ class Stage:
 
 
 @pytest.fixture
-def staged(monkeypatch) -> Iterator[Callable[[str], Stage]]:
+def staged(monkeypatch, sockets) -> Iterator[Callable[[str], Stage]]:
     stages: list[Stage] = []
 
     def stage(names: str = "ab", patience_s: float = 60.0) -> Stage:
         monkeypatch.setattr(spawner_client, "WAIT_S", 0.0)
         monkeypatch.setattr(spawner_client, "PATIENCE_S", patience_s)
-        stages.append(Stage(names))
+        stages.append(Stage(sockets, names))
         return stages[-1]
 
     yield stage
@@ -252,7 +253,7 @@ def test_no_call_waits_for_one_who_does_not_even_accept(staged):
             filler = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             filler.setblocking(False)
             fillers.append(filler)
-            filler.connect_ex(address(stage.port, name))
+            filler.connect_ex(address(stage.folder, name))
     with pytest.raises(SpawnerUnavailableError, match=r"spawner_a: not there .*; spawner_b: not"):
         stage.fork()
     for filler in fillers:

@@ -23,12 +23,11 @@ from actors import topics
 from actors.messages import Diagnostic, NodeTable, ProcessEvent, RespawnRequest
 from actors.runtime.actor import Actor, Context, Header, on
 from actors.runtime.clock import Clock
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
-from actors.supervision import node_process
+from actors.runtime.run_folder import socket_path
+from actors.supervision import node_process, run_info
 from actors.supervision.kill_node import main as kill_node
 from actors.supervision.launcher import Launcher, LaunchError
 from actors.supervision.process_title import find_processes
-from actors.supervision.processes import OsProcesses
 from actors.supervision.restart_policy import RestartPolicy
 from actors.supervision.run_info import find_runs
 from actors.supervision.run_plan import Layout, load_system
@@ -77,8 +76,7 @@ class Witness(Actor):
 @asynccontextmanager
 async def running(tmp_path, **changes) -> AsyncIterator[tuple[Launcher, Witness]]:
     async with launched(stub_plan(write_stub_system(tmp_path), **changes)) as launcher:
-        port = launcher.ports.pop("observer")  # the place of the launcher's own observer
-        bus = ZenohBus("observer", 1, endpoint(port), map(endpoint, launcher.ports.values()))
+        bus = launcher.observers_bus()
         clock = Clock(launcher.plan.origin_s)
         witness = Witness(Context("observer", 1, clock, bus, {}, {"launcher": launcher}))
         task = asyncio.create_task(witness.run())
@@ -113,6 +111,34 @@ async def test_a_process_that_dies_stops_or_wedges_is_told_apart_and_comes_back(
             os.kill(witness.pid(node), number)
             await eventually(lambda n=node: witness.state(n) == ("running", 2))
             assert witness.saw(node, event)
+
+
+async def test_a_stopped_process_and_a_dead_supervisor_do_not_end_repair(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        os.kill(witness.pid("DM5"), signal.SIGSTOP)
+        os.kill(process(port, "supervisor"), signal.SIGKILL)
+        await eventually(lambda: witness.state("supervisor") == ("running", 2))
+        os.kill(witness.pid("RM1"), signal.SIGKILL)
+        await eventually(lambda: witness.state("RM1") == ("running", 2))
+        await eventually(lambda: witness.state("DM5") == ("running", 2))
+        assert launcher.guard.supervisor_incarnation == 2
+
+
+async def test_a_node_is_back_while_who_hears_it_is_stopped(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        stopped = [process(port, name) for name in ("DM1", "DM2", "DM3", "DM4", "RM2")]
+        supervisor = process(port, "supervisor")
+        os.kill(supervisor, signal.SIGSTOP)  # it would have them replaced
+        for pid in stopped:
+            os.kill(pid, signal.SIGSTOP)
+        os.kill(process(port, "ftm_manager"), signal.SIGKILL)
+        await eventually(lambda: process(port, "ftm_manager") is None)
+        os.kill(supervisor, signal.SIGCONT)
+        await eventually(lambda: witness.state("ftm_manager")[0] == "running"
+                         and witness.state("ftm_manager")[1] > 1)
+        assert witness.state("ftm_manager")[1] == 2
 
 
 async def test_a_node_of_a_recovery_module_waits_for_its_request(tmp_path):
@@ -224,7 +250,7 @@ async def test_spawners_that_stand_still_for_a_moment_are_not_taken_for_hung(tmp
             for name in stopped:
                 os.kill(spawners[name], signal.SIGCONT)
             await eventually(lambda i=incarnation: witness.state("DM1") == ("running", i + 1))
-        client = SpawnerClient(port, os.getpid())
+        client = SpawnerClient(launcher.plan.folder, port, os.getpid())
         await eventually(lambda: client.turns("a") and client.turns("b"))  # nothing is under way
         client.close()
         assert {name: process(port, name) for name in spawners} == spawners
@@ -239,7 +265,7 @@ async def test_of_two_spawners_that_hang_one_is_replaced_first_and_then_the_othe
         for pid, number in zip(old.values(), (signal.SIGSTOP, signal.SIGUSR2), strict=True):
             os.kill(pid, number)
         os.kill(witness.pid("DM1"), signal.SIGKILL)
-        client = SpawnerClient(port, os.getpid())
+        client = SpawnerClient(launcher.plan.folder, port, os.getpid())
         seen = set()
         while not all(process(port, name) not in {None, pid} for name, pid in old.items()):
             there = {name: process(port, name) for name in old}
@@ -259,13 +285,13 @@ async def test_a_request_that_was_withdrawn_makes_no_process_however_late_it_is_
         spawners = [process(port, name) for name in ("spawner_a", "spawner_b")]
         for pid in spawners:
             os.kill(pid, signal.SIGSTOP)
-        client = SpawnerClient(port, os.getpid())
+        client = SpawnerClient(launcher.plan.folder, port, os.getpid())
         with pytest.raises(SpawnerUnavailableError):
             client.fork(("DM1",), 7)
         client.close()
         for pid in spawners:
             os.kill(pid, signal.SIGCONT)
-        client = SpawnerClient(port, os.getpid())
+        client = SpawnerClient(launcher.plan.folder, port, os.getpid())
         await eventually(lambda: client.turns("a") and client.turns("b"))  # it has been read
         client.close()
         await asyncio.sleep(0.2)
@@ -276,22 +302,23 @@ async def test_a_request_that_was_withdrawn_makes_no_process_however_late_it_is_
 @pytest.mark.parametrize("answer", [b"nonsense", b'{"error": 7}', b"{}", b""])
 async def test_what_answers_under_a_spawners_name_does_not_end_the_guard(tmp_path, answer):
     async with running(tmp_path) as (launcher, witness):
-        port, told = launcher.plan.base_port, []
+        port, told, answered = launcher.plan.base_port, [], 0
         launcher.guard.report = told.append
+        where = Path(address(launcher.plan.folder, "a"))
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        os.kill(process(port, "spawner_a"), signal.SIGKILL)
         with contextlib.closing(listener):
-            while listener.getsockname() in {b"", ""}:
-                with contextlib.suppress(OSError):
-                    listener.bind(address(port, "a"))
+            where.unlink()
+            listener.bind(str(where))
             listener.listen()
             listener.setblocking(False)
 
             def reply() -> None:
+                nonlocal answered
                 with contextlib.suppress(OSError):
                     connection, _ = listener.accept()
                     with connection:
                         connection.send(answer)
+                    answered += 1
 
             loop = asyncio.get_running_loop()
             loop.add_reader(listener, reply)
@@ -302,7 +329,7 @@ async def test_what_answers_under_a_spawners_name_does_not_end_the_guard(tmp_pat
             loop.remove_reader(listener)
         await eventually(lambda: process(port, "spawner_a") is not None, 20)
         await eventually(lambda: all(r.state.value == "running" for r in witness.table.nodes), 20)
-        assert told
+        assert answered
         assert not launcher.failure
 
 
@@ -371,10 +398,10 @@ async def test_a_process_that_nobody_holds_does_not_keep_its_node_down(tmp_path)
         os.kill(supervisor, signal.SIGSTOP)
         os.kill(victim, signal.SIGKILL)
         await eventually(lambda: process(port, "DM1") is None)
-        client = SpawnerClient(port, os.getpid())
+        client = SpawnerClient(launcher.plan.folder, port, os.getpid())
         orphan = await forked(client, "DM1", 1)  # it has the port, and is too old to be heard
         client.close()
-        await eventually(lambda: listens(launcher.ports["DM1"]))
+        await eventually(lambda: listens(launcher.plan.folder, "DM1"))
         os.kill(supervisor, signal.SIGCONT)
         await eventually(lambda: witness.state("DM1")[0] == "running"
                          and witness.pid("DM1") not in {victim, orphan})
@@ -391,15 +418,9 @@ async def forked(client: SpawnerClient, name: str, incarnation: int) -> int:
             await asyncio.sleep(0.01)
 
 
-def listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-@pytest.mark.parametrize("pid", [-1, 0, 1 << 22, 1 << 40])
-async def test_a_process_with_a_number_that_no_process_can_have_is_gone(pid):
-    with pytest.raises(ProcessLookupError):
-        OsProcesses(1, 1).hold(pid, lambda: None)
+def listens(folder: str, name: str) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        return probe.connect_ex(socket_path(folder, name)) == 0
 
 
 async def test_the_launcher_turns_while_supervisor_and_both_spawners_are_dead(tmp_path):
@@ -533,16 +554,12 @@ async def test_a_killed_launcher_leaves_nothing_within_two_seconds(tmp_path, sto
     assert not [r for r in find_runs() if r.base_port == plan.base_port]
 
 
-async def test_a_port_in_use_is_refused_before_anything_starts(tmp_path):
+def test_the_number_of_another_run_is_refused_before_anything_starts(tmp_path):
     plan = stub_plan(write_stub_system(tmp_path))
-    with socket.socket() as squatter:
-        squatter.bind(("127.0.0.1", plan.base_port + 3))
-        squatter.listen()
-        launcher = Launcher(plan, "test")
-        launcher.begin()
-        with pytest.raises(LaunchError, match=f"port {plan.base_port + 3} is in use"):
-            await launcher.load()
-        await launcher.end()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
+        other.bind(run_info.address(plan.base_port))
+        with pytest.raises(LaunchError, match=f"--port {plan.base_port}: in use by another run"):
+            Launcher(plan, "test").begin()
     assert find_processes(plan.base_port) == []
 
 

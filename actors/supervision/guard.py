@@ -17,7 +17,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 
-from actors.messages import NodeTable
 from actors.supervision.patience import Patience, usage
 from actors.supervision.process_title import RunProcess, find_processes
 from actors.supervision.restart_policy import RestartPolicy
@@ -49,7 +48,6 @@ class Guard:
     Attributes:
         supervisor_pid: of the present supervisor, 0 before the first.
         supervisor_incarnation: likewise.
-        known_incarnations: the highest that was heard of each node.
         policy: how often the supervisor is brought back.
         on_restart: called with the name of whoever was brought back.
         report: called with one line when something cannot be done.
@@ -59,7 +57,6 @@ class Guard:
                  load: Callable[[str], subprocess.Popen[bytes]]) -> None:
         self.supervisor_pid = 0
         self.supervisor_incarnation = 0
-        self.known_incarnations: dict[str, int] = {}
         self.policy = RestartPolicy()
         self.on_restart: Callable[[str], None] = lambda _name: None
         self.report: Callable[[str], None] = _to_stderr
@@ -91,18 +88,15 @@ class Guard:
         until_s = time.monotonic() + within_s
         while True:
             try:
-                return self._spawners.fork((name,), incarnation, self.known_incarnations)
+                return self._spawners.fork((name,), incarnation)
             except SpawnerUnavailableError:
                 if time.monotonic() > until_s:
                     raise
             await asyncio.sleep(_ASK_AGAIN_S)
 
-    def supervisor_heard(self, table: NodeTable) -> None:
-        """Note that the supervisor lives, and which incarnations it has reached."""
+    def supervisor_heard(self) -> None:
+        """Note that the supervisor lives."""
         self._patience[SUPERVISOR].answered()
-        for row in table.nodes:
-            known = self.known_incarnations.get(row.name, 0)
-            self.known_incarnations[row.name] = max(known, row.incarnation)
 
     async def keep(self) -> None:
         """Look after them until this is cancelled; whatever goes wrong, there is a next time."""

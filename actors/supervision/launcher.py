@@ -22,12 +22,15 @@ from pathlib import Path
 import msgspec
 
 from actors.messages import NodeTable
+from actors.runtime import run_folder
+from actors.runtime.tap import Tap
 from actors.runtime.unix_peer import is_same_user
+from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision import run_info
 from actors.supervision.descriptors import needed_descriptors, raise_descriptor_limit
 from actors.supervision.guard import Guard
 from actors.supervision.lifeline import kill_leftovers
-from actors.supervision.run_plan import RunPlan
+from actors.supervision.run_plan import OBSERVER, RunPlan
 from actors.supervision.spawner import NAMES
 from actors.supervision.spawner_client import (
     START_PATIENCE_S,
@@ -51,39 +54,22 @@ class LaunchError(Exception):
     """The run cannot be started; the text is one line for the user."""
 
 
-def check_ports(first: int, count: int) -> None:
-    """Make sure that the run's ports are free on loopback.
-
-    Raises:
-        LaunchError: one is in use; the message names it.
-    """
-    for port in range(first, first + count):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError as error:
-                raise LaunchError(f"--port {first}: port {port} is in use ({error.strerror}); the "
-                                  f"run needs {first} to {first + count - 1}; choose another "
-                                  "--port") from None
-
-
 class Launcher:
     """One run's processes. Use: `load`, then `start` on a running event loop, then `end`.
 
     Attributes:
         plan: of the run.
-        ports: of the actors by name.
+        names: of the actors.
         guard: brings back supervisor and spawners; tells whom it has brought back, and troubles.
         failure: why the run has to end, "" as long as it can go on.
     """
 
     def __init__(self, plan: RunPlan, title: str) -> None:
         self.plan = msgspec.structs.replace(plan, launcher_pid=os.getpid())
-        self.ports: dict[str, int] = {}
+        self.names: tuple[str, ...] = ()
         self.failure = ""
         self._title = title
-        self._spawners = SpawnerClient(plan.base_port, os.getpid())
+        self._spawners = SpawnerClient("", plan.base_port, os.getpid())
         self._lifeline: tuple[int, int] = (-1, -1)
         self._first: subprocess.Popen[bytes] | None = None
         self._begun_s = self._load_s = 0.0
@@ -98,7 +84,7 @@ class Launcher:
         """Claim the base port and start the first spawner, which then loads in the background.
 
         Raises:
-            LaunchError: another run has the base port.
+            LaunchError: another run has the base port, or there is no place for the run's sockets.
         """
         self._info = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
@@ -108,6 +94,15 @@ class Launcher:
             self._info = None
             raise LaunchError(f"--port {self.plan.base_port}: in use by another run; "
                               "choose another --port") from None
+        try:
+            folder = run_folder.make(self.plan.base_port, os.getpid())
+            run_folder.issue(folder, (OBSERVER,), 1)
+        except OSError as error:
+            self._info.close()
+            self._info = None
+            raise LaunchError(f"no folder for the run's sockets: {error}") from None
+        self.plan = msgspec.structs.replace(self.plan, folder=folder)
+        self._spawners.folder = folder
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         self._lifeline = os.pipe()
         self._descriptors = raise_descriptor_limit()
@@ -119,7 +114,8 @@ class Launcher:
         environment["PYTHONPATH"] = os.pathsep.join(
             [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         spawner = subprocess.Popen(  # noqa: S603 our own interpreter and module
-            [sys.executable, "-m", "actors.supervision.spawner", name, str(self._lifeline[0])],
+            [sys.executable, "-P", "-m", "actors.supervision.spawner", name,
+             str(self._lifeline[0])],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[self._lifeline[0]],
             env=environment, process_group=0)  # see `lifeline`
         assert spawner.stdin is not None  # noqa: S101 for the type checker
@@ -129,11 +125,11 @@ class Launcher:
         return spawner
 
     async def load(self) -> None:
-        """Wait until the first spawner has loaded the plan and check the ports.
+        """Wait until the first spawner has loaded the plan.
 
         Raises:
-            LaunchError: spec, airport or mission are unsound, a port is in use, or fewer files may
-                be open than the run needs.
+            LaunchError: spec, airport or mission are unsound, or fewer files may be open than the
+                run needs.
         """
         assert self._first is not None  # noqa: S101
         assert self._first.stdout is not None  # noqa: S101
@@ -146,14 +142,13 @@ class Launcher:
         text = line.decode().strip()
         if text.startswith("error: "):
             raise LaunchError(text.removeprefix("error: "))
-        if not text.startswith("{"):
+        if not text.startswith("["):
             raise LaunchError("the spawner ended while it loaded")
-        self.ports = msgspec.json.decode(text, type=dict[str, int])
-        check_ports(self.plan.base_port, len(self.ports))
-        needed = needed_descriptors(len(self.ports))
+        self.names = msgspec.json.decode(text, type=tuple[str, ...])
+        needed = needed_descriptors(len(self.names))
         if self._descriptors < needed:
             raise LaunchError(f"open files: the hard limit is {self._descriptors}, and "
-                              f"{len(self.ports)} processes need {needed}; raise it, as with "
+                              f"{len(self.names)} processes need {needed}; raise it, as with "
                               f"`ulimit -Hn {needed}` in the shell of a privileged user")
 
     async def start(self) -> None:
@@ -184,14 +179,21 @@ class Launcher:
     def _tell(self, line: str) -> None:
         self.guard.report(line)
 
-    def supervisor_heard(self, table: NodeTable) -> None:
-        """Note that the supervisor lives, and which incarnations it has reached."""
-        self.guard.supervisor_heard(table)
+    def supervisor_heard(self, _table: NodeTable) -> None:
+        """Note that the supervisor lives."""
+        self.guard.supervisor_heard()
 
     def _reap(self) -> None:
         with contextlib.suppress(ChildProcessError):
             while os.waitpid(-1, os.WNOHANG)[0]:
                 pass
+
+    def observers_bus(self) -> ZenohBus:
+        """Return the bus of an observer in this process, which hears everybody; not yet open."""
+        folder = self.plan.folder
+        others = [endpoint(folder, name) for name in self.names if name != OBSERVER]
+        return ZenohBus(OBSERVER, 1, endpoint(folder, OBSERVER), others,
+                        Tap(self.plan.base_port))
 
     # -- tools ----------------------------------------------------------------------------------
 
@@ -215,8 +217,8 @@ class Launcher:
         """Return what tools need to know of this run."""
         return run_info.RunInfo(
             os.getpid(), self.plan.base_port, self.plan.rate, self.plan.origin_s,
-            self.plan.system_file, self.ports, self.plan.run_id, self.plan.hmi_port, self._title,
-            self.plan.hmi_page, self.plan.description)
+            self.plan.system_file, self.plan.folder, self.names, self.plan.run_id,
+            self.plan.hmi_port, self._title, self.plan.hmi_page, self.plan.description)
 
     # -- end ------------------------------------------------------------------------------------
 
@@ -251,4 +253,5 @@ class Launcher:
         deadline = time.monotonic() + 1.0
         while kill_leftovers(self.plan.launcher_pid) and time.monotonic() < deadline:
             time.sleep(0.01)
+        run_folder.remove(self.plan.folder)
         self._reap()

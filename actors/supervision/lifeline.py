@@ -20,16 +20,18 @@ import os
 import signal
 import threading
 
+from actors.runtime.run_folder import remove
 from actors.supervision.process_title import find_processes
 
 
-def exit_with_launcher(read_end: int, launcher: int) -> None:
-    """Start the thread that ends this process, and all others, when the launcher has ended."""
+def exit_with_launcher(read_end: int, launcher: int, folder: str) -> None:
+    """Start the thread that ends this process, and all of the run, when the launcher has ended."""
 
     def wait() -> None:
         while os.read(read_end, 1):
             pass
         kill_leftovers(launcher)
+        remove(folder)
         os.kill(os.getpid(), signal.SIGKILL)
 
     threading.Thread(target=wait, name="lifeline", daemon=True).start()

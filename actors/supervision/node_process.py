@@ -22,6 +22,7 @@ from actors.runtime.bus import BusError
 from actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from actors.runtime.checkpoint_store import SqliteCheckpoints
 from actors.runtime.clock import Clock
+from actors.runtime.run_folder import register_of
 from actors.runtime.tap import Tap
 from actors.runtime.zenoh_bus import ZenohBus
 from actors.supervision.lifeline import exit_with_launcher
@@ -49,6 +50,7 @@ def make_actor(
                    Tap(layout.plan.base_port))
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, shared,
+        register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed))
 
@@ -89,8 +91,9 @@ def node_main(
         born()
         if any(node.kind is Kind.WORLD for node in layout.spec.nodes if node.name in names):
             go_first()
-        exit_with_launcher(lifeline, launcher)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is the launcher's to handle
+        exit_with_launcher(lifeline, launcher, layout.plan.folder)
+        for number in (signal.SIGINT, signal.SIGHUP):  # ctrl-C is the launcher's to handle
+            signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGUSR2, wedge)
         asyncio.run(_live(layout, names, incarnation, shared, tell))
     except BusError as error:

@@ -27,10 +27,6 @@ __all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerBusyEr
            "SpawnerUnavailableError"]
 
 
-_PID_LIMIT = 1 << 22
-"""No process of Linux has a higher number."""
-
-
 class Living(NamedTuple):
     """A process of the run that is there already."""
 
@@ -143,12 +139,13 @@ class OsProcesses:
     Args:
         port: base port of the run.
         launcher: pid of its launcher.
+        folder: of its sockets.
     """
 
-    def __init__(self, port: int, launcher: int) -> None:
+    def __init__(self, port: int, launcher: int, folder: str) -> None:
         self._port = port
         self._launcher = launcher
-        self._spawner = SpawnerClient(port, launcher)
+        self._spawner = SpawnerClient(folder, port, launcher)
 
     def living(self) -> list[Living]:
         """Return the processes of this run, found in /proc."""
@@ -161,8 +158,6 @@ class OsProcesses:
 
     def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
         """Open a pidfd; raises ProcessLookupError if there is no such process."""
-        if not 0 < pid < _PID_LIMIT:  # as a heartbeat may claim; no lack of descriptors
-            raise ProcessLookupError(pid)
         return _OsHandle(pid, ended)
 
     def adapt(self, adapted: AdaptedSystem) -> None:

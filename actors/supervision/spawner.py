@@ -1,8 +1,8 @@
 """The spawner: a process that has imported everything and opened nothing, and forks nodes.
 
 A fork of it is a node in about a millisecond instead of the second that the imports take. It
-holds no thread and no Zenoh session (neither survives a fork). It listens on an abstract unix
-socket, which leaves no file; any process of the same user that knows the run may ask it to fork.
+holds no thread and no Zenoh session (neither survives a fork). It listens on a unix socket in the
+folder of the run, where only the run's user gets in, and issues the incarnation of what it forks.
 There are two of them, `a` and `b`: if one dies, the other forks nodes and its own new sibling.
 
 Requests and replies are one JSON datagram each way on a sequenced-packet socket. A request to fork
@@ -13,7 +13,6 @@ does not wait for it any more has closed the connection (see `spawner_client`).
 from __future__ import annotations
 
 import contextlib
-import errno
 import gc
 import os
 import selectors
@@ -21,11 +20,14 @@ import signal
 import socket
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NoReturn
 
 import msgspec
 
 from actors.messages import AdaptedSystem
+from actors.runtime import working_folder
+from actors.runtime.run_folder import issue, issued, remove, socket_path
 from actors.runtime.unix_peer import is_same_user
 from actors.supervision.lifeline import kill_leftovers
 from actors.supervision.node_process import node_main, wedge
@@ -47,15 +49,10 @@ _BACKLOG = 64
 
 
 class ForkRequest(msgspec.Struct, frozen=True, tag="fork"):
-    """Fork a process for these actors, or (names = spawner_a / spawner_b) another spawner.
-
-    `known` tells a restarted supervisor the highest incarnation heard of each node, so that a
-    node that died together with its supervisor does not come back under an old number.
-    """
+    """Fork a process for these actors, or (names = spawner_a / spawner_b) another spawner."""
 
     names: tuple[str, ...]
     incarnation: int
-    known: dict[str, int] = {}
 
 
 class Ping(msgspec.Struct, frozen=True, tag="ping"):
@@ -84,9 +81,9 @@ class Reply(msgspec.Struct, frozen=True):
 Request = ForkRequest | Ping | SetOrigin | Adapt
 
 
-def address(port: int, name: str) -> str:
-    """Return the abstract socket address of a spawner of the run on a base port."""
-    return f"\0rampart.{port}.spawner.{name}"
+def address(folder: str, name: str) -> str:
+    """Return the path of the socket of a spawner in the folder of a run."""
+    return socket_path(folder, f"spawner_{name}")
 
 
 class Spawner:
@@ -102,18 +99,23 @@ class Spawner:
         self._wakeup: tuple[socket.socket, socket.socket] | None = None
 
     def open(self) -> None:
-        """Take the name and the address.
+        """Take the title and the address.
 
         Raises:
-            OSError: another run has the address.
+            OSError: there is no folder to listen in.
         """
+        self.take_title()
+        self._listen(address(self._layout.plan.folder, self.name))
+
+    def take_title(self) -> None:
+        """Have /proc show what this process is."""
         plan = self._layout.plan
         set_title(plan.base_port, plan.launcher_pid, (f"spawner_{self.name}",), 1)
-        self._listen(address(plan.base_port, self.name))
 
     def serve(self) -> NoReturn:
         """Serve until the launcher ends."""
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for number in (signal.SIGINT, signal.SIGHUP):  # it ends with the lifeline
+            signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         signal.signal(signal.SIGUSR2, wedge)
         for number in (signal.SIGTTIN, signal.SIGTTOU):  # no terminal's foreground is here
@@ -126,6 +128,8 @@ class Spawner:
 
     def _listen(self, where: str) -> None:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with contextlib.suppress(FileNotFoundError):  # of the one that this replaces
+            Path(where).unlink()
         self._listener.bind(where)
         self._listener.listen(_BACKLOG)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
@@ -180,10 +184,13 @@ class Spawner:
         self._let_go(connection)  # the child answers; if it cannot, its end is the answer
 
     def _become(self, request: ForkRequest, connection: socket.socket) -> NoReturn:
+        folder = self._layout.plan.folder
+
         def born() -> None:
             if not _answer(connection, Reply()):
                 os._exit(0)  # nobody waits for it any more: another one may have its place
             connection.close()
+            issue(folder, request.names, request.incarnation)
 
         code = 1
         try:
@@ -199,12 +206,13 @@ class Spawner:
             if request.names[0].startswith("spawner_"):
                 name = request.names[0].removeprefix("spawner_")
                 sibling = Spawner(name, self._layout, self._shared, lifeline)
-                sibling.open()
+                sibling.take_title()
                 born()
+                sibling.open()
                 sibling.serve()
             code = node_main(
                 self._layout, request.names, request.incarnation,
-                {**self._shared, "known_incarnations": request.known}, lifeline, born=born)
+                {**self._shared, "known_incarnations": issued(folder)}, lifeline, born=born)
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
@@ -230,6 +238,7 @@ class Spawner:
         if os.read(lifeline, 1):
             return
         kill_leftovers(self._layout.plan.launcher_pid)
+        remove(self._layout.plan.folder)
         os._exit(0)
 
 
@@ -246,10 +255,11 @@ def main() -> int:
 
     NAME is `a` or `b`, FD the read end of the lifeline.
 
-    Prints one line on stdout: a JSON object of all actors' ports when it is ready to fork, or
+    Prints one line on stdout: a JSON list of all actors' names when it is ready to fork, or
     `error: …` if the plan cannot be run.
     """
     name, lifeline = sys.argv[1], int(sys.argv[2])
+    working_folder.admit()
     plan = msgspec.json.decode(sys.stdin.buffer.read(), type=RunPlan)
     try:
         spec = load_system(plan)
@@ -263,16 +273,12 @@ def main() -> int:
     spawner = Spawner(name, layout, shared, lifeline)
     try:
         spawner.open()
-        print(msgspec.json.encode(layout.port_of).decode(), flush=True)
+        print(msgspec.json.encode(tuple(layout.members)).decode(), flush=True)
         os.dup2(2, 1)  # nobody reads the pipe from here on
         spawner.serve()
     except BrokenPipeError:  # the launcher ended while this was loading: nobody to tell
         os._exit(2)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            print(f"error: port in use: another run has base port {plan.base_port}", flush=True)
-            return 2
-        raise
+    return 0
 
 
 if __name__ == "__main__":

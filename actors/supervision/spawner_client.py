@@ -137,11 +137,13 @@ class SpawnerClient:
     """Talks to the spawners of one run. No call waits longer than some tens of milliseconds.
 
     Args:
+        folder: of the run.
         port: base port of the run.
         launcher: pid of its launcher.
     """
 
-    def __init__(self, port: int, launcher: int) -> None:
+    def __init__(self, folder: str, port: int, launcher: int) -> None:
+        self.folder = folder
         self._port = port
         self._launcher = launcher
         self._forks: dict[tuple[str, ...], tuple[int, _Asked]] = {}
@@ -151,21 +153,20 @@ class SpawnerClient:
         self._adapted: set[int] = set()
 
     def fork(
-        self, names: tuple[str, ...], incarnation: int, known: dict[str, int] | None = None
+        self, names: tuple[str, ...], incarnation: int
     ) -> int:
         """Fork a process for the named actors and return its pid.
 
         Args:
             names: of the actors.
             incarnation: of the process.
-            known: see `ForkRequest`.
 
         Raises:
             SpawnerBusyError: none has answered yet; to be called again with the same names and
                 incarnation, which goes on waiting.
             SpawnerUnavailableError: no spawner could do it, or none has answered for long.
         """
-        request = ForkRequest(names, incarnation, known or {})
+        request = ForkRequest(names, incarnation)
         asked = self._resumed(names, incarnation)
         queue = [n for n in sorted(NAMES, key=lambda n: n in self._slow)
                  if names != (f"spawner_{n}",) and (asked is None or n != asked.spawner)]
@@ -274,7 +275,7 @@ class SpawnerClient:
             try:
                 connection.setblocking(False)  # who does not accept must not keep us
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
-                connection.connect(address(self._port, name))
+                connection.connect(address(self.folder, name))
             except OSError as error:
                 connection.close()
                 failures.append(f"spawner_{name}: not there ({error.strerror})")

@@ -63,6 +63,9 @@ START_TIMEOUT_S = 3.0
 _CHECK_S = 0.1
 """Simulated seconds between two looks at who is silent."""
 
+_SEARCH_S = 0.05
+"""Wall seconds between two looks into /proc on account of one node's messages."""
+
 _STATUS = "fresh status of the manager"
 """Stands among the names of a process' nodes for what the Safety Pilot lives on."""
 
@@ -93,6 +96,7 @@ class _Process:
     requested_by: str = ""
     state: NodeState = NodeState.CRASHED
     started_s: float = 0.0
+    searched_s: float = -math.inf
     heard_s: dict[str, float] = field(default_factory=dict)
     next_step: Timer | None = None
 
@@ -114,7 +118,7 @@ class Supervisor(Actor):
         self._spec: SystemSpec = context.shared["system"]
         self._layout = Layout(self._plan, self._spec)
         self._machine: Processes = context.shared.get("processes") or OsProcesses(
-            self._plan.base_port, self._plan.launcher_pid)
+            self._plan.base_port, self._plan.launcher_pid, self._plan.folder)
         self._processes = {
             u.name: _Process(u, RestartPolicy()) for u in self._layout.units.values()}
         for node, incarnation in context.shared.get("known_incarnations", {}).items():
@@ -167,7 +171,7 @@ class Supervisor(Actor):
 
     @on(topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
-        """Note that a node's loop turns; adopt a process that was not known."""
+        """Note that a node's loop turns; adopt a process that was not known, if the kernel does."""
         unit = self._layout.unit_of.get(header.source)
         if unit is None:
             return
@@ -175,7 +179,7 @@ class Supervisor(Actor):
         if header.incarnation > process.incarnation or (
                 header.incarnation == process.incarnation and process.pid != message.pid
                 and process.state in _DEAD):
-            self._adopt(process, message.pid, header.incarnation)
+            self._look_for(process)
         if (header.incarnation, message.pid) != (process.incarnation, process.pid):
             return
         if process.next_step is not None:  # said before it was killed
@@ -310,11 +314,9 @@ class Supervisor(Actor):
         self._event(process, "crashed", self.name, detail)
         if process.state is NodeState.STARTING:
             # Never heard: another life that nobody holds may have its port.
-            try:
-                if self._adopt_living(process, self._machine.living()):
-                    return
-            except OSError as error:  # no descriptor left to look with
-                self.report_diagnostic("search", str(error), process.unit.name)
+            process.searched_s = -math.inf
+            if self._look_for(process):
+                return
         self._lost(process, NodeState.CRASHED)
 
     def _owns(self, process: _Process) -> bool:
@@ -401,6 +403,22 @@ class Supervisor(Actor):
         self._event(process, "adopted", self.name)
         self._hold(process, pid)
 
+    def _look_for(self, process: _Process) -> bool:
+        """Adopt what lives and was not known, as the kernel knows it: a message may name any pid.
+
+        Returns:
+            Whether there is one.
+        """
+        now = self._loop.time()
+        if now - process.searched_s < _SEARCH_S:
+            return False
+        process.searched_s = now
+        try:
+            return self._adopt_living(process, self._machine.living())
+        except OSError as error:  # no descriptor left to look with
+            self.report_diagnostic("search", str(error), process.unit.name)
+            return False
+
     def _adopt_living(self, process: _Process, living: Sequence[Living]) -> bool:
         """Adopt the highest life that is there and end the others; False if there is none."""
         found = sorted((p for p in living if p.names == process.names),
@@ -410,7 +428,7 @@ class Supervisor(Actor):
                 handle = self._machine.hold(other.pid, lambda: None)
                 handle.kill()
                 handle.close()
-        if found:
+        if found and (found[0].pid != process.pid or process.state in _DEAD):
             self._adopt(process, found[0].pid, found[0].incarnation)
         return bool(found)
 
