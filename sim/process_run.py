@@ -95,12 +95,13 @@ class ProcessRun:
                 await asyncio.sleep(_LOOK_S)
                 why = mission.over(clock.now())
             if launcher.failure:
-                launcher.guard.report(launcher.failure)
+                why = launcher.failure
+                launcher.guard.report(why)
         finally:
             for actor in reversed(actors):
                 actor.stop()
             await asyncio.gather(*tasks, return_exceptions=True)
             if mission.console:
                 mission.console.close()
-        return mission.conclude(clock.now(), self.interrupted or launcher.failure or why or "ended",
+        return mission.conclude(clock.now(), self.interrupted or why or "ended",
                                 injector.outcomes() if injector else ())

@@ -16,6 +16,7 @@ import asyncio
 import contextlib
 import os
 import random
+import re
 import signal
 import time
 from collections.abc import Sequence
@@ -45,6 +46,10 @@ GAP_S = 0.4
 LAUNCHER_PAUSE_S = (0.3, 1.5)
 BACK_WITHIN_S = 20.0
 """Wall seconds after which it counts as failed that everything is back; the machine may be busy."""
+
+_DECISION = re.compile(r"\] decision \d+: (.*)")
+_LATCHED = "RM1"
+"""What a decision names when nothing is active any more and the emergency stop is not released."""
 
 _LISTEN_S = 1.5
 """So long one session listens: who comes back later does not dial it."""
@@ -126,6 +131,8 @@ class PairChaos:
         self._rate = run.info.rate
         self._read = 0
         self._ended = False
+        self._decided = ""
+        self.resets = 0
 
     def strike(self, pair: Pair) -> Outcome | None:
         """Hit a pair and wait until everything is back; None if the mission was over first."""
@@ -157,7 +164,14 @@ class PairChaos:
         whole = new.rpartition("\n")[0]
         self._read += len(whole.encode())
         self._ended = self._ended or tells_end(whole)
+        for decision in _DECISION.finditer(whole):
+            self._decided = decision[1]
         return self._ended or self._run.process.poll() is not None
+
+    def release(self) -> None:
+        """Do what an operator does when all is well again and the robot still stands: reset it."""
+        if not self.over() and self._decided == _LATCHED:
+            self.resets += self._run.tool("reset", _LATCHED).returncode == 0
 
     def _hit(self, pair: Pair, old: dict[str, int]) -> None:
         """Send the signals, those that let the paused go on included, each when it is due."""

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 
 import msgspec
 import pytest
@@ -194,8 +195,7 @@ def test_who_does_not_answer_at_once_is_passed_over_until_the_other_one_does_not
         stage.fork()
 
 
-def test_a_request_that_is_not_answered_for_long_moves_on_and_is_answered_once(
-        staged, monkeypatch):
+def test_a_request_that_is_not_answered_for_long_moves_on_and_is_answered_once(staged):
     stage = staged("ab", patience_s=0.0)
     with pytest.raises(SpawnerUnavailableError, match="spawner_b: no answer yet"):
         stage.fork()
@@ -205,9 +205,24 @@ def test_a_request_that_is_not_answered_for_long_moves_on_and_is_answered_once(
     late, _ = stage.spawners["b"].take()
     with pytest.raises(BrokenPipeError):
         late.send(b"{}")
-    monkeypatch.setattr(spawner_client, "PATIENCE_S", 60.0)
+    stage.client._forks[DM1][1].patience_s = 60.0
     child = stage.spawners["a"].fork()
     assert stage.until_answered() == child
+
+
+def test_a_request_stays_longer_each_time_so_that_a_busy_machine_answers_some_time(
+        staged, monkeypatch):
+    stage, now_s, asked = staged("ab", patience_s=0.25), [0.0], []
+    monkeypatch.setattr(spawner_client.time, "monotonic", lambda: now_s[0])
+    for _ in range(1000):
+        with pytest.raises(SpawnerUnavailableError):
+            stage.fork()
+        here = stage.client._forks[DM1][1]
+        if not asked or asked[-1][1] is not here:
+            asked.append((now_s[0], here))
+        now_s[0] += 0.01
+    stays_s = [after[0] - before[0] for before, after in pairwise(asked)]
+    assert stays_s == pytest.approx([0.25, 0.5, 1.0, 2.0, 4.0], abs=0.03)
 
 
 def test_an_answer_that_came_before_the_request_was_withdrawn_counts(staged, monkeypatch):

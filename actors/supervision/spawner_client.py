@@ -46,7 +46,8 @@ WAIT_S = 0.05
 spawner, and not for one that was slow before."""
 
 PATIENCE_S = 0.25
-"""So long a request stays with a spawner that does not answer, if there is another one to ask."""
+"""So long a request stays with a spawner that does not answer, if there is another one to ask; each
+time longer, for on a machine that is busy enough the new process cannot answer sooner either."""
 
 START_PATIENCE_S = 10.0
 
@@ -68,13 +69,14 @@ class _Asked:
         self._connection = connection
         self._unanswered = 0
         self.sent = False
+        self.patience_s = PATIENCE_S
         self._since_s = time.monotonic()
         self._reply: Reply | None = None
 
     @property
     def overdue(self) -> bool:
         """Whether another spawner is to be asked."""
-        return time.monotonic() - self._since_s > PATIENCE_S
+        return time.monotonic() - self._since_s > self.patience_s
 
     def send(self, *requests: Request) -> None:
         """Send requests, one after the other."""
@@ -179,6 +181,8 @@ class SpawnerClient:
                 self._slow.add(asked.spawner)
                 if asked.overdue or not self._slow.issuperset(queue):
                     other = self._reach(queue, failures)
+                    if other is not None and asked.overdue:
+                        other.patience_s = 2 * asked.patience_s
                 if other is None:
                     self._forks[names] = (incarnation, asked)
                     kind = SpawnerUnavailableError if asked.overdue else SpawnerBusyError
