@@ -403,7 +403,7 @@ async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -
         await run.run()
     if options.json:
         print(json.dumps(run.summary()), flush=True)
-    return EXIT_SUCCESS
+    return EXIT_FAILED if run.launcher.failure else EXIT_SUCCESS
 
 
 def _directory(options: argparse.Namespace, name: str) -> Path:

@@ -81,7 +81,7 @@ async def measure(port: int, kills: int) -> dict[str, list[float]]:
     try:
         await launcher.load()
         await launcher.start()
-        launcher.on_restart = lambda _name: back.append(time.monotonic())
+        launcher.guard.on_restart = lambda _name: back.append(time.monotonic())
         bus = launcher.observers_bus()
         clock = Clock(launcher.plan.origin_s)
         ear = Ear(Context(OBSERVER, 1, clock, bus, {}, {"launcher": launcher}))

@@ -16,6 +16,7 @@ from actors.supervision.launcher import Launcher
 from actors.supervision.process_hand import ProcessHand
 from actors.supervision.run_plan import OBSERVER
 from actors.supervision.system_topics import system_topics
+from actors.supervision.unseen import watch
 from manager.schema import SystemSpec
 from sim.injector import INJECTOR, Injector, can_be_hit
 from sim.mission_run import MissionRun
@@ -63,9 +64,9 @@ class ProcessRun:
         launcher, mission = self.launcher, self._mission
         plan = launcher.plan
         clock = Clock(plan.origin_s, plan.rate)
-        launcher.on_restart = lambda name: mission.brought_back(name, clock.now())
+        launcher.guard.on_restart = lambda name: mission.brought_back(name, clock.now())
         if console := mission.console:
-            launcher.on_trouble = lambda text: console.line(clock.now(), text)
+            launcher.guard.report = lambda text: console.line(clock.now(), text)
 
         def to_launcher(_topic: Topic[Any], message: Any, _header: Header) -> None:
             if isinstance(message, NodeTable):
@@ -84,21 +85,23 @@ class ProcessRun:
                 INJECTOR, 1, clock, SharedBus(bus), {}, shared, register=register))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
+        for task, actor in zip(tasks, actors, strict=True):
+            watch(task, f"the launcher's {actor.name}", launcher.failed)
         if mission.console:
             mission.console.banner(
                 mission.airport.name, mission.mission, plan, self._spec)
         try:
             why = None
-            while why is None and not self.interrupted and not any(t.done() for t in tasks):
+            while why is None and not self.interrupted and not launcher.failure:
                 looked_s = clock.now()
                 await asyncio.sleep(_LOOK_S)
                 stall_s = clock.now() - looked_s - _LOOK_S * plan.rate
                 if stall_s > _STALL_S * plan.rate:  # ctrl-Z; what was sent meanwhile comes now
                     mission.excuse(stall_s)
                 why = mission.over(clock.now())
-            for task in tasks:
-                if task.done():
-                    await task
+            if launcher.failure:
+                why = launcher.failure
+                launcher.guard.report(why)
         finally:
             for actor in reversed(actors):
                 actor.stop()
