@@ -18,6 +18,7 @@ from actors.messages import (
     Route,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
 from actors.runtime.parameters import names
 
 UNCERTAIN_S = 1.0
@@ -151,4 +152,4 @@ def hold_reason(status: ManagerStatus, holding: tuple[str, ...]) -> str:
     if not held_by:
         return ""
     causes = [f"{view.name}: {view.reason}" for view in status.detections if view.active]
-    return f"held by {' and '.join(held_by)}" + (f": {'; '.join(causes)}" if causes else "")
+    return clip(f"held by {' and '.join(held_by)}" + (f": {'; '.join(causes)}" if causes else ""))

@@ -32,6 +32,7 @@ from actors.messages import (
     Mode,
     Route,
 )
+from actors.runtime.bounds import clip
 
 P = MissionPhase
 
@@ -227,11 +228,11 @@ def obey(
     for answer in state.answers:
         if answer.order == order.order:
             return state, answer
-    outcome = _OBEDIENCE[order.action](state, f"{order.by}: {order.reason}", now)
+    outcome = _OBEDIENCE[order.action](state, clip(f"{order.by}: {order.reason}"), now)
     after = state if isinstance(outcome, str) else outcome
     answer = MissionOrderAnswer(
-        order.order, not isinstance(outcome, str), outcome if isinstance(outcome, str) else "",
-        after.plan)
+        order.order, not isinstance(outcome, str),
+        clip(outcome) if isinstance(outcome, str) else "", after.plan)
     kept = (*state.answers, answer)[-ANSWERS_KEPT:]
     return msgspec.structs.replace(after, answers=kept), answer
 
@@ -353,7 +354,7 @@ def status(state: MissionState) -> MissionStatus:
         goals=state.goals,
         step_times_s=state.step_times_s,
         lights=state.lights,
-        reason=state.reason,
+        reason=clip(state.reason),
         skipped=tuple(index for index, _ in state.skipped),
         unmeasured=tuple(
             name for name in state.unmeasured

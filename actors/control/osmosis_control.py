@@ -39,6 +39,7 @@ from actors.messages import (
     Twist,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
 from actors.runtime.parameters import amount, switch
 from actors.runtime.topic import Topic
 from airport.model import Airport
@@ -172,7 +173,7 @@ class OsmosisControl(Actor):
         if not finite:
             self.report_diagnostic("route", "a waypoint is not finite", message.mission_id)
             return
-        self._why_refused = self._fault_of(message)
+        self._why_refused = clip(self._fault_of(message))
         self._refused = message if self._why_refused else None
         if self._refused is not None:
             self.report_diagnostic("route refused", self._why_refused, message.mission_id)

@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 from actors import topics
 from actors.messages import RecoveryCommand, RecoveryPhase, RecoveryReport, RecoveryState
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
 from actors.runtime.topic import Topic
 from manager.schema import SystemSpec
 
@@ -211,7 +212,7 @@ class RecoveryModule(Actor):
             raise IllegalTransitionError(
                 f"{self.name}: no transition from {self.phase} to {phase}")
         self.phase = phase
-        self._reason = reason
+        self._reason = clip(reason)
 
     # -- reports --------------------------------------------------------------------------------
 

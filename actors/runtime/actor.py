@@ -22,10 +22,11 @@ from typing import Any, ClassVar, TypeVar
 
 import msgspec
 
+from actors.runtime.bounds import MAX_PAYLOAD_BYTES, clip
 from actors.runtime.bus import Bus
 from actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
 from actors.runtime.clock import Clock
-from actors.runtime.envelope import ArrivalGuard, Envelope, Header, pack
+from actors.runtime.envelope import ArrivalGuard, Envelope, Header, pack, too_long
 from actors.runtime.injection_desk import InjectionDesk
 from actors.runtime.mailbox import Mailbox
 from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection
@@ -285,7 +286,8 @@ class Actor:
             self._diagnostics[slot] = (last, count + 1)
             return
         self._diagnostics[slot] = (now, 0)
-        self.publish(DIAGNOSTIC, Diagnostic(self.name, context, reason, offender, count + 1))
+        self.publish(DIAGNOSTIC, Diagnostic(
+            self.name, clip(context), clip(reason), clip(offender), count + 1))
 
     def stop(self) -> None:
         """End the actor after the items that already wait."""
@@ -479,6 +481,9 @@ class Actor:
         self._sequence = sequence = self._sequence + 1
         self._last_sent[key] = (body, stamp)
         payload = pack((self.name, self._incarnation, sequence, stamp, body))
+        if len(payload) > MAX_PAYLOAD_BYTES:  # no reader would take it
+            self.report_diagnostic("not sent", too_long(payload), key)
+            return
         for _ in range(copies):
             self._bus.publish(topic, key, payload)
 

@@ -13,6 +13,7 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
+from actors.runtime.bounds import MAX_PAYLOAD_BYTES, Count, Incarnation, Name, Seconds
 from actors.runtime.topic import Qos, Topic
 
 B = TypeVar("B")
@@ -34,10 +35,10 @@ class Header(msgspec.Struct, frozen=True, gc=False):
     simulated time at which the content was true (for a sensor: when it was measured).
     """
 
-    source: str
-    incarnation: int
-    sequence: int
-    stamp: float
+    source: Name
+    incarnation: Incarnation
+    sequence: Count
+    stamp: Seconds
 
 
 class Envelope(Header, Generic[B], frozen=True, array_like=True, gc=False):
@@ -62,10 +63,18 @@ def decode(topic: Topic[Any], payload: bytes) -> tuple[Header, Any]:
     """Return header and body of a payload.
 
     Raises:
-        ValueError, RecursionError: the payload is not a message of this topic's type.
+        ValueError, RecursionError: the payload is not a message of this topic's type, or longer
+            than any may be.
     """
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise ValueError(too_long(payload))
     envelope = (_decoders.get(topic.type) or _decoder(topic.type))(payload)
     return envelope, envelope.body
+
+
+def too_long(payload: bytes) -> str:
+    """Return what is wrong with a payload that is too long to be decoded."""
+    return f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are right"
 
 
 def _decoder(kind: type[Any]) -> Callable[[bytes], Envelope[Any]]:
@@ -107,6 +116,9 @@ class ArrivalGuard:
         now = self._now
 
         def receive(key: str, payload: bytes) -> None:  # made of every message
+            if len(payload) > MAX_PAYLOAD_BYTES:
+                refuse(key, f"not a {kind}: {too_long(payload)}")
+                return
             try:
                 message = unpack(payload)
             except UNREADABLE as error:

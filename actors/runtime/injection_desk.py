@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from actors.runtime.bounds import clip
 from actors.runtime.injection import FaultGate, News
 from actors.runtime.messages import Injection, InjectionReport
 from actors.runtime.timer import Timer
@@ -40,7 +41,7 @@ class InjectionDesk:
             return
         reason = self.gate.order(order, actor.clock.now(), topic.type)
         actor.publish(INJECTION_REPORT, InjectionReport(
-            order.injection, actor.name, 0, bool(reason), reason))
+            order.injection, actor.name, 0, bool(reason), clip(reason)))
         if reason:
             return
         self._forget_end(order.injection)  # of an earlier order with the same id
@@ -75,7 +76,7 @@ class InjectionDesk:
             self._forget_end(news.injection)
             actor.report_diagnostic("fault injection", news.reason, news.topic)
         actor.publish(INJECTION_REPORT, InjectionReport(
-            news.injection, actor.name, news.affected, news.finished, news.reason))
+            news.injection, actor.name, news.affected, news.finished, clip(news.reason)))
 
     def _forget_end(self, injection: str) -> None:
         timer = self._ends.pop(injection, None)

@@ -37,6 +37,7 @@ from actors.messages import (
     RespawnRequest,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
 from actors.runtime.timer import Timer
 from actors.runtime.topic import Topic
 from actors.supervision.processes import (
@@ -234,7 +235,8 @@ class Supervisor(Actor):
         unit = self._layout.unit_of.get(request.node)
         if unit is None:
             self.publish(topics.PROCESS_EVENT, ProcessEvent(
-                request.node, "refused", 0, 0, request.by, f"no such node: {request.node!r}"))
+                request.node, "refused", 0, 0, request.by,
+                clip(f"no such node: {request.node!r}")))
             return
         process = self._processes[unit]
         if process.state in _HEALTHY and process.incarnation > request.failed_incarnation:
@@ -421,7 +423,7 @@ class Supervisor(Actor):
     def _event(self, process: _Process, event: str, by: str, detail: str = "") -> None:
         for node in process.unit.nodes:
             self.publish(topics.PROCESS_EVENT, ProcessEvent(
-                node.name, event, process.pid, process.incarnation, by, detail))
+                node.name, event, process.pid, process.incarnation, by, clip(detail)))
 
     def _publish_table(self) -> None:
         rows = [NodeInfo(self.name, Kind.SUPERVISION.value, self.context.pid, NodeState.RUNNING,
