@@ -7,6 +7,8 @@ imitated that does not use the message classes at all.
 from __future__ import annotations
 
 import math
+import struct
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from random import Random
 from typing import Any
@@ -193,14 +195,22 @@ _EDGES: dict[type[inspect.Type], Callable[[Any, str], Iterator[Edge]]] = {
 class Drawer:
     """Draws values of types, within their bounds and often at them.
 
+    A field is often what one of the same name was before, or else no two messages would ever be
+    about the same thing.
+
     Args:
         seed: of the dice.
         words: names that mean something to the reader, beside those that do not.
+
+    Attributes:
+        wild: whether to draw what no sound sender would say.
     """
 
     def __init__(self, seed: Any, words: Sequence[str] = ("x",)) -> None:
         self.dice = Random(seed)
         self._words = words
+        self._before: dict[str, deque[Plain]] = {}
+        self.wild = True
         self._ways: dict[type[inspect.Type], Callable[[Any, int], Plain]] = {
             inspect.IntType: self._int, inspect.FloatType: self._float,
             inspect.BoolType: lambda _kind, _depth: self.dice.random() < 0.5,
@@ -212,6 +222,11 @@ class Drawer:
             inspect.DictType: self._dict, inspect.StructType: self._struct,
             inspect.AnyType: self._any}
 
+    def remember(self, body: dict[str, Plain]) -> None:
+        """Take the fields of a message for ones that others may say again."""
+        for name, value in body.items() if isinstance(body, dict) else ():
+            self._before.setdefault(name, deque(maxlen=6)).append(value)
+
     def value(self, kind: inspect.Type, depth: int = 0) -> Plain:
         """Return a value of a type; the deeper in collections, the smaller."""
         return self._ways[type(kind)](kind, depth)
@@ -220,6 +235,8 @@ class Drawer:
         least = -(2**63) if kind.ge is None else kind.ge
         most = 2**63 - 1 if kind.le is None else kind.le
         small = min(most, max(least, self.dice.randrange(6)))
+        if not self.wild:
+            return small
         return self.dice.choice((small, small, small, small, least, most, most - 1,
                                  self.dice.randint(least, most)))
 
@@ -227,6 +244,8 @@ class Drawer:
         least = -math.inf if kind.ge is None else float(kind.ge)
         most = math.inf if kind.le is None else float(kind.le)
         near, dice = self.dice.uniform(-50, 50), self.dice
+        if not self.wild:
+            return max(least, min(most, dice.choice((near, 0.0, dice.uniform(-1, 1)))))
         value = dice.choice((*FLOATS, near, near, dice.uniform(0, 1), least, most))
         if kind.ge is None or least <= value <= most:
             return value
@@ -234,19 +253,21 @@ class Drawer:
 
     def _text(self, kind: inspect.StrType, _depth: int) -> str:
         longest = kind.max_length or 1000
-        if self.dice.random() < 0.6:
+        if not self.wild or self.dice.random() < 0.6:
             return self.dice.choice(self._words)[:longest]
         robots = "\U0001f916" * min(longest, 5000)
-        return self.dice.choice((*TEXTS, "x" * longest, robots))[:longest]
+        return self.dice.choice((*TEXTS, "x" * longest, "[" * longest, robots))[:longest]
 
     def _bytes(self, kind: inspect.BytesType, _depth: int) -> bytes:
         size = self.dice.choice((0, 1, 3, 4, 8, 724, 724, 726, kind.max_length or 1000))
+        if not self.wild:
+            return struct.pack("<181f", *(self.dice.uniform(0, 8) for _ in range(181)))
         pattern = self.dice.choice((*_FLOATS32, self.dice.randbytes(4)))
         return (pattern * (size // 4 + 1))[:size]
 
     def _sequence(self, kind: inspect.VarTupleType, depth: int) -> list[Plain]:
         most = kind.max_length or 100
-        if depth == 0 and self.dice.random() < 0.05:  # as many as there may be, all the same
+        if self.wild and depth == 0 and self.dice.random() < 0.1:  # as many as there may be
             return [self.value(kind.item_type, 3)] * self.dice.choice((most, most // 2))
         count = min(most, self.dice.choice((0, 0, 1, 1, 2, 3) if depth < 3 else (0, 1)))
         return [self.value(kind.item_type, depth + 1) for _ in range(count)]
@@ -256,8 +277,14 @@ class Drawer:
                 for _ in range(self.dice.randrange(3))}
 
     def _struct(self, kind: inspect.StructType, depth: int) -> dict[str, Plain]:
-        return {field.encode_name: self.value(field.type, depth)
+        return {field.encode_name: self._field(field, depth)
                 for field in kind.fields if field.required or self.dice.random() < 0.7}
+
+    def _field(self, field: inspect.Field, depth: int) -> Plain:
+        before = self._before.get(field.encode_name)
+        if depth == 0 and before and self.dice.random() < 0.4:
+            return self.dice.choice(before)  # if it is of another type the message is drawn anew
+        return self.value(field.type, depth)
 
     def _any(self, _kind: inspect.AnyType, _depth: int) -> Plain:
         return self.dice.choice((None, True, 2**63, -1, *FLOATS, "x", b"\x00\x00", [], [[1.0]], {}))

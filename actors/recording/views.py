@@ -228,7 +228,8 @@ def _sweep(channel: str, sweep: m.LaserScan, at_ns: int) -> list[View]:
     count = len(sweep.ranges_f32) // 4
     ranges = np.frombuffer(sweep.ranges_f32, dtype="<f4", count=count)
     # No echo: at the laser itself, where the robot hides it. JSON has no number that says "none".
-    echo = np.isfinite(ranges) & (ranges < sweep.range_max_m)
+    with np.errstate(over="ignore", invalid="ignore"):  # a range may be anything
+        echo = np.isfinite(ranges) & (ranges < sweep.range_max_m)
     seen = np.round(np.where(echo, ranges, 0.0).astype(np.float64), 3)
     end_rad = sweep.angle_min_rad + max(0, count - 1) * sweep.angle_increment_rad
     if not (math.isfinite(sweep.angle_min_rad) and math.isfinite(end_rad)):

@@ -230,7 +230,10 @@ def adapted_system(
     Raises:
         ValueError: the changed system is unsound; the manager does not let that happen.
     """
-    document = msgspec.json.decode(adapted.document)
+    try:
+        document = msgspec.json.decode(adapted.document, type=dict[str, Any])
+    except RecursionError:
+        raise ValueError("the changed system is nested too deep") from None
     spec = tailor(layout.plan, check_document(document, layout.plan.system_file))
     return Layout(layout.plan, spec), {
         **shared, "system": spec, "document": document, "adapted": adapted}
