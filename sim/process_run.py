@@ -76,13 +76,15 @@ class ProcessRun:
         others = [endpoint(port) for port in ports.values()]
         bus = ZenohBus(OBSERVER, 1, endpoint(own), others, Tap(plan.base_port))
         sinks: list[Sink] = [to_launcher, *mission.sinks(clock)]
-        actors: list[Actor] = [Observer(Context(OBSERVER, 1, clock, bus, {}, {"sinks": sinks}))]
+        actors: list[Actor] = [Observer(Context(
+            OBSERVER, 1, clock, bus, {}, {"sinks": sinks}, members=frozenset(launcher.ports)))]
         injector = None
         if self._scenario:
             shared = {"scenario": self._scenario, "hand": ProcessHand(plan.base_port),
                       "nodes": can_be_hit(self._spec), "topics": system_topics(self._spec)}
             injector = Injector(Context(
-                INJECTOR, 1, clock, SharedBus(bus), {}, shared))
+                INJECTOR, 1, clock, SharedBus(bus), {}, shared,
+                members=frozenset(launcher.ports)))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         if mission.console:

@@ -6,6 +6,7 @@ For systems that are being specified, and for those whose world is not simulated
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from typing import Any, TextIO
 
 import msgspec
@@ -13,7 +14,9 @@ import msgspec
 from actors import topics
 from actors.messages import DecisionRecord, NodeTable, ProcessEvent
 from actors.runtime.actor import Context, Header
+from actors.runtime.bounds import MANY
 from actors.runtime.clock import Clock
+from actors.runtime.limits import Remembered
 from actors.runtime.tap import Tap
 from actors.runtime.topic import Topic
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
@@ -22,6 +25,9 @@ from actors.supervision.run_plan import OBSERVER, RunPlan
 from manager.schema import SystemSpec
 from sim.console import Console
 from sim.observer import Observer
+
+KEPT_DECISIONS = 10_000
+"""The last so many decisions of a run are kept."""
 
 
 class WatchedRun:
@@ -41,8 +47,8 @@ class WatchedRun:
         self._spec = spec
         self._duration_s = duration_s
         self._console = Console(stream)
-        self._decisions: list[DecisionRecord] = []
-        self._restarts: dict[str, int] = {}
+        self._decisions: deque[DecisionRecord] = deque(maxlen=KEPT_DECISIONS)
+        self._restarts: Remembered[str, int] = Remembered(MANY)
         self._lasted_s = 0.0
 
     async def run(self) -> None:
@@ -76,7 +82,8 @@ class WatchedRun:
         bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()),
                        Tap(plan.base_port))
         observer = Observer(Context(
-            OBSERVER, 1, clock, bus, {}, {"sinks": [self._take, self._console.take]}))
+            OBSERVER, 1, clock, bus, {}, {"sinks": [self._take, self._console.take]},
+            members=frozenset(self.launcher.ports)))
         task = asyncio.create_task(observer.run())
         self._console.line(clock.now(), f"{self._spec.title} ({self._spec.name}), "
                            f"{self._spec.strategy}, rate {plan.rate:g}; ctrl-C ends it")

@@ -53,6 +53,9 @@ ACTIVE = frozenset({P.RUNNING, P.PAUSED, P.RETURNING})
 DRIVING = frozenset({P.RUNNING, P.RETURNING})
 """Phases in which the robot has a goal."""
 
+ACCEPTED_KEPT = 256
+"""A mission that is sent again is not accepted again as long as it is among the last so many."""
+
 ANSWERS_KEPT = 32
 """An order that is repeated gets its old answer as long as it is among the last so many."""
 
@@ -85,7 +88,7 @@ class MissionState(msgspec.Struct, frozen=True):
         step_times_s: duration of each finished step in simulated seconds.
         lights: the first measurement of each light, in order of arrival.
         reason: why it failed, was cancelled or paused, or goes another way than the shortest.
-        accepted: ids of all missions ever accepted.
+        accepted: ids of the last missions that were accepted.
         plan: how often another plan was asked for in this mission.
         paused: on whose order it is paused and why; empty without such an order.
         held: which recovery holds the robot and why; empty if none does.
@@ -145,7 +148,7 @@ def accept(state: MissionState, request: MissionRequest, now: float) -> MissionS
         step_started_s=now,
         step_times_s=(),
         lights=(),
-        accepted=(*state.accepted, request.mission_id),
+        accepted=(*state.accepted, request.mission_id)[-ACCEPTED_KEPT:],
         plan=0,
         paused="",
         home=None,

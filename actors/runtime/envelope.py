@@ -8,7 +8,7 @@ stamped ahead of now: it would stay fresh for ever, and shut out all that is tru
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -26,6 +26,13 @@ AHEAD_S = 0.1
 """A stamp this far ahead of now (simulated seconds) is no jitter of a clock but wrong."""
 
 _REMEMBERED_COMMANDS = 64
+
+STRANGERS = 512
+"""Sources that are no nodes of the system, tools for the most part, of which something is
+remembered."""
+
+_KEYS = 256
+"""On which one source may publish; of those above the first is forgotten."""
 
 
 class Header(msgspec.Struct, frozen=True, gc=False):
@@ -91,13 +98,22 @@ the topics of which only the newest counts; of commands, by key, the last number
 class ArrivalGuard:
     """Decides for each arriving payload whether the actor may see it.
 
+    What it has to remember is bounded: nodes of the system are never forgotten, and of all others
+    only the last `STRANGERS`. So no flood of names can bring a superseded node back.
+
     Args:
         now: returns simulated seconds.
+        members: names of the nodes of the system.
+        crowded: called for each stranger that is forgotten.
     """
 
-    def __init__(self, now: Callable[[], float]) -> None:
+    def __init__(self, now: Callable[[], float], members: Collection[str] = (),
+                 crowded: Callable[[], None] = lambda: None) -> None:
         self._now = now
+        self._members = frozenset(members)
+        self._crowded = crowded
         self._lives: dict[str, Life] = {}
+        self._strangers: deque[str] = deque()
 
     def receiver(
         self, topic: Topic[Any], take: Callable[[str, Envelope[Any]], None],
@@ -138,13 +154,17 @@ class ArrivalGuard:
             if is_command:
                 recent = life[2].get(key)
                 if recent is None:
+                    _make_room(life[2])
                     recent = life[2][key] = deque(maxlen=_REMEMBERED_COMMANDS)
                 if sequence in recent:
                     return
                 recent.append(sequence)
             else:
                 newest = life[1]
-                if sequence <= newest.get(key, -1):
+                before = newest.get(key)
+                if before is None:
+                    _make_room(newest)
+                elif sequence <= before:
                     return
                 newest[key] = sequence
             take(key, message)
@@ -153,5 +173,15 @@ class ArrivalGuard:
 
     def _meet(self, source: str, incarnation: int) -> Life:
         life: Life = (incarnation, {}, {})
+        if source not in self._members and source not in self._lives:
+            self._strangers.append(source)
+            if len(self._strangers) > STRANGERS:
+                del self._lives[self._strangers.popleft()]
+                self._crowded()
         self._lives[source] = life
         return life
+
+
+def _make_room(by_key: dict[str, Any]) -> None:
+    if len(by_key) >= _KEYS:
+        del by_key[next(iter(by_key))]

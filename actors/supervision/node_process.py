@@ -49,7 +49,8 @@ def make_actor(
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, shared,
         checkpoints=make_store(layout, name, incarnation),
-        heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed))
+        heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
+        members=frozenset(layout.members)))
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
