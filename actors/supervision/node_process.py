@@ -80,7 +80,8 @@ def node_main(
             go_first()
         exit_with_launcher(
             lifeline, (lambda: kill_leftovers(launcher)) if SUPERVISOR in names else None)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is the launcher's to handle
+        for number in (signal.SIGINT, signal.SIGHUP):  # the launcher's to handle
+            signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGUSR2, wedge)
         asyncio.run(_live(layout, names, incarnation, shared, tell))
     except BusError as error:

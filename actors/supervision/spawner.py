@@ -24,6 +24,7 @@ from typing import Any, NoReturn
 import msgspec
 
 from actors.messages import AdaptedSystem
+from actors.runtime import streams
 from actors.runtime.unix_peer import is_same_user
 from actors.supervision.lifeline import kill_leftovers
 from actors.supervision.node_process import node_main, wedge
@@ -109,7 +110,8 @@ class Spawner:
 
     def serve(self) -> NoReturn:
         """Serve until the launcher ends."""
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for number in (signal.SIGINT, signal.SIGHUP):  # the launcher's to handle; we see its end
+            signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         signal.signal(signal.SIGUSR2, wedge)
         self._reap_on_child_end()
@@ -236,6 +238,7 @@ def main() -> int:
         spawner.open()
         print(msgspec.json.encode(layout.port_of).decode(), flush=True)
         os.dup2(2, 1)  # nobody reads the pipe from here on
+        streams.secure()  # and perhaps nobody stderr: that ends no node
         spawner.serve()
     except BrokenPipeError:  # the launcher ended while this was loading: nobody to tell
         os._exit(2)
