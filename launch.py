@@ -72,7 +72,8 @@ while it runs, from another shell:
   rampart inject localization-not-updated           inject one of the paper's faults
   rampart status                                    what the robot and its nodes are doing
 exit code: 0 success and safe, 1 mission failed but safe, 2 bad usage or spec, 3 unsafe,
-4 safety not known: no ground truth ever came
+4 safety not known: no ground truth ever came. A report that cannot be written and output that
+nobody reads change none of them; with --json, "report_error" says why there is no "report"
 """
 
 
