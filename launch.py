@@ -24,7 +24,7 @@ import systems
 from actors.recording.bag_writer import BagError, check_target
 from actors.recording.process import Order, RecorderProcess
 from actors.recording.virtual import VirtualRecording
-from actors.runtime import working_folder
+from actors.runtime import streams, working_folder
 from actors.runtime.topic import Topic
 from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
 from actors.runtime.wiring import load_class
@@ -40,7 +40,7 @@ from sim.mission_run import MissionRun, summary
 from sim.network import NETWORKS, find_network
 from sim.offered_faults import offered_faults
 from sim.process_run import ProcessRun
-from sim.report import write_report
+from sim.report import in_words, try_report
 from sim.report_record import RunRecord
 from sim.scenario import action_of, parse_fault
 from sim.virtual_run import LEAD_S, VirtualRun
@@ -72,7 +72,8 @@ while it runs, from another shell:
   rampart inject localization-not-updated           inject one of the paper's faults
   rampart status                                    what the robot and its nodes are doing
 exit code: 0 success and safe, 1 mission failed but safe, 2 bad usage or spec, 3 unsafe,
-4 safety not known: no ground truth ever came
+4 safety not known: no ground truth ever came. A report that cannot be written and output that
+nobody reads change none of them; with --json, "report_error" says why there is no "report"
 """
 
 
@@ -230,28 +231,45 @@ class Run:
         finally:
             self._console.close()
             if recording is not None:
-                print(f"launch.py: {recording.close()}", file=sys.stderr)
+                _say(recording.close())
         self._console.speed(result.speed, result.messages, result.trace)
         for name, error in result.failures:
-            print(f"launch.py: {name} failed: {error}", file=sys.stderr)
+            _say(f"{name} failed: {error}")
         if result.tracebacks:
-            with Path(self._plan.error_log).open("a", encoding="utf-8") as log:
-                log.write(result.tracebacks)
+            try:
+                with Path(self._plan.error_log).open("a", encoding="utf-8") as log:
+                    log.write(result.tracebacks)
+            except OSError as error:
+                _say(f"{self._plan.error_log}: tracebacks are lost: {in_words(error)}")
         return self._conclude(result.record, trace=result.trace)
 
     def _conclude(self, record: RunRecord, **more: str) -> int:
-        html, data = write_report(record, self._directory)
-        self._console.conclusion(record, html)
+        """Tell what came of the run; no disk and no reader that fails changes the verdict."""
+        report = try_report(record, self._directory)
+        self._console.conclusion(record, report.html)
+        if report.problem:
+            _say(f"report: {report.problem}")
         for fault in record.faults:
             if not fault.effective:
-                print(f"launch.py: fault {fault.fault} had no effect: {fault.reason}",
-                      file=sys.stderr)
+                _say(f"fault {fault.fault} had no effect: {fault.reason}")
         if self._options.json:
-            print(json.dumps(summary(record, report=str(html), record=str(data), **more)),
-                  flush=True)
+            _print_result(summary(
+                record, report=str(report.html) if report.html else None,
+                record=str(report.data) if report.data else None,
+                report_error=report.problem or None, **more))
         if record.safety != "safe":
             return EXIT_UNSAFE if record.safety == "unsafe" else EXIT_NOT_KNOWN
         return EXIT_SUCCESS if record.mission == "success" else EXIT_FAILED
+
+
+def _say(text: str) -> None:
+    print("launch.py: " + " ".join(text.split()), file=sys.stderr, flush=True)
+
+
+def _print_result(result: dict[str, Any]) -> None:
+    print(json.dumps(result), flush=True)
+    if why := streams.lost_result():
+        _say(f"stdout: {why}: the result is lost")
 
 
 @contextlib.contextmanager
@@ -269,15 +287,22 @@ def _kept(directory: Path) -> Iterator[None]:
     except OSError as error:
         raise UsageError(f"--report {directory}: no directory that can be written "
                          f"({error.strerror})") from None
-    before = log.stat().st_size if log.exists() else 0
+    before = _size(log)
     try:
         yield
     finally:
-        if log.exists() and log.stat().st_size > before:
-            print(f"launch.py: tracebacks of what failed: {log}", file=sys.stderr)
+        if _size(log) > before:
+            _say(f"tracebacks of what failed: {log}")
         if made:
             with contextlib.suppress(OSError):  # there is something in it
                 directory.rmdir()
+
+
+def _size(file: Path) -> int:
+    try:
+        return file.stat().st_size
+    except OSError:
+        return 0
 
 
 @contextlib.contextmanager
@@ -296,7 +321,7 @@ def _recorded(options: argparse.Namespace) -> Iterator[None]:
 
 
 def _interruptible(run: ProcessRun | WatchedRun) -> None:
-    """Have SIGINT and SIGTERM end a run in order; the second one is meant."""
+    """Have SIGINT, SIGTERM, and the end of the terminal, end a run; the second one is meant."""
 
     def interrupt(name: str) -> None:
         if run.interrupted:
@@ -304,9 +329,15 @@ def _interruptible(run: ProcessRun | WatchedRun) -> None:
             raise SystemExit(EXIT_FAILED)
         run.interrupted = f"interrupted by {name}"
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in _ends():
         asyncio.get_running_loop().add_signal_handler(
             number, interrupt, signal.Signals(number).name)
+
+
+def _ends() -> list[signal.Signals]:
+    """Return the signals that end a run; under nohup the end of the terminal does not."""
+    ends = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    return [number for number in ends if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 @contextlib.contextmanager
@@ -318,11 +349,7 @@ def _interruptible_between_bytecodes(run: VirtualRun) -> Iterator[None]:
             raise KeyboardInterrupt
         run.interrupted = f"interrupted by {signal.Signals(number).name}"
 
-    ends = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.getsignal(number) for number in ends}
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:  # as SIGHUP is under nohup
-            signal.signal(number, interrupt)
+    before = {number: signal.signal(number, interrupt) for number in _ends()}
     try:
         yield
     finally:
@@ -402,7 +429,7 @@ async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -
         _interruptible(run)
         await run.run()
     if options.json:
-        print(json.dumps(run.summary()), flush=True)
+        _print_result(run.summary())
     return EXIT_FAILED if run.launcher.failure else EXIT_SUCCESS
 
 
@@ -478,7 +505,7 @@ def _joystick(options: argparse.Namespace) -> str:
         raise UsageError(f"--joystick {name}: neither a device nor a FIFO; joysticks are "
                          "/dev/input/js0, /dev/input/js1 …")
     if not device.exists():
-        print(f"launch.py: --joystick {name}: not there yet, waiting for it", file=sys.stderr)
+        _say(f"--joystick {name}: not there yet, waiting for it")
     return str(device.resolve())
 
 
@@ -489,6 +516,7 @@ def _existing_path(name: str) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line, run, and return the exit code."""
+    streams.secure()
     options = parser().parse_args(arguments)
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
@@ -499,12 +527,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         run = Run(options, plan, spec)
         return run.in_virtual_time() if options.virtual else run.on_processes()
     except (UsageError, LaunchError, BagError, ValueError, OSError) as error:
-        print("launch.py: " + " ".join(str(error).split()), file=sys.stderr)
+        _say(str(error))
         return EXIT_USAGE
     except KeyboardInterrupt:
         return EXIT_FAILED
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(BrokenPipeError):
-        sys.exit(main())
+    sys.exit(main())

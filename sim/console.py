@@ -113,18 +113,23 @@ class Console:
         """Write one line with its simulated time."""
         self._print(f"[{at_s:7.2f} s] {text}")
 
+    def trouble(self, text: str) -> None:
+        """Write a line of what went wrong at no time of the run."""
+        self._print(f"launch.py: {' '.join(text.split())}")
+
     def close(self) -> None:
         """Take the live line away."""
         self._clear()
 
-    def conclusion(self, record: RunRecord, report: Path) -> None:
-        """Say how it ended."""
+    def conclusion(self, record: RunRecord, report: Path | None) -> None:
+        """Say how it ended, and where the report is, if there is one."""
         self._print(f"Mission {record.mission_name}: {record.mission}, {record.safety}, "
                     f"{record.duration_s:.1f} s simulated, {record.distance_m:.0f} m driven.")
         self._print(headline(record))
         for reason in record.reasons:
             self._print(f"  {reason}")
-        self._print(f"Report: {report}")
+        if report is not None:
+            self._print(f"Report: {report}")
 
     def _take_mission(self, status: MissionStatus, at: float) -> None:
         self._mission = status

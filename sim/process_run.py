@@ -58,7 +58,11 @@ class ProcessRun:
             await self.launcher.start()
             return await self._observe()
         finally:
-            await self.launcher.end()
+            try:
+                await self.launcher.end()
+            except Exception as error:  # the verdict stands; the lifeline ends who is left
+                if self._mission.console:
+                    self._mission.console.trouble(f"at the end: {type(error).__name__}: {error}")
 
     async def _observe(self) -> RunRecord:
         launcher, mission = self.launcher, self._mission

@@ -34,12 +34,20 @@ from sim.campaign.store import Run, Store, StoreError
 from sim.disturbance import UnknownFaultError
 from sim.injector import can_be_hit
 from sim.network import NETWORKS
-from sim.report import write_report
+from sim.report import in_words, write_report
 from sim.report_record import RunRecord
 from sim.scenario import PlannedFault, ScenarioError, action_of, parse_fault
 from toolbox import systems
 from toolbox.hunting import hunt
-from toolbox.output import NoEffectError, UsageError, print_json, print_table, say, unknown
+from toolbox.output import (
+    NoEffectError,
+    UsageError,
+    print_json,
+    print_table,
+    say,
+    unknown,
+    warn,
+)
 
 
 def campaign(options: argparse.Namespace) -> int:
@@ -60,18 +68,26 @@ def campaign(options: argparse.Namespace) -> int:
     directory = _directory(options, name)
     try:
         store = Store(directory)
+    except StoreError as error:
+        raise UsageError(str(error)) from None
+    try:
         made = _execute(options, jobs, store)
         keys = {job.key for job in jobs}
         runs = _in_order(store.runs(keys), jobs)
         store.close()
-    except (StoreError, BackendError) as error:
+    except BackendError as error:
         raise UsageError(str(error)) from None
-    except JobError as error:
-        raise UsageError(f"{error}; what was finished is in {directory}") from None
+    except (StoreError, JobError) as error:
+        raise UsageError(f"{error}; what was finished is in {directory}, and the same command "
+                         "goes on from there") from None
     _show(options, spec, runs, made)
-    page = _write_report(options, spec, directory, runs)
-    if not options.json:
-        say(f"\nReport: {page}")
+    try:
+        page = _write_report(options, spec, directory, runs)
+    except Exception as error:  # of disk, template or chart alike: the verdict stands
+        warn(f"report: {directory}: {in_words(error)}")
+    else:
+        if not options.json:
+            say(f"\nReport: {page}")
     unsafe = any(r.job.ftm and not r.result.safe for r in runs)
     failed = options.full and not all(cell.agrees for cell in cells(runs))
     return 1 if unsafe or failed else 0

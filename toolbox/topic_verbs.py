@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from actors import topics
+from actors.runtime import streams
 from actors.runtime.bounds import MANY
 from actors.runtime.envelope import Header
 from actors.runtime.limits import Remembered
@@ -164,7 +165,8 @@ async def topic_echo(options: argparse.Namespace) -> int:
         session.listen(topic, key, heard, garbage)
         loop = asyncio.get_running_loop()
         end = math.inf if options.duration is None else loop.time() + options.duration
-        while not (done.is_set() or is_over(session.run)) and (left := end - loop.time()) > 0:
+        while not (done.is_set() or is_over(session.run) or streams.lost()) and (
+                left := end - loop.time()) > 0:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(done.wait(), min(LOOK_S, left))
         _tell_end(session)
@@ -193,7 +195,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
         session.listen(topic, key, heard)
         loop = asyncio.get_running_loop()
         end = math.inf if duration_s is None else loop.time() + duration_s
-        while (left := end - loop.time()) > 0 and not is_over(session.run):
+        while (left := end - loop.time()) > 0 and not (is_over(session.run) or streams.lost()):
             await asyncio.sleep(min(_HZ_REPORT_S, left))
             if not options.json:
                 for short in sorted(arrivals):

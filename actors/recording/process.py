@@ -20,6 +20,7 @@ import setproctitle
 
 from actors.recording.bag_writer import BagError
 from actors.recording.recorder import RUN_ENDED, Recorder
+from actors.runtime import streams
 
 _ROOT = Path(__file__).resolve().parents[2]
 _READY = "ready"
@@ -83,7 +84,8 @@ class RecorderProcess:
             process.wait(_END_S)
         except subprocess.TimeoutExpired:
             process.kill()
-            process.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):  # as one that waits for its disk
+                process.wait(_END_S)
 
 
 def stop_pipe() -> int:
@@ -130,6 +132,8 @@ def told(recorder: Recorder) -> str:
     writer = recorder.writer
     if writer is None:
         return f"{recorder.path}: nothing was recorded"
+    if not recorder.path.exists():
+        return f"{recorder.path}: was taken away while it was written: nothing is recorded"
     lost = sum(writer.gaps.lost().values())
     parts = [f"{writer.messages} messages in {recorder.path}",
              *([f"{writer.garbage} of them garbage"] if writer.garbage else []),
@@ -148,4 +152,5 @@ def _say(text: str) -> None:
 
 
 if __name__ == "__main__":
+    streams.secure()
     sys.exit(record(msgspec.json.decode(sys.argv[1], type=Order)))

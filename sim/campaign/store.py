@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +24,7 @@ _FORMAT = "1"
 
 
 class StoreError(ValueError):
-    """The file cannot be used; the message is one line."""
+    """The file cannot be used, or not any more; the message is one line."""
 
 
 class Run(NamedTuple):
@@ -36,6 +37,9 @@ class Run(NamedTuple):
 class Store:
     """Results by the keys of their jobs.
 
+    A run is kept whole or not at all: a disk that fills up costs none of those before it. Every
+    method raises `StoreError` when the file cannot be read or written.
+
     Args:
         directory: Of the campaign; it is made if need be.
 
@@ -44,8 +48,12 @@ class Store:
     """
 
     def __init__(self, directory: Path) -> None:
-        directory.mkdir(parents=True, exist_ok=True)
         self.path = directory / FILE_NAME
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StoreError(f"{directory}: no directory that can be written ({error.strerror})"
+                             ) from None
         try:
             self._database = sqlite3.connect(self.path, timeout=30.0)
             self._database.execute("pragma journal_mode = wal")
@@ -63,31 +71,42 @@ class Store:
 
     def keys(self) -> set[str]:
         """Return the keys of the runs that are there."""
-        return {key for (key,) in self._database.execute("select key from runs")}
+        with self._told():
+            return {key for (key,) in self._database.execute("select key from runs")}
 
     def add(self, job: Job, result: RunResult) -> None:
         """Keep a run; one that is there already stays as it is."""
-        with self._database:
+        with self._told(), self._database:
             self._database.execute(
                 "insert or ignore into runs (key, job, result) values (?, ?, ?)",
                 (job.key, msgspec.msgpack.encode(job), msgspec.msgpack.encode(result)))
 
     def find(self, key: str) -> Run | None:
         """Return the run whose key begins so, if there is exactly one."""
-        found = self._database.execute(
-            "select job, result from runs where key like ? limit 2", (f"{key}%",)).fetchall()
-        return _run(*found[0]) if len(found) == 1 else None
+        with self._told():
+            found = self._database.execute(
+                "select job, result from runs where key like ? limit 2", (f"{key}%",)).fetchall()
+            return _run(*found[0]) if len(found) == 1 else None
 
     def runs(self, keys: set[str] | None = None) -> Iterator[Run]:
         """Yield the runs in the order in which they were made; all, or those with the keys."""
-        for key, job, result in self._database.execute(
-                "select key, job, result from runs order by rowid"):
-            if keys is None or key in keys:
-                yield _run(job, result)
+        with self._told():
+            for key, job, result in self._database.execute(
+                    "select key, job, result from runs order by rowid"):
+                if keys is None or key in keys:
+                    yield _run(job, result)
 
     def close(self) -> None:
         """Close the file."""
-        self._database.close()
+        with self._told():
+            self._database.close()
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, msgspec.MsgspecError, OSError) as error:
+            raise StoreError(f"{self.path}: {' '.join(str(error).split())}") from None
 
 
 def _run(job: bytes, result: bytes) -> Run:
