@@ -24,6 +24,7 @@ import systems
 from actors.recording.bag_writer import BagError, check_target
 from actors.recording.process import Order, RecorderProcess
 from actors.recording.virtual import VirtualRecording
+from actors.runtime.plain_text import one_line
 from actors.runtime.topic import Topic
 from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
 from actors.runtime.wiring import load_class
@@ -231,7 +232,7 @@ class Run:
                 print(f"launch.py: {recording.close()}", file=sys.stderr)
         self._console.speed(result.speed, result.messages, result.trace)
         for name, error in result.failures:
-            print(f"launch.py: {name} failed: {error}", file=sys.stderr)
+            print(f"launch.py: {name} failed: {one_line(error)}", file=sys.stderr)
         if result.tracebacks:
             with Path(self._plan.error_log).open("a", encoding="utf-8") as log:
                 log.write(result.tracebacks)
@@ -242,7 +243,7 @@ class Run:
         self._console.conclusion(record, html)
         for fault in record.faults:
             if not fault.effective:
-                print(f"launch.py: fault {fault.fault} had no effect: {fault.reason}",
+                print(f"launch.py: fault {fault.fault} had no effect: {one_line(fault.reason)}",
                       file=sys.stderr)
         if self._options.json:
             print(json.dumps(summary(record, report=str(html), record=str(data), **more)),
