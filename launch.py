@@ -25,6 +25,7 @@ from actors.recording.bag_writer import BagError, check_target
 from actors.recording.process import Order, RecorderProcess
 from actors.recording.virtual import VirtualRecording
 from actors.runtime import streams, working_folder
+from actors.runtime.plain_text import one_line
 from actors.runtime.topic import Topic
 from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
 from actors.runtime.wiring import load_class
@@ -234,7 +235,7 @@ class Run:
                 _say(recording.close())
         self._console.speed(result.speed, result.messages, result.trace)
         for name, error in result.failures:
-            _say(f"{name} failed: {error}")
+            _say(f"{name} failed: {one_line(error)}")
         if result.tracebacks:
             try:
                 with Path(self._plan.error_log).open("a", encoding="utf-8") as log:
@@ -251,7 +252,7 @@ class Run:
             _say(f"report: {report.problem}")
         for fault in record.faults:
             if not fault.effective:
-                _say(f"fault {fault.fault} had no effect: {fault.reason}")
+                _say(f"fault {fault.fault} had no effect: {one_line(fault.reason)}")
         if self._options.json:
             _print_result(summary(
                 record, report=str(report.html) if report.html else None,

@@ -45,6 +45,7 @@ from toolbox.output import (
     print_json,
     print_table,
     say,
+    say_text,
     unknown,
     warn,
 )
@@ -87,7 +88,8 @@ def campaign(options: argparse.Namespace) -> int:
         warn(f"report: {directory}: {in_words(error)}")
     else:
         if not options.json:
-            say(f"\nReport: {page}")
+            say()
+            say(f"Report: {page}")
     unsafe = any(r.job.ftm and not r.result.safe for r in runs)
     failed = options.full and not all(cell.agrees for cell in cells(runs))
     return 1 if unsafe or failed else 0
@@ -302,7 +304,7 @@ def _replay(options: argparse.Namespace) -> int:
         print_json({"run": found.job.key, "job": found.job, "same_trace": same,
                     "report": str(html), "record": str(data)})
     else:
-        say(f"{found.job.key}: {found.job.text()}\n"
+        say_text(f"{found.job.key}: {found.job.text()}\n"
             f"{again.record.mission}, {again.record.safety}; "
             f"{'; '.join(again.record.reasons) or 'as it should be'}\n"
             f"{'the same run, to the byte' if same else 'NOT the same run: the program changed'}\n"
@@ -334,7 +336,8 @@ def _show(options: argparse.Namespace, spec: SystemSpec, runs: Sequence[Run], ma
             [_cells(row) for row in shown[:60]])
         if len(shown) > 60:
             say(f"... and {len(shown) - 60} rows more, in the report")
-    say(f"\n{len(runs)} runs, {made} of them made now")
+    say()
+    say(f"{len(runs)} runs, {made} of them made now")
     protected = [run for run in runs if run.job.ftm and run.job.faults]
     if protected:
         all_of_them = total(protected, "all")
@@ -364,13 +367,16 @@ def _milliseconds(found: Spread | None) -> str:
 
 
 def _show_paper(spec: SystemSpec, runs: Sequence[Run]) -> None:
-    say("Table III: what is executed\n")
+    say("Table III: what is executed")
+    say()
     print_table(("active", "block", "paper", "ours", ""), [
         (", ".join(row.active), row.block, ", ".join(row.paper), ", ".join(row.ours),
          "agrees" if row.agrees else f"DIFFERS: block {row.our_block}")
         for row in table_iii(spec)])
     for title in ("IV", "V"):
-        say(f"\nTable {title}: mission and safety, worst run of each row\n")
+        say()
+        say(f"Table {title}: mission and safety, worst run of each row")
+        say()
         print_table(("condition", "fault", "obst.", "paper", "ours", "runs", "no effect",
                      "success", "safe", ""),
                     [(c.condition, c.fault, c.obstacles, c.paper, c.ours, c.runs, c.ineffective,
@@ -393,7 +399,8 @@ def _show_full(runs: Sequence[Run]) -> None:
 def _show_differing(found: Iterable[Cell]) -> None:
     for cell in found:
         if not cell.agrees:
-            say(f"\n{cell.condition}, {cell.fault}, {cell.obstacles} obstacles: paper "
+            say()
+            say(f"{cell.condition}, {cell.fault}, {cell.obstacles} obstacles: paper "
                 f"{cell.paper}, ours {cell.ours}; worst run {cell.worst_key}, "
                 f"{cell.worst_fault}\n  "
                 f"{cell.story or 'no decision'}\n  {'; '.join(cell.reasons) or 'nothing amiss'}")

@@ -66,7 +66,8 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
     else:
         print_table(("margin", "run", "faults"), [
             (f"{margin(result):.3f} m", job.key, job.text()) for job, result in made[:10]])
-        say(f"\n{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} m")
+        say()
+        say(f"{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} m")
         for job, path in shrunk:
             say(f"counterexample: {job.text()}, {job.obstacles} obstacles, seed {job.seed}: "
                 f"{path or 'not written'}")

@@ -21,7 +21,16 @@ from actors.runtime.limits import Remembered
 from actors.runtime.topic import Topic
 from toolbox import systems
 from toolbox.following import LOOK_S, is_over
-from toolbox.output import NoEffectError, UsageError, print_json, print_table, say, unknown, warn
+from toolbox.output import (
+    NoEffectError,
+    UsageError,
+    print_json,
+    print_table,
+    say,
+    say_text,
+    unknown,
+    warn,
+)
 from toolbox.session import Session, connect
 from toolbox.topic_catalogue import MAILBOX, fields, markdown, resolve, topics_for, uses
 
@@ -90,7 +99,7 @@ def topic_list(options: argparse.Namespace) -> int:
     """Print all topics."""
     spec = systems.load(options.system)
     if options.markdown:
-        say(markdown(spec).rstrip("\n"))
+        say_text(markdown(spec).rstrip("\n"))
         return 0
     table = uses(spec)
     if options.json:

@@ -21,6 +21,7 @@ import setproctitle
 from actors.recording.bag_writer import BagError
 from actors.recording.recorder import RUN_ENDED, Recorder
 from actors.runtime import streams
+from actors.runtime.plain_text import one_line
 
 _ROOT = Path(__file__).resolve().parents[2]
 _READY = "ready"
@@ -148,7 +149,7 @@ def _answer(text: str) -> None:
 
 
 def _say(text: str) -> None:
-    print("rampart: " + " ".join(text.split()), file=sys.stderr, flush=True)
+    print(f"rampart: {one_line(text)}", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":
