@@ -114,7 +114,8 @@ def parser() -> argparse.ArgumentParser:
                    help="that token, 16 characters or more, to keep it over several runs "
                    "(default: a random one; on this machine none is needed)")
     p.add_argument("--port", metavar="PORT", type=int, default=DEFAULT_PORT,
-                   help=f"first of the run's Zenoh ports on loopback (default: {DEFAULT_PORT})")
+                   help="number that tells runs on this machine apart; no port is opened "
+                   f"(default: {DEFAULT_PORT})")
     p.add_argument("--joystick", metavar="DEVICE", nargs="?", const="auto", default="",
                    help="drive with a joystick or gamepad of this machine, e.g. /dev/input/js0 "
                    "(without DEVICE: the first one); hold its left shoulder button to drive")

@@ -25,6 +25,7 @@ from sim.report_record import RunRecord
 from sim.scenario import PlannedFault
 
 _LOOK_S = 0.05
+_STALL_S = 0.5
 
 
 class ProcessRun:
@@ -73,15 +74,16 @@ class ProcessRun:
 
         bus = launcher.observers_bus()
         sinks: list[Sink] = [to_launcher, *mission.sinks(clock)]
-        register = register_of(plan.folder)
+        of_the_run: dict[str, Any] = {
+            "register": register_of(plan.folder), "members": frozenset(launcher.names)}
         actors: list[Actor] = [Observer(Context(
-            OBSERVER, 1, clock, bus, {}, {"sinks": sinks}, register=register))]
+            OBSERVER, 1, clock, bus, {}, {"sinks": sinks}, **of_the_run))]
         injector = None
         if self._scenario:
             shared = {"scenario": self._scenario, "hand": ProcessHand(plan.base_port),
                       "nodes": can_be_hit(self._spec), "topics": system_topics(self._spec)}
             injector = Injector(Context(
-                INJECTOR, 1, clock, SharedBus(bus), {}, shared, register=register))
+                INJECTOR, 1, clock, SharedBus(bus), {}, shared, **of_the_run))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         for task, actor in zip(tasks, actors, strict=True):
@@ -92,7 +94,11 @@ class ProcessRun:
         try:
             why = None
             while why is None and not self.interrupted and not launcher.failure:
+                looked_s = clock.now()
                 await asyncio.sleep(_LOOK_S)
+                stall_s = clock.now() - looked_s - _LOOK_S * plan.rate
+                if stall_s > _STALL_S * plan.rate:  # ctrl-Z; what was sent meanwhile comes now
+                    mission.excuse(stall_s)
                 why = mission.over(clock.now())
             if launcher.failure:
                 why = launcher.failure

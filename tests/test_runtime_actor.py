@@ -19,7 +19,7 @@ from actors import topics
 from actors.runtime.actor import Actor, Context, Header, every, on
 from actors.runtime.bus import Bus, BusError
 from actors.runtime.clock import Clock
-from actors.runtime.envelope import encode
+from actors.runtime.envelope import ArrivalGuard, encode
 from actors.runtime.virtual_bus import Hub, VirtualBus
 from actors.runtime.wiring import load_class
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
@@ -170,6 +170,19 @@ async def test_a_superseded_incarnation_is_refused(make_bus):
             talker._bus.publish(topics.POSE, topics.POSE.at(), stale)
             await eventually(lambda: listener._rejected == 1)
             assert [body.x_m for body, _ in listener.heard] == [2.0]
+
+
+@pytest.mark.parametrize("forged", [1, 3, 77, 2 ** 31 - 1])
+def test_an_incarnation_that_was_not_issued_last_makes_nobody_deaf_to_the_real_one(forged):
+    taken, refused = [], []
+    guard = ArrivalGuard(lambda: 10.0, register={"talker": 2}.get)
+    receive = guard.receiver(topics.POSE, lambda _key, message: taken.append(message.incarnation),
+                             lambda _key, reason: refused.append(reason))
+    for life, source in ((forged, "talker"), (2, "talker"), (forged, "talker"), (5, "a tool")):
+        receive("k", encode(Header(source, life, 1, 1.0), m.Pose(0.0, 0.0, 0.0)))
+    assert taken == [2, 5]
+    assert refused[0] == f"incarnation {forged} of talker, of which 2 was issued last"
+    assert len(refused) == 2
 
 
 async def test_a_command_that_comes_twice_is_handled_once(make_bus):

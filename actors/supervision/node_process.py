@@ -52,7 +52,8 @@ def make_actor(
         name, incarnation, clock, bus, member.parameters, shared,
         register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
-        heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed))
+        heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
+        members=frozenset(layout.members)))
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:

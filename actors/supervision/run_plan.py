@@ -232,7 +232,10 @@ def adapted_system(
         ValueError: the changed system is unsound, has other processes, or names a module that the
             system as it was started does not. The manager lets none of this happen; a message may.
     """
-    document = msgspec.json.decode(adapted.document, type=dict[str, Any])
+    try:
+        document = msgspec.json.decode(adapted.document, type=dict[str, Any])
+    except RecursionError:
+        raise ValueError("the changed system is nested too deep") from None
     spec = tailor(layout.plan, check_document(document, layout.plan.system_file))
     check_modules(layout.spec, spec)
     if spec.processes().keys() != layout.units.keys():

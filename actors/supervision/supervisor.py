@@ -42,6 +42,8 @@ from actors.messages import (
     RespawnRequest,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
+from actors.runtime.limits import RateLimit
 from actors.runtime.timer import Timer
 from actors.runtime.topic import Topic
 from actors.supervision.patience import AT_LEISURE, Patience
@@ -63,6 +65,9 @@ STOP_GRACE_S = 0.5
 
 START_TIMEOUT_S = 3.0
 """Wall seconds in which a new process must have sent its first heartbeat."""
+
+PASSED_ON_PER_S = 200
+"""Error reports, orders and results of injections that are passed on in a simulated second."""
 
 _CHECK_S = 0.1
 """Simulated seconds between two looks at who is silent."""
@@ -136,6 +141,7 @@ class Supervisor(Actor):
         if adapted is not None:
             self._machine.adapt(adapted)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
+        self._passed_on = RateLimit(PASSED_ON_PER_S)
         self._loop = asyncio.get_running_loop()
         self._checked_s = self._loop.time()
 
@@ -211,18 +217,21 @@ class Supervisor(Actor):
 
     @on(topics.DIAGNOSTIC)
     def diagnostic(self, message: Diagnostic, _header: Header) -> None:
-        """Pass a node's error report on to whoever shows it."""
-        self.publish(topics.ERROR_REPORT, message)
+        """Pass a node's error report on to whoever shows it, unless there are too many."""
+        if self._passed_on.allows(self.clock.now()):
+            self.publish(topics.ERROR_REPORT, message)
 
     @on(topics.INJECTION_REQUEST)
     def inject(self, message: Injection, _header: Header) -> None:
         """Order a fault for the operator's page; whoever publishes the topic hears it."""
-        self.publish(topics.INJECT, message)
+        if self._passed_on.allows(self.clock.now()):
+            self.publish(topics.INJECT, message)
 
     @on(topics.INJECTION_REPORT)
     def injected(self, message: InjectionReport, _header: Header) -> None:
         """Pass on what came of a fault."""
-        self.publish(topics.INJECTION_RESULT, message)
+        if self._passed_on.allows(self.clock.now()):
+            self.publish(topics.INJECTION_RESULT, message)
 
     @on(topics.ADAPTED_SYSTEM)
     def adapted(self, message: AdaptedSystem, header: Header) -> None:
@@ -253,7 +262,8 @@ class Supervisor(Actor):
         unit = self._layout.unit_of.get(request.node)
         if unit is None:
             self.publish(topics.PROCESS_EVENT, ProcessEvent(
-                request.node, "refused", 0, 0, request.by, f"no such node: {request.node!r}"))
+                request.node, "refused", 0, 0, request.by,
+                clip(f"no such node: {request.node!r}")))
             return
         process = self._processes[unit]
         if process.state in _HEALTHY and process.incarnation > request.failed_incarnation:
@@ -293,6 +303,10 @@ class Supervisor(Actor):
     def repeat(self) -> None:
         """Repeat the node table for whoever joined late."""
         self._publish_table()
+        left_out = self._passed_on.left_out(self.clock.now())
+        if left_out:
+            self.report_diagnostic(
+                "passing on", f"{left_out} more messages were not passed on", self.name)
 
     def _discount_own_stall(self, now: float) -> None:
         # Who was stopped, starved or waiting for a hung spawner has heard nobody meanwhile. What
@@ -486,7 +500,7 @@ class Supervisor(Actor):
     def _event(self, process: _Process, event: str, by: str, detail: str = "") -> None:
         for node in process.unit.nodes:
             self.publish(topics.PROCESS_EVENT, ProcessEvent(
-                node.name, event, process.pid, process.incarnation, by, detail))
+                node.name, event, process.pid, process.incarnation, by, clip(detail)))
 
     def _publish_table(self) -> None:
         rows = [NodeInfo(self.name, Kind.SUPERVISION.value, self.context.pid, NodeState.RUNNING,
