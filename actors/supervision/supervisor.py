@@ -6,6 +6,9 @@
 * *Wedged*: no heartbeat although the process runs: its event loop turns no more. Of the manager,
   whose silence stops the robot, the status counts as much as the heartbeat.
 
+Who waits for a processor is neither (see `patience`): on a machine that stands still for half a
+second all are silent, and replacing them all would keep it busy for longer.
+
 What a recovery module owns (RM3, RM4) is respawned on that module's request, so that the FTM
 Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order,
 stop in reverse, SIGTERM before SIGKILL, a bounded restart intensity. What is given up on is not
@@ -43,6 +46,7 @@ from actors.runtime.bounds import clip
 from actors.runtime.limits import RateLimit
 from actors.runtime.timer import Timer
 from actors.runtime.topic import Topic
+from actors.supervision.patience import AT_LEISURE, Patience
 from actors.supervision.processes import (
     Living,
     OsProcesses,
@@ -93,6 +97,7 @@ class _Process:
 
     unit: Unit
     policy: RestartPolicy
+    patience: Patience
     pid: int = 0
     handle: ProcessHandle | None = None
     unheld: bool = False
@@ -125,7 +130,8 @@ class Supervisor(Actor):
         self._machine: Processes = context.shared.get("processes") or OsProcesses(
             self._plan.base_port, self._plan.launcher_pid, self._plan.folder)
         self._processes = {
-            u.name: _Process(u, RestartPolicy()) for u in self._layout.units.values()}
+            u.name: _Process(u, RestartPolicy(), Patience(2 * _CHECK_S / self._plan.rate))
+            for u in self._layout.units.values()}
         for node, incarnation in context.shared.get("known_incarnations", {}).items():
             if node in self._layout.unit_of:
                 process = self._processes[self._layout.unit_of[node]]
@@ -275,13 +281,23 @@ class Supervisor(Actor):
         self._discount_own_stall(now)
         for process in self._processes.values():
             if process.state is NodeState.STARTING:
-                if now - process.started_s > START_TIMEOUT_S:
+                if self._has_been_silent(process, process.started_s, START_TIMEOUT_S):
                     self._event(process, "wedged", self.name, "no heartbeat after its start")
                     self._lost(process, NodeState.WEDGED)
             elif process.state is NodeState.RUNNING:
                 silent = [n for n, at in process.heard_s.items() if now - at > self._timeout_s]
-                if silent:
+                heard_s = min(process.heard_s.values(), default=now)
+                if self._has_been_silent(process, heard_s, self._timeout_s) and silent:
                     self._silent(process, silent)
+
+    def _has_been_silent(self, process: _Process, since_s: float, limit_s: float) -> bool:
+        """Whether a process that is silent since then could have been heard for so long."""
+        now = self._loop.time()
+        if now - since_s <= limit_s / 2:  # not worth a look into /proc
+            process.patience.answered()
+            return False
+        used = process.handle.usage() if process.handle is not None else AT_LEISURE
+        return process.patience.look(now, process.pid, used, since_s) > limit_s
 
     @every(0.5)
     def repeat(self) -> None:
