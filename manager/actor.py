@@ -41,6 +41,7 @@ from manager.arbiter_memory import Memory, objection, recall, remember
 from manager.detection_track import overdue
 from manager.recovery_track import Command, Phase
 from manager.schema import SystemSpec
+from manager.specification import check_modules
 
 MANAGER_STATE = StateFormat(Memory, version=1, objection=objection)
 
@@ -167,6 +168,7 @@ class FtmManager(Actor):
         busy = self.arbiter_state.busy
         if busy:
             return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"
+        check_modules(self._system, system)
         for detection in system.detections:
             load_class(detection.actor, topics.DETECTION)
         for recovery in system.recoveries:

@@ -20,7 +20,7 @@ from actors.runtime.clock import Clock
 from actors.runtime.envelope import UNREADABLE, Header, decode, encode
 from actors.runtime.tap import Tap
 from actors.runtime.topic import ROOT, Topic
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
+from actors.runtime.zenoh_bus import ZenohBus
 from actors.supervision.run_info import NoRunError, RunInfo, find_run
 from toolbox.output import UsageError
 
@@ -150,8 +150,7 @@ async def connect(port: int | None = None) -> AsyncIterator[Session]:
         run = find_run(port)
     except NoRunError as error:
         raise UsageError(str(error)) from None
-    ports = dict.fromkeys(run.nodes.values())  # a replay plays all nodes on one
-    bus = ZenohBus("", 0, None, map(endpoint, ports), Tap(run.base_port))
+    bus = ZenohBus("", 0, None, run.endpoints, Tap(run.base_port))
     try:
         await bus.open()
     except BusError as error:

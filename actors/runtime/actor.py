@@ -29,6 +29,7 @@ from actors.runtime.envelope import ArrivalGuard, Envelope, Header, pack
 from actors.runtime.injection_desk import InjectionDesk
 from actors.runtime.mailbox import Mailbox
 from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection
+from actors.runtime.run_folder import Register
 from actors.runtime.timer import Timer
 from actors.runtime.topic import Qos, Topic
 from actors.runtime.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
@@ -72,6 +73,7 @@ class Context:
         checkpoints: where this node's state is kept.
         heartbeat_period_s: simulated seconds between two heartbeats.
         failed: told of the error that ends the actor, while its peers still believe that it lives.
+        register: returns the incarnation of a node that was issued last, None if it is not known.
     """
 
     name: str
@@ -84,6 +86,7 @@ class Context:
     checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
     heartbeat_period_s: float = 0.1
     failed: Callable[[Exception], None] = lambda _error: None
+    register: Register = lambda _node: None
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:
@@ -138,7 +141,7 @@ class Actor:
         self.clock = context.clock
         self.parameters = context.parameters
         self._bus = context.bus
-        self._guard = ArrivalGuard(context.clock.now)
+        self._guard = ArrivalGuard(context.clock.now, context.register)
         self._injections = InjectionDesk(self)
         self._in_force = self._injections.gate.in_force
         self._last_sent = self._injections.gate.last

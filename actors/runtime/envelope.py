@@ -1,8 +1,9 @@
 """The wire format: a msgpack array of header and body, and the guard that checks what arrives.
 
 `[source, incarnation, sequence, stamp, body]`. The guard refuses what does not decode, what an
-older incarnation of a node still sends after its successor was heard, what comes twice, and what is
-stamped ahead of now: it would stay fresh for ever, and shut out all that is true after it.
+older incarnation of a node still sends after its successor was heard or started, what claims an
+incarnation that was never issued, what comes twice, and what is stamped ahead of now: it would stay
+fresh for ever, and shut out all that is true after it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
+from actors.runtime.run_folder import Register
 from actors.runtime.topic import Qos, Topic
 
 B = TypeVar("B")
@@ -84,10 +86,14 @@ class ArrivalGuard:
 
     Args:
         now: returns simulated seconds.
+        register: returns the incarnation of a node that was issued last; None if that is not known,
+            as of tools.
     """
 
-    def __init__(self, now: Callable[[], float]) -> None:
+    def __init__(self, now: Callable[[], float],
+                 register: Register = lambda _node: None) -> None:
         self._now = now
+        self._register = register
         self._lives: dict[str, Life] = {}
 
     def receiver(
@@ -104,7 +110,7 @@ class ArrivalGuard:
         """
         unpack, kind = _decoders.get(topic.type) or _decoder(topic.type), topic.type.__name__
         lives, meet, is_command = self._lives, self._meet, topic.qos is Qos.COMMAND
-        now = self._now
+        now, register = self._now, self._register
 
         def receive(key: str, payload: bytes) -> None:  # made of every message
             try:
@@ -120,6 +126,11 @@ class ArrivalGuard:
                 if life is not None and message.incarnation < life[0]:
                     refuse(key, f"incarnation {message.incarnation} of {message.source} "
                                 f"was superseded by {life[0]}")
+                    return
+                issued = register(message.source)
+                if issued is not None and message.incarnation != issued:
+                    refuse(key, f"incarnation {message.incarnation} of {message.source}, "
+                                f"of which {issued} was issued last")
                     return
                 life = meet(message.source, message.incarnation)
             sequence = message.sequence

@@ -10,7 +10,9 @@ What a recovery module owns (RM3, RM4) is respawned on that module's request, so
 Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order,
 stop in reverse, SIGTERM before SIGKILL, a bounded restart intensity. What is given up on is not
 hidden: a silent detection module counts as active, a silent manager stops the Safety Pilot, a
-silent Safety Pilot trips the dead man.
+silent Safety Pilot trips the dead man. Nor is that the end: the supervisor goes on with single
+attempts until one of them lasts. A request is carried out when the new process was heard: until
+then the supervisor repeats it by itself, for the module that asked may have missed its deadline.
 """
 
 from __future__ import annotations
@@ -44,6 +46,7 @@ from actors.supervision.processes import (
     OsProcesses,
     Processes,
     ProcessHandle,
+    SpawnerBusyError,
     SpawnerUnavailableError,
 )
 from actors.supervision.restart_policy import RestartPolicy
@@ -60,10 +63,14 @@ START_TIMEOUT_S = 3.0
 _CHECK_S = 0.1
 """Simulated seconds between two looks at who is silent."""
 
+_SEARCH_S = 0.05
+"""Wall seconds between two looks into /proc on account of one node's messages."""
+
 _STATUS = "fresh status of the manager"
 """Stands among the names of a process' nodes for what the Safety Pilot lives on."""
 
 _RETRY_S = 0.05
+_ASK_AGAIN_S = 0.01
 _DEAD = (NodeState.CRASHED, NodeState.GIVEN_UP)
 _HEALTHY = (NodeState.RUNNING, NodeState.STARTING)
 
@@ -75,18 +82,21 @@ class _Process:
     Attributes:
         unheld: It may be there, but there was no descriptor left to hold it by.
         highest: The highest incarnation that there was.
+        requested_by: The module that asked for it, until it was heard.
         next_step: Of its respawn, while that is under way; there is never more than one.
     """
 
     unit: Unit
-    policy: RestartPolicy = field(default_factory=RestartPolicy)
+    policy: RestartPolicy
     pid: int = 0
     handle: ProcessHandle | None = None
     unheld: bool = False
     incarnation: int = 0
     highest: int = 0
+    requested_by: str = ""
     state: NodeState = NodeState.CRASHED
     started_s: float = 0.0
+    searched_s: float = -math.inf
     heard_s: dict[str, float] = field(default_factory=dict)
     next_step: Timer | None = None
 
@@ -108,8 +118,9 @@ class Supervisor(Actor):
         self._spec: SystemSpec = context.shared["system"]
         self._layout = Layout(self._plan, self._spec)
         self._machine: Processes = context.shared.get("processes") or OsProcesses(
-            self._plan.base_port, self._plan.launcher_pid)
-        self._processes = {u.name: _Process(u) for u in self._layout.units.values()}
+            self._plan.base_port, self._plan.launcher_pid, self._plan.folder)
+        self._processes = {
+            u.name: _Process(u, RestartPolicy()) for u in self._layout.units.values()}
         for node, incarnation in context.shared.get("known_incarnations", {}).items():
             if node in self._layout.unit_of:
                 process = self._processes[self._layout.unit_of[node]]
@@ -160,7 +171,7 @@ class Supervisor(Actor):
 
     @on(topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
-        """Note that a node's loop turns; adopt a process that was not known."""
+        """Note that a node's loop turns; adopt a process that was not known, if the kernel does."""
         unit = self._layout.unit_of.get(header.source)
         if unit is None:
             return
@@ -168,12 +179,13 @@ class Supervisor(Actor):
         if header.incarnation > process.incarnation or (
                 header.incarnation == process.incarnation and process.pid != message.pid
                 and process.state in _DEAD):
-            self._adopt(process, message.pid, header.incarnation)
+            self._look_for(process)
         if (header.incarnation, message.pid) != (process.incarnation, process.pid):
             return
         if process.next_step is not None:  # said before it was killed
             return
         process.heard_s[header.source] = self._loop.time()
+        process.requested_by = ""
         if process.state in (NodeState.STARTING, NodeState.STOPPED, NodeState.WEDGED):
             resumed = process.state is not NodeState.STARTING
             process.state = NodeState.RUNNING
@@ -225,6 +237,7 @@ class Supervisor(Actor):
         for unit in {self._layout.unit_of[name] for name in changed}:
             process = self._processes[unit]
             process.unit = self._layout.units[unit]
+            self._anew(process)
             self._event(process, "adapted", self.name, message.change)
             self._respawn(process, self.name)
 
@@ -240,6 +253,7 @@ class Supervisor(Actor):
         if process.state in _HEALTHY and process.incarnation > request.failed_incarnation:
             self._event(process, "respawned", request.by, "already")
             return
+        process.requested_by = request.by
         self._respawn(process, request.by)
 
     # -- watching -------------------------------------------------------------------------------
@@ -285,8 +299,8 @@ class Supervisor(Actor):
     def _lost(self, process: _Process, state: NodeState) -> None:
         process.state = state
         self._publish_table()
-        if self._owns(process):
-            self._respawn(process, self.name)
+        if self._owns(process) or process.policy.attempts or process.requested_by:
+            self._respawn(process, process.requested_by or self.name)
 
     def _exited(self, process: _Process, pid: int) -> None:
         if process.pid != pid:  # it was replaced while the news waited in the mailbox
@@ -300,11 +314,9 @@ class Supervisor(Actor):
         self._event(process, "crashed", self.name, detail)
         if process.state is NodeState.STARTING:
             # Never heard: another life that nobody holds may have its port.
-            try:
-                if self._adopt_living(process, self._machine.living()):
-                    return
-            except OSError as error:  # no descriptor left to look with
-                self.report_diagnostic("search", str(error), process.unit.name)
+            process.searched_s = -math.inf
+            if self._look_for(process):
+                return
         self._lost(process, NodeState.CRASHED)
 
     def _owns(self, process: _Process) -> bool:
@@ -317,16 +329,15 @@ class Supervisor(Actor):
 
     def _respawn(self, process: _Process, by: str) -> None:
         if process.next_step is not None:
+            if process.state is NodeState.GIVEN_UP:
+                self._event(process, "given up", by, "an attempt will follow by itself")
             return
         delay_s = process.policy.delay_s(self._loop.time())
         if process.handle is not None:
             process.handle.ignore()
             process.handle.kill()
         if delay_s is None:
-            process.state = NodeState.GIVEN_UP
-            self._event(process, "given up", by, (
-                f"{process.policy.intensity} restarts in {process.policy.period_s:.0f} s"))
-            self._publish_table()
+            self._give_up(process, by)
             return
         if process.state in _HEALTHY:
             process.state = NodeState.CRASHED
@@ -335,6 +346,23 @@ class Supervisor(Actor):
             self._go_on(process, max(delay_s, 0.002), lambda: self._finish_respawn(process, by))
         else:
             self._finish_respawn(process, by)
+
+    def _give_up(self, process: _Process, by: str) -> None:
+        policy, failed = process.policy, process.policy.attempts
+        wait_s = policy.attempt_in_s(self._loop.time())
+        process.state = NodeState.GIVEN_UP
+        self._event(process, "given up", by, (
+            f"attempt {failed} failed" if failed else
+            f"{policy.intensity} restarts in {policy.period_s:.0f} s"
+        ) + f", the next attempt is in {wait_s:.0f} s")
+        self._publish_table()
+        self._go_on(process, wait_s, lambda: self._finish_respawn(process, self.name))
+
+    def _anew(self, process: _Process) -> None:
+        """Forget that it was given up: it will be another one, and may do better."""
+        if process.state is NodeState.GIVEN_UP and process.next_step is not None:
+            process.next_step.cancel()
+            process.next_step, process.policy = None, RestartPolicy()
 
     def _go_on(self, process: _Process, delay_s: float, step: Callable[[], None]) -> None:
         process.next_step = self.call_later(delay_s * self.clock.rate, step)
@@ -350,6 +378,9 @@ class Supervisor(Actor):
         incarnation = process.highest + 1
         try:
             pid = self._machine.fork(process.names, incarnation)
+        except SpawnerBusyError:
+            self._go_on(process, _ASK_AGAIN_S, lambda: self._spawn(process, by))
+            return
         except (SpawnerUnavailableError, OSError) as error:
             self.report_diagnostic("fork", str(error), process.unit.name)
             self._go_on(process, _RETRY_S, lambda: self._spawn(process, by))
@@ -358,7 +389,9 @@ class Supervisor(Actor):
         self._take(process, pid, incarnation)
         process.state = NodeState.STARTING
         process.started_s = self._loop.time()
-        self._event(process, "started" if first else "respawned", by)
+        attempt = process.policy.attempts
+        self._event(process, "started" if first else "respawned", by, (
+            f"attempt {attempt} since it was given up" if attempt else ""))
         self._publish_table()
         self._hold(process, pid)
 
@@ -370,6 +403,22 @@ class Supervisor(Actor):
         self._event(process, "adopted", self.name)
         self._hold(process, pid)
 
+    def _look_for(self, process: _Process) -> bool:
+        """Adopt what lives and was not known, as the kernel knows it: a message may name any pid.
+
+        Returns:
+            Whether there is one.
+        """
+        now = self._loop.time()
+        if now - process.searched_s < _SEARCH_S:
+            return False
+        process.searched_s = now
+        try:
+            return self._adopt_living(process, self._machine.living())
+        except OSError as error:  # no descriptor left to look with
+            self.report_diagnostic("search", str(error), process.unit.name)
+            return False
+
     def _adopt_living(self, process: _Process, living: Sequence[Living]) -> bool:
         """Adopt the highest life that is there and end the others; False if there is none."""
         found = sorted((p for p in living if p.names == process.names),
@@ -379,7 +428,7 @@ class Supervisor(Actor):
                 handle = self._machine.hold(other.pid, lambda: None)
                 handle.kill()
                 handle.close()
-        if found:
+        if found and (found[0].pid != process.pid or process.state in _DEAD):
             self._adopt(process, found[0].pid, found[0].incarnation)
         return bool(found)
 
