@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+import numpy as np
 import shapely
-from shapely.geometry import LineString
 
 from airport.errors import Problem
+from airport.limits import MAX_GOALS_BY_EDGES, sides
 from airport.model import GOAL_MODES, GRAPH_REACH_M, Airport, Mission
 
 MIN_EDGE_CLEARANCE_M = 0.5
@@ -25,6 +26,7 @@ def problems(airport: Airport) -> Iterator[Problem]:
     yield from _ground(airport)
     yield from _lights(airport)
     yield from _obstacles(airport)
+    yield from _search(sum(len(m.goals) for m in airport.missions.values()), "missions", airport)
     for mission in airport.missions.values():
         yield from mission_problems(mission, airport)
 
@@ -48,6 +50,12 @@ def _graph(airport: Airport) -> Iterator[Problem]:
                           tolerable=True)
 
 
+def _search(goals: int, where: str, airport: Airport) -> Iterator[Problem]:
+    if goals * len(airport.edges) > MAX_GOALS_BY_EDGES:
+        yield Problem(where, f"{goals} goals on {len(airport.edges)} edges",
+                      f"their product must be at most {MAX_GOALS_BY_EDGES}")
+
+
 def _ground(airport: Airport) -> Iterator[Problem]:
     if airport.allowed.is_empty:
         yield Problem("surface", "empty", "the airport needs pavement to drive on")
@@ -63,22 +71,37 @@ def _ground(airport: Airport) -> Iterator[Problem]:
     if off_m > GRAPH_REACH_M:
         yield Problem("start", f"({start.x_m:g}, {start.y_m:g})",
                       f"{off_m:.1f} m from the graph; must be within {GRAPH_REACH_M:g} m")
-    inside = set()
-    for name, (x_m, y_m) in airport.nodes.items():
-        if airport.prohibited_distance_m(x_m, y_m) <= 0:
-            inside.add(name)
-            yield Problem(f"nodes.{name}", f"({x_m:g}, {y_m:g})",
-                          "in the prohibited area; put it on the pavement", tolerable=True)
-    for i, (a, b) in enumerate(airport.edges):
-        if inside & {a, b}:
-            continue
-        line = LineString([airport.nodes[a], airport.nodes[b]])
-        if not shapely.covers(airport.allowed, line):
+    off = _off_pavement(airport, list(airport.nodes.values()))
+    inside = [name for name, is_off in zip(airport.nodes, off, strict=True) if is_off]
+    for name in inside:
+        x_m, y_m = airport.nodes[name]
+        yield Problem(f"nodes.{name}", f"({x_m:g}, {y_m:g})",
+                      "in the prohibited area; put it on the pavement", tolerable=True)
+    yield from _edges(airport, set(inside))
+
+
+def _edges(airport: Airport, inside: set[str]) -> Iterator[Problem]:
+    """Yield edges that lead over grass or near it; those of nodes that are on it go without."""
+    edges = [(i, *edge) for i, edge in enumerate(airport.edges) if not inside & {*edge}]
+    lines = shapely.linestrings(
+        np.reshape([(airport.nodes[a], airport.nodes[b]) for _, a, b in edges], (-1, 2, 2)))
+    paved = shapely.covers(airport.allowed, lines)
+    rings = shapely.get_rings(shapely.get_parts(airport.allowed))
+    _, clear_m = shapely.STRtree(sides(rings)).query_nearest(
+        lines, all_matches=False, return_distance=True)
+    for (i, a, b), is_paved, distance_m in zip(edges, paved, clear_m, strict=True):
+        if not is_paved:
             yield Problem(f"edges[{i}]", f"{a} to {b}", "passes through the prohibited area; "
                           "lead it over pavement", tolerable=True)
-        elif shapely.distance(airport.allowed.boundary, line) < MIN_EDGE_CLEARANCE_M:
+        elif distance_m < MIN_EDGE_CLEARANCE_M:
             yield Problem(f"edges[{i}]", f"{a} to {b}", "nearer to the prohibited area than "
                           f"{MIN_EDGE_CLEARANCE_M:g} m; the robot needs more room", tolerable=True)
+
+
+def _off_pavement(airport: Airport, points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Tell of each point whether it lies in the prohibited area or on its boundary."""
+    x_m, y_m = np.reshape(points, (-1, 2)).T
+    return [not paved for paved in shapely.contains_xy(airport.allowed, x_m, y_m).tolist()]
 
 
 def _lights(airport: Airport) -> Iterator[Problem]:
@@ -86,11 +109,12 @@ def _lights(airport: Airport) -> Iterator[Problem]:
     for name, times in names.items():
         if times > 1:
             yield Problem("row", repr(name), "two lights of this name; names must be unique")
-    for light in airport.lights:
+    off = _off_pavement(airport, [(light.x_m, light.y_m) for light in airport.lights])
+    for light, is_off in zip(airport.lights, off, strict=True):
         if not light.nominal_cd > 0:
             yield Problem(f"row.{light.name}.nominal_cd", f"{light.nominal_cd:g}",
                           "the nominal intensity must be positive")
-        if airport.prohibited_distance_m(light.x_m, light.y_m) <= 0:
+        if is_off:
             yield Problem(f"row.{light.name}", f"({light.x_m:g}, {light.y_m:g})",
                           "off the pavement; inset lights lie in it", tolerable=True)
 
@@ -119,8 +143,8 @@ def mission_problems(mission: Mission, airport: Airport) -> Iterator[Problem]:
     where = f"missions.{mission.name}"
     if not mission.goals:
         yield Problem(where, "empty", "a mission needs at least one goal")
-    start = airport.nearest_on_graph(airport.start.x_m, airport.start.y_m)
-    reachable = airport.component(start.a)
+    yield from _search(len(mission.goals), where, airport)
+    off = _off_pavement(airport, [(goal.x_m, goal.y_m) for goal in mission.goals])
     for i, goal in enumerate(mission.goals):
         at = f"({goal.x_m:g}, {goal.y_m:g})"
         spot = f"{where}.goals[{i}]"
@@ -133,8 +157,8 @@ def mission_problems(mission: Mission, airport: Airport) -> Iterator[Problem]:
         if nearest.distance_m > GRAPH_REACH_M:
             yield Problem(spot, at, f"{nearest.distance_m:.1f} m from the graph; a mission point "
                           f"must be within {GRAPH_REACH_M:g} m of it")
-        elif nearest.a not in reachable:
+        elif nearest.a not in airport.within_reach:
             yield Problem(spot, at, "no way there from the start; connect the graph")
-        if airport.prohibited_distance_m(goal.x_m, goal.y_m) <= 0:
+        if off[i]:
             yield Problem(spot, at, "in the prohibited area; put it on the pavement",
                           tolerable=True)

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from files.reading import plain_line
+
 
 class AirportError(ValueError):
     """An airport or mission file is wrong: one line naming file, field, value and the remedy."""
+
+    def __init__(self, line: str) -> None:
+        super().__init__(plain_line(line))
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,4 +32,4 @@ class Problem:
 
     def line(self, file: str) -> str:
         """Return the one-line message for `file`."""
-        return f"{file}: {self.field}: {self.value}: {self.remedy}"
+        return plain_line(f"{file}: {self.field}: {self.value}: {self.remedy}")

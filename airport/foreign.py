@@ -20,10 +20,15 @@ import shapely
 from shapely.geometry import MultiPoint, MultiPolygon
 
 from airport.errors import AirportError
+from airport.limits import MAX_COUNTS, MAX_GOALS, MAX_NAME, MAX_NUMBER, check_count
 from airport.mask import MaskScale, allowed_area
 from airport.model import Airport, Mission, MissionGoal, StartPose, Surface
+from files.reading import FileError, read_text, shown
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+MAX_TEXT_BYTES = 1 << 20
+"""Of a graph or a mission: 5,000 nodes and 10,000 edges take half of it."""
+
 _FIELD = re.compile(r"\s*(x|y|taxi)\s*=\s*(\S+)\s*")
 
 
@@ -43,7 +48,9 @@ def read_airport(graph: Path, scale: MaskScale | None = None) -> Airport:
     first, second = _first_edge(nodes, edges)
     (x_m, y_m), (to_x, to_y) = nodes[first], nodes[second]
     missions: dict[str, Mission] = {}
-    for path in sorted(graph.parent.glob("*.miss")):
+    files = sorted(graph.parent.glob("*.miss"))
+    check_count(str(graph.parent), "*.miss", len(files), MAX_COUNTS["missions"])
+    for path in files:
         mission = read_mission(path)
         if mission.name in missions:
             raise AirportError(f"{path}: mission name: {mission.name!r}: already used; rename it")
@@ -76,12 +83,14 @@ def read_graph(
     """
     try:
         table = json.loads(_text(path))
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits; nesting
         raise AirportError(f"{path}: not JSON: {error}: see the format's sample") from None
     if not isinstance(table, dict) or not all(
         isinstance(table.get(key), list) for key in ("nodes", "edges")
     ):
-        raise AirportError(f"{path}: file: {str(table)[:40]}: needs the lists nodes and edges")
+        raise AirportError(f"{path}: file: {shown(table)}: needs the lists nodes and edges")
+    for key in ("nodes", "edges"):
+        check_count(str(path), key, len(table[key]), MAX_COUNTS[key])
     nodes: dict[str, tuple[float, float]] = {}
     for i, entry in enumerate(table["nodes"]):
         name, at = _node(entry, f"{path}: nodes[{i}]")
@@ -92,7 +101,7 @@ def read_graph(
     for i, entry in enumerate(table["edges"]):
         if not (isinstance(entry, list) and len(entry) == 2
                 and all(isinstance(end, str) for end in entry)):  # fmt: skip
-            raise AirportError(f'{path}: edges[{i}]: {entry}: must be ["N1", "N2"]')
+            raise AirportError(f'{path}: edges[{i}]: {shown(entry)}: must be ["N1", "N2"]')
         for end in entry:
             if end not in nodes:
                 raise AirportError(f"{path}: edges[{i}]: {end!r}: unknown node; name one of nodes")
@@ -112,6 +121,7 @@ def read_mission(path: Path) -> Mission:
     for number, line in enumerate(_text(path).splitlines(), start=1):
         if line.strip():
             goals.append(_goal(line, f"{path}: line {number}"))
+            check_count(str(path), "goals", len(goals), MAX_GOALS)
     if not goals:
         raise AirportError(f"{path}: goals: empty: give lines such as x=20,y=-57,taxi=1")
     return Mission(path.stem.removeprefix("MISSION_"), tuple(goals))
@@ -121,17 +131,21 @@ def _goal(line: str, where: str) -> MissionGoal:
     found = [_FIELD.fullmatch(part) for part in line.split(",")]
     fields = {match.group(1): match.group(2) for match in found if match}
     if len(found) != 3 or fields.keys() != {"x", "y", "taxi"}:
-        raise AirportError(f"{where}: {line.strip()!r}: must be like x=20,y=-57,taxi=1")
+        raise AirportError(f"{where}: {shown(line.strip())}: must be like x=20,y=-57,taxi=1")
     if fields["taxi"] not in ("0", "1"):
-        raise AirportError(f"{where}: taxi={fields['taxi']}: 1 is taxi, 0 light verification")
+        raise AirportError(f"{where}: taxi={fields['taxi'][:20]}: 1 is taxi, 0 light verification")
     x_m, y_m = (_number(fields[axis], f"{where}: {axis}") for axis in ("x", "y"))
     return MissionGoal(x_m, y_m, "taxi" if fields["taxi"] == "1" else "light verification")
 
 
 def _node(entry: Any, where: str) -> tuple[str, tuple[float, float]]:
     if not (isinstance(entry, dict) and isinstance(entry.get("id"), str)):
-        raise AirportError(f'{where}: {entry}: must be {{"id": "N1", "x": 0, "y": 0}}')
-    return entry["id"], (
+        raise AirportError(f'{where}: {shown(entry)}: must be {{"id": "N1", "x": 0, "y": 0}}')
+    name = entry["id"]
+    if not name.isprintable() or len(name) > MAX_NAME:
+        raise AirportError(f"{where}.id: {shown(name)}: must be a name of at most {MAX_NAME} "
+                           "printable characters")
+    return name, (
         _number(entry.get("x"), f"{where}.x"),
         _number(entry.get("y"), f"{where}.y"),
     )
@@ -142,10 +156,12 @@ def _number(value: Any, where: str) -> float:
         if isinstance(value, bool):
             raise TypeError
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise AirportError(f"{where}: {value!r}: must be a finite number of metres")
+        raise AirportError(f"{where}: {shown(value)}: must be a finite number of metres")
+    if abs(number) > MAX_NUMBER:
+        raise AirportError(f"{where}: {shown(value)}: must be within {MAX_NUMBER:,.0f} m of 0")
     return number
 
 
@@ -172,10 +188,10 @@ def _image_beside(graph: Path) -> Path:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return read_text(path, MAX_TEXT_BYTES)
     except OSError as error:
         raise AirportError(
             f"{path}: cannot be read: {error.strerror}: give a readable file"
         ) from None
-    except UnicodeDecodeError:
-        raise AirportError(f"{path}: not text: it must be UTF-8") from None
+    except FileError as error:
+        raise AirportError(f"{path}: file: {error}: give a text like the format's sample") from None

@@ -9,6 +9,7 @@ from pathlib import Path
 from airport import foreign, toml_format
 from airport.checks import mission_problems, problems
 from airport.errors import AirportError
+from airport.limits import MAX_WARNINGS
 from airport.mask import MaskScale
 from airport.model import Airport, Mission
 from airport.world import WorldTruth
@@ -88,6 +89,9 @@ def _load(name_or_path: str | Path, scale: MaskScale | None) -> tuple[Airport, W
         if own or not problem.tolerable:
             raise AirportError(problem.line(str(path)))
         warnings.append(problem.line(path.name))
+    if len(warnings) > MAX_WARNINGS:
+        warnings[MAX_WARNINGS:] = [
+            f"{path.name}: and {len(warnings) - MAX_WARNINGS} more: mend these first"]
     if not airport.lights:
         warnings.append(f"{path.name}: lights: none: nothing will be measured")
     return dataclasses.replace(airport, warnings=tuple(warnings), source=str(path)), truth

@@ -9,6 +9,8 @@ prohibited.
 
 from __future__ import annotations
 
+import io
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +18,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import shapely
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from shapely.geometry import MultiPolygon, Polygon
 
 from airport.errors import AirportError
+from files.reading import FileError, read_bytes
 
 RED_THRESHOLD = 250
 """A pixel with R above this is prohibited (authors' code)."""
@@ -29,6 +32,13 @@ PLAINLY_RED = 128
 
 SPECK_PIXELS = 12
 """Islands and holes smaller than this are compression noise."""
+
+MAX_IMAGE_BYTES = 32 << 20
+MAX_PIXELS = 1 << 24
+"""4,096 x 4,096; at the authors' scale 790 m x 890 m. The authors' own image has 0.6 million."""
+
+MAX_BOXES = 20_000
+"""Rectangles into which the pavement falls; a slanted edge makes one for each row of pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,36 +67,65 @@ def allowed_area(path: Path, scale: MaskScale) -> Any:
     Raises:
         AirportError: not an image, or all of it prohibited.
     """
-    try:
-        with Image.open(path) as image:
-            lossy = image.format == "JPEG"
-            pixels = np.asarray(image.convert("RGB")).astype(np.int16)
-    except (OSError, UnidentifiedImageError):
-        raise AirportError(f"{path}: area image: unreadable: give a JPEG or PNG") from None
+    pixels, lossy = _decoded(path)
     prohibited = pixels[:, :, 0] > RED_THRESHOLD
     if lossy:
-        prohibited |= pixels[:, :, 0] - pixels[:, :, 1:].max(axis=2) > PLAINLY_RED
+        others = pixels[:, :, 1:].max(axis=2)
+        prohibited |= (pixels[:, :, 0] > others) & (pixels[:, :, 0] - others > PLAINLY_RED)
     allowed = _without_lone_pixels(~prohibited)
     if not allowed.any():
         raise AirportError(f"{path}: area image: all of it red: pavement must not be red")
-    area = shapely.unary_union(_rectangles(allowed, scale))
+    boxes = _boxes(allowed)
+    if boxes is None:
+        raise AirportError(f"{path}: area image: its pavement falls into more than {MAX_BOXES} "
+                           "rectangles: give areas with straight edges, without noise")
+    area = shapely.unary_union(_rectangles(boxes, scale))
     pixel_m = max(1 / scale.columns_per_m, 1 / scale.rows_per_m)
     speck_m2 = SPECK_PIXELS / (scale.columns_per_m * scale.rows_per_m)
     return _without_specks(shapely.simplify(area, pixel_m).buffer(0), speck_m2)
+
+
+def _decoded(path: Path) -> tuple[npt.NDArray[np.uint8], bool]:
+    """Return the image as rows x columns x RGB, and whether it was compressed with loss."""
+    try:
+        data = read_bytes(path, MAX_IMAGE_BYTES)
+    except OSError as error:
+        raise AirportError(f"{path}: cannot be read: {error.strerror}: give a readable file"
+                           ) from None
+    except FileError as error:
+        raise AirportError(f"{path}: area image: {error}: give a smaller one") from None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of its size, which is looked at here
+            with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+                columns, rows = image.size
+                if columns * rows <= MAX_PIXELS:
+                    return np.asarray(image.convert("RGB")), image.format != "PNG"
+    except Image.DecompressionBombError:
+        columns = rows = 0
+    except Exception:  # what a decoder raises that meets damaged bytes is not to be listed
+        raise AirportError(f"{path}: area image: unreadable: give a JPEG or PNG") from None
+    size = f"{columns} x {rows}" if columns else "far too many"
+    raise AirportError(f"{path}: area image: {size} pixels: at most {MAX_PIXELS} are right")
 
 
 def _without_lone_pixels(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """Majority vote of each pixel with its eight neighbours (a median filter)."""
     padded = np.pad(allowed, 1, mode="edge").astype(np.int8)
     rows, columns = allowed.shape
-    votes = sum(
-        padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)
-    )
-    return np.asarray(votes) >= 5
+    votes = np.zeros(allowed.shape, dtype=np.int8)
+    for i in range(3):
+        for j in range(3):
+            votes += padded[i : i + rows, j : j + columns]
+    return votes >= 5
 
 
-def _rectangles(allowed: npt.NDArray[np.bool_], scale: MaskScale) -> list[Any]:
-    """One rectangle for each run of allowed pixels in a row, over all equal rows below it."""
+def _boxes(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64] | None:
+    """One box for each run of allowed pixels in a row, over all equal rows below it.
+
+    Returns:
+        First column, first row, last column, last row, each one array; None if there are too many.
+    """
     steps = np.diff(np.pad(allowed, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     boxes: list[tuple[float, float, float, float]] = []
     open_runs: dict[tuple[int, int], int] = {}
@@ -99,7 +138,14 @@ def _rectangles(allowed: npt.NDArray[np.bool_], scale: MaskScale) -> list[Any]:
             boxes.append((run[0], open_runs.pop(run), run[1], row))
         for run in runs:
             open_runs.setdefault(run, row)
-    c0, r0, c1, r1 = np.array(boxes, dtype=float).T
+        if len(boxes) > MAX_BOXES:
+            return None
+    return np.array(boxes, dtype=float).T
+
+
+def _rectangles(boxes: npt.NDArray[np.float64], scale: MaskScale) -> list[Any]:
+    """Return boxes of pixels as rectangles in `map`."""
+    c0, r0, c1, r1 = boxes
     x0, x1 = (scale.left_m + c / scale.columns_per_m for c in (c0, c1))
     y0, y1 = (scale.top_m - r / scale.rows_per_m for r in (r1, r0))
     return list(shapely.box(x0, y0, x1, y1))

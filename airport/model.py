@@ -200,6 +200,11 @@ class Airport:
                 best = Attachment(px, py, off_m, a, b)
         return best
 
+    @cached_property
+    def within_reach(self) -> frozenset[str]:
+        """All nodes that can be reached from the start pose."""
+        return self.component(self.nearest_on_graph(self.start.x_m, self.start.y_m).a)
+
     def component(self, node: str) -> frozenset[str]:
         """Return all nodes that can be reached from `node`, itself included."""
         reached, todo = {node}, [node]
@@ -283,9 +288,13 @@ def rectangle(x_m: float, y_m: float, yaw_rad: float, length_m: float, width_m: 
     return shapely.polygons([(x_m + u * cos - v * sin, y_m + u * sin + v * cos) for u, v in half])
 
 
-def union(polygons: Iterable[Any], fillet_radius_m: float = 0.0) -> Any:
-    """Merge polygons; inner corners sharper than the fillet radius are rounded, as on taxiways."""
-    merged = shapely.unary_union(list(polygons))
+def union(polygons: Iterable[Any]) -> Any:
+    """Merge polygons."""
+    return shapely.unary_union(list(polygons))
+
+
+def rounded(area: Any, fillet_radius_m: float) -> Any:
+    """Round inner corners sharper than the fillet radius, as on taxiways, and simplify."""
     if fillet_radius_m > 0:
-        merged = merged.buffer(fillet_radius_m).buffer(-fillet_radius_m)
-    return merged.simplify(SIMPLIFICATION_M)
+        area = area.buffer(fillet_radius_m).buffer(-fillet_radius_m)
+    return area.simplify(SIMPLIFICATION_M)

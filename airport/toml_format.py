@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 import shapely
@@ -15,6 +15,19 @@ from shapely.geometry import LineString, Polygon
 from shapely.validation import explain_validity
 
 from airport.errors import AirportError, Problem
+from airport.limits import (
+    MAX_COUNTS,
+    MAX_CROSSINGS,
+    MAX_GOALS,
+    MAX_LIGHTS,
+    MAX_NAME,
+    MAX_NEAR_IN_FILLET,
+    MAX_NEAR_IN_STRIPS,
+    MAX_NUMBER,
+    MAX_POINTS,
+    check_count,
+    check_nearness,
+)
 from airport.model import (
     GOAL_MODES,
     Airport,
@@ -26,10 +39,14 @@ from airport.model import (
     ObstacleShape,
     StartPose,
     Surface,
+    rounded,
     union,
 )
 from airport.world import WorldTruth
+from files import toml
+from files.reading import FileError, read_text, shown
 
+Name = Annotated[str, msgspec.Meta(max_length=MAX_NAME)]
 Point = tuple[float, float]
 SurfaceKind = Literal["runway", "taxiway", "apron", "area"]
 _CHOICES = {
@@ -49,7 +66,7 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Surface(_Table, frozen=True):
-    name: str
+    name: Name
     kind: SurfaceKind
     polygon: list[Point] | None = None
     centre_line: list[Point] | None = None
@@ -57,12 +74,12 @@ class _Surface(_Table, frozen=True):
 
 
 class _Area(_Table, frozen=True):
-    name: str
+    name: Name
     polygon: list[Point]
 
 
 class _Row(_Table, frozen=True):
-    name: str
+    name: Name
     nominal_cd: float
     first: Point | None = None
     last: Point | None = None
@@ -79,7 +96,7 @@ class _World(_Table, frozen=True):
 
 
 class _File(_Table, frozen=True):
-    name: str
+    name: Name
     start: StartPose
     nodes: dict[str, Point]
     edges: list[tuple[str, str]]
@@ -94,7 +111,7 @@ class _File(_Table, frozen=True):
 
 
 class _MissionFile(_Table, frozen=True):
-    name: str
+    name: Name
     goals: list[MissionGoal]
 
 
@@ -106,7 +123,8 @@ def read_airport(path: Path) -> tuple[Airport, WorldTruth]:
     """
     file = _convert(path, _File)
     name = str(path)
-    surfaces = tuple(_surface(part, i, name) for i, part in enumerate(file.surface))
+    _count(file, name)
+    surfaces = _surfaces(file.surface, name)
     prohibited = [
         _polygon(area.polygon, f"prohibited[{i}].polygon", name)
         for i, area in enumerate(file.prohibited)
@@ -121,9 +139,16 @@ def read_airport(path: Path) -> tuple[Airport, WorldTruth]:
     for building in buildings:
         if min(building.length_m, building.width_m, building.height_m) <= 0:
             raise _error(name, f"building.{building.name}", "size", "sides must be positive")
-    allowed = union([part.polygon for part in surfaces], file.fillet_radius_m)
     # A building stands on no pavement the robot may use, wherever it stands.
     solid = [building.polygon for building in buildings]
+    pavement = [part.polygon for part in surfaces]
+    check_nearness(name, "surface, prohibited and building", [*pavement, *prohibited, *solid], 0.0,
+                   MAX_CROSSINGS)
+    allowed = union(pavement)
+    if file.fillet_radius_m > 0:
+        check_nearness(name, "fillet_radius_m", [allowed], 2 * file.fillet_radius_m,
+                       MAX_NEAR_IN_FILLET)
+    allowed = rounded(allowed, file.fillet_radius_m)
     allowed = allowed.difference(shapely.unary_union([*prohibited, *solid]))
     lights = tuple(light for i, row in enumerate(file.row) for light in _lights(row, i, name))
     airport = Airport(
@@ -150,19 +175,20 @@ def read_mission(path: Path) -> Mission:
         AirportError: as `read_airport`.
     """
     file = _convert(path, _MissionFile)
+    check_count(str(path), "goals", len(file.goals), MAX_GOALS)
     return Mission(file.name, tuple(file.goals))
 
 
 def _convert(path: Path, kind: Any) -> Any:
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = toml.parse(read_text(path, toml.MAX_SIZE))
     except OSError as error:
         raise AirportError(
             f"{path}: cannot be read: {error.strerror}: give a readable file"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise AirportError(f"{path}: not TOML: {error}: see https://toml.io") from None
-    _finite(table, "", str(path))
+    except FileError as error:
+        raise AirportError(f"{path}: file: {error}: see https://toml.io") from None
+    _check_numbers(table, "", str(path))
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
@@ -187,15 +213,14 @@ def _locate(table: Any, path: str, message: str) -> tuple[str, str]:
     Where a table has free keys msgspec's path says `[...]`: the first key is taken whose value
     fits the message, by itself or by its type.
     """
-    found = list(_resolve(table, "", _KEY.findall(path)))
+    found = list(_resolve(table, "", _KEY.findall(path))) or [(path, table)]
     fitting = [
         (where, value)
         for where, value in found
         if f"{value!r}" in message or f"got `{_TYPE_NAMES.get(type(value), '')}`" in message
     ]
     where, value = (fitting or found)[0]
-    text = repr(value)
-    return where.lstrip(".") or "file", text if len(text) <= 60 else text[:57] + "..."
+    return where.lstrip(".") or "file", shown(value)
 
 
 def _resolve(value: Any, where: str, keys: list[str]) -> Iterator[tuple[str, Any]]:
@@ -213,16 +238,43 @@ def _resolve(value: Any, where: str, keys: list[str]) -> Iterator[tuple[str, Any
         yield where + "".join(f".{rest}" for rest in keys), value
 
 
-def _finite(value: Any, path: str, file: str) -> None:
-    """Refuse NaN and infinities anywhere: TOML can write both."""
+def _check_numbers(value: Any, path: str, file: str) -> None:
+    """Refuse NaN and infinities anywhere, TOML can write both, and what no airport measures."""
     if isinstance(value, float) and not math.isfinite(value):
         raise _error(file, path.lstrip("."), value, "must be a finite number")
+    if isinstance(value, (int, float)) and abs(value) > MAX_NUMBER:
+        raise _error(file, path.lstrip("."), shown(value),
+                     f"must be between -{MAX_NUMBER:g} and {MAX_NUMBER:g}")
     if isinstance(value, dict):
         for key, part in value.items():
-            _finite(part, f"{path}.{key}", file)
+            _check_numbers(part, f"{path}.{key}", file)
     elif isinstance(value, list):
         for i, part in enumerate(value):
-            _finite(part, f"{path}[{i}]", file)
+            _check_numbers(part, f"{path}[{i}]", file)
+
+
+def _count(file: _File, name: str) -> None:
+    """Refuse more of anything than there may be, before anything is built of it."""
+    for table, most in MAX_COUNTS.items():
+        check_count(name, table, len(getattr(file, table)), most)
+    check_count(name, "goals of all missions",
+                sum(len(mission.goals) for mission in file.missions.values()), MAX_GOALS)
+    check_count(name, "lights of all rows", sum(
+        max(row.count or 0, len(row.positions or ())) for row in file.row), MAX_LIGHTS)
+    points = [*(part.polygon or part.centre_line or () for part in file.surface),
+              *(area.polygon for area in file.prohibited)]
+    check_count(name, "points of all outlines", sum(map(len, points)), MAX_POINTS)
+
+
+def _surfaces(parts: list[_Surface], file: str) -> tuple[Surface, ...]:
+    near, surfaces = 0, []
+    for i, part in enumerate(parts):
+        if len(part.centre_line or ()) > 1 and part.half_width_m is not None:
+            near += check_nearness(
+                file, f"surface[{i}].centre_line", [LineString(part.centre_line)],
+                2 * part.half_width_m, MAX_NEAR_IN_STRIPS - near)
+        surfaces.append(_surface(part, i, file))
+    return tuple(surfaces)
 
 
 def _surface(part: _Surface, i: int, file: str) -> Surface:
@@ -233,7 +285,8 @@ def _surface(part: _Surface, i: int, file: str) -> Surface:
         shape = _polygon(part.polygon, f"{where}.polygon", file)
         return Surface(part.name, part.kind, shape)
     if part.centre_line is None or len(part.centre_line) < 2:
-        raise _error(file, f"{where}.centre_line", part.centre_line, "needs two points or more")
+        raise _error(file, f"{where}.centre_line", shown(part.centre_line),
+                     "needs two points or more")
     if part.half_width_m is None or part.half_width_m <= 0:
         raise _error(file, f"{where}.half_width_m", part.half_width_m, "must be positive")
     cap = "flat" if part.kind == "runway" else "round"
@@ -243,7 +296,7 @@ def _surface(part: _Surface, i: int, file: str) -> Surface:
 
 def _polygon(points: list[Point], where: str, file: str) -> Any:
     if len(points) < 3:
-        raise _error(file, where, points, "a polygon needs three points or more")
+        raise _error(file, where, shown(points), "a polygon needs three points or more")
     shape = Polygon(points)
     if not shape.is_valid or shape.area == 0:
         raise _error(file, where, explain_validity(shape), "the outline must not cross itself")
@@ -279,8 +332,8 @@ def _truth(world: _World, airport: Airport, file: str) -> WorldTruth:
 
 
 def _unique(file: str, where: str, names: list[str]) -> None:
-    for name in names:
-        if names.count(name) > 1:
+    for name, times in Counter(names).items():
+        if times > 1:
             raise _error(file, where, repr(name), "name given twice; names must be unique")
 
 

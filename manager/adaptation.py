@@ -8,12 +8,13 @@ Document in, document out; nobody sees a half-applied change.
 from __future__ import annotations
 
 import copy
-import tomllib
 from enum import StrEnum
 from typing import Any
 
 import msgspec
 
+from files import toml
+from files.reading import FileError, shown
 from manager.schema import SpecificationError, SystemSpec
 from manager.specification import check_document
 
@@ -107,11 +108,11 @@ def parse_value(text: str) -> Any:
         ChangeError: It is neither.
     """
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
+        return toml.parse(f"value = {text}")["value"]
+    except FileError:
         if text and all(c.isalnum() or c in "_-./ :()," for c in text):
             return text
-        raise ChangeError(f"{text!r}: expected a TOML value, e.g. 0.5, true, 'text' or [1, 2]"
+        raise ChangeError(f"{shown(text)}: expected a TOML value, e.g. 0.5, true, 'text' or [1, 2]"
                           ) from None
 
 

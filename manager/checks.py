@@ -7,8 +7,10 @@ sequence and the first finding is the one reported, so a validator may rely on t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from itertools import permutations, product
+from collections.abc import Callable, Collection, Iterator
+from functools import reduce
+from itertools import chain, permutations, product
+from operator import or_
 from typing import Any, NamedTuple
 
 import msgspec
@@ -67,7 +69,7 @@ def find_nonsense_of_rest(spec: SystemSpec) -> Finding | None:
     return None
 
 
-def _unknown(path: str, value: str, what: str, known: Sequence[str]) -> Finding:
+def _unknown(path: str, value: str, what: str, known: Collection[str]) -> Finding:
     return Finding(path, f"unknown {what}; known: {', '.join(known) or 'none'}", (value,))
 
 
@@ -156,7 +158,7 @@ def _processes(spec: SystemSpec) -> Iterator[Finding]:
 
 
 def _detections(spec: SystemSpec) -> Iterator[Finding]:
-    nodes = [node.name for node in spec.nodes]
+    nodes = dict.fromkeys(node.name for node in spec.nodes)  # in sequence, and quick to look into
     for index, detection in enumerate(spec.detections):
         path = f"$.detection[{index}]"
         parameters = detection.parameters
@@ -166,11 +168,13 @@ def _detections(spec: SystemSpec) -> Iterator[Finding]:
                     not all(isinstance(name, str) for name in watch):
                 yield Finding(f"{path}.parameters.watch", "expected a list of node names", (watch,))
                 return
+            watched: set[str] = set()
             for place, name in enumerate(watch):
                 if name not in nodes:
                     yield _unknown(f"{path}.parameters.watch[{place}]", name, "node", nodes)
-                if name in watch[:place]:
+                if name in watched:
                     yield Finding(f"{path}.parameters.watch[{place}]", "listed twice", (name,))
+                watched.add(name)
         for key in ("timeout_s", "margin_m"):
             value = parameters.get(key, 1.0)
             if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
@@ -187,17 +191,17 @@ def _detections(spec: SystemSpec) -> Iterator[Finding]:
                                               "detects, here or as parameters.timeout_s")
 
 
-def _parameters(path: str, module: DetectionSpec | RecoverySpec, nodes: Sequence[str],
-                derived: Sequence[str] = ()) -> Iterator[Finding]:
+def _parameters(path: str, module: DetectionSpec | RecoverySpec, nodes: Collection[str],
+                derived: Collection[str] = ()) -> Iterator[Finding]:
     for name, problem in find_wrong(module.actor, module.parameters, nodes, derived):
         value = (module.parameters[name],) if name in module.parameters else ()
         yield Finding(f"{path}.parameters.{name}", problem, value)
 
 
 def _mechanisms(spec: SystemSpec) -> Iterator[Finding]:
-    detections = [detection.name for detection in spec.detections]
-    recoveries = [recovery.name for recovery in spec.recoveries]
-    events = [event.name for event in spec.events]
+    detections = dict.fromkeys(detection.name for detection in spec.detections)
+    recoveries = dict.fromkeys(recovery.name for recovery in spec.recoveries)
+    events = dict.fromkeys(event.name for event in spec.events)
     for index, mechanism in enumerate(spec.mechanisms):
         path = f"$.mechanism[{index}]"
         for field, text, read, what, known in (
@@ -219,6 +223,8 @@ def _mechanisms(spec: SystemSpec) -> Iterator[Finding]:
 
 def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
     names = [recovery.name for recovery in spec.recoveries]
+    nodes = dict.fromkeys(node.name for node in spec.nodes)
+    respawns = {node.respawn for node in spec.nodes}
     there = {node.name for node in spec.nodes}.union(
         *(recovery.claims | recovery.disables for recovery in spec.recoveries))
     for index, recovery in enumerate(spec.recoveries):
@@ -234,8 +240,8 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
         if recovery.escalate_to and recovery.escalate_to not in names:
             yield _unknown(f"$.recovery[{index}].escalate_to", recovery.escalate_to,
                            "recovery module", names)
-        own = ["nodes"] if any(node.respawn == recovery.name for node in spec.nodes) else []
-        yield from _parameters(f"$.recovery[{index}]", recovery, [n.name for n in spec.nodes], own)
+        own = ["nodes"] if recovery.name in respawns else []
+        yield from _parameters(f"$.recovery[{index}]", recovery, nodes, own)
     cycle = find_cycle({r.name: [r.escalate_to] if r.escalate_to else [] for r in spec.recoveries})
     if cycle:
         yield Finding(f"$.recovery[{names.index(cycle[0])}].escalate_to",
@@ -265,9 +271,12 @@ def _reachability(spec: SystemSpec) -> Iterator[Finding]:
             yield Finding(f"$.recovery[{index}].name", "unreachable: no mechanism and no escalation"
                                                        " leads to this recovery", (recovery.name,))
     watch = {detection.name: detection.watch for detection in spec.detections}
-    watched = {(node, recovery) for mechanism in spec.mechanisms
-               for detection in mechanism.detections for node in watch[detection]
-               for recovery in mechanism.recoveries}
+    answers: dict[str, set[str]] = {}
+    for mechanism in spec.mechanisms:
+        for name in mechanism.detections:
+            answers.setdefault(name, set()).update(mechanism.recoveries)
+    watched = {(node, recovery) for name, recoveries in answers.items() for node in watch[name]
+               for recovery in recoveries}
     for index, node in enumerate(spec.nodes):
         if node.respawn != SUPERVISOR and (node.name, node.respawn) not in watched:
             yield Finding(f"$.node[{index}].respawn", f"node {node.name!r} is unreachable for "
@@ -277,12 +286,13 @@ def _reachability(spec: SystemSpec) -> Iterator[Finding]:
 
 def _fault_tree(spec: SystemSpec) -> Iterator[Finding]:
     names = [event.name for event in spec.events]
+    known = set(names)
     for index, event in enumerate(spec.events):
         path = f"$.event[{index}]"
         if event.of and event.gate is None:
             yield Finding(f"{path}.of", "inputs without a gate; add gate = 'or'", (event.of,))
         for place, name in enumerate(event.of):
-            if name not in names:
+            if name not in known:
                 yield _unknown(f"{path}.of[{place}]", name, "event", names)
     try:
         tree = spec.build_fault_tree()
@@ -320,17 +330,19 @@ def _policy(spec: SystemSpec) -> Iterator[Finding]:
 
 
 def _orders(spec: SystemSpec) -> Iterator[Finding]:
-    recoveries = [recovery.name for recovery in spec.recoveries]
+    recoveries = dict.fromkeys(recovery.name for recovery in spec.recoveries)
     for name, relation in spec.orders.items():
         for upper, lowers in relation.items():
             path = f"$.orders.{name}.{upper}"
             if upper not in recoveries:
                 yield _unknown(path, upper, "recovery module", recoveries)
+            listed: set[str] = set()
             for place, lower in enumerate(lowers):
                 if lower not in recoveries:
                     yield _unknown(f"{path}[{place}]", lower, "recovery module", recoveries)
-                if lower in lowers[:place]:
+                if lower in listed:
                     yield Finding(f"{path}[{place}]", "duplicate", (lower,))
+                listed.add(lower)
         try:
             spec.build_order(name)
         except CycleError as error:
@@ -351,15 +363,16 @@ def _compounds(spec: SystemSpec) -> Iterator[Finding]:
     """Recoveries that one mechanism runs together must be able to run together."""
     contracts = spec.build_mechanisms().contracts
     for index, mechanism in enumerate(spec.mechanisms):
-        for way in recovery_gate(mechanism.recover).alternatives():
-            for one, other in permutations(way, 2):
-                shared = contracts[one].claims & contracts[other].claims
-                harmed = contracts[one].disables & contracts[other].needs
-                if shared or harmed:
-                    yield Finding(f"$.mechanism[{index}].recover", (
-                        f"{one} and {other} both claim {', '.join(sorted(shared))}" if shared else
-                        f"{one} disables {', '.join(sorted(harmed))}, which {other} needs"
-                        ) + "; they cannot run together", (mechanism.recover,))
+        ways = recovery_gate(mechanism.recover).alternatives()
+        together = dict.fromkeys(chain.from_iterable(permutations(way, 2) for way in ways))
+        for one, other in together:
+            shared = contracts[one].claims & contracts[other].claims
+            harmed = contracts[one].disables & contracts[other].needs
+            if shared or harmed:
+                yield Finding(f"$.mechanism[{index}].recover", (
+                    f"{one} and {other} both claim {', '.join(sorted(shared))}" if shared else
+                    f"{one} disables {', '.join(sorted(harmed))}, which {other} needs"
+                    ) + "; they cannot run together", (mechanism.recover,))
 
 
 def _order_against_tree(spec: SystemSpec) -> Iterator[Finding]:
@@ -368,8 +381,13 @@ def _order_against_tree(spec: SystemSpec) -> Iterator[Finding]:
     order, tree = spec.build_safety_order(), spec.build_ftm_tree()
     safer = spec.criteria[0]
     recover = {mechanism.name: mechanism.recoveries for mechanism in spec.mechanisms}
+    own = {name: order.mask(names) for name, names in recover.items()}
+    under = {name: reduce(or_, (order.below[order.number[r]] for r in names))
+             for name, names in recover.items()}
     for upper in tree.names:
         for lower in tree.members(tree.below[tree.number[upper]]):
+            if not under[lower] & own[upper]:
+                continue
             for above, below in product(recover[lower], recover[upper]):
                 if order.is_above(above, below):
                     yield Finding(

@@ -84,12 +84,14 @@ class FaultTree:
         if not 0 <= event.required <= len(event.inputs) or bool(event.inputs) > event.required:
             raise FaultTreeError(event.name, f"gate needs {event.required} of "
                                              f"{len(event.inputs)} inputs")
+        joined: set[str] = set()
         for name in event.inputs:
             if name not in self.parents:
                 raise FaultTreeError(event.name, f"unknown input {name!r}; "
                                                  f"known: {', '.join(self.parents)}")
-            if event.name in self.parents[name]:
+            if name in joined:
                 raise FaultTreeError(event.name, f"input {name!r} is listed twice")
+            joined.add(name)
             self.parents[name].append(event.name)
 
     def occurring(self, basic: Iterable[str]) -> frozenset[str]:

@@ -19,8 +19,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
-from functools import lru_cache
+from functools import lru_cache, reduce
 from itertools import chain, combinations
+from operator import and_, or_
 
 import msgspec
 
@@ -28,6 +29,12 @@ MAX_NAMES = 16
 """A gate over more modules than these is a fault tree; it belongs there."""
 
 MAX_DEPTH = 50
+
+MAX_TOKENS = 400
+"""Names, words and parentheses of a gate."""
+
+MAX_INPUTS = 64
+"""Of `k of`: each input is counted with each number of those before it."""
 
 WORDS = frozenset({"and", "or", "not", "of"})
 """Of the language; no module can be called so."""
@@ -117,8 +124,7 @@ def detection_gate(text: str) -> Gate:
                         "belong into the fault tree")
     if gate.holds(()):
         raise GateError("it is active while all its detection modules are idle")
-    if not any(gate.holds(active) for size in range(1, len(names) + 1)
-               for active in combinations(names, size)):
+    if not _truth_table(gate, names):
         raise GateError("it can never be active")
     return gate
 
@@ -149,6 +155,29 @@ def recovery_gate(text: str) -> Gate:
     if ways > MAX_WAYS:
         raise GateError(f"{ways} alternatives; at most {MAX_WAYS} are right")
     return gate
+
+
+def _truth_table(gate: Gate, names: tuple[str, ...]) -> int:
+    """Return for which sets of active names a gate holds: one bit for each of the 2^n sets."""
+    sets = 1 << len(names)
+    every = (1 << sets) - 1
+    # Of name k: 2^k sets without it, 2^k sets with it, and so on.
+    with_name = {name: every // ((1 << (2 << k)) - 1) * ((1 << (1 << k)) - 1) << (1 << k)
+                 for k, name in enumerate(names)}
+
+    def table(part: Gate) -> int:
+        if part.name:
+            return every & ~with_name[part.name] if part.negated else with_name[part.name]
+        tables = [table(inner) for inner in part.inputs]
+        if part.required in {1, len(tables)}:
+            return reduce(or_ if part.required == 1 else and_, tables)
+        at_least = [every] + [0] * part.required  # of the inputs met so far
+        for holds in tables:
+            for count in range(part.required, 0, -1):
+                at_least[count] |= at_least[count - 1] & holds
+        return at_least[-1]
+
+    return table(gate)
 
 
 def _count_ways(gate: Gate) -> int:
@@ -195,6 +224,9 @@ class _Parser:
         if self._peek():
             raise GateError(f"unexpected {self._peek()!r} after a complete gate; join two parts "
                             "with 'and' or 'or'")
+        if len(self._tokens) > MAX_TOKENS:
+            raise GateError(f"{len(self._tokens)} names, words and parentheses; at most "
+                            f"{MAX_TOKENS} are right, more belong into the fault tree")
         return gate
 
     def _peek(self) -> str:
@@ -254,6 +286,8 @@ class _Parser:
             self._take()
             inputs.append(self._or())
         self._take(")")
+        if len(inputs) > MAX_INPUTS:
+            raise GateError(f"{required} of {len(inputs)} inputs; at most {MAX_INPUTS} are right")
         if not 1 <= required <= len(inputs):
             raise GateError(f"{required} of {len(inputs)} inputs; between 1 and {len(inputs)} "
                             "is right")

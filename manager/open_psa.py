@@ -17,15 +17,25 @@ from itertools import count
 
 import msgspec
 from defusedxml import DefusedXmlException
-from defusedxml.ElementTree import fromstring
+from defusedxml.ElementTree import DefusedXMLParser
 
+from files.reading import FileError, check_size, plain_line, shown
 from manager.formula import GENERATED, Connective, Formula, FormulaError
 from manager.schema import SystemSpec
 
 CONNECTIVES = ("and", "or", "not", "xor", "nand", "nor", "iff", "imply", "atleast", "cardinality")
 REFERENCES = ("event", "gate", "basic-event", "house-event")
+MAX_BYTES = 16 << 20
+"""Of a file; published fault trees with thousands of gates have one or two million."""
+
+MAX_ELEMENTS = 200_000
 MAX_DEPTH = 10_000
 """Nesting of XML elements beyond which a file is refused."""
+
+MAX_CONTAINERS = 50
+"""Fault trees and components in each other: names in them are looked up level by level."""
+
+MAX_NAME = 1000
 
 _PATH_SHOWN = 300
 """Characters of a path beyond which nothing is added to it."""
@@ -44,7 +54,31 @@ class OpenPsaError(ValueError):
     """A file that cannot be read. The message is one line: file, path, what is wrong."""
 
     def __init__(self, file: str, path: str, problem: str) -> None:
-        super().__init__(" ".join(f"{file}: {path}: {problem}".split()))
+        super().__init__(plain_line(f"{file}: {path}: {problem}"))
+
+
+class _BoundedBuilder(ET.TreeBuilder):
+    """Makes elements of XML until there are too many, or one lies too deep."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._depth = self._count = 0
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:
+        """Open an element."""
+        self._depth += 1
+        self._count += 1
+        if self._depth > MAX_DEPTH:
+            raise FileError(f"elements are nested more than {MAX_DEPTH} deep; name the inner "
+                            "formulas as gates")
+        if self._count > MAX_ELEMENTS:
+            raise FileError(f"more than {MAX_ELEMENTS} elements")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> ET.Element:
+        """Close an element."""
+        self._depth -= 1
+        return super().end(tag)
 
 
 class _Definition(msgspec.Struct, frozen=True):
@@ -69,10 +103,16 @@ def read_open_psa(text: str | bytes, file: str, top: str = "") -> Formula:
         OpenPsaError: The text is no XML, or no MEF, or makes no sense.
     """
     try:
-        root = fromstring(text, forbid_dtd=True, forbid_entities=True, forbid_external=True)
+        check_size(text, MAX_BYTES)
+        parser = DefusedXMLParser(target=_BoundedBuilder(), forbid_dtd=True, forbid_entities=True,
+                                  forbid_external=True)
+        parser.feed(text)
+        root = parser.close()
     except DefusedXmlException as error:
         raise OpenPsaError(file, "/", f"{type(error).__name__}: document type definitions and "
                                       "entities are not read; leave them out") from None
+    except FileError as error:
+        raise OpenPsaError(file, "/", str(error)) from None
     except (ET.ParseError, ValueError, LookupError) as error:
         raise OpenPsaError(file, "/", f"not well-formed XML: {error}") from None
     if root.tag != "opsa-mef":
@@ -90,19 +130,9 @@ class _Reader:
         self._gates: dict[str, Connective] = {}
         self._basic: set[str] = set()
         self._house: dict[str, bool] = {}
-        self._check_depth(root)
         for definition in self._find(root):
             self._add(definition)
         self._names = {place: self._name(place) for place in self._definitions}
-
-    def _check_depth(self, root: ET.Element) -> None:
-        stack = [(root, 1)]
-        while stack:
-            element, depth = stack.pop()
-            if depth > MAX_DEPTH:
-                raise OpenPsaError(self._file, f"/{root.tag}", f"elements are nested more than "
-                                   f"{MAX_DEPTH} deep; name the inner formulas as gates")
-            stack.extend((child, depth + 1) for child in element)
 
     # -- definitions ----------------------------------------------------------------------------
 
@@ -113,11 +143,14 @@ class _Reader:
             parent, path, place, private = stack.pop()
             inner = []
             counts: dict[str, int] = {}
+            if len(place) > MAX_CONTAINERS:
+                raise OpenPsaError(self._file, path, f"more than {MAX_CONTAINERS} fault trees and "
+                                                     "components in each other")
             for element in parent:
                 tag = element.tag
                 counts[tag] = counts.get(tag, 0) + 1
                 name = element.get("name", "")
-                here = f"{path}/{tag}[{f'@name={name!r}' if name else counts[tag]}]"
+                here = f"{path}/{tag}[{f'@name={shown(name)}' if name else counts[tag]}]"
                 if tag in _UNSUPPORTED:
                     raise OpenPsaError(self._file, here, f"not supported: {_UNSUPPORTED[tag]}")
                 if tag in {"define-fault-tree", "define-component", "model-data"}:
@@ -134,7 +167,11 @@ class _Reader:
 
     def _checked(self, name: str, path: str) -> str:
         if not name or "." in name:
-            raise OpenPsaError(self._file, path, f"name {name!r}: expected a name without dots")
+            raise OpenPsaError(self._file, path, f"name {shown(name)}: expected a name without "
+                                                 "dots")
+        if len(name) > MAX_NAME:
+            raise OpenPsaError(self._file, path, f"name {shown(name)}: expected at most {MAX_NAME} "
+                                                 "characters")
         return name
 
     def _add(self, definition: _Definition) -> None:
@@ -223,7 +260,7 @@ class _Reader:
 
     def _refer(self, element: ET.Element, place: tuple[str, ...], path: str) -> str:
         name = element.get("name", "")
-        here = f"{path}/{element.tag}[@name={name!r}]"
+        here = f"{path}/{element.tag}[@name={shown(name)}]"
         found = self._resolve(name, place)
         kind = element.get("type", "") if element.tag == "event" else element.tag
         if found is None:

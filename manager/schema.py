@@ -16,13 +16,15 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
+from files.reading import plain_line, shown
 from manager.fault_tree import Event, FaultTree
 from manager.gates import detection_gate, recovery_gate
 from manager.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
 from manager.order import PartialOrder, Tree, refine
 
-_NAME_CHARS = 100
-"""Well below what a message takes as a name (`actors.runtime.bounds`), which may add to it."""
+_NAME_CHARS = 64
+"""What the address of a node's socket has room for (`actors.runtime.run_folder`), and well below what
+a message takes as a name (`actors.runtime.bounds`), which may add to it."""
 
 OptionalName = Annotated[str, msgspec.Meta(
     pattern=r"^([A-Za-z][A-Za-z0-9_]*)?\Z", max_length=_NAME_CHARS)]
@@ -52,16 +54,8 @@ class SpecificationError(ValueError):
         self.file = file
         self.path = path
         self.problem = problem
-        shown = f" = {_shown(value[0])}" if value else ""
-        super().__init__(" ".join(f"{file}: {path}{shown}: {problem}".split()))
-
-
-def _shown(value: object) -> str:
-    try:
-        text = repr(value)
-    except ValueError:  # an integer has too many digits
-        return "a number with thousands of digits"
-    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
+        said = f" = {shown(value[0], _LONGEST_SHOWN)}" if value else ""
+        super().__init__(plain_line(f"{file}: {path}{said}: {problem}"))
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

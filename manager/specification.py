@@ -3,7 +3,7 @@
 Reading happens in three steps, each with its own kind of error, and every error is one line that
 names file, path, value, and what would be right (`SpecificationError`):
 
-1. syntax and types: `tomllib`, then `msgspec`, strict, unknown fields forbidden;
+1. syntax, sizes and types: `files.toml`, then `msgspec`, strict, unknown fields forbidden;
 2. timing values left out are derived from the robot (`manager.budget`), and parameters that name
    a timing value are replaced by it;
 3. sense: names, cycles, the tree, the order, the time budget (`manager.checks`).
@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Iterable, Iterator
 from enum import Enum
 from typing import Any
 
 import msgspec
 
+from files import toml
+from files.reading import FileError
 from manager.budget import derive_timeouts
 from manager.checks import find_nonsense, find_nonsense_of_rest
 from manager.mechanisms import RecoveryKind
@@ -56,8 +57,6 @@ TABLES: dict[str, type[Table]] = {
     "event": EventSpec, "gate": AtLeast, "against": Within,
 }
 
-_TOO_DEEP = "nested too deeply; a spec needs three levels"
-
 ENUMS: dict[tuple[str, str], Iterable[Enum]] = {
     ("node", "kind"): NODE_KINDS, ("recovery", "kind"): RecoveryKind,
     ("mechanism", "against"): Hazard,
@@ -71,7 +70,9 @@ limits of a float, and a thousand million seconds are thirty years.
 LARGEST_INTEGER = 2 ** 63 - 1
 """In parameters, which go to an actor as they are, by way of MessagePack."""
 
-MAX_DEPTH = 32
+MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
+            "orders": 16}
+"""Of each table; the shipped systems have 31 actors, and checks compare many with many."""
 
 
 def parse_specification(text: str, file: str) -> SystemSpec:
@@ -98,14 +99,9 @@ def read_document(text: str, file: str) -> dict[str, Any]:
         SpecificationError: The text is no TOML.
     """
     try:
-        return tomllib.loads(text.removeprefix("\ufeff"))
-    except tomllib.TOMLDecodeError as error:
-        raise SpecificationError(file, "$", f"not valid TOML: {error}") from None
-    except ValueError:
-        raise SpecificationError(file, "$", "an integer with thousands of digits; numbers have "
-                                 f"to be below {LARGEST:g}") from None
-    except RecursionError:
-        raise SpecificationError(file, "$", _TOO_DEEP) from None
+        return toml.parse(text)
+    except FileError as error:
+        raise SpecificationError(file, "$", str(error)) from None
 
 
 def check_modules(before: SystemSpec, after: SystemSpec) -> None:
@@ -140,6 +136,11 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
     for key, value in document.items():  # by hand: msgspec gives no path that ends the key here
         if key not in _known_fields(""):
             raise _unknown_field(file, f"$.{key}", "", value)
+    for key, most in MAX_ROWS.items():
+        rows = document.get(key, ())
+        if isinstance(rows, list | dict) and len(rows) > most:
+            raise SpecificationError(file, f"$.{key}", f"{len(rows)} of them; at most {most} are "
+                                     "right")
     _check_orders(document.get("orders", {}), file)
     try:
         spec = msgspec.convert(document, SystemSpec)
@@ -166,9 +167,13 @@ def _find_unwritable(document: dict[str, Any]) -> Iterator[tuple[str, str, tuple
     left: list[tuple[object, str, int, bool]] = [(document, "$", 0, False)]
     while left:
         value, path, depth, free = left.pop()
-        if depth > MAX_DEPTH:
-            yield "$", _TOO_DEEP, ()
-        elif isinstance(value, dict):
+        if depth > toml.MAX_DEPTH:
+            yield "$", f"nested more than {toml.MAX_DEPTH} deep; a spec needs three levels", ()
+            return
+        if isinstance(value, dict) and any(len(key) > toml.MAX_KEY for key in value):
+            yield path, f"a key of more than {toml.MAX_KEY} characters", ()
+            return
+        if isinstance(value, dict):
             left += [(member, f"{path}.{key}", depth + 1, free or key == "parameters")
                      for key, member in reversed(value.items())]
         elif isinstance(value, list):

@@ -138,7 +138,7 @@ def test_a_store_of_another_format_is_refused(tmp_path):
     with sqlite3.connect(tmp_path / "runs.sqlite") as database:
         database.execute("update about set value = '99'")
     database.close()
-    with pytest.raises(StoreError, match="format 99, this program reads 1"):
+    with pytest.raises(StoreError, match="format '99', this program reads 1"):
         Store(tmp_path)
 
 

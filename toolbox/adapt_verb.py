@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import tomllib
 import uuid
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,8 @@ import msgspec
 from actors import messages as m
 from actors import topics
 from actors.runtime.envelope import Header
+from files import toml
+from files.reading import FileError, read_text
 from manager.adaptation import SETTINGS, Action, ChangeError, parse_value
 from toolbox.output import NoEffectError, UsageError, print_json, say
 from toolbox.session import connect
@@ -125,11 +126,11 @@ def _values(options: argparse.Namespace) -> dict[str, Any]:
                 return {"value": names if options.name == "order" and len(names) > 1
                         else " ".join(options.values)}
             case Action.REPLACE:
-                return tomllib.loads(Path(options.file).read_text(encoding="utf-8"))
+                return toml.parse(read_text(Path(options.file), toml.MAX_SIZE))
     except ChangeError as error:
         raise UsageError(str(error)) from None
     except OSError as error:
         raise UsageError(f"{options.file}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise UsageError(f"{options.file}: not valid TOML: {error}") from None
+    except FileError as error:
+        raise UsageError(f"{options.file}: {error}") from None
     return {}

@@ -10,7 +10,11 @@ from typing import Any
 from actors.recording.bag_reader import BagReader, Summary
 from actors.recording.bag_repair import repair
 from actors.recording.bag_writer import BagError
+from files.reading import plain_line
 from toolbox.output import UsageError, print_json, print_table, say
+
+_WIDTH = 11
+"""Of the names in front of the lines."""
 
 
 def add(verbs: Any, formatter: Any) -> None:
@@ -50,24 +54,24 @@ def bag_info(options: argparse.Namespace) -> int:
         print_json(described(summary))
         return 0
     reader, run = summary.reader, summary.run
-    say(f"file       {options.file}, {reader.size_bytes / 1e6:.1f} MB, {reader.library}")
+    _say(f"file       {options.file}, {reader.size_bytes / 1e6:.1f} MB, {reader.library}")
     if reader.is_recording:
-        say(f"run        {run.get('title', '')} ({run.get('run_id', '')}), "
+        _say(f"run        {run.get('title', '')} ({run.get('run_id', '')}), "
             f"rate {run.get('rate', '')}, rampart {run.get('rampart_version', '')}")
-        say(f"began      {run.get('started') or 'in virtual time'}")
+        _say(f"began      {run.get('started') or 'in virtual time'}")
     else:
-        say(f"run        none: not a recording of a run{_profile(reader.profile)}")
+        _say(f"run        none: not a recording of a run{_profile(reader.profile)}")
     first_s = (summary.first_ns or 0) / 1e9 + summary.time_zero_s
     say(f"duration   {summary.duration_s:.1f} s, from {first_s:.1f} s of simulated time"
         if reader.is_recording else f"duration   {summary.duration_s:.1f} s")
     say(f"messages   {summary.messages} on {len(reader.channels)} channels")
-    say(f"lost       {_lost(summary)}")
-    say(f"closed     {_closing(summary)}")
+    _say(f"lost       {_lost(summary)}")
+    _say(f"closed     {_closing(summary)}")
     if summary.files:
-        say(f"attached   {', '.join(name for name, _, _ in summary.files)}")
+        _say(f"attached   {', '.join(name for name, _, _ in summary.files)}")
     say()
     print_table(("channel", "schema", "messages", "rate"), [
-        (row["channel"], row["schema"], row["messages"],
+        (plain_line(row["channel"]), plain_line(row["schema"]), row["messages"],
          f"{row['rate_hz']:.2f} Hz" if row["rate_hz"] is not None else "")
         for row in summary.table()])
     return 0
@@ -82,6 +86,12 @@ def bag_repair(options: argparse.Namespace) -> int:
         raise UsageError(str(error)) from None
     say(f"{options.out}: {copied} messages; left behind: {reader.damage or 'nothing'}")
     return 0
+
+
+def _say(line: str) -> None:
+    """Print a line in which words of the file are; they steer no terminal."""
+    head, words = line[:_WIDTH], line[_WIDTH:]
+    say(head + plain_line(words))
 
 
 def described(summary: Summary) -> dict[str, Any]:
@@ -101,7 +111,7 @@ def _losses(summary: Summary) -> dict[str, int] | None:
     """Return source → messages lost; None if the file does not say."""
     try:
         return {str(k): int(v) for k, v in json.loads(summary.end["lost"]).items()}
-    except (KeyError, ValueError, AttributeError, TypeError):
+    except (KeyError, ValueError, AttributeError, TypeError, RecursionError, OverflowError):
         return None
 
 

@@ -290,14 +290,17 @@ def _replay(options: argparse.Namespace) -> int:
         raise UsageError(f"--out {options.out}: no such directory")
     try:
         store = Store(directory)
+        found = store.find(options.replay)
+        store.close()
     except StoreError as error:
         raise UsageError(str(error)) from None
-    found = store.find(options.replay)
-    store.close()
     if found is None:
         raise UsageError(f"--replay {options.replay}: no run, or several, of this key in "
                          f"{directory}")
-    again = run_virtually(found.job)
+    try:
+        again = run_virtually(found.job)
+    except ValueError as error:
+        raise UsageError(f"--replay {options.replay}: {' '.join(str(error).split())}") from None
     same = again.trace == found.result.trace
     html, data = write_report(again.record, directory / "replays")
     if options.json:

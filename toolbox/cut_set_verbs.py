@@ -10,10 +10,11 @@ from typing import Any
 
 from actors import messages as m
 from actors import topics
+from files.reading import FileError, read_bytes
 from manager.barriers import Outlook, guard, outlook
 from manager.cut_sets import CutSets, TooLargeError
 from manager.formula import Formula, FormulaError, formula_of
-from manager.open_psa import OpenPsaError, read_open_psa, write_open_psa
+from manager.open_psa import MAX_BYTES, OpenPsaError, read_open_psa, write_open_psa
 from manager.order import UnknownElementError
 from manager.schema import SystemSpec
 from toolbox import systems
@@ -89,9 +90,12 @@ def run(options: argparse.Namespace) -> int:
 def _load(options: argparse.Namespace) -> tuple[SystemSpec | None, Formula]:
     if options.file and options.file.lower().endswith(".xml"):
         try:
-            return None, read_open_psa(Path(options.file).read_bytes(), options.file, options.top)
+            text = read_bytes(Path(options.file), MAX_BYTES)
+            return None, read_open_psa(text, options.file, options.top)
         except OSError as error:
             raise UsageError(f"{options.file}: {error.strerror}") from None
+        except FileError as error:
+            raise UsageError(f"{options.file}: {error}") from None
         except OpenPsaError as error:
             raise UsageError(str(error)) from None
     spec = systems.load(options.file)

@@ -14,6 +14,8 @@ from actors.runtime.topic import ROOT, Topic
 from actors.supervision.run_info import RunInfo
 from airport.formats import load_airport
 from airport.model import Airport
+from files import toml
+from files.reading import FileError, read_bytes
 from toolbox.extras import extra
 from toolbox.following import LOOK_S, is_over, sessions, stopped_by_signals
 from toolbox.output import UsageError, say, warn
@@ -153,8 +155,8 @@ def _airport(run: RunInfo) -> Airport | None:
 def _footprint_m(run: RunInfo) -> tuple[float, float] | None:
     """Return length and width of the run's robot, None if its system does not say."""
     try:
-        return footprint_m([(SYSTEM, "", Path(run.system_file).read_bytes())])
-    except OSError:
+        return footprint_m([(SYSTEM, "", read_bytes(Path(run.system_file), toml.MAX_SIZE))])
+    except (OSError, FileError):
         return None
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import os
 import socket
 import tempfile
@@ -28,6 +27,7 @@ from actors.runtime import run_folder
 from actors.runtime.actor import Context
 from actors.runtime.bus import BusError
 from actors.runtime.clock import Clock
+from actors.runtime.envelope import UNREADABLE
 from actors.runtime.messages import Message
 from actors.runtime.shared_bus import SharedBus
 from actors.runtime.tap import Tap
@@ -37,6 +37,8 @@ from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision import run_info
 from actors.supervision.process_title import find_processes
 from airport.formats import load_airport
+from files import toml
+from files.reading import read_text
 from manager.specification import check_document, read_document
 from toolbox.output import UsageError
 from toolbox.replay_page import NAME, ReplayPage
@@ -227,8 +229,8 @@ class Replay:
     def _info(self, clock: Clock, folder: Path) -> run_info.RunInfo:
         run = self.summary.run
         try:
-            nodes = [str(name) for name in json.loads(run.get("nodes", "[]"))]
-        except ValueError:
+            nodes = msgspec.json.decode(run.get("nodes", "[]"), type=list[str])
+        except UNREADABLE:
             nodes = []
         if not nodes:  # 0.5.0 wrote none of a run in virtual time
             head = topics.HEARTBEAT.at("")
@@ -252,11 +254,11 @@ class Replay:
             return None
         shared: dict[str, Any] = {
             "run_id": f"replay of {self._path.name}", "hmi_port": self._hmi_port}
-        text = (folder / SYSTEM).read_text("utf-8") if (folder / SYSTEM).exists() else ""
         with contextlib.suppress(ValueError, OSError):  # a page without a map shows the rest
             found = restore(self.summary.files, folder)
             shared["airport"] = load_airport(found) if found else None
-        with contextlib.suppress(ValueError):
+        with contextlib.suppress(ValueError, OSError):
+            text = read_text(folder / SYSTEM, toml.MAX_SIZE)
             shared["document"] = document = read_document(text, SYSTEM)
             shared["system"] = check_document(document, SYSTEM)
         return ReplayPage(Context(NAME, 1, clock, SharedBus(bus), {}, shared))

@@ -9,6 +9,8 @@ from typing import Any
 import systems
 from actors.runtime.topic import Topic
 from actors.supervision.system_topics import own_topics, system_topics
+from files import toml
+from files.reading import FileError, read_text
 from manager.specification import SpecificationError, SystemSpec, parse_specification
 from toolbox.output import UsageError
 
@@ -40,12 +42,12 @@ def load(file: str | None) -> SystemSpec:
     """
     path = DEFAULT if file is None else systems.find(file)
     try:
-        return parse_specification(path.read_text(encoding="utf-8"), str(path))
+        return parse_specification(read_text(path, toml.MAX_SIZE), str(path))
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}; a spec is right, or the name of a shipped "
                          f"one: {systems.names()}") from None
-    except UnicodeDecodeError:
-        raise UsageError(f"{path}: not UTF-8 text") from None
+    except FileError as error:
+        raise UsageError(f"{path}: {error}") from None
     except SpecificationError as error:
         raise UsageError(str(error)) from None
 

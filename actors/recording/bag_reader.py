@@ -7,12 +7,12 @@ said so; the rest counts.
 
 from __future__ import annotations
 
-import struct
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from mcap.exceptions import InvalidMagic, McapError
+from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     Channel,
@@ -24,15 +24,28 @@ from mcap.records import (
     Metadata,
     Schema,
 )
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
+from actors.recording.bag_records import (
+    COMPRESSIONS,
+    HEAD,
+    MAX_RECORD_BYTES,
+    TORN,
+    WANTED,
+    ExpansionError,
+    record_of,
+    records_in,
+    unpacked,
+)
 from actors.recording.bag_writer import END, KEY, RUN, BagError
+from actors.recording.run_documents import MAX_FILE_BYTES
+from files.reading import shown
 
-_TORN = (McapError, CRCValidationError, struct.error, UnicodeDecodeError, EOFError, RuntimeError,
-         MemoryError, OverflowError, ValueError)
-"""What reading a record raises that was cut off or overwritten; lz4 raises RuntimeError."""
+MAX_EXPANSION = 16 << 20, 64
+"""What a file may be unpacked: so many bytes, and so many times its own size on top. Ours are a
+tenth unpacked; one of nothing but equal messages in lz4 would be 255 times as large."""
 
-_COMPRESSIONS = ("", "lz4", "zstd")
+MAX_KEPT_BYTES = 64 << 20
+"""Of schemas, channels and metadata, which are kept while a file is read."""
 
 
 class BagReader:
@@ -78,12 +91,15 @@ class BagReader:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: dict[str, dict[str, str]] = {}
+        self._unpacked_bytes = 0
+        self._kept_bytes = 0
 
     def records(self) -> Iterator[McapRecord]:
         """Return metadata, attachments and messages in the order of the file.
 
         Raises:
-            BagError: it is compressed in a way that is not known here, or cannot be read any more.
+            BagError: it is compressed in a way that is not known here, is far larger than it
+                looks, or cannot be read any more.
         """
         self._reset()
         try:
@@ -92,7 +108,7 @@ class BagReader:
                     if isinstance(record, Chunk):
                         yield from self._messages(record)
                     elif isinstance(record, Metadata):
-                        self.metadata[record.name] = record.metadata
+                        self._keep(self.metadata, record.name, record.metadata)
                         yield record
                     elif isinstance(record, Attachment):
                         yield record
@@ -116,18 +132,27 @@ class BagReader:
 
     def _raw(self, file: BinaryIO) -> Iterator[McapRecord]:
         """Return the records as far as they can be read."""
-        reader = StreamReader(file, emit_chunks=True, record_size_limit=self.size_bytes)
-        records = reader.records
-        whole = 0
+        whole = file.seek(len(_MAGIC))
         while True:
+            head = file.read(HEAD.size)
+            kind, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, self.size_bytes)
+            if length > self.size_bytes - file.tell():
+                self._damaged(f"cut off after byte {whole}")
+                return
+            if kind == Opcode.FOOTER:
+                file.seek(length, 1)
+                if file.read(len(_MAGIC)) != _MAGIC:
+                    self._damaged("the last bytes")
+                return
+            if kind not in WANTED or length > MAX_RECORD_BYTES:
+                if kind in WANTED:
+                    self._damaged(f"a record of {length} bytes, at most {MAX_RECORD_BYTES} are "
+                                  "read")
+                whole = file.seek(length, 1)
+                continue
             try:
-                record = next(records)
-            except StopIteration:
-                return
-            except InvalidMagic:
-                self._damaged("the last bytes")
-                return
-            except _TORN:
+                record = record_of(kind, file.read(length))
+            except TORN:
                 self._damaged(f"cut off after byte {whole}")
                 return
             whole = file.tell()
@@ -137,28 +162,41 @@ class BagReader:
                 yield record
 
     def _messages(self, chunk: Chunk) -> Iterator[McapRecord]:
-        if chunk.compression not in _COMPRESSIONS:  # the library would take it for not compressed
-            raise BagError(f"{self.path}: compressed by {chunk.compression!r}; known are lz4, "
+        if chunk.compression not in COMPRESSIONS:
+            raise BagError(f"{self.path}: compressed by {shown(chunk.compression)}; known are lz4, "
                            "zstd and none")
         try:
-            parts = breakup_chunk(chunk, validate_crc=True)
-        except (*_TORN, Exception) as error:  # zstandard has errors of its own
+            data = unpacked(chunk)
+            self._unpacked_bytes += len(data)
+            at_least, times = MAX_EXPANSION
+            if self._unpacked_bytes > at_least + times * self.size_bytes:
+                raise BagError(f"{self.path}: unpacks to more than {times} times its size; no "
+                               "recording does")
+            for record in records_in(data):
+                yield from self._content(record)
+        except ExpansionError as error:
+            raise BagError(f"{self.path}: {error}") from None
+        except TORN as error:
             self._damaged(f"a chunk ({type(error).__name__})")
-            return
-        for record in parts:
-            yield from self._content(record)
 
     def _content(self, record: Any) -> Iterator[Message]:
         """Note schemas and channels, return messages: what stands in a chunk, or without one."""
         if isinstance(record, Schema):
-            self.schemas[record.id] = record
+            self._keep(self.schemas, record.id, record)
         elif isinstance(record, Channel):
-            self.channels[record.id] = record
+            self._keep(self.channels, record.id, record)
         elif isinstance(record, Message):
             if record.channel_id in self.channels:
                 yield record
             else:
                 self._damaged("messages of a channel that was lost")
+
+    def _keep(self, kept: dict[Any, Any], name: int | str, what: Any) -> None:
+        self._kept_bytes += _bytes_of(what) - _bytes_of(kept.get(name))
+        if self._kept_bytes > MAX_KEPT_BYTES:
+            raise BagError(f"{self.path}: more than {MAX_KEPT_BYTES >> 20} MB of schemas, channels "
+                           "and metadata")
+        kept[name] = what
 
     def _damaged(self, what: str) -> None:
         if what not in self.damage:
@@ -166,6 +204,21 @@ class BagReader:
 
 
 _MAGIC = b"\x89MCAP0\r\n"
+
+
+_ENTRY_BYTES = 200
+"""That an entry of a dictionary takes besides its text."""
+
+
+def _bytes_of(what: Any) -> int:
+    match what:
+        case Schema():
+            return len(what.data) + len(what.name) + len(what.encoding)
+        case Channel():
+            return len(what.topic) + len(what.message_encoding) + _bytes_of(what.metadata)
+        case dict():
+            return sum(len(key) + len(value) + _ENTRY_BYTES for key, value in what.items())
+    return 0
 
 
 def key_of(channel: Channel) -> str | None:
@@ -178,6 +231,10 @@ class Summary:
 
     Args:
         reader: of the file, which is read once.
+
+    Attributes:
+        files: names, media types and content of what is attached; the content of those that go
+            beyond what a recording attaches is left out.
     """
 
     def __init__(self, reader: BagReader) -> None:
@@ -186,6 +243,7 @@ class Summary:
         self.files: list[tuple[str, str, bytes]] = []
         self.first_ns: int | None = None
         self.last_ns = 0
+        left = MAX_FILE_BYTES
         for record in reader.records():
             if isinstance(record, Message):
                 self.counts[record.channel_id] = self.counts.get(record.channel_id, 0) + 1
@@ -193,7 +251,9 @@ class Summary:
                     self.first_ns = record.log_time
                 self.last_ns = max(self.last_ns, record.log_time)
             elif isinstance(record, Attachment):
-                self.files.append((record.name, record.media_type, record.data))
+                data = record.data if len(record.data) <= left else b""
+                left -= len(data)
+                self.files.append((record.name, record.media_type, data))
         self.run = reader.metadata.get(RUN, {})
         self.end = reader.metadata.get(END, {})
 
@@ -211,9 +271,10 @@ class Summary:
     def time_zero_s(self) -> float:
         """Simulated time at `log_time` 0; 0 in files of others."""
         try:
-            return float(self.run.get("time_zero_s", "0"))
+            zero_s = float(self.run.get("time_zero_s", "0"))
         except ValueError:
             return 0.0
+        return zero_s if math.isfinite(zero_s) else 0.0
 
     @property
     def keys(self) -> dict[str, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
@@ -13,6 +12,8 @@ import msgspec
 
 from airport.foreign import IMAGE_SUFFIXES
 from airport.formats import load_airport
+from files import toml
+from files.reading import FileError, read_bytes
 
 FORMAT = "1"
 SYSTEM = "system.toml"
@@ -21,7 +22,7 @@ AIRPORT = "airport/"
 
 _MEDIA = {".toml": "application/toml", ".graph": "application/json", ".png": "image/png",
           ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
-_MAX_FILE_BYTES = 64 << 20
+MAX_FILE_BYTES = 64 << 20
 
 File = tuple[str, str, bytes]
 """Name in the recording, media type, content."""
@@ -74,11 +75,10 @@ def collect(plan: Mapping[str, Any], **known: Any) -> Documents:
     files: list[File] = []
     for name, path in _paths(plan):
         try:
-            data = path.read_bytes()
-        except OSError:
+            data = read_bytes(path, MAX_FILE_BYTES)
+        except (OSError, FileError):
             continue
-        if len(data) <= _MAX_FILE_BYTES:
-            files.append((name, _MEDIA.get(path.suffix.lower(), "text/plain"), data))
+        files.append((name, _MEDIA.get(path.suffix.lower(), "text/plain"), data))
     return Documents(plan=plan, files=tuple(files), version=own_version(), **known)
 
 
@@ -95,9 +95,9 @@ def footprint_m(files: Sequence[File]) -> tuple[float, float] | None:
     for name, _media, data in files:
         if name == SYSTEM:
             try:
-                robot = tomllib.loads(data.decode())["robot"]
+                robot = toml.parse(data.decode())["robot"]
                 return float(robot["length_m"]), float(robot["width_m"])
-            except (ValueError, KeyError, TypeError):
+            except (ValueError, KeyError, TypeError, OverflowError):
                 return None
     return None
 

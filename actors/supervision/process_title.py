@@ -15,7 +15,7 @@ from pathlib import Path
 
 import setproctitle
 
-_TITLE = re.compile(r"^rampart\[(\d+)/(\d+)\] ([\w+.-]+) #(\d+)")
+_TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
 _STATE_STOPPED = ("T", "t")
 
 

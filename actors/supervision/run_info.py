@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 
+from actors.runtime.envelope import UNREADABLE
 from actors.runtime.unix_peer import is_same_user
 from actors.runtime.zenoh_bus import endpoint
 
@@ -104,5 +105,5 @@ def ask(port: int) -> RunInfo | None:
             if not is_same_user(connection):
                 return None
             return msgspec.json.decode(connection.recv(65536), type=RunInfo)
-        except (OSError, ValueError):
+        except (OSError, *UNREADABLE):
             return None

@@ -21,6 +21,8 @@ from actors.runtime.web_access import page_url
 from actors.runtime.wiring import Member, load_class, partners
 from actors.runtime.zenoh_bus import endpoint
 from actors.supervision.kill_node import signal_node
+from files import toml
+from files.reading import FileError, read_text
 from manager.specification import (
     Kind,
     Layers,
@@ -138,9 +140,9 @@ def load_document(plan: RunPlan) -> dict[str, Any]:
         OSError: it cannot be read.
     """
     try:
-        text = Path(plan.system_file).read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise SpecificationError(plan.system_file, "$", "not UTF-8 text") from None
+        text = read_text(Path(plan.system_file), toml.MAX_SIZE)
+    except FileError as error:
+        raise SpecificationError(plan.system_file, "$", str(error)) from None
     document = read_document(text, plan.system_file)
     chosen = {"strategy": plan.strategy, "shadow": plan.shadow}
     return {**document, **{key: name for key, name in chosen.items() if name}}

@@ -17,6 +17,8 @@ import msgspec
 
 import systems
 from actors.supervision.run_plan import RunPlan, load_shared, load_system, tailor
+from files import toml
+from files.reading import read_text
 from manager.adaptation import Action, Change, adapt
 from manager.specification import check_document, read_document
 from sim.campaign.defaults import PATIENCE_S
@@ -219,7 +221,7 @@ def _metres(value: float) -> float | None:
 def _document(system: str) -> tuple[str, dict[str, Any]]:
     """Return path and document of a system spec."""
     file = systems.find(system)
-    return str(file), read_document(file.read_text(encoding="utf-8"), str(file))
+    return str(file), read_document(read_text(file, toml.MAX_SIZE), str(file))
 
 
 @lru_cache(maxsize=8)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import msgspec
 
+from files.reading import shown
 from sim.campaign.job import Job, RunResult
 
 FILE_NAME = "runs.sqlite"
@@ -21,6 +22,9 @@ create table if not exists runs (
     finished_at text not null default current_timestamp);
 """
 _FORMAT = "1"
+
+MAX_VALUE_BYTES = 16 << 20
+"""Of a job or a result; those of the paper's campaign have some kilobytes."""
 
 
 class StoreError(ValueError):
@@ -56,41 +60,62 @@ class Store:
                              ) from None
         try:
             self._database = sqlite3.connect(self.path, timeout=30.0)
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
             self._database.execute("pragma journal_mode = wal")
             self._database.executescript(_SCHEMA)
             self._database.execute(
                 "insert or ignore into about values ('format', ?)", (_FORMAT,))
             self._database.commit()
-            found = self._database.execute(
-                "select value from about where name = 'format'").fetchone()[0]
-        except sqlite3.DatabaseError as error:
+            (found,) = self._database.execute(
+                "select value from about where name = 'format'").fetchone()
+            foreign = self._database.execute(
+                "select name from sqlite_master where type in ('view', 'trigger')").fetchone()
+        except (sqlite3.Error, ValueError, TypeError) as error:
             raise StoreError(f"{self.path}: no store of campaign results: {error}") from None
+        if foreign is not None:  # what it computes nobody bounds
+            raise StoreError(f"{self.path}: no store of campaign results: it has a view or trigger")
         if found != _FORMAT:
-            raise StoreError(f"{self.path}: format {found}, this program reads {_FORMAT}; "
+            raise StoreError(f"{self.path}: format {shown(found)}, this program reads {_FORMAT}; "
                              "choose another --out")
 
     def keys(self) -> set[str]:
-        """Return the keys of the runs that are there."""
-        with self._told():
+        """Return the keys of the runs that are there.
+
+        Raises:
+            StoreError: the file is damaged.
+        """
+        with self._using():
             return {key for (key,) in self._database.execute("select key from runs")}
 
     def add(self, job: Job, result: RunResult) -> None:
-        """Keep a run; one that is there already stays as it is."""
-        with self._told(), self._database:
+        """Keep a run; one that is there already stays as it is.
+
+        Raises:
+            StoreError: it cannot be written.
+        """
+        with self._using(), self._database:
             self._database.execute(
                 "insert or ignore into runs (key, job, result) values (?, ?, ?)",
                 (job.key, msgspec.msgpack.encode(job), msgspec.msgpack.encode(result)))
 
     def find(self, key: str) -> Run | None:
-        """Return the run whose key begins so, if there is exactly one."""
-        with self._told():
+        """Return the run whose key begins so, if there is exactly one.
+
+        Raises:
+            StoreError: the file is damaged.
+        """
+        with self._using():
             found = self._database.execute(
                 "select job, result from runs where key like ? limit 2", (f"{key}%",)).fetchall()
             return _run(*found[0]) if len(found) == 1 else None
 
     def runs(self, keys: set[str] | None = None) -> Iterator[Run]:
-        """Yield the runs in the order in which they were made; all, or those with the keys."""
-        with self._told():
+        """Yield the runs in the order in which they were made; all, or those with the keys.
+
+        Raises:
+            StoreError: the file is damaged.
+        """
+        with self._using():
             for key, job, result in self._database.execute(
                     "select key, job, result from runs order by rowid"):
                 if keys is None or key in keys:
@@ -98,15 +123,20 @@ class Store:
 
     def close(self) -> None:
         """Close the file."""
-        with self._told():
+        with self._using():
             self._database.close()
 
     @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
+    def _using(self) -> Iterator[None]:
         try:
             yield
-        except (sqlite3.Error, msgspec.MsgspecError, OSError) as error:
-            raise StoreError(f"{self.path}: {' '.join(str(error).split())}") from None
+        except (sqlite3.Error, OSError, *_NO_RUN) as error:
+            raise StoreError(f"{self.path}: cannot be used: {' '.join(str(error).split())}; "
+                             "choose another --out") from None
+
+
+_NO_RUN = (ValueError, TypeError, RecursionError)
+"""What decoding raises that meets other bytes, or no bytes at all."""
 
 
 def _run(job: bytes, result: bytes) -> Run:

@@ -1,0 +1,1 @@
+"""How a file that somebody else wrote is read: bounded before any work is done."""
