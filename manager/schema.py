@@ -23,8 +23,8 @@ from manager.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
 from manager.order import PartialOrder, Tree, refine
 
 _NAME_CHARS = 64
-"""What the address of a node's socket has room for (`actors.runtime.run_folder`), and well below what
-a message takes as a name (`actors.runtime.bounds`), which may add to it."""
+"""What the address of a node's socket has room for (`actors.runtime.run_folder`), well below what a
+message takes as a name (`actors.runtime.bounds`), which may add to it."""
 
 OptionalName = Annotated[str, msgspec.Meta(
     pattern=r"^([A-Za-z][A-Za-z0-9_]*)?\Z", max_length=_NAME_CHARS)]
