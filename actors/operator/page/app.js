@@ -40,7 +40,7 @@ function connect() {
   socket = new WebSocket(`ws://${location.host}/ws`, protocols());
   socket.onmessage = (event) => { lastHeard = Date.now(); receive(JSON.parse(event.data)); };
   socket.onclose = (event) => lost(
-    event.code === NO_TOKEN ? "token missing: open the address that the run has printed"
+    event.code === NO_TOKEN ? "token missing: open the address that the run has printed, or #token=… with yours"
       : event.reason ? `closed by the HMI: ${event.reason}; reconnecting`
         : "HMI not reachable, reconnecting");
 }
