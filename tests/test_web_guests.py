@@ -10,8 +10,10 @@ from actors.runtime.web_guests import (
     BYTES_AT_ONCE,
     BYTES_PER_S,
     PATIENCE_S,
+    REQUESTS_AT_ONCE,
     ROOM,
     WAITING_ROOM,
+    Bucket,
     Guests,
 )
 
@@ -114,6 +116,29 @@ def test_who_sends_as_much_as_is_allowed_may_stay_and_who_sends_more_may_not(hal
     assert guest.sends(BYTES_AT_ONCE, 1.0)
     assert all(guest.sends(BYTES_PER_S, 1.0 + second) for second in range(1, 100))
     assert not guest.sends(BYTES_PER_S, 100.5)
+
+
+def test_a_source_without_a_token_may_ask_for_so_much_with_all_its_connections_together(hall):
+    guests = [hall.come("a"), hall.come("a")]
+    assert all(guests[i % 2].answered(2.0) for i in range(REQUESTS_AT_ONCE))
+    assert not guests[0].answered(2.0)
+    assert hall.come("b").answered(3.0)
+    assert hall.come("a", known=True).answered(2.0)
+
+
+def test_a_bucket_says_how_long_to_wait_and_fills_again():
+    bucket = Bucket(2, 10, 0.0)
+    assert [bucket.take(1, 0.0) for _ in range(4)] == [0, 0, pytest.approx(0.1), pytest.approx(0.2)]
+    assert bucket.take(1, 0.5) == 0
+    assert [bucket.take(1, 100.0) for _ in range(3)] == [0, 0, pytest.approx(0.1)]
+
+
+def test_nothing_is_kept_of_a_source_that_has_left(hall):
+    hall.come("a", 2)
+    for number in (1, 2):
+        assert "a" in hall.guests._requests
+        hall.guests.left(number)
+    assert hall.guests._requests == {}
 
 
 @given(st.lists(st.tuples(st.sampled_from("abcdef"), st.booleans(), st.booleans())))

@@ -5,8 +5,10 @@ end for a request that is not finished. Here `web_guests` decides who goes, and 
 protocols tell it who comes, who is answered and who leaves. What uvicorn can do is left to it: to
 close an idle connection, to ping a WebSocket, to bound a message.
 
-It runs on the caller's event loop, without uvicorn's main loop (ten wake-ups a second) and without
-its signal handlers. It costs nothing while nobody is connected.
+It runs on the caller's event loop, of uvicorn there are but the two protocols: its server wakes up
+ten times a second, handles signals, and takes as many connections in one turn of the loop as come.
+Here it is one, so that who is there has a turn after each; and whoever is refused costs a tenth of
+whoever is let in. Nothing is done while nobody is connected.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ import contextlib
 import os
 import socket
 from collections.abc import Iterator
-from typing import Any, cast
+from functools import partial
+from typing import Any
 
 import uvicorn
 from starlette.types import ASGIApp, Scope
@@ -25,13 +28,17 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from uvicorn.server import ServerState
 
 from actors.runtime.tcp_peer import plain_address, user_of_peer
-from actors.runtime.web_guests import Guest, Guests
-
-AT_ONCE = 16
-"""Connections that are taken in one turn of the loop; those that there are have their turn then."""
+from actors.runtime.web_guests import (
+    COMING_AT_ONCE,
+    COMING_PER_S,
+    REFUSED_COST,
+    Bucket,
+    Guest,
+    Guests,
+)
 
 QUEUE = 256
-"""Connections that the kernel keeps until then. Beyond, one is lost and tried again in a second."""
+"""Connections that wait in the kernel. Beyond, one is lost and tried again in a second."""
 
 RECEIVE_BUFFER = 16_384
 """Bytes that the kernel keeps of a connection: what it can send that is handled in one turn."""
@@ -44,8 +51,10 @@ PING_S = 5.0
 """A WebSocket that does not answer a ping for so long is closed."""
 
 _SWEEP_S = 1.0
+_RETRY_S = 0.1
 _GUEST = "guest"
 _RECEPTION = "reception"
+_SOURCE = "source"
 
 _NOT_YOURS = (
     b"HTTP/1.1 403 Forbidden\r\ncontent-type: text/plain; charset=utf-8\r\nconnection: close\r\n"
@@ -61,7 +70,8 @@ class Reception:
     """
 
     def __init__(self, refusal: str, *, known: bool) -> None:
-        self._refusal = refusal.encode() + b"\n" if refusal else b""
+        text = refusal.encode() + b"\n"
+        self._refusal = _NOT_YOURS % (len(text), text) if refusal else b""
         self._known = known
         self._guests: Guests[asyncio.Transport] = Guests()
         self._sweeper: asyncio.TimerHandle | None = None
@@ -69,14 +79,29 @@ class Reception:
     def __len__(self) -> int:
         return len(self._guests)
 
-    def came(self, transport: asyncio.Transport) -> Guest | None:
-        """Let a connection in, at the cost of another if need be; None if it is refused."""
-        loop = asyncio.get_running_loop()
-        user, source = _whose(transport)
-        if self._refusal and user != os.getuid():
-            transport.write(_NOT_YOURS % (len(self._refusal), self._refusal))
-            transport.close()
+    def source(self, connection: socket.socket) -> str | None:
+        """Return whom a connection is counted with; None if it was refused and is closed.
+
+        A machine has as many addresses of IPv6 as it likes; those of one network are one source.
+        """
+        try:
+            peer, local = connection.getpeername()[:2], connection.getsockname()[:2]
+        except OSError:  # it has gone again
+            connection.close()
             return None
+        address = plain_address(peer[0])
+        user = user_of_peer(local, peer) if address.is_loopback else None
+        if self._refusal and user != os.getuid():
+            with connection, contextlib.suppress(OSError):
+                connection.send(self._refusal)
+            return None
+        if address.is_loopback:
+            return f"user {user}"
+        return str(address) if address.version == 4 else address.packed[:8].hex()
+
+    def came(self, transport: asyncio.Transport, source: str) -> Guest:
+        """Let a connection in, at the cost of another if need be."""
+        loop = asyncio.get_running_loop()
         guest, go = self._guests.came(transport, source, known=self._known, now_s=loop.time())
         for one in go:
             one.abort()
@@ -98,21 +123,6 @@ class Reception:
         for one in self._guests.overdue(loop.time()):
             one.abort()
         self._sweeper = loop.call_later(_SWEEP_S, self._sweep) if len(self._guests) else None
-
-
-def _whose(transport: asyncio.Transport) -> tuple[int | None, str]:
-    """Return the user at the other end, None if it is another machine or unknown, and the source.
-
-    A machine has as many addresses of IPv6 as it likes; those of one network are one source.
-    """
-    peer, local = transport.get_extra_info("peername"), transport.get_extra_info("sockname")
-    if not (peer and local):  # it has gone again
-        return None, "gone"
-    address = plain_address(peer[0])
-    if address.is_loopback:
-        user = user_of_peer(local[:2], peer[:2])
-        return user, f"user {user}"
-    return None, str(address) if address.version == 4 else address.packed[:8].hex()
 
 
 def is_known(scope: Scope) -> None:
@@ -140,29 +150,24 @@ def served(scope: Scope) -> Iterator[None]:
 class _Http(H11Protocol):
     """A connection that makes requests, until it becomes a WebSocket."""
 
-    _guest: Guest | None = None
-
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self._guest = self._reception.came(transport)
-        self.app_state = {**self.app_state, _GUEST: self._guest}
+        reception: Reception = self.app_state[_RECEPTION]
+        guest = reception.came(transport, self.app_state[_SOURCE])
+        self.app_state = {**self.app_state, _GUEST: guest}
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
-        self._reception.left(self.transport)
+        self.app_state[_RECEPTION].left(self.transport)
 
     def data_received(self, data: bytes) -> None:
-        if _may(self._guest, data, self.transport):
+        if _may(self.app_state[_GUEST], data, self.transport):
             super().data_received(data)
 
     def on_response_complete(self) -> None:
-        if self._guest is not None:
-            self._guest.since_s = self.loop.time()
+        if not self.app_state[_GUEST].answered(self.loop.time()):
+            self.transport.close()
         super().on_response_complete()
-
-    @property
-    def _reception(self) -> Reception:
-        return cast("Reception", self.app_state[_RECEPTION])
 
 
 class _WebSocket(WebSocketsSansIOProtocol):
@@ -186,9 +191,9 @@ class _WebSocket(WebSocketsSansIOProtocol):
             super().data_received(data)
 
 
-def _may(guest: Guest | None, data: bytes, transport: asyncio.Transport) -> bool:
+def _may(guest: Guest, data: bytes, transport: asyncio.Transport) -> bool:
     """Tell whether a connection may go on; if it floods or does not read, end it."""
-    if guest is None or not guest.sends(len(data), asyncio.get_running_loop().time()) or (
+    if not guest.sends(len(data), asyncio.get_running_loop().time()) or (
             transport.get_write_buffer_size() > UNREAD_BYTES):
         transport.abort()
         return False
@@ -211,26 +216,46 @@ class WebServer:
         self.reception = Reception(refusal, known=known)
         self._listening = listening
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)  # inherited
-        config = uvicorn.Config(
+        self._config = uvicorn.Config(
             app, log_config=None, log_level="critical", access_log=False, lifespan="off",
-            server_header=False, date_header=False, http=_Http, ws=_WebSocket, backlog=AT_ONCE,
+            server_header=False, date_header=False, http=_Http, ws=_WebSocket,
             timeout_keep_alive=KEEP_ALIVE_S, ws_ping_interval=PING_S, ws_ping_timeout=PING_S,
             ws_per_message_deflate=False, **settings)
-        config.load()
-        self._server = uvicorn.Server(config)
-        self._server.lifespan = config.lifespan_class(config)
-        self._server.lifespan.state[_RECEPTION] = self.reception
+        self._config.load()
+        self._state = ServerState()
+        self._accepting: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
         """Begin to serve, on the running loop."""
-        await self._server.startup(sockets=[self._listening])
-        self._listening.listen(QUEUE)  # asyncio has one number for both
+        self._listening.setblocking(False)
+        self._listening.listen(QUEUE)
+        self._accepting = asyncio.get_running_loop().create_task(self._accept())
 
     def stop(self) -> None:
         """Stop listening and say goodbye; harmless when not started."""
         self.reception.close()
-        for server in getattr(self._server, "servers", []):
-            server.close()
+        if self._accepting is not None:
+            asyncio.get_running_loop().remove_reader(self._listening)
+            self._accepting.cancel()
         self._listening.close()
-        for connection in list(self._server.server_state.connections):
+        for connection in list(self._state.connections):
             connection.shutdown()
+
+    async def _accept(self) -> None:
+        """Take one connection after the other, at the pace that leaves time for those there are."""
+        loop = asyncio.get_running_loop()
+        coming = Bucket(COMING_AT_ONCE, COMING_PER_S, loop.time())
+        while True:
+            cost = REFUSED_COST
+            try:
+                connection, _ = await loop.sock_accept(self._listening)
+                source = self.reception.source(connection)
+                if source is not None:
+                    cost = 1.0
+                    await loop.connect_accepted_socket(partial(self._protocol, source), connection)
+            except OSError:  # no descriptor is left, for instance
+                await asyncio.sleep(_RETRY_S)
+            await asyncio.sleep(coming.take(cost, loop.time()))  # others have their turn
+
+    def _protocol(self, source: str) -> _Http:
+        return _Http(self._config, self._state, {_RECEPTION: self.reception, _SOURCE: source})
