@@ -284,7 +284,9 @@ async def test_a_token_lets_another_user_in(world):
 
 
 @needs_root
-async def test_on_loopback_users_are_told_apart_and_one_does_not_displace_another(world):
+async def test_on_loopback_users_are_told_apart_and_one_does_not_displace_another(
+        world, monkeypatch):
+    monkeypatch.setattr(web_guests, "PATIENCE_S", 60.0)
     hold = f"""
 held = [connect() for _ in range({MANY})]
 print("here", flush=True)
