@@ -43,7 +43,7 @@ REQUESTS_PER_S = 100
 """Of a source that has shown no token; a page that opens makes some twenty."""
 
 COMING_AT_ONCE = 150
-COMING_PER_S = 200
+COMING_PER_S = 400
 """Connections that are taken; others wait in the kernel's queue."""
 
 REFUSED_COST = 0.2

@@ -37,7 +37,7 @@ from actors.runtime.web_guests import (
     Guests,
 )
 
-QUEUE = 256
+QUEUE = 1024
 """Connections that wait in the kernel. Beyond, one is lost and tried again in a second."""
 
 RECEIVE_BUFFER = 16_384
