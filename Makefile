@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test test-slow lint campaign bench bench-respawn chaos setup clean requirements
+.PHONY: run test test-slow lint campaign bench bench-respawn chaos chaos-pairs setup clean requirements
 
 run: setup
 	$(BIN)/python launch.py
@@ -41,6 +41,11 @@ bench-respawn: setup
 chaos: setup
 	$(BIN)/python tests/checkpoint_runs.py 0 10 6
 	$(BIN)/python tests/chaos_runs.py
+
+# Hits every pair of processes of the full system, one after the other in long missions; an hour or
+# more. Interrupted, it goes on where it was: reports/chaos-pairs.jsonl says what is done.
+chaos-pairs: setup
+	$(BIN)/python tests/chaos_pair_runs.py
 
 setup: .venv/installed
 

@@ -24,6 +24,7 @@ import systems
 from actors.recording.bag_writer import BagError, check_target
 from actors.recording.process import Order, RecorderProcess
 from actors.recording.virtual import VirtualRecording
+from actors.runtime import working_folder
 from actors.runtime.token_file import SecretError, read_secret
 from actors.runtime.topic import Topic
 from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
@@ -118,7 +119,8 @@ def parser() -> argparse.ArgumentParser:
                    "one; for yourself on this machine none is needed)")
     p.add_argument("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS)  # refused
     p.add_argument("--port", metavar="PORT", type=int, default=DEFAULT_PORT,
-                   help=f"first of the run's Zenoh ports on loopback (default: {DEFAULT_PORT})")
+                   help="number that tells runs on this machine apart; no port is opened "
+                   f"(default: {DEFAULT_PORT})")
     p.add_argument("--joystick", metavar="DEVICE", nargs="?", const="auto", default="",
                    help="drive with a joystick or gamepad of this machine, e.g. /dev/input/js0 "
                    "(without DEVICE: the first one); hold its left shoulder button to drive")
@@ -408,7 +410,7 @@ async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -
         await run.run()
     if options.json:
         print(json.dumps(run.summary()), flush=True)
-    return EXIT_SUCCESS
+    return EXIT_FAILED if run.launcher.failure else EXIT_SUCCESS
 
 
 def _directory(options: argparse.Namespace, name: str) -> Path:
@@ -506,8 +508,7 @@ def _existing_path(name: str) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line, run, and return the exit code."""
     options = parser().parse_args(arguments)
-    if "" not in sys.path:
-        sys.path.append("")  # actors of one's own are found here, as by the processes of a run
+    working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
         _check(options)
         plan, spec = _plan(options)

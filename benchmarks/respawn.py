@@ -25,7 +25,6 @@ from actors.messages import DecisionRecord, DetectionReport, DetectionState, Nod
 from actors.runtime.actor import Actor, Context, Header, on
 from actors.runtime.clock import Clock
 from actors.runtime.topic import Topic
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher
 from actors.supervision.process_title import find_processes
 from actors.supervision.run_plan import OBSERVER, RunPlan
@@ -139,8 +138,7 @@ async def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
     try:
         await launcher.load()
         await launcher.start()
-        ports = dict(launcher.ports)
-        bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()))
+        bus = launcher.observers_bus()
         clock = Clock(launcher.plan.origin_s)
         watch = Stopwatch(Context(OBSERVER, 1, clock, bus, {}, {"launcher": launcher}))
         task = asyncio.create_task(watch.run())

@@ -21,7 +21,6 @@ from actors import topics
 from actors.messages import NodeTable, ProcessEvent
 from actors.runtime.actor import Actor, Context, Header, on
 from actors.runtime.clock import Clock
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher
 from actors.supervision.process_title import find_processes
 from actors.supervision.run_plan import OBSERVER, SUPERVISOR, RunPlan
@@ -82,9 +81,8 @@ async def measure(port: int, kills: int) -> dict[str, list[float]]:
     try:
         await launcher.load()
         await launcher.start()
-        launcher.on_restart = lambda _name: back.append(time.monotonic())
-        ports = dict(launcher.ports)
-        bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()))
+        launcher.guard.on_restart = lambda _name: back.append(time.monotonic())
+        bus = launcher.observers_bus()
         clock = Clock(launcher.plan.origin_s)
         ear = Ear(Context(OBSERVER, 1, clock, bus, {}, {"launcher": launcher}))
         task = asyncio.create_task(ear.run())

@@ -47,7 +47,7 @@ from manager.schema import (
 __all__ = [
     "AtLeast", "DetectionSpec", "EventSpec", "Hazard", "Kind", "Layers", "MechanismSpec",
     "NodeSpec", "RecoverySpec", "Robot", "SpecificationError", "SystemSpec", "Timing",
-    "check_document", "parse_specification", "read_document",
+    "check_document", "check_modules", "parse_specification", "read_document",
 ]
 
 TABLES: dict[str, type[Table]] = {
@@ -106,6 +106,23 @@ def read_document(text: str, file: str) -> dict[str, Any]:
                                  f"to be below {LARGEST:g}") from None
     except RecursionError:
         raise SpecificationError(file, "$", _TOO_DEEP) from None
+
+
+def check_modules(before: SystemSpec, after: SystemSpec) -> None:
+    """Make sure that a changed system names no module that the system it came from does not.
+
+    A class is imported when it is named, and its module is executed: which ones may be is said by
+    the file that the operator started the system with, and by no message.
+
+    Raises:
+        ValueError: It does; the message names node, field and value.
+    """
+    known = {node.actor.partition(":")[0] for node in before.actors()}
+    for node in after.actors():
+        if node.actor.partition(":")[0] not in known:
+            raise ValueError(f"{node.name}: actor = {node.actor!r}: no actor of the system that "
+                             "was started is in that module; known modules: "
+                             f"{', '.join(sorted(known))}")
 
 
 def check_document(document: dict[str, Any], file: str) -> SystemSpec:

@@ -21,6 +21,8 @@ from actors.messages import (
     ShadowRecord,
 )
 from actors.runtime.actor import Header
+from actors.runtime.bounds import MANY, MOST
+from actors.runtime.limits import Remembered
 from actors.runtime.topic import Topic
 from actors.supervision.run_plan import SUPERVISOR, RunPlan
 from airport.model import Mission
@@ -43,8 +45,8 @@ class Console:
         self._live_text = ""
         self._step = -1
         self._phase: MissionPhase | None = None
-        self._lights: dict[str, LightVerdict] = {}
-        self._detections: dict[str, DetectionState] = {}
+        self._lights: dict[str, LightVerdict] = Remembered(MOST)
+        self._detections: dict[str, DetectionState] = Remembered(MANY)
         self._silent: tuple[str, ...] = ()
         self._mission: MissionStatus | None = None
         self._pilot = ""

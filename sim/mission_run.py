@@ -78,6 +78,10 @@ class MissionRun:
             ProcessEvent(name, "respawned", 0, self._brought_back, LAUNCHER, ""),
             Header(LAUNCHER, 1, self._brought_back, now_s))
 
+    def excuse(self, stall_s: float) -> None:
+        """Do not count simulated seconds in which the launcher heard nothing, being stopped."""
+        self._end.excuse(stall_s)
+
     def over(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
         return self._end.ended(now_s)

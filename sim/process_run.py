@@ -9,14 +9,14 @@ from typing import Any
 from actors.messages import NodeTable
 from actors.runtime.actor import Actor, Context, Header
 from actors.runtime.clock import Clock
+from actors.runtime.run_folder import register_of
 from actors.runtime.shared_bus import SharedBus
-from actors.runtime.tap import Tap
 from actors.runtime.topic import Topic
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher
 from actors.supervision.process_hand import ProcessHand
 from actors.supervision.run_plan import OBSERVER
 from actors.supervision.system_topics import system_topics
+from actors.supervision.unseen import watch
 from manager.schema import SystemSpec
 from sim.injector import INJECTOR, Injector, can_be_hit
 from sim.mission_run import MissionRun
@@ -25,6 +25,7 @@ from sim.report_record import RunRecord
 from sim.scenario import PlannedFault
 
 _LOOK_S = 0.05
+_STALL_S = 0.5
 
 
 class ProcessRun:
@@ -63,39 +64,45 @@ class ProcessRun:
         launcher, mission = self.launcher, self._mission
         plan = launcher.plan
         clock = Clock(plan.origin_s, plan.rate)
-        launcher.on_restart = lambda name: mission.brought_back(name, clock.now())
+        launcher.guard.on_restart = lambda name: mission.brought_back(name, clock.now())
         if console := mission.console:
-            launcher.on_trouble = lambda text: console.line(clock.now(), text)
+            launcher.guard.report = lambda text: console.line(clock.now(), text)
 
         def to_launcher(_topic: Topic[Any], message: Any, _header: Header) -> None:
             if isinstance(message, NodeTable):
                 launcher.supervisor_heard(message)
 
-        ports = dict(launcher.ports)
-        own = ports.pop(OBSERVER)
-        others = [endpoint(port) for port in ports.values()]
-        bus = ZenohBus(OBSERVER, 1, endpoint(own), others, Tap(plan.base_port))
+        bus = launcher.observers_bus()
         sinks: list[Sink] = [to_launcher, *mission.sinks(clock)]
-        actors: list[Actor] = [Observer(Context(OBSERVER, 1, clock, bus, {}, {"sinks": sinks}))]
+        of_the_run: dict[str, Any] = {
+            "register": register_of(plan.folder), "members": frozenset(launcher.names)}
+        actors: list[Actor] = [Observer(Context(
+            OBSERVER, 1, clock, bus, {}, {"sinks": sinks}, **of_the_run))]
         injector = None
         if self._scenario:
             shared = {"scenario": self._scenario, "hand": ProcessHand(plan.base_port),
                       "nodes": can_be_hit(self._spec), "topics": system_topics(self._spec)}
             injector = Injector(Context(
-                INJECTOR, 1, clock, SharedBus(bus), {}, shared))
+                INJECTOR, 1, clock, SharedBus(bus), {}, shared, **of_the_run))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
+        for task, actor in zip(tasks, actors, strict=True):
+            watch(task, f"the launcher's {actor.name}", launcher.failed)
         if mission.console:
             mission.console.banner(
                 mission.airport.name, mission.mission, plan, self._spec)
         try:
             why = None
-            while why is None and not self.interrupted and not any(t.done() for t in tasks):
+            while why is None and not self.interrupted and not launcher.failure:
+                looked_s = clock.now()
                 await asyncio.sleep(_LOOK_S)
+                stall_s = clock.now() - looked_s - _LOOK_S * plan.rate
+                if stall_s > _STALL_S * plan.rate:  # ctrl-Z; what was sent meanwhile comes now
+                    mission.excuse(stall_s)
                 why = mission.over(clock.now())
-            for task in tasks:
-                if task.done():
-                    await task
+            if launcher.failure:
+                why = launcher.failure
+                launcher.guard.report(why)
         finally:
             for actor in reversed(actors):
                 actor.stop()

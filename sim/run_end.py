@@ -87,6 +87,14 @@ class RunEnd:
         self._moves = (abs(twist.linear_mps) > STANDING_MPS
                        or abs(twist.angular_radps) > STANDING_RADPS)
 
+    def excuse(self, stall_s: float) -> None:
+        """Do not count a time in which nobody here listened: the launcher itself was stopped."""
+        self._progress_at_s += stall_s
+        if self._truth_at_s is not None:
+            self._truth_at_s += stall_s
+        if self._lost_at_s is not None:
+            self._lost_at_s += stall_s
+
     def ended(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
         if self._truth_at_s is not None and now_s - self._truth_at_s > WORLD_SILENT_S:

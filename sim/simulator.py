@@ -15,6 +15,7 @@ import numpy as np
 from actors import messages as m
 from actors import topics
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
 from actors.runtime.topic import Topic
 from airport.formats import load_world
 from airport.model import Airport
@@ -169,7 +170,7 @@ class Simulator(Actor):
     def _report_fault(
         self, injection: str, affected: int, *, finished: bool, reason: str = ""
     ) -> None:
-        report = m.InjectionReport(injection, self.name, affected, finished, reason)
+        report = m.InjectionReport(injection, self.name, affected, finished, clip(reason))
         self.publish(topics.INJECTION_REPORT, report)
 
     def _measure_speed(self, now_s: float) -> None:

@@ -281,7 +281,8 @@ class VirtualMachine:
                 actor = member.actor(Context(
                     name, process.incarnation, self._clock, bus, member.parameters, self._shared,
                     process.pid, self._store(name, process.incarnation),
-                    self._layout.spec.timing.heartbeat_period_s))
+                    self._layout.spec.timing.heartbeat_period_s, register=self._known.get,
+                    members=frozenset(self._layout.members)))
             except Exception as error:
                 self._failed(process, name, error)
                 return

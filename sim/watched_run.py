@@ -6,6 +6,7 @@ For systems that are being specified, and for those whose world is not simulated
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from typing import Any, TextIO
 
 import msgspec
@@ -13,15 +14,20 @@ import msgspec
 from actors import topics
 from actors.messages import DecisionRecord, NodeTable, ProcessEvent
 from actors.runtime.actor import Context, Header
+from actors.runtime.bounds import MANY
 from actors.runtime.clock import Clock
-from actors.runtime.tap import Tap
+from actors.runtime.limits import Remembered
+from actors.runtime.run_folder import register_of
 from actors.runtime.topic import Topic
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision.launcher import Launcher
 from actors.supervision.run_plan import OBSERVER, RunPlan
+from actors.supervision.unseen import watch
 from manager.schema import SystemSpec
 from sim.console import Console
 from sim.observer import Observer
+
+KEPT_DECISIONS = 10_000
+"""The last so many decisions of a run are kept."""
 
 
 class WatchedRun:
@@ -41,8 +47,8 @@ class WatchedRun:
         self._spec = spec
         self._duration_s = duration_s
         self._console = Console(stream)
-        self._decisions: list[DecisionRecord] = []
-        self._restarts: dict[str, int] = {}
+        self._decisions: deque[DecisionRecord] = deque(maxlen=KEPT_DECISIONS)
+        self._restarts: Remembered[str, int] = Remembered(MANY)
         self._lasted_s = 0.0
 
     async def run(self) -> None:
@@ -69,25 +75,25 @@ class WatchedRun:
     async def _watch(self) -> None:
         plan = self.launcher.plan
         clock = Clock(plan.origin_s, plan.rate)
-        self.launcher.on_restart = lambda name: self._console.line(
+        self.launcher.guard.on_restart = lambda name: self._console.line(
             clock.now(), f"{name} brought back")
-        self.launcher.on_trouble = lambda text: self._console.line(clock.now(), text)
-        ports = dict(self.launcher.ports)
-        bus = ZenohBus(OBSERVER, 1, endpoint(ports.pop(OBSERVER)), map(endpoint, ports.values()),
-                       Tap(plan.base_port))
+        self.launcher.guard.report = lambda text: self._console.line(clock.now(), text)
         observer = Observer(Context(
-            OBSERVER, 1, clock, bus, {}, {"sinks": [self._take, self._console.take]}))
+            OBSERVER, 1, clock, self.launcher.observers_bus(), {},
+            {"sinks": [self._take, self._console.take]},
+            register=register_of(plan.folder), members=frozenset(self.launcher.names)))
         task = asyncio.create_task(observer.run())
+        watch(task, "the launcher's observer", self.launcher.failed)
         self._console.line(clock.now(), f"{self._spec.title} ({self._spec.name}), "
                            f"{self._spec.strategy}, rate {plan.rate:g}; ctrl-C ends it")
         if plan.hmi_port:
             self._console.line(clock.now(), f"operator's page: {plan.hmi_page_to_open}")
         try:
-            while not (self.interrupted or task.done()  # noqa: ASYNC110 three kinds of end
+            while not (self.interrupted or self.launcher.failure  # noqa: ASYNC110 three ends
                        or self._is_over(clock.now())):
                 await asyncio.sleep(0.05)
-            if task.done():
-                await task
+            if self.launcher.failure:
+                self._console.line(clock.now(), self.launcher.failure)
         finally:
             self._lasted_s = clock.now()
             observer.stop()

@@ -124,6 +124,11 @@ class Struck:
         return f"{self.at_s:7.2f} s  {self.hit.way:<5} {self.hit.name:<16} pid {self.pid:<8} {took}"
 
 
+def tells_end(story: str) -> bool:
+    """Whether the mission has ended, by what its run told."""
+    return _ENDED.search(story) is not None
+
+
 class Chaos:
     """Carries out hits on a run.
 
@@ -156,7 +161,7 @@ class Chaos:
         return time.monotonic() - self._begun_s
 
     def _over(self) -> bool:
-        return self._run.process.poll() is not None or _ENDED.search(self._run.story) is not None
+        return self._run.process.poll() is not None or tells_end(self._run.story)
 
     def _rest(self, pause_s: float) -> bool:
         until = time.monotonic() + pause_s

@@ -67,11 +67,11 @@ def everybody_in_every_way(root: Path, seed: int, rate: float) -> list[str]:
     return _judged("ways", run, chaos.struck, wrong)
 
 
-def write_laps(directory: Path) -> Path:
+def write_laps(directory: Path, laps: int = LAPS) -> Path:
     """Write mission AB and then its way again and again, without looking at the lights."""
     goals = load_airport("vallombre").missions["AB"].goals
     lines = [f"x={g.x_m},y={g.y_m},taxi={int(lap > 0 or g.mode == 'taxi')}"
-             for lap in range(LAPS + 1) for g in goals]
+             for lap in range(laps + 1) for g in goals]
     file = directory / "LAPS.miss"
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return file

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
+
+from actors.runtime import run_folder
+
+
+@pytest.fixture
+def sockets():
+    """The folder of a run, for sockets: the tests' own would make their addresses too long."""
+    folder = run_folder.make(0, os.getpid())
+    yield folder
+    run_folder.remove(folder)
 
 
 @pytest.fixture

@@ -29,16 +29,14 @@ NO_SESSION = "spawner_"
 class Counts:
     """What was there at one moment; the first two by name of a process that survives.
 
-    `listening` are the run's TCP ports that somebody listens on, `half_closed` its connections
-    that the other end has left and this one keeps.
+    `files` are those in the folder of the run, its sockets among them.
     """
 
     descriptors: dict[str, int]
     memory_mb: dict[str, float]
     processes: int
     zombies: int
-    listening: int
-    half_closed: int
+    files: int
     shared_memory: frozenset[str]
 
     def __str__(self) -> str:
@@ -46,7 +44,7 @@ class Counts:
             f"{name} {self.descriptors[name]} fd {memory:.1f} MB"
             for name, memory in self.memory_mb.items())
         return (f"{each}  | {self.processes} processes, {self.zombies} zombies, "
-                f"{self.listening} ports, {self.half_closed} half closed, "
+                f"{self.files} files in the folder, "
                 f"{len(self.shared_memory)} in shared memory")
 
 
@@ -57,16 +55,13 @@ def count(run: RealRun, survivors: tuple[str, ...]) -> Counts:
     pids |= {name: p.pid for name in survivors for p in running if name in p.names}
     one_by_one = {name: psutil.Process(pid) for name, pid in pids.items()}
     family = {run.process.pid, *(p.pid for p in running)}
-    ports = range(run.port, run.port + len(run.info.nodes))
-    sockets = [c for c in psutil.net_connections("tcp") if c.laddr.port in ports]
     return Counts(
         {name: p.num_fds() for name, p in one_by_one.items()},
         {name: p.memory_info().rss / 1e6 for name, p in one_by_one.items()},
         len(running),
         sum(p.info["status"] == psutil.STATUS_ZOMBIE and p.info["ppid"] in family
             for p in psutil.process_iter(["status", "ppid"])),
-        len({c.laddr.port for c in sockets if c.status == psutil.CONN_LISTEN}),
-        sum(c.status == psutil.CONN_CLOSE_WAIT for c in sockets),
+        sum(1 for _ in Path(run.info.folder).rglob("*")),
         shared_memory())
 
 
@@ -91,9 +86,8 @@ def leaks(before: Counts, after: Counts) -> list[str]:
     found += [
         f"{what}: {old} -> {new}"
         for what, old, new in (("processes", before.processes, after.processes),
-                               ("ports", before.listening, after.listening),
-                               ("zombies", before.zombies, after.zombies),
-                               ("half closed", before.half_closed, after.half_closed))
+                               ("files", before.files, after.files),
+                               ("zombies", before.zombies, after.zombies))
         if new > old]
     return found + [f"shared memory: {name}"
                     for name in sorted(after.shared_memory - before.shared_memory)]

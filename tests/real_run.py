@@ -57,6 +57,12 @@ class RealRun:
         """What it has told on stderr so far."""
         return self._stderr.read_text()
 
+    def story_from(self, byte: int) -> str:
+        """What it has told after so many bytes; a mission of many hits tells much."""
+        with self._stderr.open("rb") as told:
+            told.seek(byte)
+            return told.read().decode(errors="replace")
+
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
         deadline = time.monotonic() + timeout_s
         while not condition():

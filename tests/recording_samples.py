@@ -68,7 +68,7 @@ class AnsweringLauncher:
     def __init__(self, port: int, origin_s: float, pid: int | None = None) -> None:
         self.info = run_info.RunInfo(
             pid or os.getpid(), port, 1.0, origin_s, PLAN["system_file"],
-            {"localization": port, "DM1": port + 1}, "sample", 0, "a sample", "", PLAN)
+            "", ("localization", "DM1"), "sample", 0, "a sample", "", PLAN)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._thread = threading.Thread(target=self._serve, daemon=True)
 

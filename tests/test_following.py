@@ -14,7 +14,7 @@ from actors.supervision.run_info import RunInfo
 from toolbox import following
 from toolbox.output import UsageError
 
-RUN = RunInfo(os.getpid(), 7450, 1.0, 0.0, "paper.toml", {}, "first", 0, "AB")
+RUN = RunInfo(os.getpid(), 7450, 1.0, 0.0, "paper.toml", "", (), "first", 0, "AB")
 
 
 class Machine:

@@ -155,9 +155,9 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
     script = (
         "import sys, zenoh, time\n"
         "from actors import topics\n"
-        "from actors.runtime.zenoh_bus import session_config, endpoint\n"
-        "ports = map(int, sys.argv[1:])\n"
-        "s = zenoh.open(session_config(None, [endpoint(p) for p in ports]))\n"
+        "from actors.runtime.zenoh_bus import session_config\n"
+        "s = zenoh.open(session_config(None, sys.argv[1:]))\n"
+        "time.sleep(1)\n"
         "names = ['DM1', 'RM1', 'osmosis_control', 'no/such', 'x']\n"
         "for _ in range(3):\n"
         "    for t in topics.ALL:\n"
@@ -170,9 +170,8 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
     with RealRun(tmp_path, "--mission", "A", "--rate", "2") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(5)
-        ports = [str(p) for p in run.info.nodes.values()]
-        done = subprocess.run([sys.executable, "-c", script, *ports], cwd=ROOT, timeout=60,
-                              check=False, capture_output=True, text=True)
+        done = subprocess.run([sys.executable, "-c", script, *run.info.endpoints], cwd=ROOT,
+                              timeout=60, check=False, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         run.wait_for("goal 2/3", 60)
         assert "payload rejected" in run.story
@@ -182,16 +181,36 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_nothing_is_left_two_seconds_after_any_end(tmp_path, number):
-    before = set(Path("/dev/shm").iterdir()), set(Path("/tmp").glob("*rampart*"))
+    before = set(Path("/dev/shm").glob("*.zenoh")), set(Path("/tmp").glob("*rampart*"))
     with RealRun(tmp_path, "--mission", "A") as run:
         run.wait_for("goal 1/3")
+        folder = Path(run.info.folder)
+        assert folder.exists()
         run.process.send_signal(number)
         run.process.wait(3)
         run.wait_until(
             lambda: find_processes(run.port) == []
-            and f"rampart.{run.port}." not in Path("/proc/net/unix").read_text(),
-            2, "processes or sockets were left")
-    assert (set(Path("/dev/shm").iterdir()), set(Path("/tmp").glob("*rampart*"))) == before
+            and f"rampart.{run.port}." not in Path("/proc/net/unix").read_text()
+            and not folder.exists(), 2, "processes or sockets were left")
+    assert (set(Path("/dev/shm").glob("*.zenoh")), set(Path("/tmp").glob("*rampart*"))) == before
+
+
+def test_a_launcher_that_was_stopped_goes_on_and_its_nodes_came_back_meanwhile(tmp_path):
+    with RealRun(tmp_path, "--mission", "A", system="osmosis") as run:
+        run.wait_for("goal 1/3")
+        run.sleep_until(3)
+        run.process.send_signal(signal.SIGSTOP)
+        for node in ("safety_pilot", "osmosis_control"):
+            old = run.kill(node)
+            run.wait_until(lambda n=node, o=old: run.pid(n) not in {None, o}, 5, "not back")
+        time.sleep(4)  # longer than a link lives without a sign of life, and than silence counts
+        back = {n: p.incarnation for p in find_processes(run.port) for n in p.names}
+        assert (back["safety_pilot"], back["osmosis_control"]) == (2, 2)
+        run.process.send_signal(signal.SIGCONT)
+        time.sleep(4)  # partners that it has lost are dialled again every two seconds
+        run.kill("RM1")
+        run.wait_for("RM1 respawned")
+        assert run.process.poll() is None
 
 
 BAD_USAGE = [

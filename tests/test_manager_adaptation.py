@@ -290,9 +290,11 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
     ("disable", "FTM7", "{", "Input data was truncated"),
     ("disable", "FTM1", "{}", "the FTMTree has 3 roots"),
     ("retune", "DM1", '{"actor": "actors.detection.bounds:Nobody"}', "no such actor class"),
-    ("retune", "DM3", '{"actor": "actors.stub.recovery:StubRecovery"}',
+    ("retune", "DM3", '{"actor": "actors.recovery.emergency_stop:EmergencyStop"}',
      "it does not publish detection/{name}, as the modules of this table do"),
-    ("retune", "RM5", '{"actor": "actors.stub.node:StubNode"}',
+    ("retune", "DM3", '{"actor": "actors.stub.detection:StubDetection"}',
+     "no actor of the system that was started is in that module"),
+    ("retune", "RM5", '{"actor": "actors.control.localization:Localization"}',
      "it does not publish recovery/{name}/state, as the modules of this table do"),
 ])
 def test_what_is_refused_changes_nothing(action, name, values, words):

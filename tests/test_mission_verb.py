@@ -8,7 +8,7 @@ import json
 
 import msgspec
 import pytest
-from test_toolbox_live import RATE, Run, free_ports
+from test_toolbox_live import RATE, Run
 
 from actors import messages as m
 from actors import topics
@@ -34,17 +34,17 @@ class Planner(Actor):
 
 
 @pytest.fixture
-async def run(monkeypatch):
+async def run(monkeypatch, sockets):
     loop = asyncio.get_running_loop()
     clock = Clock(loop.time(), RATE, loop.time)
-    ports = dict(zip(("mission_manager", "planner"), free_ports(2), strict=True))
-    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), ports, "r1", 0,
-                   "test run")
+    names = ("mission_manager", "planner")
+    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), sockets, names,
+                   "r1", 0, "test run")
     monkeypatch.setattr("toolbox.session.find_run", lambda _port: info)
     nodes, tasks = [], []
     for name, cls in (("mission_manager", MissionManager), ("planner", Planner)):
-        bus = ZenohBus(name, 1, endpoint(ports[name]),
-                       [endpoint(p) for n, p in ports.items() if n != name])
+        bus = ZenohBus(name, 1, endpoint(sockets, name),
+                       [endpoint(sockets, n) for n in names if n != name])
         node = cls(Context(name, 1, clock, bus, {"held_by": ["RM2"]}))
         tasks.append(asyncio.create_task(node.run()))
         nodes.append((node, bus))

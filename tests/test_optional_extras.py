@@ -27,7 +27,7 @@ from airport.formats import load_airport
 from toolbox.live_verb import SHOWN, _watch
 from toolbox.main import main
 
-RUN = RunInfo(1, 7450, 1.0, 0.0, "paper.toml", {}, "run", 0, 'a "title"\\ and\nmore')
+RUN = RunInfo(1, 7450, 1.0, 0.0, "paper.toml", "", (), "run", 0, 'a "title"\\ and\nmore')
 
 
 @pytest.mark.parametrize(("module", "arguments", "extra"), [

@@ -379,7 +379,8 @@ def test_a_wish_that_makes_no_sense_is_refused(port, tmp_path, capsys, arguments
 
 
 def test_topics_of_the_robot_s_own_can_be_wished_for(port, tmp_path, monkeypatch, capsys):
-    own = RunInfo(1, port, 1.0, 0.0, str(write_porter_system(tmp_path)), {}, "r1", 0, "porter")
+    own = RunInfo(1, port, 1.0, 0.0, str(write_porter_system(tmp_path)), "",
+                  (), "r1", 0, "porter")
     monkeypatch.setattr("toolbox.record_verbs.find_run", lambda _port: own)
     taken = tmp_path / "x.mcap"
     taken.touch()

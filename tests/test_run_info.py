@@ -36,7 +36,7 @@ def answering(answer: bytes) -> Iterator[int]:
         teller.join()
 
 
-INFO = run_info.RunInfo(1, 7450, 1.0, 0.0, "x.toml", {}, "r", 0, "a run")
+INFO = run_info.RunInfo(1, 7450, 1.0, 0.0, "x.toml", "", (), "r", 0, "a run")
 
 
 def test_a_launcher_tells_what_it_runs():

@@ -7,7 +7,6 @@ import asyncio
 import inspect
 import math
 import re
-import socket
 import textwrap
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -20,7 +19,7 @@ from actors import topics
 from actors.runtime.actor import Actor, Context, Header, every, on
 from actors.runtime.bus import Bus, BusError
 from actors.runtime.clock import Clock
-from actors.runtime.envelope import encode
+from actors.runtime.envelope import ArrivalGuard, encode
 from actors.runtime.virtual_bus import Hub, VirtualBus
 from actors.runtime.wiring import load_class
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
@@ -73,29 +72,18 @@ class Listener(Actor):
         self.peers.append((node, incarnation, alive))
 
 
-def free_ports(count: int) -> list[int]:
-    sockets = [socket.socket() for _ in range(count)]
-    for s in sockets:
-        s.bind(("127.0.0.1", 0))
-    ports = [s.getsockname()[1] for s in sockets]
-    for s in sockets:
-        s.close()
-    return ports
-
-
 MakeBus = Callable[[str, int], Bus]
 
 
 @pytest.fixture(params=["virtual", "zenoh"])
-def make_bus(request: pytest.FixtureRequest) -> MakeBus:
+def make_bus(request: pytest.FixtureRequest, sockets: str) -> MakeBus:
     if request.param == "virtual":
         hub = Hub()
         return lambda name, incarnation: VirtualBus(hub, name, incarnation)
     names = ("talker", "listener", "impostor", "third")
-    ports = dict(zip(names, free_ports(4), strict=True))
     return lambda name, incarnation: ZenohBus(
-        name, incarnation, endpoint(ports[name]),
-        [endpoint(p) for n, p in ports.items() if n != name])
+        name, incarnation, endpoint(sockets, name),
+        [endpoint(sockets, n) for n in names if n != name])
 
 
 @asynccontextmanager
@@ -184,6 +172,19 @@ async def test_a_superseded_incarnation_is_refused(make_bus):
             assert [body.x_m for body, _ in listener.heard] == [2.0]
 
 
+@pytest.mark.parametrize("forged", [1, 3, 77, 2 ** 31 - 1])
+def test_an_incarnation_that_was_not_issued_last_makes_nobody_deaf_to_the_real_one(forged):
+    taken, refused = [], []
+    guard = ArrivalGuard(lambda: 10.0, register={"talker": 2}.get)
+    receive = guard.receiver(topics.POSE, lambda _key, message: taken.append(message.incarnation),
+                             lambda _key, reason: refused.append(reason))
+    for life, source in ((forged, "talker"), (2, "talker"), (forged, "talker"), (5, "a tool")):
+        receive("k", encode(Header(source, life, 1, 1.0), m.Pose(0.0, 0.0, 0.0)))
+    assert taken == [2, 5]
+    assert refused[0] == f"incarnation {forged} of talker, of which 2 was issued last"
+    assert len(refused) == 2
+
+
 async def test_a_command_that_comes_twice_is_handled_once(make_bus):
     async with running(Listener, "listener", make_bus) as listener:
         async with running(Talker, "talker", make_bus) as talker:
@@ -223,13 +224,12 @@ async def test_timers_run_at_the_rate_of_simulated_time(make_bus):
         assert ticked == pytest.approx(elapsed / 0.02, rel=0.5)
 
 
-async def test_a_port_in_use_is_one_clear_line():
-    (port,) = free_ports(1)
-    first = ZenohBus("talker", 1, endpoint(port), [])
+async def test_a_socket_in_use_is_one_clear_line(sockets):
+    first = ZenohBus("talker", 1, endpoint(sockets, "talker"), [])
     await first.open()
     try:
-        with pytest.raises(BusError, match=f"port in use: tcp/127.0.0.1:{port}"):
-            await ZenohBus("talker", 2, endpoint(port), []).open()
+        with pytest.raises(BusError, match=f"{sockets}/talker is in use by another process"):
+            await ZenohBus("talker", 2, endpoint(sockets, "talker"), []).open()
     finally:
         await first.close()
 

@@ -17,21 +17,21 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
-from stub_actors import ROOT, free_base_port, launched, stub_plan, write_stub_system
+from stub_actors import ROOT, launched, stub_plan, write_stub_system
 
 from actors import topics
 from actors.messages import Diagnostic, NodeTable, ProcessEvent, RespawnRequest
 from actors.runtime.actor import Actor, Context, Header, on
 from actors.runtime.clock import Clock
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
-from actors.supervision import node_process
+from actors.runtime.run_folder import socket_path
+from actors.supervision import node_process, run_info
 from actors.supervision.kill_node import main as kill_node
 from actors.supervision.launcher import Launcher, LaunchError
 from actors.supervision.process_title import find_processes
-from actors.supervision.processes import OsProcesses
 from actors.supervision.restart_policy import RestartPolicy
 from actors.supervision.run_info import find_runs
 from actors.supervision.run_plan import Layout, load_system
+from actors.supervision.spawner import address
 from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
 pytestmark = pytest.mark.processes
@@ -76,8 +76,7 @@ class Witness(Actor):
 @asynccontextmanager
 async def running(tmp_path, **changes) -> AsyncIterator[tuple[Launcher, Witness]]:
     async with launched(stub_plan(write_stub_system(tmp_path), **changes)) as launcher:
-        port = launcher.ports.pop("observer")  # the place of the launcher's own observer
-        bus = ZenohBus("observer", 1, endpoint(port), map(endpoint, launcher.ports.values()))
+        bus = launcher.observers_bus()
         clock = Clock(launcher.plan.origin_s)
         witness = Witness(Context("observer", 1, clock, bus, {}, {"launcher": launcher}))
         task = asyncio.create_task(witness.run())
@@ -112,6 +111,34 @@ async def test_a_process_that_dies_stops_or_wedges_is_told_apart_and_comes_back(
             os.kill(witness.pid(node), number)
             await eventually(lambda n=node: witness.state(n) == ("running", 2))
             assert witness.saw(node, event)
+
+
+async def test_a_stopped_process_and_a_dead_supervisor_do_not_end_repair(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        os.kill(witness.pid("DM5"), signal.SIGSTOP)
+        os.kill(process(port, "supervisor"), signal.SIGKILL)
+        await eventually(lambda: witness.state("supervisor") == ("running", 2))
+        os.kill(witness.pid("RM1"), signal.SIGKILL)
+        await eventually(lambda: witness.state("RM1") == ("running", 2))
+        await eventually(lambda: witness.state("DM5") == ("running", 2))
+        assert launcher.guard.supervisor_incarnation == 2
+
+
+async def test_a_node_is_back_while_who_hears_it_is_stopped(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        stopped = [process(port, name) for name in ("DM1", "DM2", "DM3", "DM4", "RM2")]
+        supervisor = process(port, "supervisor")
+        os.kill(supervisor, signal.SIGSTOP)  # it would have them replaced
+        for pid in stopped:
+            os.kill(pid, signal.SIGSTOP)
+        os.kill(process(port, "ftm_manager"), signal.SIGKILL)
+        await eventually(lambda: process(port, "ftm_manager") is None)
+        os.kill(supervisor, signal.SIGCONT)
+        await eventually(lambda: witness.state("ftm_manager")[0] == "running"
+                         and witness.state("ftm_manager")[1] > 1)
+        assert witness.state("ftm_manager")[1] == 2
 
 
 async def test_a_node_of_a_recovery_module_waits_for_its_request(tmp_path):
@@ -160,7 +187,7 @@ async def test_the_supervisor_comes_back_and_adopts_the_living(tmp_path):
     async with running(tmp_path) as (launcher, witness):
         before = {r.name: r.pid for r in witness.table.nodes if r.name != "supervisor"}
         for number in (signal.SIGKILL, signal.SIGSTOP):
-            generation = launcher.supervisor_incarnation
+            generation = launcher.guard.supervisor_incarnation
             os.kill(process(launcher.plan.base_port, "supervisor"), number)
             await eventually(lambda g=generation: witness.state("supervisor")[1] == g + 1)
             await eventually(lambda: all(r.state.value == "running" for r in witness.table.nodes))
@@ -205,6 +232,144 @@ async def test_nodes_come_back_whatever_happens_to_the_spawners(tmp_path):
                 process(port, v) not in {None, p} for v, p in o.items()), 20)
 
 
+async def test_spawners_that_stand_still_for_a_moment_are_not_taken_for_hung(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        spawners = {name: process(port, name) for name in ("spawner_a", "spawner_b")}
+        for stopped in (["spawner_a"], ["spawner_b"], list(spawners)):
+            incarnation = witness.state("DM1")[1]
+            for name in stopped:
+                os.kill(spawners[name], signal.SIGSTOP)
+            os.kill(witness.pid("DM1"), signal.SIGKILL)
+            if len(stopped) == 1:  # the other one forks
+                await eventually(
+                    lambda i=incarnation: witness.state("DM1") == ("running", i + 1))
+            else:
+                await asyncio.sleep(0.5)
+                assert witness.state("DM1")[1] == incarnation
+            for name in stopped:
+                os.kill(spawners[name], signal.SIGCONT)
+            await eventually(lambda i=incarnation: witness.state("DM1") == ("running", i + 1))
+        client = SpawnerClient(launcher.plan.folder, port, os.getpid())
+        await eventually(lambda: client.turns("a") and client.turns("b"))  # nothing is under way
+        client.close()
+        assert {name: process(port, name) for name in spawners} == spawners
+        assert [p.pid for p in find_processes(port) if "DM1" in p.names] == [witness.pid("DM1")]
+        assert witness.state("DM1") == ("running", 4)
+
+
+async def test_of_two_spawners_that_hang_one_is_replaced_first_and_then_the_other(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        old = {name: process(port, name) for name in ("spawner_a", "spawner_b")}
+        for pid, number in zip(old.values(), (signal.SIGSTOP, signal.SIGUSR2), strict=True):
+            os.kill(pid, number)
+        os.kill(witness.pid("DM1"), signal.SIGKILL)
+        client = SpawnerClient(launcher.plan.folder, port, os.getpid())
+        seen = set()
+        while not all(process(port, name) not in {None, pid} for name, pid in old.items()):
+            there = {name: process(port, name) for name in old}
+            replaced = [name for name, pid in old.items() if there[name] != pid]
+            seen.add(len(replaced))
+            if len(replaced) == 2:  # the second was killed when the first was back
+                assert any(there[name] is not None for name in replaced)
+            await asyncio.sleep(0.005)
+        client.close()
+        assert 1 in seen
+        await eventually(lambda: witness.state("DM1") == ("running", 2))
+
+
+async def test_a_request_that_was_withdrawn_makes_no_process_however_late_it_is_read(tmp_path):
+    async with running(tmp_path) as (launcher, witness):
+        port = launcher.plan.base_port
+        spawners = [process(port, name) for name in ("spawner_a", "spawner_b")]
+        for pid in spawners:
+            os.kill(pid, signal.SIGSTOP)
+        client = SpawnerClient(launcher.plan.folder, port, os.getpid())
+        with pytest.raises(SpawnerUnavailableError):
+            client.fork(("DM1",), 7)
+        client.close()
+        for pid in spawners:
+            os.kill(pid, signal.SIGCONT)
+        client = SpawnerClient(launcher.plan.folder, port, os.getpid())
+        await eventually(lambda: client.turns("a") and client.turns("b"))  # it has been read
+        client.close()
+        await asyncio.sleep(0.2)
+        assert [p.incarnation for p in find_processes(port) if "DM1" in p.names] == [1]
+        assert witness.state("DM1") == ("running", 1)
+
+
+@pytest.mark.parametrize("answer", [b"nonsense", b'{"error": 7}', b"{}", b""])
+async def test_what_answers_under_a_spawners_name_does_not_end_the_guard(tmp_path, answer):
+    async with running(tmp_path) as (launcher, witness):
+        port, told, answered = launcher.plan.base_port, [], 0
+        launcher.guard.report = told.append
+        where = Path(address(launcher.plan.folder, "a"))
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with contextlib.closing(listener):
+            where.unlink()
+            listener.bind(str(where))
+            listener.listen()
+            listener.setblocking(False)
+
+            def reply() -> None:
+                nonlocal answered
+                with contextlib.suppress(OSError):
+                    connection, _ = listener.accept()
+                    with connection:
+                        connection.send(answer)
+                    answered += 1
+
+            loop = asyncio.get_running_loop()
+            loop.add_reader(listener, reply)
+            for name in ("supervisor", "DM1", "spawner_b"):
+                before = process(port, name)
+                os.kill(before, signal.SIGKILL)
+                await eventually(lambda n=name, p=before: process(port, n) not in {None, p}, 20)
+            loop.remove_reader(listener)
+        await eventually(lambda: process(port, "spawner_a") is not None, 20)
+        await eventually(lambda: all(r.state.value == "running" for r in witness.table.nodes), 20)
+        assert answered
+        assert not launcher.failure
+
+
+@pytest.mark.parametrize("where", ["_reap", "info", "look_after", "on_restart", "report"])
+async def test_whatever_fails_in_the_launcher_is_told_and_ends_no_guard(
+        tmp_path, monkeypatch, where):
+    failures, told = [], []
+
+    def failing(*_: object) -> None:
+        failures.append(where)
+        raise RuntimeError("never thought of")
+
+    if where == "_reap":
+        monkeypatch.setattr(Launcher, where, failing)
+    async with running(tmp_path) as (launcher, witness):
+        guard = launcher.guard
+        guard.report = told.append
+        if where == "look_after":
+            usual, guard.look_after = guard.look_after, failing
+            await eventually(lambda: len(failures) > 1)
+            guard.look_after = usual
+        elif where == "on_restart":
+            guard.on_restart = failing
+        elif where == "report":
+            guard.report = failing
+            guard._tell("trouble")
+        elif where == "info":
+            launcher.info = failing
+            assert launcher.plan.base_port not in {
+                run.base_port for run in await asyncio.to_thread(find_runs)}
+        os.kill(process(launcher.plan.base_port, "spawner_a"), signal.SIGKILL)
+        os.kill(process(launcher.plan.base_port, "supervisor"), signal.SIGKILL)
+        await eventually(lambda: witness.state("supervisor") == ("running", 2), 20)
+        await eventually(lambda: process(launcher.plan.base_port, "spawner_a") is not None, 20)
+        assert failures
+        assert where == "report" or any("RuntimeError: never thought of" in t for t in told)
+        assert not launcher.failure
+        monkeypatch.undo()
+
+
 async def test_a_supervisor_without_descriptors_harms_nobody_and_goes_on_when_it_has_some(tmp_path):
     async with running(tmp_path) as (_, witness):
         before = {r.name: r.pid for r in witness.table.nodes}
@@ -212,7 +377,8 @@ async def test_a_supervisor_without_descriptors_harms_nobody_and_goes_on_when_it
         resource.prlimit(before["supervisor"], resource.RLIMIT_NOFILE, (3, limits[1]))
         os.kill(before["DM3"], signal.SIGKILL)
         await eventually(lambda: any(
-            e.node == "supervisor" and e.context == "hold" for e in witness.errors))
+            e.node == "supervisor" and e.context == "fork" and "open files" in e.reason
+            for e in witness.errors))
         resource.prlimit(before["supervisor"], resource.RLIMIT_NOFILE, limits)
         await eventually(lambda: witness.state("DM3")[0] == "running"
                          and witness.state("DM3")[1] > 1)
@@ -232,10 +398,10 @@ async def test_a_process_that_nobody_holds_does_not_keep_its_node_down(tmp_path)
         os.kill(supervisor, signal.SIGSTOP)
         os.kill(victim, signal.SIGKILL)
         await eventually(lambda: process(port, "DM1") is None)
-        client = SpawnerClient(port)
-        orphan = client.fork(("DM1",), 1)  # it has the port, and is too old to be heard
+        client = SpawnerClient(launcher.plan.folder, port, os.getpid())
+        orphan = await forked(client, "DM1", 1)  # it has the port, and is too old to be heard
         client.close()
-        await eventually(lambda: listens(launcher.ports["DM1"]))
+        await eventually(lambda: listens(launcher.plan.folder, "DM1"))
         os.kill(supervisor, signal.SIGCONT)
         await eventually(lambda: witness.state("DM1")[0] == "running"
                          and witness.pid("DM1") not in {victim, orphan})
@@ -244,66 +410,17 @@ async def test_a_process_that_nobody_holds_does_not_keep_its_node_down(tmp_path)
         assert sum(e.node == "DM1" and e.event == "respawned" for e in witness.events) < 5
 
 
-def listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+async def forked(client: SpawnerClient, name: str, incarnation: int) -> int:
+    while True:
+        try:
+            return client.fork((name,), incarnation)
+        except SpawnerUnavailableError:
+            await asyncio.sleep(0.01)
 
 
-_MUTE_SPAWNER = """
-import os, socket, sys, time
-from actors.supervision.process_title import set_title
-from actors.supervision.spawner import address
-port, how = int(sys.argv[1]), sys.argv[2]
-listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-listener.bind(address(port, "a"))
-listener.listen()
-print("ready", flush=True)
-connection, _ = listener.accept()
-connection.recv(100_000)
-if os.fork() == 0:
-    listener.close()
-    connection.close()
-    set_title(port, os.getppid() if how == "stranger" else int(sys.argv[3]), ("DM1",), 2)
-    os.write(1, b"%d\\n" % os.getpid())
-    time.sleep(60)
-time.sleep(0.1)
-if how != "dies":
-    time.sleep(60)
-os._exit(1)
-"""
-
-
-@pytest.mark.parametrize("how", ["dies", "hangs", "stranger"])
-def test_the_child_of_a_spawner_that_forked_and_did_not_answer_is_found(how):
-    port = free_base_port()
-    spawner = subprocess.Popen(
-        [sys.executable, "-c", _MUTE_SPAWNER, str(port), how, str(os.getpid())],
-        stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-    machine, child = OsProcesses(port, os.getpid()), 0
-    try:
-        assert spawner.stdout.readline() == "ready\n"
-        if how == "stranger":  # of another run: not this one's child
-            with pytest.raises(SpawnerUnavailableError):
-                machine.fork(("DM1",), 2)
-            child = int(spawner.stdout.readline())
-        else:
-            found = machine.fork(("DM1",), 2)
-            child = int(spawner.stdout.readline())
-            assert found == child
-        assert spawner.wait(5) != 0
-    finally:
-        machine.close()
-        spawner.kill()
-        spawner.wait()
-        spawner.stdout.close()
-        if child:
-            os.kill(child, signal.SIGKILL)
-
-
-@pytest.mark.parametrize("pid", [-1, 0, 1 << 22, 1 << 40])
-async def test_a_process_with_a_number_that_no_process_can_have_is_gone(pid):
-    with pytest.raises(ProcessLookupError):
-        OsProcesses(1, 1).hold(pid, lambda: None)
+def listens(folder: str, name: str) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        return probe.connect_ex(socket_path(folder, name)) == 0
 
 
 async def test_the_launcher_turns_while_supervisor_and_both_spawners_are_dead(tmp_path):
@@ -314,14 +431,14 @@ async def test_the_launcher_turns_while_supervisor_and_both_spawners_are_dead(tm
         for pid in old.values():
             os.kill(pid, signal.SIGKILL)
         turns = rounds = 0
-        look_after = launcher._look_after_guards
+        look_after = launcher.guard.look_after
 
         async def counted() -> bool:
             nonlocal rounds
             rounds += 1
             return await look_after()
 
-        launcher._look_after_guards = counted
+        launcher.guard.look_after = counted
         while any(process(launcher.plan.base_port, v) in {None, p} for v, p in old.items()):
             await asyncio.sleep(0.01)
             turns += 1
@@ -333,8 +450,8 @@ async def test_the_launcher_turns_while_supervisor_and_both_spawners_are_dead(tm
 async def test_a_supervisor_that_ends_whenever_it_starts_is_not_started_without_end(tmp_path):
     async with running(tmp_path) as (launcher, witness):
         told, lives = [], set()
-        launcher.on_trouble = told.append
-        launcher._policy = RestartPolicy(intensity=6, period_s=6.0)
+        launcher.guard.report = told.append
+        launcher.guard.policy = RestartPolicy(intensity=6, period_s=6.0)
         while not told:
             pid = process(launcher.plan.base_port, "supervisor")
             if pid is not None:
@@ -346,18 +463,18 @@ async def test_a_supervisor_that_ends_whenever_it_starts_is_not_started_without_
         assert told == ["the supervisor ended 6 times within 6 s: it is started less often from "
                         "now on"]
         await eventually(lambda: witness.state("supervisor") == (
-            "running", launcher.supervisor_incarnation), 20)
-        assert launcher.supervisor_incarnation == 8
+            "running", launcher.guard.supervisor_incarnation), 20)
+        assert launcher.guard.supervisor_incarnation == 8
         assert len(told) == 1
 
 
 async def test_spawners_are_looked_after_while_a_supervisor_that_keeps_ending_has_to_wait(tmp_path):
     async with running(tmp_path) as (launcher, witness):
         port = launcher.plan.base_port
-        launcher._policy = RestartPolicy(intensity=4, backoff_s=4.0, backoff_max_s=4.0)
+        launcher.guard.policy = RestartPolicy(intensity=4, backoff_s=4.0, backoff_max_s=4.0)
         for life in (1, 2, 3):
             await eventually(lambda life=life: (process(port, "supervisor") is not None
-                                                and launcher.supervisor_incarnation == life))
+                                                and launcher.guard.supervisor_incarnation == life))
             os.kill(process(port, "supervisor"), signal.SIGKILL)
         spawner = process(port, "spawner_b")
         os.kill(spawner, signal.SIGKILL)
@@ -380,8 +497,8 @@ def test_what_fails_before_the_actors_of_a_process_start_is_told(tmp_path, monke
 async def test_a_launcher_that_cannot_look_says_so_once_and_goes_on(tmp_path):
     async with running(tmp_path) as (launcher, witness):
         told, failures = [], 0
-        launcher.on_trouble = told.append
-        look_after = launcher._look_after_guards
+        launcher.guard.report = told.append
+        look_after = launcher.guard.look_after
 
         async def without_descriptors() -> bool:
             nonlocal failures
@@ -390,7 +507,7 @@ async def test_a_launcher_that_cannot_look_says_so_once_and_goes_on(tmp_path):
             failures += 1
             raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
-        launcher._look_after_guards = without_descriptors
+        launcher.guard.look_after = without_descriptors
         await eventually(lambda: failures == 2)
         os.kill(process(launcher.plan.base_port, "supervisor"), signal.SIGKILL)
         await eventually(lambda: witness.state("supervisor")[1] == 2, 20)
@@ -405,7 +522,12 @@ async def test_an_orderly_end_leaves_no_process(tmp_path):
     assert find_processes(port) == []
 
 
-async def test_a_killed_launcher_leaves_nothing_within_two_seconds(tmp_path):
+GUARDS = ("supervisor", "spawner_a", "spawner_b")
+
+
+@pytest.mark.parametrize("stopped", [
+    ("DM5",), (*GUARDS, "DM1", "DM2", "RM1"), None], ids=["one", "the guards too", "all"])
+async def test_a_killed_launcher_leaves_nothing_within_two_seconds(tmp_path, stopped):
     system = write_stub_system(tmp_path)
     plan = stub_plan(system)
     script = (
@@ -416,12 +538,15 @@ async def test_a_killed_launcher_leaves_nothing_within_two_seconds(tmp_path):
         "asyncio.run(main())\n")
     child = subprocess.Popen(
         [sys.executable, "-c", script],
-        env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"})
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"},
+        start_new_session=True)  # as a terminal's; this process adopts what is left of others
     try:
         await eventually(lambda: len(find_processes(plan.base_port)) == 24, 20)
         await asyncio.sleep(0.5)
-        os.kill(process(plan.base_port, "DM5"), signal.SIGSTOP)  # cannot read its lifeline
         os.kill(process(plan.base_port, "DM6"), signal.SIGUSR2)
+        for one in find_processes(plan.base_port):  # who is stopped cannot read its lifeline
+            if stopped is None or set(one.names) & set(stopped):
+                os.kill(one.pid, signal.SIGSTOP)
     finally:
         child.kill()
         child.wait()
@@ -429,16 +554,12 @@ async def test_a_killed_launcher_leaves_nothing_within_two_seconds(tmp_path):
     assert not [r for r in find_runs() if r.base_port == plan.base_port]
 
 
-async def test_a_port_in_use_is_refused_before_anything_starts(tmp_path):
+def test_the_number_of_another_run_is_refused_before_anything_starts(tmp_path):
     plan = stub_plan(write_stub_system(tmp_path))
-    with socket.socket() as squatter:
-        squatter.bind(("127.0.0.1", plan.base_port + 3))
-        squatter.listen()
-        launcher = Launcher(plan, "test")
-        launcher.begin()
-        with pytest.raises(LaunchError, match=f"port {plan.base_port + 3} is in use"):
-            await launcher.load()
-        await launcher.end()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
+        other.bind(run_info.address(plan.base_port))
+        with pytest.raises(LaunchError, match=f"--port {plan.base_port}: in use by another run"):
+            Launcher(plan, "test").begin()
     assert find_processes(plan.base_port) == []
 
 

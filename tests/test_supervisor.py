@@ -81,6 +81,7 @@ class Machine:
     def __init__(self) -> None:
         self.processes: dict[int, Process] = {}
         self.forks: list[tuple[str, int]] = []
+        self.issued: dict[str, int] = {}
         self.fork_error: Exception | None = None
         self.hold_error: Exception | None = None
         self.look_error: Exception | None = None
@@ -89,6 +90,7 @@ class Machine:
         self.searches = 0
 
     def add(self, names: tuple[str, ...], incarnation: int, *, bound: bool = False) -> Process:
+        self.issued |= dict.fromkeys(names, incarnation)
         bound = bound or not any(
             p.names == names and not p.gone for p in self.processes.values())
         pid = 1000 + len(self.processes)
@@ -166,7 +168,7 @@ class World:
         self.supervisor = Supervisor(Context(
             SUPERVISOR, self.lives, self.clock, VirtualBus(self.hub, SUPERVISOR, self.lives),
             parameters, {"plan": PLAN, "system": self.spec, "processes": self.machine,
-                         "known_incarnations": known or {}}))
+                         "known_incarnations": known or {}}, register=self.machine.issued.get))
         self.task = asyncio.create_task(self.supervisor.run())
         return self.supervisor, self.task
 
@@ -458,6 +460,24 @@ def test_a_process_that_is_adapted_while_it_is_replaced_is_replaced_once(outage_
             await asyncio.sleep(1.0)
             assert world.machine.forks == [("DM2", 2)]
             assert world.machine.questions == 0  # nobody waits for its end any more
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("life", [1, 2, 77, 2 ** 31 - 1])
+def test_a_heartbeat_that_names_a_process_of_somebody_elses_has_nobody_adopted_or_killed(life):
+    async def scenario() -> None:
+        async with running() as world:
+            (own,) = world.machine.of("DM1")
+            stranger = world.machine.add(("editor",), 1)
+            world.machine.kill(own)
+            for _ in range(20):
+                world.say(topics.HEARTBEAT, Heartbeat(stranger.pid, 0, 0.1, 0, 0), "DM1", life,
+                          key=topics.HEARTBEAT.at("DM1"))
+                await asyncio.sleep(0.05)
+            assert not stranger.killed
+            assert world.row("DM1")[0] == "running"
+            assert world.row("DM1")[2] not in {stranger.pid, own.pid}
 
     run(scenario)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 from contextlib import AsyncExitStack
 
 import msgspec
@@ -99,27 +98,19 @@ class Run:
         return code, captured.out, captured.err
 
 
-def free_ports(count: int) -> list[int]:
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [s.getsockname()[1] for s in sockets]
-    for s in sockets:
-        s.close()
-    return ports
-
-
 @pytest.fixture
-async def run(monkeypatch):
+async def run(monkeypatch, sockets):
     loop = asyncio.get_running_loop()
     clock = Clock(loop.time(), RATE, loop.time)
-    ports = dict(zip(("simulator", "DM1"), free_ports(2), strict=True))
-    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), ports, "r1", 0,
-                   "test run", plan={"mission": "AB"})
+    names = ("simulator", "DM1")
+    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), sockets, names,
+                   "r1", 0, "test run", plan={"mission": "AB"})
     monkeypatch.setattr("toolbox.session.find_run", lambda _port: info)
     async with AsyncExitStack() as stack:
         nodes = []
         for name, cls in (("simulator", Everything), ("DM1", Bystander)):
-            bus = ZenohBus(name, 1, endpoint(ports[name]),
-                           [endpoint(p) for n, p in ports.items() if n != name])
+            bus = ZenohBus(name, 1, endpoint(sockets, name),
+                           [endpoint(sockets, n) for n in names if n != name])
             node = cls(Context(name, 1, clock, bus))
             task = asyncio.create_task(node.run())
             stack.push_async_callback(asyncio.wait_for, task, 5)
@@ -242,7 +233,8 @@ async def test_a_member_of_a_family_that_is_no_node_is_unknown(run, capsys):
 
 async def test_topics_of_the_robot_s_own_are_heard_measured_and_disturbed(
         run, capsys, monkeypatch, tmp_path):
-    own = RunInfo(1, 7450, RATE, 0.0, str(write_porter_system(tmp_path)), {}, "r1", 0, "porter")
+    own = RunInfo(1, 7450, RATE, 0.0, str(write_porter_system(tmp_path)), "", (),
+                  "r1", 0, "porter")
     monkeypatch.setattr("toolbox.topic_catalogue.find_run", lambda _port: own)
     code, out, _ = await run.call(capsys, "topic", "echo", "porter/axle/front", "-n", "1")
     assert (code, out.split()[1:]) == (0, ["simulator#1", "porter/axle/front", "[3.0]"])

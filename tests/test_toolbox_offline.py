@@ -315,7 +315,7 @@ def test_an_actor_that_cannot_be_loaded_is_one_line_and_needed_for_its_own_topic
         capsys, monkeypatch, tmp_path):
     file = write_porter_system(tmp_path)
     file.write_text(file.read_text().replace("porter_actors:", "no_actors:"))
-    run = RunInfo(1, 7450, 1.0, 0.0, str(file), {}, "r1", 0, "test run")
+    run = RunInfo(1, 7450, 1.0, 0.0, str(file), "", (), "r1", 0, "test run")
     monkeypatch.setattr("toolbox.topic_catalogue.find_run", lambda _port: run)
     monkeypatch.setattr("actors.supervision.run_info.find_runs", list)
     for arguments in (["topic", "list", "--system", str(file)],

@@ -186,7 +186,8 @@ def test_on_a_replay_nobodys_processes_are_measured(monkeypatch, replay_of):
     mine = m.NodeTable((m.NodeInfo("hmi", "operator", os.getpid(), m.NodeState.RUNNING, 1, 0),))
     monkeypatch.setattr(top_screen, "draw", lambda _session, picture: told(
         picture, topics.NODES, mine))
-    run = RunInfo(os.getpid(), 7450, 1.0, 0.0, "", {}, "run", 0, "AB", replay_of=replay_of)
+    run = RunInfo(os.getpid(), 7450, 1.0, 0.0, "", "", (), "run", 0, "AB",
+                  replay_of=replay_of)
     shown = top_screen._Watch(SimpleNamespace(run=run, clock=Clock(0.0))).frame()
     assert list(shown.usage) == ([] if replay_of else ["hmi", "launch.py"])
     assert [row["name"] for row in shown.guards] == ([] if replay_of else ["launch.py"])

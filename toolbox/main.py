@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 
+from actors.runtime import working_folder
 from toolbox import (
     adapt_verb,
     bag_verbs,
@@ -84,8 +85,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code."""
     options = build_parser().parse_args(arguments)
-    if "" not in sys.path:
-        sys.path.append("")  # actors of one's own are found here, as by the processes of a run
+    working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
         return int(options.run(options))
     except UsageError as error:

@@ -1,9 +1,8 @@
 """Plays a recording back onto a bus of its own, where tools and an operator's page can read it.
 
-A replay must never reach a robot. It dials nobody; it listens on one port of its own, which must
-not be near those of a run that lives; nodes of a run dial only ports of their own run, and a run
-does not start on ports that are taken. Tools find it as they find a run, and are told that it is
-none: they give it no orders, and prefer a run to it.
+A replay must never reach a robot. It dials nobody; it listens on one socket, in a folder of its
+own; nodes of a run dial only what is in the folder of their run. Tools find it as they find a run,
+and are told that it is none: they give it no orders, and prefer a run to it.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from actors import topics
 from actors.recording.bag_reader import BagReader, Summary, key_of
 from actors.recording.message_form import form_of, header_of, renumbered
 from actors.recording.run_documents import SYSTEM, restore
+from actors.runtime import run_folder
 from actors.runtime.actor import Context
 from actors.runtime.bus import BusError
 from actors.runtime.clock import Clock
@@ -35,7 +35,6 @@ from actors.runtime.topic import Qos, Topic
 from actors.runtime.unix_peer import is_same_user
 from actors.runtime.zenoh_bus import ZenohBus, endpoint
 from actors.supervision import run_info
-from actors.supervision.launcher import LaunchError, check_ports
 from actors.supervision.process_title import find_processes
 from airport.formats import load_airport
 from manager.specification import check_document, read_document
@@ -43,9 +42,6 @@ from toolbox.output import UsageError
 from toolbox.replay_page import NAME, ReplayPage
 
 DEFAULT_PORT = 7400
-RESERVED_PORTS = 128
-"""So many ports from the base port of a living run are left to it: those of its nodes."""
-
 GAP_S = 0.1
 """Simulated seconds between two laps."""
 
@@ -62,7 +58,7 @@ class Replay:
 
     Args:
         path: of the recording.
-        port: on which it is played.
+        port: number under which tools find it.
         rate: simulated seconds per second.
         loop: begin anew at the end.
         start_s: simulated time at which to begin; None for the beginning.
@@ -89,6 +85,7 @@ class Replay:
         self._wants = wants
         self._hmi_port = hmi_port
         self._said = said
+        self._sockets = ""
         self._lives: dict[str, int] = {}
         summary = self.summary
         if not summary.reader.is_recording:
@@ -116,7 +113,7 @@ class Replay:
             delay_s: real seconds before the first message, for readers to come.
 
         Raises:
-            UsageError: a port is in use.
+            UsageError: the number is taken, or there is no place for a socket.
         """
         async with contextlib.aclosing(self._messages(stop)) as messages:
             first = await anext(messages, None)  # may lie deep in the file: no clock runs yet
@@ -124,15 +121,16 @@ class Replay:
 
     async def _perform(self, first: _Due | None, messages: AsyncIterator[_Due],
                        stop: asyncio.Event, delay_s: float) -> None:
-        with tempfile.TemporaryDirectory(prefix="rampart-replay-") as directory:
+        with _sockets(self._port) as self._sockets, tempfile.TemporaryDirectory(
+                prefix="rampart-replay-") as directory:
             folder = Path(directory)
             clock = Clock(time.monotonic() + delay_s - self._start_s / self._rate, self._rate)
-            bus = ZenohBus("", 0, endpoint(self._port), [], Tap(self._port))
+            bus = ZenohBus("", 0, endpoint(self._sockets, run_info.REPLAY), [], Tap(self._port))
             with self._answering(clock, folder):
                 try:
                     await bus.open()
                 except BusError as error:
-                    raise UsageError(f"--port {self._port}: {error}") from None
+                    raise UsageError(str(error)) from None
                 page = self._page(bus, clock, folder)
                 showing = asyncio.create_task(page.run()) if page else None
                 if showing:
@@ -244,7 +242,7 @@ class Replay:
             "airport", "mission", "strategy", "shadow", "seed", "obstacles", "ftm")}
         return run_info.RunInfo(
             os.getpid(), self._port, self._rate, clock.source_time(0.0),
-            str(system) if system.exists() else "", dict.fromkeys(nodes or ["replay"], self._port),
+            str(system) if system.exists() else "", self._sockets, tuple(nodes or ["replay"]),
             run.get("run_id", ""), self._hmi_port,
             f"replay of {self._path.name}: {run.get('title', '')}", page,
             {**told, "system_file": str(system)}, str(self._path))
@@ -265,25 +263,42 @@ class Replay:
 
 
 def claim_port(port: int) -> None:
-    """Make sure that a replay on a port is out of reach of all that lives.
+    """Make sure that a replay is not taken for a run that lives.
 
     Raises:
-        UsageError: a run may use it, or it is taken.
+        UsageError: a run has that number.
     """
     living = {process.port for process in find_processes()} | {  # either may be dead just now
         run.base_port for run in run_info.find_runs() if not run.replay_of}
-    for base in sorted(living):
-        if base <= port < base + RESERVED_PORTS:
-            raise UsageError(f"--port {port}: belongs to the run on port {base}; a replay must "
-                             "never reach a living robot, choose another --port")
-    _check_free("--port", port)
+    if port in living:
+        raise UsageError(f"--port {port}: belongs to a run; a replay must never be taken for a "
+                         "living robot, choose another --port")
+
+
+@contextlib.contextmanager
+def _sockets(port: int) -> Iterator[str]:
+    """Have a folder for the sockets of a replay.
+
+    Raises:
+        UsageError: there is no place for one.
+    """
+    try:
+        folder = run_folder.make(port, os.getpid())
+    except OSError as error:
+        raise UsageError(f"no folder for a socket: {error}") from None
+    try:
+        yield folder
+    finally:
+        run_folder.remove(folder)
 
 
 def _check_free(option: str, port: int) -> None:
-    try:
-        check_ports(port, 1)
-    except LaunchError:
-        raise UsageError(f"{option} {port}: in use; choose another {option}") from None
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            raise UsageError(f"{option} {port}: in use; choose another {option}") from None
 
 
 async def _until(due: float, stop: asyncio.Event) -> bool:

@@ -20,7 +20,7 @@ from actors.runtime.clock import Clock
 from actors.runtime.envelope import UNREADABLE, Header, decode, encode
 from actors.runtime.tap import Tap
 from actors.runtime.topic import ROOT, Topic
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
+from actors.runtime.zenoh_bus import ZenohBus
 from actors.supervision.run_info import NoRunError, RunInfo, find_run
 from toolbox.output import UsageError
 
@@ -118,13 +118,15 @@ class Session:
         """Send a command until `effect` holds; return False if it did not within real seconds.
 
         Raises:
-            UsageError: the run is a replay, where nobody obeys.
+            UsageError: the run is a replay, where nobody obeys, or the message has a value that
+                every reader would refuse.
         """
         if self.run.replay_of:
             raise UsageError(f"port {self.run.base_port} is a replay of {self.run.replay_of}: "
                              "nobody is there to obey")
         self._sequence += 1
-        payload = encode(Header(self.name, 1, self._sequence, self.clock.now()), body)
+        payload = _checked(
+            topic, encode(Header(self.name, 1, self._sequence, self.clock.now()), body))
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout_s
         resend = loop.time()
@@ -139,6 +141,19 @@ class Session:
         return True
 
 
+def _checked(topic: Topic[Any], payload: bytes) -> bytes:
+    """Return a payload that the topic's readers will take.
+
+    Raises:
+        UsageError: they will not; field and bound are named.
+    """
+    try:
+        decode(topic, payload)
+    except UNREADABLE as error:
+        raise UsageError(f"not a {topic.type.__name__} that can be sent: {error}") from None
+    return payload
+
+
 @contextlib.asynccontextmanager
 async def connect(port: int | None = None) -> AsyncIterator[Session]:
     """Join the run on this machine (on base port `port` if there are several).
@@ -150,8 +165,7 @@ async def connect(port: int | None = None) -> AsyncIterator[Session]:
         run = find_run(port)
     except NoRunError as error:
         raise UsageError(str(error)) from None
-    ports = dict.fromkeys(run.nodes.values())  # a replay plays all nodes on one
-    bus = ZenohBus("", 0, None, map(endpoint, ports), Tap(run.base_port))
+    bus = ZenohBus("", 0, None, run.endpoints, Tap(run.base_port))
     try:
         await bus.open()
     except BusError as error:

@@ -14,7 +14,9 @@ from typing import Any
 import msgspec
 
 from actors import topics
+from actors.runtime.bounds import MANY
 from actors.runtime.envelope import Header
+from actors.runtime.limits import Remembered
 from actors.runtime.topic import Topic
 from toolbox import systems
 from toolbox.following import LOOK_S, is_over
@@ -175,7 +177,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
     """Measure rates."""
     topic, key = resolve(options.key, topics_for(options.key, options.port))
     _positive("--duration", options.duration)
-    arrivals: dict[str, deque[float]] = {}
+    arrivals: Remembered[str, deque[float]] = Remembered(MANY)
     duration_s = options.duration
     if options.json and duration_s is None:
         duration_s = 3.0
@@ -183,7 +185,10 @@ async def topic_hz(options: argparse.Namespace) -> int:
         _check_member(session, topic, key)
 
         def heard(short: str, _header: Header, _body: Any) -> None:
-            arrivals.setdefault(short, deque(maxlen=_WINDOW)).append(session.clock.now())
+            times = arrivals.get(short)
+            if times is None:
+                times = arrivals[short] = deque(maxlen=_WINDOW)
+            times.append(session.clock.now())
 
         session.listen(topic, key, heard)
         loop = asyncio.get_running_loop()

@@ -18,6 +18,7 @@ from actors.messages import (
     Twist,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
 
 _PERIOD_S = 0.05
 
@@ -120,8 +121,8 @@ class SafetyPilot(Actor):
     def _tell(self) -> None:
         last = self._last
         self.publish(topics.PILOT_STATUS, PilotStatus(
-            last.mode, last.stopped, last.reason, self._gate.refused, self._gate.top_speed_mps,
-            self._gate.forbidden(self.clock.now())))
+            last.mode, last.stopped, clip(last.reason), self._gate.refused,
+            self._gate.top_speed_mps, clip(self._gate.forbidden(self.clock.now()))))
 
     def _note(self, refused: str, header: Header) -> None:
         if refused:

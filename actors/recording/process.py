@@ -57,7 +57,7 @@ class RecorderProcess:
         environment["PYTHONPATH"] = os.pathsep.join(
             [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         self._process = subprocess.Popen(  # noqa: S603 our own interpreter and module
-            [sys.executable, "-m", "actors.recording.process",
+            [sys.executable, "-P", "-m", "actors.recording.process",
              msgspec.json.encode(self._order).decode()],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, env=environment)
         assert self._process.stdout is not None  # noqa: S101 for the type checker

@@ -14,7 +14,6 @@ process and its liveliness token live on.
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -22,13 +21,16 @@ from typing import Any, ClassVar, TypeVar
 
 import msgspec
 
+from actors.runtime.bounds import MAX_PAYLOAD_BYTES, clip
 from actors.runtime.bus import Bus
 from actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
 from actors.runtime.clock import Clock
-from actors.runtime.envelope import ArrivalGuard, Envelope, Header, pack
+from actors.runtime.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from actors.runtime.injection_desk import InjectionDesk
+from actors.runtime.limits import ReportLimit
 from actors.runtime.mailbox import Mailbox
 from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection
+from actors.runtime.run_folder import Register
 from actors.runtime.timer import Timer
 from actors.runtime.topic import Qos, Topic
 from actors.runtime.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
@@ -45,8 +47,6 @@ BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT, HELLO)
 
 _REPEATED_SOON_HZ = 7.0
 """A state that is repeated this often anyway is not repeated for a newcomer."""
-
-_DIAGNOSTIC_PERIOD_S = 1.0
 
 # What an actor is doing. Numbers, because they are compared and set for each message.
 _RESTING = 0
@@ -72,6 +72,8 @@ class Context:
         checkpoints: where this node's state is kept.
         heartbeat_period_s: simulated seconds between two heartbeats.
         failed: told of the error that ends the actor, while its peers still believe that it lives.
+        register: returns the incarnation of a node that was issued last, None if it is not known.
+        members: names of all nodes of the system; what others make it remember is bounded.
     """
 
     name: str
@@ -84,6 +86,8 @@ class Context:
     checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
     heartbeat_period_s: float = 0.1
     failed: Callable[[Exception], None] = lambda _error: None
+    register: Register = lambda _node: None
+    members: frozenset[str] = frozenset()
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:
@@ -138,7 +142,8 @@ class Actor:
         self.clock = context.clock
         self.parameters = context.parameters
         self._bus = context.bus
-        self._guard = ArrivalGuard(context.clock.now)
+        self._guard = ArrivalGuard(
+            context.clock.now, context.members, self._crowded, context.register)
         self._injections = InjectionDesk(self)
         self._in_force = self._injections.gate.in_force
         self._last_sent = self._injections.gate.last
@@ -159,7 +164,7 @@ class Actor:
         self._abandoned = False
         self._timers: set[asyncio.TimerHandle] = set()
         self._tickers: list[_Ticker] = []
-        self._diagnostics: dict[str, tuple[float, int]] = {}
+        self._reports = ReportLimit()
         self._states: dict[str, tuple[Topic[Any], msgspec.Struct, float]] = {}
         self._outlets: dict[str | tuple[str, str], tuple[str, bool]] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
@@ -277,15 +282,11 @@ class Actor:
         self._keeper.keep(form, state)
 
     def report_diagnostic(self, context: str, reason: str, offender: str) -> None:
-        """Publish an error report, at most one a second per context and offender."""
-        slot = f"{context} {offender}"
-        last, count = self._diagnostics.get(slot, (-math.inf, 0))
-        now = self.clock.now()
-        if now - last < _DIAGNOSTIC_PERIOD_S:
-            self._diagnostics[slot] = (last, count + 1)
-            return
-        self._diagnostics[slot] = (now, 0)
-        self.publish(DIAGNOSTIC, Diagnostic(self.name, context, reason, offender, count + 1))
+        """Publish an error report: one a second per context and offender, and few in all."""
+        count = self._reports.stands_for(f"{context} {offender}", self.clock.now())
+        if count:
+            self.publish(DIAGNOSTIC, Diagnostic(
+                self.name, clip(context), clip(reason), clip(offender), count))
 
     def stop(self) -> None:
         """End the actor after the items that already wait."""
@@ -425,7 +426,7 @@ class Actor:
 
     def _fail(self, error: Exception) -> None:
         try:
-            self._diagnostics.clear()
+            self._reports.clear()
             self.report_diagnostic("handler failed", f"{type(error).__name__}: {error}", self.name)
             self._keeper.failed()
             self.on_failure(error)
@@ -439,6 +440,7 @@ class Actor:
         self, topic: Topic[Any], handler: Callable[[Any, Header], None]
     ) -> Callable[[str, bytes], None]:
         command, name, waiting = topic.qos is Qos.COMMAND, handler.__name__, self._waiting
+        members, mailbox = self.context.members, self._mailbox
 
         def take(key: str, message: Envelope[Any]) -> None:
             if self._stance == _IDLE:  # as `_handle`, once more because it is run so often
@@ -454,10 +456,11 @@ class Actor:
                 else:
                     self._stance = _IDLE
             elif command:
-                self._mailbox.put(lambda: handler(message.body, message))
+                mailbox.put(lambda: handler(message.body, message),
+                            reserved=not members or message.source in members)
             else:
-                self._mailbox.put_latest(
-                    f"{key} {name}", lambda: handler(message.body, message))
+                mailbox.put_message(f"{key} {name}", lambda: handler(message.body, message),
+                                    reserved=not members or message.source in members)
 
         return self._guard.receiver(topic, take, self._reject)
 
@@ -466,11 +469,15 @@ class Actor:
         self.report_diagnostic("payload rejected", reason, key)
 
     def _peer_changed(self, node: str, incarnation: int, alive: bool) -> None:
-        self._mailbox.put_latest(
+        self._mailbox.put_message(
             f"peer {node} {incarnation} {alive}", lambda: self.on_peer(node, incarnation, alive))
 
     def _overflowed(self, _item: Any) -> None:
-        self.report_diagnostic("mailbox full", "a command was refused", self.name)
+        self.report_diagnostic("mailbox full", "a message was refused", self.name)
+
+    def _crowded(self) -> None:
+        self.report_diagnostic("many sources", f"more than {STRANGERS} that are no nodes of the "
+                               "system; those heard first are forgotten", self.name)
 
     def send(
         self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float, copies: int = 1
@@ -479,6 +486,9 @@ class Actor:
         self._sequence = sequence = self._sequence + 1
         self._last_sent[key] = (body, stamp)
         payload = pack((self.name, self._incarnation, sequence, stamp, body))
+        if len(payload) > MAX_PAYLOAD_BYTES:  # no reader would take it
+            self.report_diagnostic("not sent", too_long(payload), key)
+            return
         for _ in range(copies):
             self._bus.publish(topic, key, payload)
 
@@ -512,6 +522,10 @@ class Actor:
         self.publish(HEARTBEAT, Heartbeat(
             context.pid, self._progress, context.heartbeat_period_s, self._rejected,
             self._mailbox.overflowed))
+        left_out = self._reports.left_out(self.clock.now())
+        if left_out:
+            self.report_diagnostic(
+                "diagnostics", f"{left_out} more reports were left out", self.name)
 
     # -- newcomers ------------------------------------------------------------------------------
 

@@ -19,3 +19,22 @@ def peer(connection: socket.socket) -> tuple[int, int]:
 def is_same_user(connection: socket.socket) -> bool:
     """Whether the process at the other end belongs to this user."""
     return peer(connection)[1] == os.getuid()
+
+
+def receive_signed(connection: socket.socket, size: int) -> tuple[bytes, int]:
+    """Receive one datagram and return it with the process that sent it, as the kernel knows it.
+
+    The socket needs SO_PASSCRED (unix(7)) before the datagram is sent. The process is 0 if the
+    sender belongs to another user, or if there was none: the connection was closed.
+
+    Raises:
+        BlockingIOError: there is none yet.
+        OSError: the connection is broken.
+    """
+    data, ancillary, _flags, _address = connection.recvmsg(
+        size, socket.CMSG_SPACE(_CREDENTIALS.size))
+    for level, kind, content in ancillary:
+        if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS):
+            pid, uid, _gid = _CREDENTIALS.unpack(content)
+            return data, pid if uid == os.getuid() else 0
+    return data, 0

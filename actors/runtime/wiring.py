@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from actors.runtime import working_folder
 from actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from actors.runtime.topic import Topic
 
@@ -91,7 +92,9 @@ def load_class(path: str, reports_on: Topic[Any] | None = None) -> type[Actor]:
     try:
         imported = importlib.import_module(module)
     except ImportError as error:
-        raise ValueError(f"actor = {path!r}: {error}") from None
+        hidden = working_folder.why_not()
+        hint = f"; nothing is imported from the working folder: {hidden}" if hidden else ""
+        raise ValueError(f"actor = {path!r}: {error}{hint}") from None
     except Exception as error:  # a module of the user's own may raise anything
         at = traceback.extract_tb(error.__traceback__)[-1]
         where = "" if isinstance(error, SyntaxError) else f" ({at.filename}, line {at.lineno})"

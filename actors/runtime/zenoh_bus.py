@@ -1,9 +1,14 @@
-"""The bus over Zenoh: a partial mesh of peers on loopback, no router, no rendezvous.
+"""The bus over Zenoh: a partial mesh of peers on unix sockets, no router, no rendezvous.
 
-Every actor listens on its own fixed port and at its start dials the actors that it shares a
-topic with. Who starts later dials who is there already, so a respawned actor is connected to
-all its partners by the time `open` returns, no process is a single point of failure, and the
-opening costs about 1.3 ms per partner (a full mesh of 22 costs three times as much).
+Every actor listens on a socket of its own in the folder of the run, which only the run's user can
+enter, and at its start dials the actors that it shares a topic with. Who starts later dials who is
+there already, so a respawned actor is connected to all its partners by the time `open` returns, and
+no process is a single point of failure.
+
+**Nobody's start waits for a partner that does not answer.** Zenoh dials all partners in the
+background and goes on trying; `open` waits until those that are there are linked, and not for one
+that is dead or stopped, nor for one that is slower than `PATIENCE_S`. Such a link comes later, so a
+stopped process that goes on finds its partners again.
 
 Zenoh calls back on threads of its own. They only append to a deque and wake the event loop once
 per burst; everything else happens on the loop.
@@ -12,20 +17,40 @@ per burst; everything else happens on the loop.
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
+import secrets
+import socket
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from actors.runtime.bus import BusError, Deliver, PeerChange
+from actors.runtime.run_folder import socket_path
 from actors.runtime.tap import Tap
 from actors.runtime.topic import ROOT, Qos, Topic
+from actors.runtime.unix_peer import peer
 
 LEASE_MS = 2000
 """A link that is silent for so long is closed; a stopped process is found sooner by heartbeat."""
 
+PATIENCE_S = 0.25
+"""Real seconds that a newcomer waits for a partner that runs; the link may come later."""
+
+HANDSHAKE_MS = 300
+"""A handshake that takes longer is given up on either side: what connects and says nothing holds
+one of the hundred places that Zenoh has for handshakes no longer than this."""
+
+_REDIAL_MS = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2.0}
+_LOOK_S = 0.001
+_FIRST_LOOKS = 5
+"""So many looks, a millisecond each, before a partner that is missing is looked at more closely."""
+
+_PROTOCOL = "unixsock-stream"
+_STOPPED = (b"T", b"t")
 _ALIVE = f"{ROOT}/alive"
 _PRIORITY = {
     Qos.SENSOR: zenoh.Priority.DATA,
@@ -34,9 +59,9 @@ _PRIORITY = {
 }
 
 
-def endpoint(port: int) -> str:
-    """Return the Zenoh endpoint of a loopback port."""
-    return f"tcp/127.0.0.1:{port}"
+def endpoint(folder: str, name: str) -> str:
+    """Return the Zenoh endpoint of a node in the folder of a run."""
+    return f"{_PROTOCOL}/{socket_path(folder, name)}"
 
 
 def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
@@ -47,17 +72,40 @@ def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
         "listen/endpoints": [listen] if listen else [],
         "listen/exit_on_failure": True,
         "connect/endpoints": list(dial),
-        "connect/timeout_ms": 0,  # one attempt: who is not there yet will dial us
+        "connect/timeout_ms": -1,  # in the background; `open` knows whom to wait for
+        "connect/retry": _REDIAL_MS,
         "connect/exit_on_failure": False,
+        "open/return_conditions": {"connect_scouted": False, "declares": False},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
         "transport/shared_memory/enabled": False,  # a SIGKILL would leave its segment behind
+        "transport/unicast/open_timeout": HANDSHAKE_MS,
+        "transport/unicast/accept_timeout": HANDSHAKE_MS,
         "transport/link/tx/lease": LEASE_MS,
     }
+    if listen:
+        settings["id"] = _mark(listen) + secrets.token_hex(8)
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _mark(where: str) -> str:
+    """Return how the Zenoh id of whoever listens at an endpoint begins."""
+    return "1" + hashlib.blake2b(where.encode(), digest_size=8).hexdigest()[1:]
+
+
+def _answers(where: str) -> bool:
+    """Whether there is a process at an endpoint, and it is not stopped."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(where.removeprefix(f"{_PROTOCOL}/"))
+            status = Path(f"/proc/{peer(probe)[0]}/stat").read_bytes()
+        except OSError:  # nobody, or so many wait to be let in that nobody is
+            return False
+    return status.rpartition(b") ")[2][:1] not in _STOPPED
 
 
 class ZenohBus:
@@ -90,7 +138,7 @@ class ZenohBus:
         self._held: list[Any] = []
 
     async def open(self) -> None:
-        """Open the session and declare this node alive.
+        """Open the session, link it with the partners that are there, and declare this node alive.
 
         Raises:
             BusError: the endpoint is in use or invalid.
@@ -100,13 +148,29 @@ class ZenohBus:
             self._session = zenoh.open(session_config(self._listen, self._dial))
         except zenoh.ZError as error:
             text = " ".join(str(error).split())
-            if "in use" in text:
-                raise BusError(f"port in use: {self._listen} (node {self._node}); "
-                               "another run is using it, choose another --port") from None
+            if "acquire lock" in text:
+                raise BusError(f"{self._listen} is in use by another process "
+                               f"(node {self._node})") from None
             raise BusError(f"cannot open {self._listen} (node {self._node}): {text}") from None
+        await self._linked(self._session)
         if self._node:
             self._held.append(self._session.liveliness().declare_token(
                 f"{_ALIVE}/{self._node}/{self._incarnation}"))
+
+    async def _linked(self, session: zenoh.Session) -> None:
+        """Wait until all partners that answer are linked, `PATIENCE_S` at most."""
+        loop = asyncio.get_running_loop()
+        missing = {_mark(where): where for where in self._dial}
+        deadline_s, looks = loop.time() + PATIENCE_S, 0
+        while True:
+            for zid in session.info.peers_zid():
+                missing.pop(str(zid)[:len(_mark(""))], None)
+            if looks == _FIRST_LOOKS:
+                missing = {mark: where for mark, where in missing.items() if _answers(where)}
+            if not missing or loop.time() > deadline_s:
+                return
+            looks += 1
+            await asyncio.sleep(_LOOK_S)
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
         """Send to all present subscribers of the key."""

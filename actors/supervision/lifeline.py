@@ -2,8 +2,15 @@
 
 When the launcher ends, however it ends, the kernel closes the write end and every process of
 the run reads end-of-file. A thread does the reading, so that a wedged event loop dies too. A
-stopped process cannot read: supervisor and spawners therefore kill whatever else is left of the
-run before they go.
+stopped process cannot read. Two things end it all the same:
+
+* whichever process reads the end kills all others of the run before itself: one that is not
+  stopped is enough;
+* the launcher has the run in a process group of its own, and when the last process outside that
+  holds it together, the launcher, is gone, the kernel sends SIGHUP and SIGCONT to the group if one
+  of its members is stopped (setpgid(2), "orphaned process group"): with all of them stopped there
+  is still the kernel. Not where whoever adopts the launcher's children is of the same session, as
+  a shell that is the first process of a container.
 """
 
 from __future__ import annotations
@@ -12,19 +19,19 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Callable
 
+from actors.runtime.run_folder import remove
 from actors.supervision.process_title import find_processes
 
 
-def exit_with_launcher(read_end: int, last_act: Callable[[], object] | None = None) -> None:
-    """Start the thread that ends this process, after `last_act`, when the launcher has ended."""
+def exit_with_launcher(read_end: int, launcher: int, folder: str) -> None:
+    """Start the thread that ends this process, and all of the run, when the launcher has ended."""
 
     def wait() -> None:
         while os.read(read_end, 1):
             pass
-        if last_act is not None:
-            last_act()
+        kill_leftovers(launcher)
+        remove(folder)
         os.kill(os.getpid(), signal.SIGKILL)
 
     threading.Thread(target=wait, name="lifeline", daemon=True).start()

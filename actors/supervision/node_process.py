@@ -22,11 +22,13 @@ from actors.runtime.bus import BusError
 from actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from actors.runtime.checkpoint_store import SqliteCheckpoints
 from actors.runtime.clock import Clock
+from actors.runtime.run_folder import register_of
 from actors.runtime.tap import Tap
 from actors.runtime.zenoh_bus import ZenohBus
-from actors.supervision.lifeline import exit_with_launcher, kill_leftovers
+from actors.supervision.lifeline import exit_with_launcher
 from actors.supervision.process_title import set_title
-from actors.supervision.run_plan import SUPERVISOR, Layout
+from actors.supervision.run_plan import Layout
+from actors.supervision.unseen import tell_of_callbacks
 from manager.schema import Kind
 
 WORLD_NICE = -10
@@ -48,8 +50,10 @@ def make_actor(
                    Tap(layout.plan.base_port))
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, shared,
+        register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
-        heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed))
+        heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
+        members=frozenset(layout.members)))
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
@@ -63,9 +67,18 @@ def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
 
 def node_main(
     layout: Layout, names: tuple[str, ...], incarnation: int, shared: Mapping[str, Any],
-    lifeline: int,
+    lifeline: int, *, born: Callable[[], None] = lambda: None,
 ) -> int:
-    """Run the actors of one process to their end and return the exit code."""
+    """Run the actors of one process to their end and return the exit code.
+
+    Args:
+        layout: of the run.
+        names: of the actors.
+        incarnation: of the process.
+        shared: objects that actors share.
+        lifeline: read end of the pipe; see `lifeline`.
+        born: called as soon as the process has its title, before it does anything that others see.
+    """
     told: list[Exception] = []
 
     def tell(error: Exception) -> None:  # at once: whoever replaces this process may kill it
@@ -76,11 +89,12 @@ def node_main(
     try:
         launcher = layout.plan.launcher_pid
         set_title(layout.plan.base_port, launcher, names, incarnation)
+        born()
         if any(node.kind is Kind.WORLD for node in layout.spec.nodes if node.name in names):
             go_first()
-        exit_with_launcher(
-            lifeline, (lambda: kill_leftovers(launcher)) if SUPERVISOR in names else None)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is the launcher's to handle
+        exit_with_launcher(lifeline, launcher, layout.plan.folder)
+        for number in (signal.SIGINT, signal.SIGHUP):  # ctrl-C is the launcher's to handle
+            signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGUSR2, wedge)
         asyncio.run(_live(layout, names, incarnation, shared, tell))
     except BusError as error:
@@ -99,6 +113,7 @@ async def _live(
     failed: Callable[[Exception], None],
 ) -> None:
     loop = asyncio.get_running_loop()
+    tell_of_callbacks(loop, lambda line: _complain(f"{'+'.join(names)} #{incarnation}: {line}"))
     actors = [make_actor(layout, name, incarnation, shared, loop, failed=failed) for name in names]
 
     def stop_all() -> None:

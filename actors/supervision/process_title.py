@@ -49,21 +49,22 @@ def find_processes(port: int | None = None) -> list[RunProcess]:
 
     Zombies are left out: they run no code and hold nothing.
     """
-    mine = os.getuid()
-    found = []
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdecimal():
-            continue
-        try:
-            raw = (entry / "cmdline").read_bytes()
-            if not raw.startswith(b"rampart[") or entry.stat().st_uid != mine:
-                continue
-        except OSError:
-            continue  # it ended while we looked
-        process = parse_title(int(entry.name), raw.rstrip(b"\0").decode(errors="replace"))
-        if process and port in {None, process.port} and process_state(process.pid) not in "ZX":
-            found.append(process)
+    found = [process for entry in Path("/proc").iterdir() if entry.name.isdecimal()
+             and (process := find_process(int(entry.name))) and port in {None, process.port}]
     return sorted(found, key=lambda p: (p.port, p.pid))
+
+
+def find_process(pid: int) -> RunProcess | None:
+    """Return the process of a run that has this number, or None if there is none of this user."""
+    entry = Path(f"/proc/{pid}")
+    try:
+        raw = (entry / "cmdline").read_bytes()
+        if not raw.startswith(b"rampart[") or entry.stat().st_uid != os.getuid():
+            return None
+    except OSError:
+        return None  # it ended while we looked
+    process = parse_title(pid, raw.rstrip(b"\0").decode(errors="replace"))
+    return process if process and process_state(pid) not in "ZX" else None
 
 
 def process_state(pid: int) -> str:

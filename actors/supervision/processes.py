@@ -17,13 +17,14 @@ from typing import NamedTuple, Protocol
 
 from actors.messages import AdaptedSystem
 from actors.supervision.process_title import find_processes, is_stopped
-from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+from actors.supervision.spawner_client import (
+    SpawnerBusyError,
+    SpawnerClient,
+    SpawnerUnavailableError,
+)
 
-__all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerUnavailableError"]
-
-
-_PID_LIMIT = 1 << 22
-"""No process of Linux has a higher number."""
+__all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerBusyError",
+           "SpawnerUnavailableError"]
 
 
 class Living(NamedTuple):
@@ -63,7 +64,9 @@ class Processes(Protocol):
         """Start a process for the named actors and return its pid.
 
         Raises:
-            SpawnerUnavailableError: Nobody could do it now.
+            SpawnerBusyError: It is under way; to be called again with the same names and
+                incarnation.
+            SpawnerUnavailableError: Nobody could do it now; likewise.
             OSError: Likewise, for want of memory or descriptors.
         """
 
@@ -110,7 +113,11 @@ class _OsHandle:
     def gone(self) -> bool:
         # Not the state in /proc: that is the main thread's, which may be a zombie while another
         # thread still ends and holds the ports. A pidfd is readable when the last one has ended.
-        return self.pidfd < 0 or bool(select.select([self.pidfd], [], [], 0)[0])
+        if self.pidfd < 0:
+            return True
+        poll = select.poll()  # not select(), which knows 1024 descriptors
+        poll.register(self.pidfd, select.POLLIN)
+        return bool(poll.poll(0))
 
     def stopped(self) -> bool:
         return is_stopped(self._pid)
@@ -132,12 +139,13 @@ class OsProcesses:
     Args:
         port: base port of the run.
         launcher: pid of its launcher.
+        folder: of its sockets.
     """
 
-    def __init__(self, port: int, launcher: int) -> None:
+    def __init__(self, port: int, launcher: int, folder: str) -> None:
         self._port = port
         self._launcher = launcher
-        self._spawner = SpawnerClient(port)
+        self._spawner = SpawnerClient(folder, port, launcher)
 
     def living(self) -> list[Living]:
         """Return the processes of this run, found in /proc."""
@@ -145,14 +153,11 @@ class OsProcesses:
                 if p.launcher == self._launcher]
 
     def fork(self, names: tuple[str, ...], incarnation: int) -> int:
-        """Have a spawner fork; raises SpawnerUnavailableError if none answers."""
-        return self._spawner.fork(names, incarnation, orphan=lambda: next(
-            (p.pid for p in self.living() if (p.names, p.incarnation) == (names, incarnation)), 0))
+        """Have a spawner fork; raises SpawnerUnavailableError while none answers."""
+        return self._spawner.fork(names, incarnation)
 
     def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
         """Open a pidfd; raises ProcessLookupError if there is no such process."""
-        if not 0 < pid < _PID_LIMIT:  # as a heartbeat may claim; no lack of descriptors
-            raise ProcessLookupError(pid)
         return _OsHandle(pid, ended)
 
     def adapt(self, adapted: AdaptedSystem) -> None:

@@ -14,6 +14,10 @@ from typing import Any
 import msgspec
 
 from actors.runtime.unix_peer import is_same_user
+from actors.runtime.zenoh_bus import endpoint
+
+REPLAY = "replay"
+"""Name of the one socket in the folder of a replay: it plays all nodes."""
 
 _NAME = re.compile(r"@rampart\.(\d+)\.launcher$")
 _TIMEOUT_S = 1.0
@@ -22,7 +26,7 @@ _TIMEOUT_S = 1.0
 class RunInfo(msgspec.Struct, frozen=True):
     """One run: where it is, what it runs, and when its simulated time began.
 
-    `nodes` maps node names to their Zenoh ports; `origin_s` is a reading of the machine's
+    `folder` holds the sockets of its nodes, `nodes`; `origin_s` is a reading of the machine's
     monotonic clock. `page` is where the operator's page is, without its token. `plan` is
     what a recording keeps of the run's plan. `replay_of` names the file of a replay.
     """
@@ -32,13 +36,20 @@ class RunInfo(msgspec.Struct, frozen=True):
     rate: float
     origin_s: float
     system_file: str
-    nodes: dict[str, int]
+    folder: str
+    nodes: tuple[str, ...]
     run_id: str
     hmi_port: int
     title: str
     page: str = ""
     plan: dict[str, Any] = {}
     replay_of: str = ""
+
+    @property
+    def endpoints(self) -> list[str]:
+        """Where a tool that hears everything connects to."""
+        names = (REPLAY,) if self.replay_of else self.nodes
+        return [endpoint(self.folder, name) for name in names]
 
 
 class NoRunError(Exception):

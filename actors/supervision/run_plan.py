@@ -28,6 +28,7 @@ from manager.specification import (
     SpecificationError,
     SystemSpec,
     check_document,
+    check_modules,
     read_document,
 )
 
@@ -44,7 +45,7 @@ class RunPlan(msgspec.Struct, frozen=True):
 
     Attributes:
         run_id: unique name of the run.
-        base_port: the supervisor's port; the nodes' follow.
+        base_port: number that tells the runs of this machine apart.
         rate: simulated seconds per second.
         seed: for everything random.
         system_file: path of the system spec.
@@ -56,6 +57,7 @@ class RunPlan(msgspec.Struct, frozen=True):
         ftm: False runs the paper's unprotected baseline.
         hmi_port: port of the operator's page; 0 for none.
         launcher_pid: process id of the launcher; set by it.
+        folder: folder of the run's sockets, which only its user can enter; made by the launcher.
         error_log: file that collects tracebacks of failed nodes; "" for none.
         origin_s: reading of the monotonic clock at simulated time 0; set when all is loaded.
         checkpoints: directory for the nodes' checkpoints; "" keeps none, whatever the spec says.
@@ -79,6 +81,7 @@ class RunPlan(msgspec.Struct, frozen=True):
     ftm: bool
     hmi_port: int
     launcher_pid: int = 0
+    folder: str = ""
     shadow: str = ""
     error_log: str = ""
     origin_s: float = 0.0
@@ -196,7 +199,7 @@ def _class_of(plan: RunPlan, spec: SystemSpec, node: NodeSpec) -> type[Actor]:
 
 
 class Layout:
-    """Everything derived from plan and spec: units, ports, partners.
+    """Everything derived from plan and spec: units, endpoints, partners.
 
     Raises:
         ValueError: an actor class named in the spec does not exist, cannot be imported, or belongs
@@ -218,17 +221,15 @@ class Layout:
             m.name: m for m in (*own, *(
                 Member(n.name, _class_of(plan, spec, n), actor_parameters(plan, spec, n))
                 for n in spec.actors()))}
-        self.port_of: dict[str, int] = {
-            name: plan.base_port + i for i, name in enumerate(self.members)}
         self._partners = partners(self.members.values())
 
     def listen(self, node: str) -> str:
         """Return the endpoint on which a node listens."""
-        return endpoint(self.port_of[node])
+        return endpoint(self.plan.folder, node)
 
     def dial(self, node: str) -> list[str]:
         """Return the endpoints that a node connects to when it starts."""
-        return [endpoint(self.port_of[p]) for p in self._partners[node]]
+        return [endpoint(self.plan.folder, p) for p in self._partners[node]]
 
 
 def adapted_system(
@@ -237,10 +238,17 @@ def adapted_system(
     """Return layout and shared objects of the system as it was changed while running.
 
     Raises:
-        ValueError: the changed system is unsound; the manager does not let that happen.
+        ValueError: the changed system is unsound, has other processes, or names a module that the
+            system as it was started does not. The manager lets none of this happen; a message may.
     """
-    document = msgspec.json.decode(adapted.document)
+    try:
+        document = msgspec.json.decode(adapted.document, type=dict[str, Any])
+    except RecursionError:
+        raise ValueError("the changed system is nested too deep") from None
     spec = tailor(layout.plan, check_document(document, layout.plan.system_file))
+    check_modules(layout.spec, spec)
+    if spec.processes().keys() != layout.units.keys():
+        raise ValueError(f"{layout.plan.system_file}: not the processes that were started")
     return Layout(layout.plan, spec), {
         **shared, "system": spec, "document": document, "adapted": adapted}
 

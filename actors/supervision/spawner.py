@@ -1,17 +1,18 @@
 """The spawner: a process that has imported everything and opened nothing, and forks nodes.
 
 A fork of it is a node in about a millisecond instead of the second that the imports take. It
-holds no thread and no Zenoh session (neither survives a fork). It listens on an abstract unix
-socket, which leaves no file; any process of the same user that knows the run may ask it to fork.
+holds no thread and no Zenoh session (neither survives a fork). It listens on a unix socket in the
+folder of the run, where only the run's user gets in, and issues the incarnation of what it forks.
 There are two of them, `a` and `b`: if one dies, the other forks nodes and its own new sibling.
 
-Requests and replies are one JSON datagram each way on a sequenced-packet socket.
+Requests and replies are one JSON datagram each way on a sequenced-packet socket. A request to fork
+is answered by the new process itself, and by its answer it learns whether it is still wanted: who
+does not wait for it any more has closed the connection (see `spawner_client`).
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import gc
 import os
 import selectors
@@ -19,11 +20,14 @@ import signal
 import socket
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NoReturn
 
 import msgspec
 
 from actors.messages import AdaptedSystem
+from actors.runtime import working_folder
+from actors.runtime.run_folder import issue, issued, remove, socket_path
 from actors.runtime.unix_peer import is_same_user
 from actors.supervision.lifeline import kill_leftovers
 from actors.supervision.node_process import node_main, wedge
@@ -40,17 +44,15 @@ NAMES = ("a", "b")
 MAX_DATAGRAM = 160_000
 """A changed system spec has to fit; unix sockets take 200 kB by default."""
 
+_BACKLOG = 64
+"""So many may wait to be accepted: all processes of a run, each asked for on a connection."""
+
 
 class ForkRequest(msgspec.Struct, frozen=True, tag="fork"):
-    """Fork a process for these actors, or (names = spawner_a / spawner_b) another spawner.
-
-    `known` tells a restarted supervisor the highest incarnation heard of each node, so that a
-    node that died together with its supervisor does not come back under an old number.
-    """
+    """Fork a process for these actors, or (names = spawner_a / spawner_b) another spawner."""
 
     names: tuple[str, ...]
     incarnation: int
-    known: dict[str, int] = {}
 
 
 class Ping(msgspec.Struct, frozen=True, tag="ping"):
@@ -70,19 +72,18 @@ class SetOrigin(msgspec.Struct, frozen=True, tag="origin"):
 
 
 class Reply(msgspec.Struct, frozen=True):
-    """Answer: the spawner's own pid, the child's (0 if none), and what went wrong if anything."""
+    """Answer: what went wrong, if anything; `sender`, filled in by the reader, is who answered."""
 
-    spawner: int
-    child: int = 0
     error: str = ""
+    sender: int = 0
 
 
 Request = ForkRequest | Ping | SetOrigin | Adapt
 
 
-def address(port: int, name: str) -> str:
-    """Return the abstract socket address of a spawner of the run on a base port."""
-    return f"\0rampart.{port}.spawner.{name}"
+def address(folder: str, name: str) -> str:
+    """Return the path of the socket of a spawner in the folder of a run."""
+    return socket_path(folder, f"spawner_{name}")
 
 
 class Spawner:
@@ -98,20 +99,27 @@ class Spawner:
         self._wakeup: tuple[socket.socket, socket.socket] | None = None
 
     def open(self) -> None:
-        """Take the name and the address.
+        """Take the title and the address.
 
         Raises:
-            OSError: another run has the address.
+            OSError: there is no folder to listen in.
         """
+        self.take_title()
+        self._listen(address(self._layout.plan.folder, self.name))
+
+    def take_title(self) -> None:
+        """Have /proc show what this process is."""
         plan = self._layout.plan
         set_title(plan.base_port, plan.launcher_pid, (f"spawner_{self.name}",), 1)
-        self._listen(address(plan.base_port, self.name))
 
     def serve(self) -> NoReturn:
         """Serve until the launcher ends."""
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for number in (signal.SIGINT, signal.SIGHUP):  # it ends with the lifeline
+            signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         signal.signal(signal.SIGUSR2, wedge)
+        for number in (signal.SIGTTIN, signal.SIGTTOU):  # no terminal's foreground is here
+            signal.signal(number, signal.SIG_IGN)
         self._reap_on_child_end()
         self._selector.register(self._lifeline, selectors.EVENT_READ, self._launcher_gone)
         while True:
@@ -120,12 +128,17 @@ class Spawner:
 
     def _listen(self, where: str) -> None:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with contextlib.suppress(FileNotFoundError):  # of the one that this replaces
+            Path(where).unlink()
         self._listener.bind(where)
-        self._listener.listen(16)
+        self._listener.listen(_BACKLOG)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
 
     def _accept(self, listener: socket.socket) -> None:
-        connection, _ = listener.accept()
+        try:
+            connection, _ = listener.accept()
+        except OSError:  # it has gone again, or there is no descriptor left
+            return
         if not is_same_user(connection):
             connection.close()
             return
@@ -137,43 +150,55 @@ class Spawner:
         except OSError:
             data = b""
         if not data:
-            self._selector.unregister(connection)
-            connection.close()
+            self._let_go(connection)
             return
         try:
-            reply = self._obey(msgspec.json.decode(data, type=Request))
-        except (msgspec.MsgspecError, KeyError, ValueError, OSError) as error:
-            reply = Reply(os.getpid(), error=f"{type(error).__name__}: {error}")
-        with contextlib.suppress(OSError):
-            connection.send(msgspec.json.encode(reply))
+            request = msgspec.json.decode(data, type=Request)
+            if isinstance(request, ForkRequest):
+                self._fork(request, connection)
+                return
+            self._obey(request)
+            reply = Reply()
+        except Exception as error:  # whatever is asked, it serves the next one
+            reply = Reply(error=f"{type(error).__name__}: {error}")
+        _answer(connection, reply)
 
-    def _obey(self, request: Request) -> Reply:
+    def _let_go(self, connection: socket.socket) -> None:
+        self._selector.unregister(connection)
+        connection.close()
+
+    def _obey(self, request: Ping | SetOrigin | Adapt) -> None:
         if isinstance(request, SetOrigin):
             self._layout.plan = msgspec.structs.replace(
                 self._layout.plan, origin_s=request.origin_s)
-            return Reply(os.getpid())
-        if isinstance(request, Ping):
-            return Reply(os.getpid())
-        if isinstance(request, Adapt):
+        elif isinstance(request, Adapt):
             adapted = msgspec.json.decode(request.adapted, type=AdaptedSystem)
             self._layout, self._shared = adapted_system(self._layout, self._shared, adapted)
-            return Reply(os.getpid())
+
+    def _fork(self, request: ForkRequest, connection: socket.socket) -> None:
         for name in request.names:
             if name not in self._layout.members and name not in {f"spawner_{n}" for n in NAMES}:
-                return Reply(os.getpid(), error=f"unknown node {name!r}")
-        child = os.fork()
-        if child == 0:
-            self._become(request)
-        return Reply(os.getpid(), child)
+                raise ValueError(f"unknown node {name!r}")
+        if os.fork() == 0:
+            self._become(request, connection)
+        self._let_go(connection)  # the child answers; if it cannot, its end is the answer
 
-    def _become(self, request: ForkRequest) -> NoReturn:
+    def _become(self, request: ForkRequest, connection: socket.socket) -> NoReturn:
+        folder = self._layout.plan.folder
+
+        def born() -> None:
+            if not _answer(connection, Reply()):
+                os._exit(0)  # nobody waits for it any more: another one may have its place
+            connection.close()
+            issue(folder, request.names, request.incarnation)
+
         code = 1
         try:
             signal.set_wakeup_fd(-1)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             lifeline = self._lifeline
             for key in list(self._selector.get_map().values()):
-                if key.fd != lifeline:
+                if key.fd not in {lifeline, connection.fileno()}:
                     key.fileobj.close()  # type: ignore[union-attr]
             if self._wakeup:
                 self._wakeup[1].close()
@@ -181,11 +206,13 @@ class Spawner:
             if request.names[0].startswith("spawner_"):
                 name = request.names[0].removeprefix("spawner_")
                 sibling = Spawner(name, self._layout, self._shared, lifeline)
+                sibling.take_title()
+                born()
                 sibling.open()
                 sibling.serve()
             code = node_main(
                 self._layout, request.names, request.incarnation,
-                {**self._shared, "known_incarnations": request.known}, lifeline)
+                {**self._shared, "known_incarnations": issued(folder)}, lifeline, born=born)
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
@@ -211,16 +238,28 @@ class Spawner:
         if os.read(lifeline, 1):
             return
         kill_leftovers(self._layout.plan.launcher_pid)
+        remove(self._layout.plan.folder)
         os._exit(0)
 
 
-def main() -> int:
-    """Entry of the first spawner: `python -m actors.supervision.spawner LIFELINE_FD` < plan.
+def _answer(connection: socket.socket, reply: Reply) -> bool:
+    try:
+        connection.send(msgspec.json.encode(reply))
+    except OSError:
+        return False
+    return True
 
-    Prints one line on stdout: a JSON object of all actors' ports when it is ready to fork, or
+
+def main() -> int:
+    """Entry of a spawner that loads: `python -m actors.supervision.spawner NAME FD` < plan.
+
+    NAME is `a` or `b`, FD the read end of the lifeline.
+
+    Prints one line on stdout: a JSON list of all actors' names when it is ready to fork, or
     `error: …` if the plan cannot be run.
     """
-    lifeline = int(sys.argv[1])
+    name, lifeline = sys.argv[1], int(sys.argv[2])
+    working_folder.admit()
     plan = msgspec.json.decode(sys.stdin.buffer.read(), type=RunPlan)
     try:
         spec = load_system(plan)
@@ -231,19 +270,15 @@ def main() -> int:
         return 2
     gc.collect()
     gc.freeze()  # keeps the collector from touching, and so copying, the shared pages
-    spawner = Spawner(NAMES[0], layout, shared, lifeline)
+    spawner = Spawner(name, layout, shared, lifeline)
     try:
         spawner.open()
-        print(msgspec.json.encode(layout.port_of).decode(), flush=True)
+        print(msgspec.json.encode(tuple(layout.members)).decode(), flush=True)
         os.dup2(2, 1)  # nobody reads the pipe from here on
         spawner.serve()
     except BrokenPipeError:  # the launcher ended while this was loading: nobody to tell
         os._exit(2)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            print(f"error: port in use: another run has base port {plan.base_port}", flush=True)
-            return 2
-        raise
+    return 0
 
 
 if __name__ == "__main__":

@@ -1,22 +1,34 @@
-"""The supervisor's and the launcher's side of the spawners: fork through whichever lives.
+"""The supervisor's and the launcher's side of the spawners: fork through whichever answers.
 
-A spawner that does not answer in time is killed before the other one is asked, so that no
-second process of the same incarnation can appear later. It may have forked before: its child is
-looked for.
+A spawner that is stopped, hung or starved must cost its caller no time and lead to no second
+process of one incarnation. Both follow from how a request ends:
+
+* The new process itself answers, and runs only if its answer was accepted. Who withdraws a request
+  shuts its end of the connection first and looks for an answer then. The kernel decides which of
+  the two came first: either the answer is there, and with it the process, or it is refused, and the
+  process ends at once, however late a spawner comes to fork it.
+* So a request may wait while its caller goes on: `fork` is called again, and finds the answer.
+
+Nothing is killed here. Whether a spawner hangs or only waits for a processor is judged by the
+launcher (`guard`), who can replace it. Answers are not believed blindly: both ends check the other
+one's user, and the process is the one that sent the answer, as the kernel says, if /proc shows it
+under the title that was asked for.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 import socket
-from collections.abc import Callable
+import time
 
 import msgspec
 
 from actors.messages import AdaptedSystem
-from actors.runtime.unix_peer import peer
+from actors.runtime.unix_peer import is_same_user, peer, receive_signed
+from actors.supervision.process_title import find_process
 from actors.supervision.spawner import (
     MAX_DATAGRAM,
     NAMES,
@@ -29,117 +41,251 @@ from actors.supervision.spawner import (
     address,
 )
 
-ANSWER_TIMEOUT_S = 0.25
-"""A fork takes a millisecond; a spawner that needs this long is stopped or hung."""
+WAIT_S = 0.05
+"""A fork takes a millisecond or two. So long its caller stands still for it, at most for each
+spawner, and not for one that was slow before."""
+
+PATIENCE_S = 0.25
+"""So long a request stays with a spawner that does not answer, if there is another one to ask; each
+time longer, for on a machine that is busy enough the new process cannot answer sooner either."""
+
+START_PATIENCE_S = 10.0
 
 
 class SpawnerUnavailableError(Exception):
-    """No spawner answered."""
+    """No spawner can do it now."""
+
+
+class SpawnerBusyError(SpawnerUnavailableError):
+    """A spawner has been asked a moment ago and has not answered yet."""
+
+
+class _Asked:
+    """A connection to one spawner, and what was asked of it: the answer to the last counts."""
+
+    def __init__(self, spawner: str, connection: socket.socket) -> None:
+        self.spawner = spawner
+        self.pid = peer(connection)[0]
+        self._connection = connection
+        self._unanswered = 0
+        self.sent = False
+        self.patience_s = PATIENCE_S
+        self._since_s = time.monotonic()
+        self._reply: Reply | None = None
+
+    @property
+    def overdue(self) -> bool:
+        """Whether another spawner is to be asked."""
+        return time.monotonic() - self._since_s > self.patience_s
+
+    def send(self, *requests: Request) -> None:
+        """Send requests, one after the other."""
+        self.sent = True
+        self._unanswered = len(requests)
+        try:
+            for request in requests:
+                self._connection.send(msgspec.json.encode(request))
+        except OSError as error:  # it has just ended, or does not empty its queue
+            self._end(Reply(error=f"takes no request ({error.strerror})"))
+
+    def reply(self, wait_s: float = 0.0) -> Reply | None:
+        """Return the answer, or None if there is none after so many seconds."""
+        until_s = time.monotonic() + wait_s
+        while self._reply is None:
+            left_s = max(0.0, until_s - time.monotonic())
+            poll = select.poll()
+            poll.register(self._connection, select.POLLIN)
+            if not poll.poll(left_s * 1000):
+                return None
+            self._read()
+        return self._reply
+
+    def withdraw(self) -> Reply:
+        """Take the requests back, unless they are answered; see above why that is certain."""
+        if self._reply is None:
+            with contextlib.suppress(OSError):
+                self._connection.shutdown(socket.SHUT_RD)
+        while self._reply is None:
+            self._read()
+        return self._reply
+
+    def close(self) -> None:
+        """Forget it, answered or not."""
+        self._connection.close()
+
+    def _read(self) -> None:
+        try:
+            data, sender = receive_signed(self._connection, MAX_DATAGRAM)
+        except OSError as error:
+            self._end(Reply(error=f"no answer ({error.strerror})"))
+            return
+        if not data:
+            self._end(Reply(error="no answer"))
+            return
+        self._unanswered -= 1
+        if self._unanswered <= 0:
+            try:
+                reply = msgspec.json.decode(data, type=Reply)
+            except (msgspec.MsgspecError, ValueError, RecursionError):
+                reply = Reply(error="its answer makes no sense")
+            self._end(msgspec.structs.replace(reply, sender=sender))
+
+    def _end(self, reply: Reply) -> None:
+        self._reply = reply
+        self._connection.close()
 
 
 class SpawnerClient:
-    """Talks to the spawners of the run on one base port. Blocking, a millisecond or so."""
+    """Talks to the spawners of one run. No call waits longer than some tens of milliseconds.
 
-    def __init__(self, port: int) -> None:
+    Args:
+        folder: of the run.
+        port: base port of the run.
+        launcher: pid of its launcher.
+    """
+
+    def __init__(self, folder: str, port: int, launcher: int) -> None:
+        self.folder = folder
         self._port = port
-        self._connections: dict[str, socket.socket] = {}
+        self._launcher = launcher
+        self._forks: dict[tuple[str, ...], tuple[int, _Asked]] = {}
+        self._pings: dict[str, _Asked] = {}
+        self._slow: set[str] = set()
         self._adapt: Adapt | None = None
-        self._unanswered = False
+        self._adapted: set[int] = set()
 
     def fork(
-        self, names: tuple[str, ...], incarnation: int, known: dict[str, int] | None = None,
-        orphan: Callable[[], int] = lambda: 0,
+        self, names: tuple[str, ...], incarnation: int
     ) -> int:
         """Fork a process for the named actors and return its pid.
 
         Args:
             names: of the actors.
             incarnation: of the process.
-            known: see `ForkRequest`.
-            orphan: returns the pid of that process if it is there already, else 0; asked when a
-                spawner heard the request and did not answer.
 
         Raises:
-            SpawnerUnavailableError: no spawner could do it.
+            SpawnerBusyError: none has answered yet; to be called again with the same names and
+                incarnation, which goes on waiting.
+            SpawnerUnavailableError: no spawner could do it, or none has answered for long.
         """
-        failures = []
-        for name in NAMES:
-            if names == (f"spawner_{name}",):
-                continue
-            reply = self.ask(name, ForkRequest(names, incarnation, known or {}))
-            if reply is not None and reply.child:
-                return reply.child
-            if self._unanswered and (child := orphan()):
+        request = ForkRequest(names, incarnation)
+        asked = self._resumed(names, incarnation)
+        queue = [n for n in sorted(NAMES, key=lambda n: n in self._slow)
+                 if names != (f"spawner_{n}",) and (asked is None or n != asked.spawner)]
+        failures: list[str] = []
+        while asked is not None or (asked := self._reach(queue, failures)) is not None:
+            if not asked.sent:
+                self._send(asked, request)
+            reply, other = asked.reply(0.0 if asked.spawner in self._slow else WAIT_S), None
+            if reply is None:
+                self._slow.add(asked.spawner)
+                if asked.overdue or not self._slow.issuperset(queue):
+                    other = self._reach(queue, failures)
+                    if other is not None and asked.overdue:
+                        other.patience_s = 2 * asked.patience_s
+                if other is None:
+                    self._forks[names] = (incarnation, asked)
+                    kind = SpawnerUnavailableError if asked.overdue else SpawnerBusyError
+                    raise kind(f"spawner_{asked.spawner}: no answer yet")
+                reply = asked.withdraw()
+            if child := self._child(reply, names, incarnation):
+                self._slow.discard(asked.spawner)
+                if other is not None:
+                    other.close()
                 return child
-            failures.append(f"spawner_{name}: {reply.error if reply else 'no answer'}")
+            failures.append(f"spawner_{asked.spawner}: {reply.error or 'a stranger answers'}")
+            asked = other
         raise SpawnerUnavailableError("; ".join(failures))
 
-    def ping(self, name: str) -> bool:
-        """Whether a spawner turns; one that hangs is killed."""
-        return self.ask(name, Ping()) is not None
+    def turns(self, name: str) -> bool:
+        """Whether a spawner answers; one that does not is asked once, however often this is."""
+        asked, wait_s = self._pings.pop(name, None), 0.0
+        if asked is None:
+            asked, wait_s = self._reach([name], []), WAIT_S
+            if asked is None:
+                return False
+            asked.send(Ping())
+        reply = asked.reply(wait_s)
+        if reply is None:
+            self._pings[name] = asked
+        return reply is not None and not reply.error
 
     def set_origin(self, origin_s: float) -> None:
-        """Tell the first spawner when simulated time starts."""
-        if self.ask(NAMES[0], SetOrigin(origin_s)) is None:
-            raise SpawnerUnavailableError("spawner_a: no answer")
+        """Tell the first spawner when simulated time starts.
+
+        Raises:
+            SpawnerUnavailableError: it does not answer.
+        """
+        asked = self._reach([NAMES[0]], [])
+        if asked is not None:
+            asked.send(SetOrigin(origin_s))
+            reply = asked.reply(START_PATIENCE_S)
+            asked.close()
+            if reply is not None and not reply.error:
+                return
+        raise SpawnerUnavailableError("spawner_a: no answer")
 
     def adapt(self, adapted: AdaptedSystem) -> None:
         """Have the spawners fork by a changed system from now on, those still to come included."""
         self._adapt = Adapt(msgspec.json.encode(adapted).decode())
+        self._adapted.clear()
         for name in NAMES:
-            self.ask(name, self._adapt)
-
-    def ask(self, name: str, request: Request) -> Reply | None:
-        """Send a request and return the reply, or None if the spawner is dead or was hung."""
-        self._unanswered = False
-        for _ in range(2):  # a kept connection may be to a spawner that has been replaced
-            connection = self._connections.pop(name, None)
-            requests = [request]
-            if connection is None:
-                connection = self._connect(name)
-                if self._adapt is not None and request is not self._adapt:
-                    requests.insert(0, self._adapt)  # it may have loaded the file as it was
-            if connection is None:
-                return None
-            try:
-                for one in requests:
-                    connection.send(msgspec.json.encode(one))
-                    self._unanswered = True
-                    data = connection.recv(MAX_DATAGRAM)
-            except TimeoutError:
-                _kill_peer(connection)
-                connection.close()
-                return None
-            except OSError:
-                data = b""
-            if data:
-                self._unanswered = False
-                self._connections[name] = connection
-                return msgspec.json.decode(data, type=Reply)
-            connection.close()
-        return None
+            asked = self._reach([name], [])
+            if asked is not None:  # one that does not answer now reads it first when it turns
+                asked.send(self._adapt)
+                asked.reply(0.0 if name in self._slow else WAIT_S)
+                asked.close()
 
     def close(self) -> None:
-        """Close the connections."""
-        for connection in self._connections.values():
+        """Withdraw what is under way."""
+        for _, asked in self._forks.values():
+            asked.withdraw()
+        for asked in self._pings.values():
+            asked.close()
+        self._forks.clear()
+        self._pings.clear()
+
+    def _resumed(self, names: tuple[str, ...], incarnation: int) -> _Asked | None:
+        before, asked = self._forks.pop(names, (incarnation, None))
+        if asked is None or before == incarnation:
+            return asked
+        if child := self._child(asked.withdraw(), names, before):  # its place is another's now
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(child, signal.SIGKILL)
+        return None
+
+    def _send(self, asked: _Asked, request: ForkRequest) -> None:
+        if self._adapt is None or asked.pid in self._adapted:
+            asked.send(request)
+        else:  # it may have loaded the file as it was
+            asked.send(self._adapt, request)
+
+    def _child(self, reply: Reply, names: tuple[str, ...], incarnation: int) -> int:
+        """Return who sent an answer, if that is the process that was asked for; else 0."""
+        process = find_process(reply.sender) if reply.sender and not reply.error else None
+        if process is None or (process.port, process.launcher) != (self._port, self._launcher):
+            return 0
+        return process.pid if (process.names, process.incarnation) == (names, incarnation) else 0
+
+    def _reach(self, names: list[str], failures: list[str]) -> _Asked | None:
+        """Connect to the first of these spawners that is there; takes those tried off the list."""
+        while names:
+            name = names.pop(0)
+            try:
+                connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            except OSError as error:
+                failures.append(f"spawner_{name}: {error.strerror}")
+                continue
+            try:
+                connection.setblocking(False)  # who does not accept must not keep us
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+                connection.connect(address(self.folder, name))
+            except OSError as error:
+                connection.close()
+                failures.append(f"spawner_{name}: not there ({error.strerror})")
+                continue
+            if is_same_user(connection):
+                return _Asked(name, connection)
             connection.close()
-        self._connections.clear()
-
-    def _connect(self, name: str) -> socket.socket | None:
-        try:
-            connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        except OSError:  # no descriptor left
-            return None
-        connection.settimeout(ANSWER_TIMEOUT_S)
-        try:
-            connection.connect(address(self._port, name))
-        except OSError:
-            connection.close()
-            return None
-        return connection
-
-
-def _kill_peer(connection: socket.socket) -> None:
-    pid, _ = peer(connection)
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)
+            failures.append(f"spawner_{name}: its name is taken by another user")
+        return None

@@ -10,7 +10,9 @@ What a recovery module owns (RM3, RM4) is respawned on that module's request, so
 Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order,
 stop in reverse, SIGTERM before SIGKILL, a bounded restart intensity. What is given up on is not
 hidden: a silent detection module counts as active, a silent manager stops the Safety Pilot, a
-silent Safety Pilot trips the dead man.
+silent Safety Pilot trips the dead man. Nor is that the end: the supervisor goes on with single
+attempts until one of them lasts. A request is carried out when the new process was heard: until
+then the supervisor repeats it by itself, for the module that asked may have missed its deadline.
 """
 
 from __future__ import annotations
@@ -37,6 +39,8 @@ from actors.messages import (
     RespawnRequest,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
+from actors.runtime.limits import RateLimit
 from actors.runtime.timer import Timer
 from actors.runtime.topic import Topic
 from actors.supervision.processes import (
@@ -44,6 +48,7 @@ from actors.supervision.processes import (
     OsProcesses,
     Processes,
     ProcessHandle,
+    SpawnerBusyError,
     SpawnerUnavailableError,
 )
 from actors.supervision.restart_policy import RestartPolicy
@@ -57,13 +62,20 @@ STOP_GRACE_S = 0.5
 START_TIMEOUT_S = 3.0
 """Wall seconds in which a new process must have sent its first heartbeat."""
 
+PASSED_ON_PER_S = 200
+"""Error reports, orders and results of injections that are passed on in a simulated second."""
+
 _CHECK_S = 0.1
 """Simulated seconds between two looks at who is silent."""
+
+_SEARCH_S = 0.05
+"""Wall seconds between two looks into /proc on account of one node's messages."""
 
 _STATUS = "fresh status of the manager"
 """Stands among the names of a process' nodes for what the Safety Pilot lives on."""
 
 _RETRY_S = 0.05
+_ASK_AGAIN_S = 0.01
 _DEAD = (NodeState.CRASHED, NodeState.GIVEN_UP)
 _HEALTHY = (NodeState.RUNNING, NodeState.STARTING)
 
@@ -75,18 +87,21 @@ class _Process:
     Attributes:
         unheld: It may be there, but there was no descriptor left to hold it by.
         highest: The highest incarnation that there was.
+        requested_by: The module that asked for it, until it was heard.
         next_step: Of its respawn, while that is under way; there is never more than one.
     """
 
     unit: Unit
-    policy: RestartPolicy = field(default_factory=RestartPolicy)
+    policy: RestartPolicy
     pid: int = 0
     handle: ProcessHandle | None = None
     unheld: bool = False
     incarnation: int = 0
     highest: int = 0
+    requested_by: str = ""
     state: NodeState = NodeState.CRASHED
     started_s: float = 0.0
+    searched_s: float = -math.inf
     heard_s: dict[str, float] = field(default_factory=dict)
     next_step: Timer | None = None
 
@@ -108,8 +123,9 @@ class Supervisor(Actor):
         self._spec: SystemSpec = context.shared["system"]
         self._layout = Layout(self._plan, self._spec)
         self._machine: Processes = context.shared.get("processes") or OsProcesses(
-            self._plan.base_port, self._plan.launcher_pid)
-        self._processes = {u.name: _Process(u) for u in self._layout.units.values()}
+            self._plan.base_port, self._plan.launcher_pid, self._plan.folder)
+        self._processes = {
+            u.name: _Process(u, RestartPolicy()) for u in self._layout.units.values()}
         for node, incarnation in context.shared.get("known_incarnations", {}).items():
             if node in self._layout.unit_of:
                 process = self._processes[self._layout.unit_of[node]]
@@ -119,6 +135,7 @@ class Supervisor(Actor):
         if adapted is not None:
             self._machine.adapt(adapted)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
+        self._passed_on = RateLimit(PASSED_ON_PER_S)
         self._loop = asyncio.get_running_loop()
         self._checked_s = self._loop.time()
 
@@ -160,7 +177,7 @@ class Supervisor(Actor):
 
     @on(topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
-        """Note that a node's loop turns; adopt a process that was not known."""
+        """Note that a node's loop turns; adopt a process that was not known, if the kernel does."""
         unit = self._layout.unit_of.get(header.source)
         if unit is None:
             return
@@ -168,12 +185,13 @@ class Supervisor(Actor):
         if header.incarnation > process.incarnation or (
                 header.incarnation == process.incarnation and process.pid != message.pid
                 and process.state in _DEAD):
-            self._adopt(process, message.pid, header.incarnation)
+            self._look_for(process)
         if (header.incarnation, message.pid) != (process.incarnation, process.pid):
             return
         if process.next_step is not None:  # said before it was killed
             return
         process.heard_s[header.source] = self._loop.time()
+        process.requested_by = ""
         if process.state in (NodeState.STARTING, NodeState.STOPPED, NodeState.WEDGED):
             resumed = process.state is not NodeState.STARTING
             process.state = NodeState.RUNNING
@@ -193,18 +211,21 @@ class Supervisor(Actor):
 
     @on(topics.DIAGNOSTIC)
     def diagnostic(self, message: Diagnostic, _header: Header) -> None:
-        """Pass a node's error report on to whoever shows it."""
-        self.publish(topics.ERROR_REPORT, message)
+        """Pass a node's error report on to whoever shows it, unless there are too many."""
+        if self._passed_on.allows(self.clock.now()):
+            self.publish(topics.ERROR_REPORT, message)
 
     @on(topics.INJECTION_REQUEST)
     def inject(self, message: Injection, _header: Header) -> None:
         """Order a fault for the operator's page; whoever publishes the topic hears it."""
-        self.publish(topics.INJECT, message)
+        if self._passed_on.allows(self.clock.now()):
+            self.publish(topics.INJECT, message)
 
     @on(topics.INJECTION_REPORT)
     def injected(self, message: InjectionReport, _header: Header) -> None:
         """Pass on what came of a fault."""
-        self.publish(topics.INJECTION_RESULT, message)
+        if self._passed_on.allows(self.clock.now()):
+            self.publish(topics.INJECTION_RESULT, message)
 
     @on(topics.ADAPTED_SYSTEM)
     def adapted(self, message: AdaptedSystem, header: Header) -> None:
@@ -225,6 +246,7 @@ class Supervisor(Actor):
         for unit in {self._layout.unit_of[name] for name in changed}:
             process = self._processes[unit]
             process.unit = self._layout.units[unit]
+            self._anew(process)
             self._event(process, "adapted", self.name, message.change)
             self._respawn(process, self.name)
 
@@ -234,12 +256,14 @@ class Supervisor(Actor):
         unit = self._layout.unit_of.get(request.node)
         if unit is None:
             self.publish(topics.PROCESS_EVENT, ProcessEvent(
-                request.node, "refused", 0, 0, request.by, f"no such node: {request.node!r}"))
+                request.node, "refused", 0, 0, request.by,
+                clip(f"no such node: {request.node!r}")))
             return
         process = self._processes[unit]
         if process.state in _HEALTHY and process.incarnation > request.failed_incarnation:
             self._event(process, "respawned", request.by, "already")
             return
+        process.requested_by = request.by
         self._respawn(process, request.by)
 
     # -- watching -------------------------------------------------------------------------------
@@ -263,6 +287,10 @@ class Supervisor(Actor):
     def repeat(self) -> None:
         """Repeat the node table for whoever joined late."""
         self._publish_table()
+        left_out = self._passed_on.left_out(self.clock.now())
+        if left_out:
+            self.report_diagnostic(
+                "passing on", f"{left_out} more messages were not passed on", self.name)
 
     def _discount_own_stall(self, now: float) -> None:
         # Who was stopped, starved or waiting for a hung spawner has heard nobody meanwhile. What
@@ -285,8 +313,8 @@ class Supervisor(Actor):
     def _lost(self, process: _Process, state: NodeState) -> None:
         process.state = state
         self._publish_table()
-        if self._owns(process):
-            self._respawn(process, self.name)
+        if self._owns(process) or process.policy.attempts or process.requested_by:
+            self._respawn(process, process.requested_by or self.name)
 
     def _exited(self, process: _Process, pid: int) -> None:
         if process.pid != pid:  # it was replaced while the news waited in the mailbox
@@ -300,11 +328,9 @@ class Supervisor(Actor):
         self._event(process, "crashed", self.name, detail)
         if process.state is NodeState.STARTING:
             # Never heard: another life that nobody holds may have its port.
-            try:
-                if self._adopt_living(process, self._machine.living()):
-                    return
-            except OSError as error:  # no descriptor left to look with
-                self.report_diagnostic("search", str(error), process.unit.name)
+            process.searched_s = -math.inf
+            if self._look_for(process):
+                return
         self._lost(process, NodeState.CRASHED)
 
     def _owns(self, process: _Process) -> bool:
@@ -317,16 +343,15 @@ class Supervisor(Actor):
 
     def _respawn(self, process: _Process, by: str) -> None:
         if process.next_step is not None:
+            if process.state is NodeState.GIVEN_UP:
+                self._event(process, "given up", by, "an attempt will follow by itself")
             return
         delay_s = process.policy.delay_s(self._loop.time())
         if process.handle is not None:
             process.handle.ignore()
             process.handle.kill()
         if delay_s is None:
-            process.state = NodeState.GIVEN_UP
-            self._event(process, "given up", by, (
-                f"{process.policy.intensity} restarts in {process.policy.period_s:.0f} s"))
-            self._publish_table()
+            self._give_up(process, by)
             return
         if process.state in _HEALTHY:
             process.state = NodeState.CRASHED
@@ -335,6 +360,23 @@ class Supervisor(Actor):
             self._go_on(process, max(delay_s, 0.002), lambda: self._finish_respawn(process, by))
         else:
             self._finish_respawn(process, by)
+
+    def _give_up(self, process: _Process, by: str) -> None:
+        policy, failed = process.policy, process.policy.attempts
+        wait_s = policy.attempt_in_s(self._loop.time())
+        process.state = NodeState.GIVEN_UP
+        self._event(process, "given up", by, (
+            f"attempt {failed} failed" if failed else
+            f"{policy.intensity} restarts in {policy.period_s:.0f} s"
+        ) + f", the next attempt is in {wait_s:.0f} s")
+        self._publish_table()
+        self._go_on(process, wait_s, lambda: self._finish_respawn(process, self.name))
+
+    def _anew(self, process: _Process) -> None:
+        """Forget that it was given up: it will be another one, and may do better."""
+        if process.state is NodeState.GIVEN_UP and process.next_step is not None:
+            process.next_step.cancel()
+            process.next_step, process.policy = None, RestartPolicy()
 
     def _go_on(self, process: _Process, delay_s: float, step: Callable[[], None]) -> None:
         process.next_step = self.call_later(delay_s * self.clock.rate, step)
@@ -350,6 +392,9 @@ class Supervisor(Actor):
         incarnation = process.highest + 1
         try:
             pid = self._machine.fork(process.names, incarnation)
+        except SpawnerBusyError:
+            self._go_on(process, _ASK_AGAIN_S, lambda: self._spawn(process, by))
+            return
         except (SpawnerUnavailableError, OSError) as error:
             self.report_diagnostic("fork", str(error), process.unit.name)
             self._go_on(process, _RETRY_S, lambda: self._spawn(process, by))
@@ -358,7 +403,9 @@ class Supervisor(Actor):
         self._take(process, pid, incarnation)
         process.state = NodeState.STARTING
         process.started_s = self._loop.time()
-        self._event(process, "started" if first else "respawned", by)
+        attempt = process.policy.attempts
+        self._event(process, "started" if first else "respawned", by, (
+            f"attempt {attempt} since it was given up" if attempt else ""))
         self._publish_table()
         self._hold(process, pid)
 
@@ -370,6 +417,22 @@ class Supervisor(Actor):
         self._event(process, "adopted", self.name)
         self._hold(process, pid)
 
+    def _look_for(self, process: _Process) -> bool:
+        """Adopt what lives and was not known, as the kernel knows it: a message may name any pid.
+
+        Returns:
+            Whether there is one.
+        """
+        now = self._loop.time()
+        if now - process.searched_s < _SEARCH_S:
+            return False
+        process.searched_s = now
+        try:
+            return self._adopt_living(process, self._machine.living())
+        except OSError as error:  # no descriptor left to look with
+            self.report_diagnostic("search", str(error), process.unit.name)
+            return False
+
     def _adopt_living(self, process: _Process, living: Sequence[Living]) -> bool:
         """Adopt the highest life that is there and end the others; False if there is none."""
         found = sorted((p for p in living if p.names == process.names),
@@ -379,7 +442,7 @@ class Supervisor(Actor):
                 handle = self._machine.hold(other.pid, lambda: None)
                 handle.kill()
                 handle.close()
-        if found:
+        if found and (found[0].pid != process.pid or process.state in _DEAD):
             self._adopt(process, found[0].pid, found[0].incarnation)
         return bool(found)
 
@@ -421,7 +484,7 @@ class Supervisor(Actor):
     def _event(self, process: _Process, event: str, by: str, detail: str = "") -> None:
         for node in process.unit.nodes:
             self.publish(topics.PROCESS_EVENT, ProcessEvent(
-                node.name, event, process.pid, process.incarnation, by, detail))
+                node.name, event, process.pid, process.incarnation, by, clip(detail)))
 
     def _publish_table(self) -> None:
         rows = [NodeInfo(self.name, Kind.SUPERVISION.value, self.context.pid, NodeState.RUNNING,

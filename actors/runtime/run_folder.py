@@ -1,0 +1,138 @@
+"""The folder of a run: its sockets, and which incarnation of each node was issued last.
+
+Only the run's user can enter it, and the kernel sees to that at both ends: no other user can
+connect to a socket in it, or put one of his own in the place of a node that is down. So there is no
+secret that could leak, no port that could be taken, and no handshake that takes longer for it.
+
+An incarnation is a number that is issued before the process is forked (`issue`); a reader that
+meets a new one looks it up (`Register`). It is kept as the target of a symbolic link, which is
+written and read whole or not at all, in a system call or two and with no byte of a disk.
+
+The folder lies in memory where it can: `$XDG_RUNTIME_DIR`, else `/dev/shm`, else the folder for
+temporary files. Whoever ends a run removes it; what is left when all of a run dies at once goes
+when the same user starts the next one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import stat
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+MAX_SOCKET_BYTES = 107
+"""Longest path that the address of a unix socket can hold (unix(7))."""
+
+ROOM_FOR_NAMES = 64
+"""Bytes of such a path that are left for the name of a node."""
+
+_NAME = re.compile(r"rampart-(\d+)-(\d+)-\w+\Z")
+_ISSUED = "issued"
+
+
+def make(port: int, launcher: int) -> str:
+    """Make the folder of a run and return its path; remove what dead runs of this user left.
+
+    Args:
+        port: base port of the run.
+        launcher: pid of its launcher.
+
+    Raises:
+        OSError: there is no place for it.
+    """
+    failure: OSError | None = None
+    for place in _places():
+        _remove_stale(place)
+        try:
+            folder = tempfile.mkdtemp(prefix=f"rampart-{port}-{launcher}-", dir=place)
+            (Path(folder) / _ISSUED).mkdir(mode=0o700)
+        except OSError as error:
+            failure = error
+            continue
+        return folder
+    raise failure or FileNotFoundError("no folder for temporary files")
+
+
+def remove(folder: str) -> None:
+    """Remove the folder of a run that has ended. Harmless when it is gone."""
+    if folder:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def socket_path(folder: str, name: str) -> str:
+    """Return where the socket of that name is.
+
+    Raises:
+        ValueError: the name is too long for the address of a socket.
+    """
+    path = f"{folder}/{name}"
+    if len(path.encode()) > MAX_SOCKET_BYTES:
+        raise ValueError(f"name {name!r}: must be {ROOM_FOR_NAMES} characters long at most")
+    return path
+
+
+def issue(folder: str, names: Iterable[str], incarnation: int) -> None:
+    """Make a number known as the incarnation of these nodes, before their process is forked.
+
+    Raises:
+        OSError: the folder is gone, or full.
+    """
+    for name in names:
+        fresh = Path(folder, _ISSUED, f"{name}~")
+        fresh.unlink(missing_ok=True)  # left by a process that died here
+        fresh.symlink_to(str(incarnation))
+        fresh.replace(fresh.with_name(name))
+
+
+def issued(folder: str) -> dict[str, int]:
+    """Return the incarnation issued last of each node of a run."""
+    register = register_of(folder)
+    try:
+        names = [entry.name for entry in Path(folder, _ISSUED).iterdir()]
+    except OSError:
+        return {}
+    return {name: number for name in names
+            if not name.endswith("~") and (number := register(name)) is not None}
+
+
+Register = Callable[[str], int | None]
+"""Returns the incarnation of a node that was issued last; None if none ever was."""
+
+
+def register_of(folder: str) -> Register:
+    """Return the register of a run."""
+
+    def look_up(name: str) -> int | None:
+        if "/" in name or "\0" in name:
+            return None
+        try:
+            target = os.readlink(f"{folder}/{_ISSUED}/{name}")  # noqa: PTH115 made of each newcomer
+        except (OSError, UnicodeError):
+            return None
+        return int(target) if target.isdecimal() else None
+
+    return look_up
+
+
+def _places() -> Iterator[str]:
+    room = MAX_SOCKET_BYTES - ROOM_FOR_NAMES - len("/rampart-32000-4194304-12345678/")
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    for place in (runtime, "/dev/shm", tempfile.gettempdir(), "/tmp"):  # noqa: S108 mkdtemp's
+        if place.startswith("/") and len(place.encode()) <= room and Path(place).is_dir():
+            yield place
+
+
+def _remove_stale(place: str) -> None:
+    with contextlib.suppress(OSError), os.scandir(place) as entries:
+        for entry in entries:
+            match = _NAME.match(entry.name)
+            if match is None or Path(f"/proc/{match[2]}").exists():
+                continue
+            with contextlib.suppress(OSError):
+                found = entry.stat(follow_symlinks=False)
+                if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid():
+                    remove(entry.path)

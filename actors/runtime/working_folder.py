@@ -1,0 +1,37 @@
+"""Whether actors of one's own are looked for in the working folder.
+
+With `-m` Python puts that folder first on its path, and executes what it finds there: in a folder
+that others can write, their code as this user. So processes of a run are started with `-P`, and the
+folder comes last, if only this user can write it.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+from pathlib import Path
+
+
+def admit() -> None:
+    """Have modules in the working folder found, after all others, if only this user can write it.
+
+    What is installed, and what ships, comes first: a file `json.py` in the folder changes nothing.
+    """
+    if not why_not() and (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)
+
+
+def why_not() -> str:
+    """Return why modules in the working folder are not looked for, "" if they are."""
+    try:
+        folder = Path.cwd()
+        found = folder.stat()
+    except OSError as error:
+        return f"the working folder is gone ({error.strerror})"
+    if found.st_uid != os.getuid():
+        return f"{folder} belongs to another user"
+    own_group = found.st_gid == os.getgid() == os.getuid()  # a group of this user alone
+    if found.st_mode & (stat.S_IWOTH | (0 if own_group else stat.S_IWGRP)):
+        return f"others can write {folder} (mode {stat.S_IMODE(found.st_mode):o})"
+    return ""

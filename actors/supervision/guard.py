@@ -1,0 +1,269 @@
+"""The launcher's guard: brings back supervisor and spawners, those that hang too.
+
+The supervisor brings everybody back, and needs a spawner for it; whoever is missing of the three
+the guard replaces. Who is dead is seen in /proc. Who hangs is judged with `patience`: a process
+that waits for a processor is left alone. Of two spawners that hang one is replaced first, and the
+other one when that is back, so that no error of judgement leaves none.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+
+from actors.supervision.patience import Patience, usage
+from actors.supervision.process_title import RunProcess, find_processes
+from actors.supervision.restart_policy import RestartPolicy
+from actors.supervision.run_plan import SUPERVISOR, RunPlan
+from actors.supervision.spawner import NAMES
+from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+
+PERIOD_S = 0.25
+SUPERVISOR_PATIENCE_S = 1.5
+"""A supervisor that could have published its table (every 0.5 s at rate 1) for so long is hung."""
+
+SPAWNER_PATIENCE_S = 1.0
+"""A spawner that could have answered for so long is hung."""
+
+LOAD_PATIENCE_S = 20.0
+"""A spawner that could have loaded for so long is hung; it takes a second or two."""
+
+_ASK_AGAIN_S = 0.01
+
+
+class Guard:
+    """Looks after the supervisor and the spawners of one run.
+
+    Args:
+        plan: of the run.
+        spawners: to fork by.
+        load: starts a process that loads everything and becomes the spawner of a name.
+
+    Attributes:
+        supervisor_pid: of the present supervisor, 0 before the first.
+        supervisor_incarnation: likewise.
+        policy: how often the supervisor is brought back.
+        on_restart: called with the name of whoever was brought back.
+        report: called with one line when something cannot be done.
+    """
+
+    def __init__(self, plan: RunPlan, spawners: SpawnerClient,
+                 load: Callable[[str], subprocess.Popen[bytes]]) -> None:
+        self.supervisor_pid = 0
+        self.supervisor_incarnation = 0
+        self.policy = RestartPolicy()
+        self.on_restart: Callable[[str], None] = lambda _name: None
+        self.report: Callable[[str], None] = _to_stderr
+        self._plan = plan
+        self._spawners = spawners
+        self._load = load
+        self._loaded: subprocess.Popen[bytes] | None = None
+        self._patience = {
+            **{f"spawner_{n}": Patience(SPAWNER_PATIENCE_S, 2 * PERIOD_S) for n in NAMES},
+            SUPERVISOR: Patience(SUPERVISOR_PATIENCE_S / min(1.0, plan.rate), 2 * PERIOD_S)}
+        self._load_patience = Patience(LOAD_PATIENCE_S, 2 * PERIOD_S)
+        self._hung: set[str] = set()
+        self._supervisor_due_s: float | None = None
+        self._trouble = ""
+
+    async def start_supervisor(self, within_s: float = PERIOD_S) -> None:
+        """Start the next supervisor.
+
+        Raises:
+            SpawnerUnavailableError: no spawner answers within so many seconds.
+        """
+        incarnation = self.supervisor_incarnation + 1
+        self.supervisor_pid = await self.fork(SUPERVISOR, incarnation, within_s)
+        self.supervisor_incarnation = incarnation
+        self._patience[SUPERVISOR].answered()
+
+    async def fork(self, name: str, incarnation: int, within_s: float = PERIOD_S) -> int:
+        """Fork a supervisor or spawner and return its pid, as `SpawnerClient.fork`."""
+        until_s = time.monotonic() + within_s
+        while True:
+            try:
+                return self._spawners.fork((name,), incarnation)
+            except SpawnerUnavailableError:
+                if time.monotonic() > until_s:
+                    raise
+            await asyncio.sleep(_ASK_AGAIN_S)
+
+    def supervisor_heard(self) -> None:
+        """Note that the supervisor lives."""
+        self._patience[SUPERVISOR].answered()
+
+    async def keep(self) -> None:
+        """Look after them until this is cancelled; whatever goes wrong, there is a next time."""
+        # The pidfd wakes the guard the moment the supervisor dies; the period serves the rest.
+        while True:
+            try:
+                await self.supervisor_gone(PERIOD_S)
+                all_there = await self.look_after()
+                if all_there:
+                    self._trouble = ""
+            except Exception as error:  # no descriptors left, or what nobody has thought of
+                all_there = False
+                why = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+                self._tell(f"cannot look after supervisor and spawners: {why}")
+            if not all_there:  # with no supervisor to wait for, the next round would come at once
+                await asyncio.sleep(PERIOD_S)
+
+    async def look_after(self) -> bool:
+        """Bring back whichever guard is missing; False if that was not possible."""
+        living: dict[str, RunProcess] = {}
+        for process in find_processes(self._plan.base_port):
+            if process.launcher == self._plan.launcher_pid:
+                for name in process.names:  # a child bears its spawner's name for a moment
+                    living.setdefault(name, process)
+        all_there = True
+        turning = {f"spawner_{n}": self._spawners.turns(n) for n in NAMES}
+        for name, turns in turning.items():
+            if turns:
+                self._patience[name].answered()
+                self._hung.discard(name)
+            elif name not in living:
+                self._hung.discard(name)
+                all_there &= await self._bring_spawner_back(name, living)
+            else:
+                all_there &= self._judge(name, living[name].pid, turning)
+        supervisor = living.get(SUPERVISOR)
+        if supervisor is not None:  # it may be a child of a spawner that died before it answered
+            self.supervisor_pid = supervisor.pid
+            self.supervisor_incarnation = max(self.supervisor_incarnation, supervisor.incarnation)
+            if self._is_hung(SUPERVISOR, supervisor.pid):
+                self._patience[SUPERVISOR].answered()
+                _kill(supervisor.pid)
+                await self.supervisor_gone(PERIOD_S)  # its port is free only then
+                supervisor = None
+        if supervisor is not None:
+            self._supervisor_due_s = None
+            return all_there
+        return await self._bring_supervisor_back() and all_there
+
+    async def supervisor_gone(self, timeout_s: float) -> None:
+        """Wait until the supervisor has ended, or so many seconds."""
+        loop = asyncio.get_running_loop()
+        try:
+            pidfd = os.pidfd_open(self.supervisor_pid)
+        except (ProcessLookupError, ValueError):  # it has ended, or there was none yet
+            return
+        except OSError:  # no descriptor left
+            await asyncio.sleep(timeout_s)
+            return
+        gone = loop.create_future()
+
+        def readable() -> None:
+            if not gone.done():
+                gone.set_result(None)
+
+        loop.add_reader(pidfd, readable)
+        try:
+            await asyncio.wait_for(gone, timeout_s)
+        except TimeoutError:
+            pass
+        finally:
+            loop.remove_reader(pidfd)
+            os.close(pidfd)
+
+    def end(self) -> None:
+        """End a process that still loads."""
+        if self._loaded is not None:
+            self._loaded.kill()
+            self._loaded.wait()
+            if self._loaded.stdout is not None:
+                self._loaded.stdout.close()
+
+    # -- inside ---------------------------------------------------------------------------------
+
+    def _is_hung(self, name: str, pid: int) -> bool:
+        return self._patience[name].over(time.monotonic(), pid, usage(pid))
+
+    def _judge(self, name: str, pid: int, turning: Mapping[str, bool]) -> bool:
+        """Replace a spawner that hangs, if that leaves one; whether all is well so far."""
+        if not self._is_hung(name, pid):
+            return True
+        self._hung.add(name)
+        if any(turning.values()) or self._hung.issuperset(turning):
+            self._hung.discard(name)
+            self._patience[name].answered()
+            _kill(pid)
+        return False
+
+    async def _bring_spawner_back(self, name: str, living: Mapping[str, RunProcess]) -> bool:
+        others = [n for n in self._patience if n not in {name, SUPERVISOR}]
+        if any(n in living and n not in self._hung for n in others):
+            try:
+                await self.fork(name, 1)
+            except SpawnerUnavailableError as error:
+                self._tell(f"{name} cannot be brought back yet: {error}")
+                return False
+        elif not self._start_loading(name):
+            return False
+        self.on_restart(name)
+        return True
+
+    def _start_loading(self, name: str) -> bool:
+        """No spawner can fork another one: load everything once more, which takes a second or two.
+
+        False while that is under way.
+        """
+        if self._loaded is not None and self._loaded.poll() is None:
+            pid = self._loaded.pid
+            if self._load_patience.over(time.monotonic(), pid, usage(pid)):
+                self._loaded.kill()
+            return False
+        if self._loaded is not None and self._loaded.stdout is not None:
+            with self._loaded.stdout as output:
+                said = output.read().decode(errors="replace").strip()
+            self._loaded = None
+            if said.startswith("error: "):
+                self._tell(f"a spawner does not load: {said.removeprefix('error: ')}")
+                return False  # the other one may, if it is missing too
+        self._loaded = self._load(name.removeprefix("spawner_"))
+        return True
+
+    async def _bring_supervisor_back(self) -> bool:
+        # At once as a rule. One that ends whenever it starts would leave nothing to anybody else.
+        policy = self.policy
+        delay_s = policy.delay_s(time.monotonic())
+        if delay_s is None:
+            self._tell(f"the supervisor ended {policy.intensity} times within "
+                       f"{policy.period_s:.0f} s: it is started less often from now on")
+            return False
+        if self._supervisor_due_s is None:
+            self._supervisor_due_s = time.monotonic() + delay_s
+        wait_s = self._supervisor_due_s - time.monotonic()
+        if wait_s > 0:
+            await asyncio.sleep(min(wait_s, PERIOD_S))
+        if wait_s > PERIOD_S:  # the spawners are looked after meanwhile
+            return False
+        try:
+            await self.start_supervisor()
+        except SpawnerUnavailableError as error:
+            self._tell(f"the supervisor cannot be brought back yet: {error}")
+            return False
+        self._supervisor_due_s = None
+        policy.restarted(time.monotonic())
+        self.on_restart(SUPERVISOR)
+        return True
+
+    def _tell(self, trouble: str) -> None:
+        if trouble != self._trouble:
+            self._trouble = trouble
+            with contextlib.suppress(Exception):  # no reader is left: that ends no guard
+                self.report(trouble)
+
+
+def _to_stderr(text: str) -> None:
+    print(f"rampart: {text}", file=sys.stderr, flush=True)
+
+
+def _kill(pid: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)

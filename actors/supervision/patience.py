@@ -1,0 +1,76 @@
+"""Hung, or merely without a processor? How long a process could have answered and did not.
+
+A deadline alone takes a starved process for a hung one: on a busy machine a process may wait for a
+processor longer than any sensible deadline, and killing it makes the machine busier. So only time
+counts in which the process could have run:
+
+* not what it spent in the run queue, which the kernel counts (`/proc/PID/schedstat`, proc(5));
+* of a process that is on the run queue right now, only what it has run, for the kernel adds the
+  wait that is not over yet later: who spins is found out, who waits is not;
+* nothing while the kernel itself makes it wait (state D: a disk, or memory that is swapped);
+* and no more than a moment a look, so that a caller who stood still itself blames no other.
+
+A stopped process (state T) is not on the run queue: all of its time counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from actors.supervision.process_title import process_state
+
+
+class Usage(NamedTuple):
+    """What the kernel has counted for the main thread of a process, and its state letter now."""
+
+    state: str
+    ran_s: float
+    waited_s: float
+
+
+_NOTHING = Usage("X", 0.0, 0.0)
+
+
+def usage(pid: int) -> Usage:
+    """Return the usage of a process; without figures, where the kernel keeps none."""
+    try:
+        text = Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii")
+        ran_ns, waited_ns, _slices = map(int, text.split())
+    except (OSError, ValueError):
+        ran_ns = waited_ns = 0
+    return Usage(process_state(pid), ran_ns / 1e9, waited_ns / 1e9)
+
+
+@dataclass(slots=True)
+class Patience:
+    """With one process that owes an answer. Pure; times are seconds of the caller's clock.
+
+    Args:
+        limit_s: How long it may have had the chance to answer.
+        look_s: The longest time between two looks that counts.
+    """
+
+    limit_s: float
+    look_s: float
+    _pid: int = 0
+    _at_s: float = 0.0
+    _used: Usage = _NOTHING
+    _counted_s: float = 0.0
+
+    def answered(self) -> None:
+        """It owes nothing: begin anew."""
+        self._pid = 0
+
+    def over(self, now_s: float, pid: int, used: Usage) -> bool:
+        """Look at a process that has not answered: whether it has had enough time by now."""
+        if pid != self._pid:
+            self._pid, self._counted_s = pid, 0.0
+        elif used.state != "D":
+            could_s = now_s - self._at_s - (used.waited_s - self._used.waited_s)
+            if used.state == "R":
+                could_s = min(could_s, used.ran_s - self._used.ran_s)
+            self._counted_s += min(max(0.0, could_s), self.look_s)
+        self._at_s, self._used = now_s, used
+        return self._counted_s >= self.limit_s

@@ -1,0 +1,79 @@
+"""Who hangs and who merely waits for a processor, in the kernel's figures, second by second."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from actors.supervision.patience import Patience, Usage, usage
+
+
+def rounds(state: str, ran_s: float, waited_s: float, count: int = 100, every_s: float = 0.25
+           ) -> float | None:
+    """Return after how long patience of one second is over, None if it never is.
+
+    Args:
+        state: the letter of the kernel at each look.
+        ran_s: what the process has run between two looks.
+        waited_s: and waited for a processor, as far as the kernel has counted it.
+    """
+    patience = Patience(1.0, 0.5)
+    for i in range(count):
+        if patience.over(i * every_s, 7, Usage(state, i * ran_s, i * waited_s)):
+            return i * every_s
+    return None
+
+
+@pytest.mark.parametrize(("how", "over_s"), [
+    (("T", 0.0, 0.0), 1.0),  # stopped
+    (("S", 0.0, 0.0), 1.0),  # asleep with a request in its queue: wedged
+    (("R", 0.25, 0.0), 1.0),  # spins
+    (("R", 0.05, 0.2), 5.0),  # spins, with a fifth of a processor
+    (("R", 0.0, 0.0), None),  # waits, and the kernel counts only when the wait is over
+    (("R", 0.0, 0.25), None),  # waits
+    (("S", 0.0, 0.24), 25.0),  # waits nearly always: what is left is too little to answer in
+    (("D", 0.0, 0.0), None),  # the kernel lets it wait
+])
+def test_only_time_in_which_it_could_have_run_counts(how, over_s):
+    found = rounds(*how)
+    assert found == (None if over_s is None or over_s >= 25 else pytest.approx(over_s, abs=0.25))
+
+
+def test_whoever_stood_still_himself_blames_no_other_for_it():
+    patience = Patience(1.0, 0.5)
+    assert not patience.over(0.0, 7, Usage("S", 0, 0))
+    assert not patience.over(60.0, 7, Usage("S", 0, 0))
+    assert patience.over(60.5, 7, Usage("S", 0, 0))
+
+
+def test_an_answer_and_another_process_begin_anew():
+    for begin in (lambda p: p.answered(), lambda p: p.over(1.0, 8, Usage("T", 0, 0))):
+        patience = Patience(1.0, 0.5)
+        for now_s in (0.0, 0.5):
+            assert not patience.over(now_s, 7, Usage("T", 0, 0))
+        begin(patience)
+        for now_s in (1.0, 1.5):
+            assert not patience.over(now_s, 8, Usage("T", 0, 0))
+        assert patience.over(2.0, 8, Usage("T", 0, 0))
+
+
+def test_the_kernel_tells_who_runs_and_who_is_stopped():
+    child = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        deadline = time.monotonic() + 20
+        while usage(child.pid).ran_s < 0.05:
+            assert time.monotonic() < deadline
+        child.send_signal(signal.SIGSTOP)
+        while usage(child.pid).state != "T":
+            assert time.monotonic() < deadline
+        assert usage(child.pid).ran_s == usage(child.pid).ran_s
+    finally:
+        child.kill()
+        child.wait()
+    assert usage(child.pid) == Usage("X", 0.0, 0.0)
+    assert usage(os.getpid()).state == "R"
