@@ -26,6 +26,7 @@ from actors.recording.process import Order, RecorderProcess
 from actors.recording.virtual import VirtualRecording
 from actors.runtime import streams, working_folder
 from actors.runtime.plain_text import one_line
+from actors.runtime.token_file import SecretError, read_secret
 from actors.runtime.topic import Topic
 from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
 from actors.runtime.wiring import load_class
@@ -50,6 +51,7 @@ from sim.watched_run import WatchedRun
 ROOT = Path(__file__).resolve().parent
 LAST_PORT = 32_000
 ERROR_LOG = "errors.log"
+TOKEN_VARIABLE = "RAMPART_HMI_TOKEN"  # noqa: S105 the name of one
 HMI = "actors.operator.hmi:Hmi"
 TELEOPERATION = "actors.operator.teleoperation:Teleoperation"
 EXIT_SUCCESS, EXIT_FAILED, EXIT_USAGE, EXIT_UNSAFE, EXIT_NOT_KNOWN = 0, 1, 2, 3, 4
@@ -60,6 +62,7 @@ examples:
   python launch.py --mission A --obstacles 2        two obstacles on the way
   python launch.py --rate 4 --no-hmi --json         four times real time, result as JSON
   python launch.py --hmi-host 0.0.0.0               the page for other machines too, with a token
+  python launch.py --hmi-token-file FILE            the page for others, with a token of yours
   python launch.py --record run.mcap                keep everything that is said; `rampart replay`
   python launch.py --no-ftm                         the paper's baseline, without fault tolerance
   python launch.py --joystick                       drive by hand: hold the left shoulder button
@@ -112,9 +115,11 @@ def parser() -> argparse.ArgumentParser:
                    help="address of the operator's page (default: 127.0.0.1, this machine only). "
                    "Any other makes it need a token, which is printed with the page's address "
                    "when the run starts")
-    p.add_argument("--hmi-token", metavar="TOKEN", default="",
-                   help="that token, 16 characters or more, to keep it over several runs "
-                   "(default: a random one; on this machine none is needed)")
+    p.add_argument("--hmi-token-file", metavar="FILE", default="",
+                   help="a file of yours, of mode 0600, with that token, 16 characters or more, to "
+                   f"keep it over several runs; or set {TOKEN_VARIABLE} to it (default: a random "
+                   "one; for yourself on this machine none is needed)")
+    p.add_argument("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS)  # refused
     p.add_argument("--port", metavar="PORT", type=int, default=DEFAULT_PORT,
                    help="number that tells runs on this machine apart; no port is opened "
                    f"(default: {DEFAULT_PORT})")
@@ -365,12 +370,14 @@ def _plan(options: argparse.Namespace) -> tuple[RunPlan, SystemSpec]:
         what = "is a directory" if system_file.is_dir() else "no such file"
         raise UsageError(f"--system {options.system}: {what}; a spec is right, or the name of a "
                          f"shipped one: {systems.names()}")
+    token, token_is_new = _token(options)
     plan = RunPlan(
         run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
         airport="", mission="", obstacles=options.obstacles, ftm=not options.no_ftm,
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
-        joystick=_joystick(options), hmi_host=options.hmi_host, hmi_token=_token(options),
+        joystick=_joystick(options), hmi_host=options.hmi_host, hmi_token=token,
+        hmi_token_is_new=token_is_new,
         faults=() if options.no_hmi else offered_faults(), waits=options.wait)
     spec = load_system(plan)
     return _fitting(options, plan, spec), spec
@@ -383,7 +390,7 @@ def _fitting(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> Ru
         UsageError: an option needs a node that the system has not.
     """
     if not _has_actor(plan, spec, HMI):
-        _refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token"),
+        _refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token_file"),
                 f"no node of {spec.name} serves an operator's page")
         plan = msgspec.structs.replace(plan, hmi_port=0)
     if options.joystick and not _has_actor(plan, spec, TELEOPERATION):
@@ -468,21 +475,32 @@ def _check(options: argparse.Namespace) -> None:
             raise UsageError(f"{option} {name}: unknown strategy; known: {', '.join(STRATEGIES)}")
 
 
-def _token(options: argparse.Namespace) -> str:
-    """Return what the operator's page asks for: the token given, or a new one where it needs it."""
+def _token(options: argparse.Namespace) -> tuple[str, bool]:
+    """Return what the operator's page asks for, and whether it is new and has to be printed.
+
+    It comes from a file or the environment, which other users cannot read as they can read a
+    command line; where none is given and one is needed it is made.
+    """
     host: str = options.hmi_host
-    token: str = options.hmi_token
+    own = os.environ.pop(TOKEN_VARIABLE, "")  # not for whatever is started
+    if options.hmi_token is not None:
+        raise UsageError("--hmi-token: a command line is read by every user of this machine; put "
+                         "another token into a file of mode 0600 for --hmi-token-file FILE, or "
+                         f"into the variable {TOKEN_VARIABLE}")
     if options.no_hmi or options.virtual:
         if options.wait:
             raise UsageError("--wait: the mission is started from the operator's page, which there "
                              f"is not with --{'no-hmi' if options.no_hmi else 'virtual'}")
-        return ""
-    if not token and not is_loopback(host):
-        token = new_token()
+        return "", False
+    source = TOKEN_VARIABLE
     try:
+        if options.hmi_token_file:
+            source = f"--hmi-token-file {options.hmi_token_file}"
+            own = read_secret(Path(options.hmi_token_file))
+        token = own or ("" if is_loopback(host) else new_token())
         Access(host, options.hmi_port, token)
-    except AccessError as error:
-        raise UsageError(f"--hmi-token: {error}") from None
+    except (AccessError, SecretError) as error:
+        raise UsageError(f"{source}: {error}") from None
     try:
         family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, number) as probe:
@@ -491,7 +509,7 @@ def _token(options: argparse.Namespace) -> str:
         why = getattr(error, "strerror", None) or str(error)
         raise UsageError(f"--hmi-host {host}: no address of this machine ({why}); 0.0.0.0 stands "
                          "for all it has") from None
-    return token
+    return token, bool(token) and not own
 
 
 def _joystick(options: argparse.Namespace) -> str:

@@ -83,7 +83,7 @@ class Console:
         self._print(f"Rampart: mission {mission.name} ({len(mission.goals)} goals) on {airport}, "
                     f"{mode}, rate {plan.rate:g}")
         if plan.hmi_port:
-            self._print(f"Operator's page: {plan.hmi_page}")
+            self._print(f"Operator's page: {plan.hmi_page_to_open}")
         comes_back = [node.name for node in spec.nodes if node.respawn != SUPERVISOR]
         if comes_back:
             example = _EXAMPLE if _EXAMPLE in comes_back else comes_back[0]

@@ -87,7 +87,7 @@ class WatchedRun:
         self._console.line(clock.now(), f"{self._spec.title} ({self._spec.name}), "
                            f"{self._spec.strategy}, rate {plan.rate:g}; ctrl-C ends it")
         if plan.hmi_port:
-            self._console.line(clock.now(), f"operator's page: {plan.hmi_page}")
+            self._console.line(clock.now(), f"operator's page: {plan.hmi_page_to_open}")
         try:
             while not (self.interrupted or self.launcher.failure  # noqa: ASYNC110 three ends
                        or self._is_over(clock.now())):
