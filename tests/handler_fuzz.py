@@ -38,6 +38,7 @@ from actors.runtime.envelope import UNREADABLE, Header, decode
 from actors.runtime.topic import ROOT, Topic
 from actors.runtime.virtual_bus import Hub, VirtualBus
 from actors.runtime.virtual_loop import VirtualClock, VirtualLoop
+from actors.supervision.patience import AT_LEISURE, Usage
 from actors.supervision.run_plan import Layout, RunPlan, load_shared
 from actors.supervision.system_topics import find_topic
 from manager.specification import SystemSpec
@@ -142,6 +143,9 @@ class Machine:
 
     def stopped(self) -> bool:
         return False
+
+    def usage(self) -> Usage:
+        return AT_LEISURE
 
     def ignore(self) -> None:
         pass
