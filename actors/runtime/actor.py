@@ -27,7 +27,7 @@ from actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S,
 from actors.runtime.clock import Clock
 from actors.runtime.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from actors.runtime.injection_desk import InjectionDesk
-from actors.runtime.limits import ReportLimit
+from actors.runtime.limits import RateLimit, ReportLimit
 from actors.runtime.mailbox import Mailbox
 from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection
 from actors.runtime.run_folder import Register
@@ -47,6 +47,9 @@ BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT, HELLO)
 
 _REPEATED_SOON_HZ = 7.0
 """A state that is repeated this often anyway is not repeated for a newcomer."""
+
+_HELLOS_PER_S = 100
+"""More newcomers in a simulated second than a system has nodes are no newcomers."""
 
 # What an actor is doing. Numbers, because they are compared and set for each message.
 _RESTING = 0
@@ -165,6 +168,8 @@ class Actor:
         self._timers: set[asyncio.TimerHandle] = set()
         self._tickers: list[_Ticker] = []
         self._reports = ReportLimit()
+        self._hellos = RateLimit(_HELLOS_PER_S)
+        self._answer_due = False
         self._states: dict[str, tuple[Topic[Any], msgspec.Struct, float]] = {}
         self._outlets: dict[str | tuple[str, str], tuple[str, bool]] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
@@ -530,8 +535,16 @@ class Actor:
     # -- newcomers ------------------------------------------------------------------------------
 
     def _on_hello(self, _hello: Hello, header: Header) -> None:
-        if header.source == self.name:
+        if header.source == self.name or self._answer_due:
             return
+        if self._hellos.allows(self.clock.now()):
+            self._repeat_states()
+        else:  # one answer for all of them, when the flood has lasted a second
+            self._answer_due = True
+            self.call_later(1.0, self._repeat_states)
+
+    def _repeat_states(self) -> None:
+        self._answer_due = False
         for key, (topic, body, stamp) in list(self._states.items()):
             if self._in_force:
                 self._injections.send(topic, key, body, stamp)
