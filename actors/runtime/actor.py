@@ -195,6 +195,10 @@ class Actor:
         """Whether this life of the node, as it was started, has any use for one of its inputs."""
         return True
 
+    def heeds_superseded(self, topic: Topic[Any], body: Any) -> bool:  # noqa: ARG002
+        """Whether a message of a superseded incarnation is handled all the same."""
+        return False
+
     def on_start(self) -> None:
         """Runs on the loop when the bus is open, before the first message. A raise ends it."""
 
@@ -458,7 +462,8 @@ class Actor:
                 mailbox.put_message(f"{key} {name}", lambda: handler(message.body, message),
                                     reserved=not members or message.source in members)
 
-        return self._guard.receiver(topic, take, self._reject)
+        return self._guard.receiver(
+            topic, take, self._reject, lambda body: self.heeds_superseded(topic, body))
 
     def _reject(self, key: str, reason: str) -> None:
         self._rejected += 1

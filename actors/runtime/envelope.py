@@ -1,12 +1,14 @@
 """The wire format: a msgpack array of header and body, and the guard that checks what arrives.
 
 `[source, incarnation, sequence, stamp, body]`. The guard refuses what does not decode, what an
-older incarnation of a node still sends after its successor was heard, what comes twice, and what is
-stamped ahead of now: it would stay fresh for ever, and shut out all that is true after it.
+older incarnation of a node still sends after its successor was heard (and still is), what comes
+twice, and what is stamped ahead of now: it would stay fresh for ever, and shut out all that is true
+after it.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Collection
 from typing import Any, Generic, TypeVar
@@ -90,9 +92,28 @@ def _decoder(kind: type[Any]) -> Callable[[bytes], Envelope[Any]]:
     return decoder.decode
 
 
-Life = tuple[int, dict[str, int], dict[str, deque[int]]]
-"""What was heard from a node in its present life: incarnation; newest sequence number by key of
-the topics of which only the newest counts; of commands, by key, the last numbers."""
+FORGIVEN_S = 2.0
+"""A node that goes on for so long after the last word of an incarnation that superseded it was not
+superseded: nobody starts a node that then says nothing (simulated seconds, by the stamps)."""
+
+
+class _Life:
+    """What was heard from a node in its present life.
+
+    Attributes:
+        incarnation: which.
+        newest: newest sequence number by key, of the topics of which only the newest counts.
+        recent: of commands, by key, the last numbers.
+        stamp_s: of the last message.
+    """
+
+    __slots__ = ("incarnation", "newest", "recent", "stamp_s")
+
+    def __init__(self, incarnation: int) -> None:
+        self.incarnation = incarnation
+        self.newest: dict[str, int] = {}
+        self.recent: dict[str, deque[int]] = {}
+        self.stamp_s = -math.inf
 
 
 class ArrivalGuard:
@@ -112,12 +133,12 @@ class ArrivalGuard:
         self._now = now
         self._members = frozenset(members)
         self._crowded = crowded
-        self._lives: dict[str, Life] = {}
+        self._lives: dict[str, _Life] = {}
         self._strangers: deque[str] = deque()
 
     def receiver(
         self, topic: Topic[Any], take: Callable[[str, Envelope[Any]], None],
-        refuse: Callable[[str, str], None],
+        refuse: Callable[[str, str], None], heed: Callable[[Any], bool] = lambda _body: False,
     ) -> Callable[[str, bytes], None]:
         """Return what is to be called with key and payload of each message of a topic.
 
@@ -126,6 +147,8 @@ class ArrivalGuard:
             take: Called with the key and the message, unless it is a duplicate or was overtaken.
             refuse: Called with the key and the reason, if it does not decode, is stamped ahead of
                 now, or comes from a superseded incarnation.
+            heed: Says of the body of a message of a superseded incarnation that it is taken all the
+                same, beside being refused.
         """
         unpack, kind = _decoders.get(topic.type) or _decoder(topic.type), topic.type.__name__
         lives, meet, is_command = self._lives, self._meet, topic.qos is Qos.COMMAND
@@ -144,23 +167,27 @@ class ArrivalGuard:
                 refuse(key, f"stamped {message.stamp - now():.2f} s ahead of now")
                 return
             life = lives.get(message.source)
-            if life is None or life[0] != message.incarnation:
-                if life is not None and message.incarnation < life[0]:
+            if life is None or life.incarnation != message.incarnation:
+                if (life is not None and message.incarnation < life.incarnation
+                        and message.stamp <= life.stamp_s + FORGIVEN_S):
                     refuse(key, f"incarnation {message.incarnation} of {message.source} "
-                                f"was superseded by {life[0]}")
+                                f"was superseded by {life.incarnation}")
+                    if heed(message.body):
+                        take(key, message)
                     return
                 life = meet(message.source, message.incarnation)
+            life.stamp_s = message.stamp
             sequence = message.sequence
             if is_command:
-                recent = life[2].get(key)
+                recent = life.recent.get(key)
                 if recent is None:
-                    _make_room(life[2])
-                    recent = life[2][key] = deque(maxlen=_REMEMBERED_COMMANDS)
+                    _make_room(life.recent)
+                    recent = life.recent[key] = deque(maxlen=_REMEMBERED_COMMANDS)
                 if sequence in recent:
                     return
                 recent.append(sequence)
             else:
-                newest = life[1]
+                newest = life.newest
                 before = newest.get(key)
                 if before is None:
                     _make_room(newest)
@@ -171,12 +198,12 @@ class ArrivalGuard:
 
         return receive
 
-    def _meet(self, source: str, incarnation: int) -> Life:
-        life: Life = (incarnation, {}, {})
+    def _meet(self, source: str, incarnation: int) -> _Life:
+        life = _Life(incarnation)
         if source not in self._members and source not in self._lives:
             self._strangers.append(source)
             if len(self._strangers) > STRANGERS:
-                del self._lives[self._strangers.popleft()]
+                self._lives.pop(self._strangers.popleft(), None)
                 self._crowded()
         self._lives[source] = life
         return life
