@@ -390,6 +390,16 @@ class PilotStatus(Message, frozen=True):
     forbids: Text = ""
 
 
+class Holds(Message, frozen=True):
+    """Who holds the brake, or an order to the pilot, and is no recovery module of the system.
+
+    `what` is held; `holders` are obeyed until they let go, or an operator does for them.
+    """
+
+    what: Name
+    holders: Names
+
+
 class DetectionState(StrEnum):
     """State of a detection module (paper, figure 4)."""
 

@@ -92,9 +92,21 @@ def _decoder(kind: type[Any]) -> Callable[[bytes], Envelope[Any]]:
     return decoder.decode
 
 
-Life = tuple[int, dict[str, int], dict[str, deque[int]]]
-"""What was heard from a node in its present life: incarnation; newest sequence number by key of
-the topics of which only the newest counts; of commands, by key, the last numbers."""
+class _Life:
+    """What was heard from a node in its present life.
+
+    Attributes:
+        incarnation: which.
+        newest: newest sequence number by key, of the topics of which only the newest counts.
+        recent: of commands, by key, the last numbers.
+    """
+
+    __slots__ = ("incarnation", "newest", "recent")
+
+    def __init__(self, incarnation: int) -> None:
+        self.incarnation = incarnation
+        self.newest: dict[str, int] = {}
+        self.recent: dict[str, deque[int]] = {}
 
 
 class ArrivalGuard:
@@ -118,7 +130,7 @@ class ArrivalGuard:
         self._members = frozenset(members)
         self._crowded = crowded
         self._register = register
-        self._lives: dict[str, Life] = {}
+        self._lives: dict[str, _Life] = {}
         self._strangers: deque[str] = deque()
 
     def receiver(
@@ -150,7 +162,7 @@ class ArrivalGuard:
                 refuse(key, f"stamped {message.stamp - now():.2f} s ahead of now")
                 return
             life = lives.get(message.source)
-            if life is None or life[0] != message.incarnation:
+            if life is None or life.incarnation != message.incarnation:
                 objection = object_to(life, message)
                 if objection:
                     refuse(key, objection)
@@ -158,15 +170,15 @@ class ArrivalGuard:
                 life = meet(message.source, message.incarnation)
             sequence = message.sequence
             if is_command:
-                recent = life[2].get(key)
+                recent = life.recent.get(key)
                 if recent is None:
-                    _make_room(life[2])
-                    recent = life[2][key] = deque(maxlen=_REMEMBERED_COMMANDS)
+                    _make_room(life.recent)
+                    recent = life.recent[key] = deque(maxlen=_REMEMBERED_COMMANDS)
                 if sequence in recent:
                     return
                 recent.append(sequence)
             else:
-                newest = life[1]
+                newest = life.newest
                 before = newest.get(key)
                 if before is None:
                     _make_room(newest)
@@ -177,22 +189,22 @@ class ArrivalGuard:
 
         return receive
 
-    def _object_to(self, life: Life | None, message: Header) -> str:
+    def _object_to(self, life: _Life | None, message: Header) -> str:
         """Return why an incarnation is not that of a node's present process; "" if it may be."""
         which = f"incarnation {message.incarnation} of {message.source}"
-        if life is not None and message.incarnation < life[0]:
-            return f"{which} was superseded by {life[0]}"
+        if life is not None and message.incarnation < life.incarnation:
+            return f"{which} was superseded by {life.incarnation}"
         issued = self._register(message.source)
         if issued is not None and message.incarnation != issued:
             return f"{which}, of which {issued} was issued last"
         return ""
 
-    def _meet(self, source: str, incarnation: int) -> Life:
-        life: Life = (incarnation, {}, {})
+    def _meet(self, source: str, incarnation: int) -> _Life:
+        life = _Life(incarnation)
         if source not in self._members and source not in self._lives:
             self._strangers.append(source)
             if len(self._strangers) > STRANGERS:
-                del self._lives[self._strangers.popleft()]
+                self._lives.pop(self._strangers.popleft(), None)
                 self._crowded()
         self._lives[source] = life
         return life

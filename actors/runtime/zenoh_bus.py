@@ -47,7 +47,7 @@ one of the hundred places that Zenoh has for handshakes no longer than this."""
 
 _HELLOS_PER_S = 1000
 """From one partner, which publishes one when it starts. Zenoh leaves out what is above, before it
-costs a node anything: for each hello all partners repeat their states, so a flood of them is worst."""
+costs a node anything: for each hello all partners repeat their states, so such a flood is worst."""
 
 _REDIAL_MS = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2.0}
 _LOOK_S = 0.001
