@@ -117,8 +117,9 @@ class FtmManager(Actor):
 
     @on(topics.RESET)
     def reset(self, message: m.Reset, _header: Header) -> None:
-        """Hear the operator release a latched recovery."""
-        self._step(ResetAsked(message.recovery, message.by))
+        """Hear the operator release a latched recovery; strangers are let go by who obeys them."""
+        if any(recovery.name == message.recovery for recovery in self._system.recoveries):
+            self._step(ResetAsked(message.recovery, message.by))
 
     @on(topics.ADAPT)
     def adapt(self, message: m.AdaptationRequest, _header: Header) -> None:

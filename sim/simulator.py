@@ -14,7 +14,7 @@ import numpy as np
 
 from actors import messages as m
 from actors import topics
-from actors.control.holders import Holders
+from actors.holders import Holders
 from actors.runtime.actor import Actor, Context, Header, every, on
 from actors.runtime.bounds import clip
 from actors.runtime.timer import Timer

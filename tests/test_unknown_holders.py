@@ -12,8 +12,8 @@ from handler_fuzz import system
 
 from actors import messages as m
 from actors import topics
-from actors.control.holders import OTHERS, UNKNOWN, Holders
 from actors.control.safety_gate import Checks, GateLimits, SafetyGate
+from actors.holders import OTHERS, UNKNOWN, Holders
 from actors.messages import PilotMode
 from actors.runtime.actor import Context
 from actors.runtime.envelope import Header, encode

@@ -21,10 +21,10 @@ from typing import NamedTuple
 import msgspec
 
 from actors.control.command_pair import CommandPair, PairLimits
-from actors.control.holders import Holders
 from actors.control.plausible import AHEAD_S
 from actors.control.polyline import NO_POINTS, Array
 from actors.control.swept_path import StoppingRoom, limited
+from actors.holders import Holders
 from actors.messages import PilotMode
 from actors.runtime.limits import Remembered
 
