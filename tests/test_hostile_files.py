@@ -107,6 +107,8 @@ AIRPORTS = {
     "a name that steers the terminal": (edited(
         'name = "R"', 'name = "\\u001b[2J\\nlaunch.py: all is well"'
         ).split("[world")[0].replace("10.0, 0.0", "10.0, 9.0"), "off the pavement"),
+    "a fault that lies deeper than the next node has values": (
+        edited("S = [0.0, 0.0]\nT = [30.0, 0.0]", "S = [0.0, []]\nT = [0.0]"), "nodes.S[1]: []"),
     "a number where a table belongs": (edited("[missions.M]", "[missions]\nM = 3\n[world]"),
                                        "missions.M: 3"),
 }
