@@ -12,7 +12,6 @@ import json
 import random
 import sqlite3
 import struct
-import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -470,7 +469,3 @@ def test_what_is_said_of_a_file_is_one_printable_line_of_bounded_length():
 def test_a_file_is_read_no_further_than_it_may_be_long():
     with pytest.raises(FileError, match="longer than 64 kB"):
         read_bytes(Path("/dev/zero"), 1 << 16)
-
-
-def test_the_suite_reads_the_integers_that_files_can_hold():
-    assert sys.get_int_max_str_digits() >= 4300
