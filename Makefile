@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test test-slow lint campaign bench bench-respawn chaos chaos-pairs setup clean requirements
+.PHONY: run test test-slow lint campaign bench bench-respawn chaos chaos-pairs fuzz setup clean requirements
 
 run: setup
 	$(BIN)/python launch.py
@@ -46,6 +46,11 @@ chaos: setup
 # more. Interrupted, it goes on where it was: reports/chaos-pairs.jsonl says what is done.
 chaos-pairs: setup
 	$(BIN)/python tests/chaos_pair_runs.py
+
+# 100,000 inputs into each decoder of what others write; half an hour. FUZZ="--runs 1000000" makes
+# more, FUZZ=--help says what else there is. Coverage guides it where `rampart[fuzz]` is installed.
+fuzz: setup
+	PYTHONPATH=tests $(BIN)/python -m fuzz.run $(FUZZ)
 
 setup: .venv/installed
 

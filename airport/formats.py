@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
+from collections.abc import Iterator
 from pathlib import Path
 
 from airport import foreign, toml_format
@@ -77,13 +79,14 @@ def load_mission(name_or_path: str | Path, airport: Airport) -> Mission:
 
 
 def _load(name_or_path: str | Path, scale: MaskScale | None) -> tuple[Airport, WorldTruth]:
-    path = _find(name_or_path)
-    if path.suffix == ".toml":
-        airport, truth = toml_format.read_airport(path)
-        own = True
-    else:
-        airport, truth = foreign.read_airport(path, scale), WorldTruth()
-        own = False
+    with _readable(name_or_path):
+        path = _find(name_or_path)
+        if path.suffix == ".toml":
+            airport, truth = toml_format.read_airport(path)
+            own = True
+        else:
+            airport, truth = foreign.read_airport(path, scale), WorldTruth()
+            own = False
     warnings = []
     for problem in problems(airport):
         if own or not problem.tolerable:
@@ -95,6 +98,16 @@ def _load(name_or_path: str | Path, scale: MaskScale | None) -> tuple[Airport, W
     if not airport.lights:
         warnings.append(f"{path.name}: lights: none: nothing will be measured")
     return dataclasses.replace(airport, warnings=tuple(warnings), source=str(path)), truth
+
+
+@contextlib.contextmanager
+def _readable(name: str | Path) -> Iterator[None]:
+    """Have a name that is too long, or a folder that cannot be listed, refused like the rest."""
+    try:
+        yield
+    except OSError as error:
+        raise AirportError(f"{name}: cannot be read: {error.strerror}: give a file that exists"
+                           ) from None
 
 
 def _find(name_or_path: str | Path) -> Path:

@@ -230,7 +230,8 @@ def _resolve(value: Any, where: str, keys: list[str]) -> Iterator[tuple[str, Any
     if key == "[...]" and isinstance(value, dict):
         for name, part in value.items():
             yield from _resolve(part, f"{where}.{name}", keys[1:])
-    elif key.startswith("[") and isinstance(value, list) and index.isdigit():
+    elif key.startswith("[") and isinstance(value, list) and index.isdigit() \
+            and int(index) < len(value):  # another member of a table may be shorter than the one
         yield from _resolve(value[int(index)], where + key, keys[1:])
     elif isinstance(value, dict) and key in value:
         yield from _resolve(value[key], f"{where}.{key}", keys[1:])

@@ -25,6 +25,8 @@ from operator import and_, or_
 
 import msgspec
 
+from files.reading import plain_line
+
 MAX_NAMES = 16
 """A gate over more modules than these is a fault tree; it belongs there."""
 
@@ -45,6 +47,9 @@ MAX_WAYS = 64
 
 class GateError(ValueError):
     """A gate that cannot be read, or that makes no sense. The message is one line."""
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(plain_line(problem))
 
 
 class Gate(msgspec.Struct, frozen=True):

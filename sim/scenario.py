@@ -32,6 +32,7 @@ PROCESS_FAULTS = ("kill", "stop", "wedge", "slow")
 ACTUATOR_FAULTS = ("stuck-wheel", "weak-wheel", "brake-failure")
 OBSTACLE = "obstacle-ahead"
 
+_MAX_DIGITS = 9
 _SLOW_S, _AHEAD_M, _OBSTACLE_RADIUS_M = 0.1, 3.0, 0.4
 _WEAK, _NO_BRAKE = 0.2, 0.0
 _LASTS_S = {"kill": 0.0, "wedge": math.inf, "stop": 5.0, "slow": 10.0, "stuck-wheel": 10.0,
@@ -130,7 +131,7 @@ def parse_fault(text: str) -> PlannedFault:
     if not when.startswith("goal"):
         return PlannedFault(fault, _seconds(text, when, "WHEN"), duration_s=duration_s)
     number, colon, after = when.removeprefix("goal").partition(":")
-    if not number.isdecimal() or int(number) < 1:
+    if not number.isdecimal() or len(number) > _MAX_DIGITS or int(number) < 1:
         raise ScenarioError(f"fault {text!r}: goal{number}: goals are counted from 1")
     return PlannedFault(fault, _seconds(text, after, "WHEN") if colon else 0.0, int(number),
                         duration_s)

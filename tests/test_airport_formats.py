@@ -256,5 +256,12 @@ def test_an_unknown_airport_name_gets_a_suggestion():
     assert "file: missing" in refusal(load_airport, "no/such.toml")
 
 
+@pytest.mark.parametrize("name", ["a" * 300, "a" * 300 + ".toml", "a" * 300 + ".graph"])
+def test_a_name_that_no_file_can_have_is_refused_like_one_that_is_not_there(name):
+    assert "cannot be read: File name too long" in refusal(load_airport, name)
+    airport = load_airport("vallombre")
+    assert name[:200] in refusal(load_mission, f"{name}.miss", airport)
+
+
 def test_a_scale_that_is_not_positive_is_refused():
     assert "both must be positive" in refusal(MaskScale, 0.0)

@@ -12,7 +12,6 @@ import json
 import random
 import sqlite3
 import struct
-import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -107,6 +106,8 @@ AIRPORTS = {
     "a name that steers the terminal": (edited(
         'name = "R"', 'name = "\\u001b[2J\\nlaunch.py: all is well"'
         ).split("[world")[0].replace("10.0, 0.0", "10.0, 9.0"), "off the pavement"),
+    "a fault that lies deeper than the next node has values": (
+        edited("S = [0.0, 0.0]\nT = [30.0, 0.0]", "S = [0.0, []]\nT = [0.0]"), "nodes.S[1]: []"),
     "a number where a table belongs": (edited("[missions.M]", "[missions]\nM = 3\n[world]"),
                                        "missions.M: 3"),
 }
@@ -468,7 +469,3 @@ def test_what_is_said_of_a_file_is_one_printable_line_of_bounded_length():
 def test_a_file_is_read_no_further_than_it_may_be_long():
     with pytest.raises(FileError, match="longer than 64 kB"):
         read_bytes(Path("/dev/zero"), 1 << 16)
-
-
-def test_the_suite_reads_the_integers_that_files_can_hold():
-    assert sys.get_int_max_str_digits() >= 4300

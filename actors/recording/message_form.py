@@ -97,7 +97,10 @@ class MessageForm:
         found = self._decode(text)
         if found.body is msgspec.UNSET or found.stamp is None:
             raise ValueError("neither body nor payload")
-        return pack((found.source, found.incarnation, found.sequence, found.stamp, found.body))
+        try:
+            return pack((found.source, found.incarnation, found.sequence, found.stamp, found.body))
+        except OverflowError as error:  # JSON has larger numbers than MessagePack
+            raise ValueError(str(error)) from None
 
     def _is_exact(
         self, text: bytes, parts: tuple[str, int, int, float], body: Any, payload: bytes
@@ -125,7 +128,10 @@ def renumbered(payload: bytes, lives: int, later_s: float) -> bytes:
         return payload
     head = (message.source, message.incarnation + lives, message.sequence,
             message.stamp + later_s)
-    return _encode_msgpack((*head, message.body))
+    try:
+        return _encode_msgpack((*head, message.body))
+    except OverflowError:  # no life comes after the last number there is
+        return payload
 
 
 def header_of(payload: bytes) -> Header | None:

@@ -104,6 +104,15 @@ def ask(port: int) -> RunInfo | None:
             connection.connect(address(port))
             if not is_same_user(connection):
                 return None
-            return msgspec.json.decode(connection.recv(65536), type=RunInfo)
+            return read_info(connection.recv(65536))
         except (OSError, *UNREADABLE):
             return None
+
+
+def read_info(data: bytes) -> RunInfo:
+    """Return what a launcher told.
+
+    Raises:
+        ValueError, RecursionError: it is no such thing.
+    """
+    return msgspec.json.decode(data, type=RunInfo)

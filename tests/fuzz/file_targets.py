@@ -1,0 +1,351 @@
+"""Targets: files that users give to the program."""
+
+from __future__ import annotations
+
+import io
+import json
+import tempfile
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from PIL import Image
+from recording_samples import documents, pose
+from test_airport_formats import GRAPH, SCALE, TOML
+
+from actors.recording.bag_reader import BagReader, Summary
+from actors.recording.bag_repair import repair
+from actors.recording.bag_writer import BagError, BagWriter
+from actors.recording.message_form import MessageForm, header_of, renumbered, topic_of
+from actors.recording.run_documents import footprint_m, restore
+from airport.errors import AirportError
+from airport.formats import load_airport, load_mission
+from airport.mask import allowed_area
+from files import toml
+from files.reading import FileError
+from fuzz.samples import sample
+from fuzz.target import ROOT, target
+from manager.adaptation import Change, ChangeError, adapt, parse_value
+from manager.formula import formula_of
+from manager.gates import GateError, detection_gate, recovery_gate
+from manager.open_psa import OpenPsaError, read_open_psa, write_open_psa
+from manager.schema import SpecificationError
+from manager.specification import check_document, parse_specification, read_document
+from sim.campaign.job import Job, RunResult
+from sim.campaign.store import _NO_RUN, _run
+from sim.faults import UnknownFaultError
+from sim.scenario import ScenarioError, action_of, parse_fault
+from toolbox.bag_verbs import described
+
+SYSTEMS = ROOT / "systems"
+_CELL = (SYSTEMS / "cell.toml").read_text("utf-8")
+_PAPER = (SYSTEMS / "paper.toml").read_text("utf-8")
+_SMALL = """
+name = "small"
+title = "A lamp and a guard"
+[timing]
+heartbeat_timeout_s = 0.5
+command_timeout_s = 0.5
+localization_timeout_s = 0.5
+scan_timeout_s = 0.5
+dead_man_timeout_s = 0.5
+manager_timeout_s = 0.5
+detection_silence_timeout_s = 1
+[[node]]
+name = "manager"
+actor = "manager.actor:FtmManager"
+kind = "manager"
+[[node]]
+name = "lamp"
+actor = "actors.stub.node:StubNode"
+kind = "control"
+respawn = "RM1"
+[[detection]]
+name = "DM1"
+title = "No light"
+actor = "actors.detection.watchdog:Watchdog"
+parameters = { watch = ["lamp"], timeout_s = 0.5 }
+[[recovery]]
+name = "RM1"
+title = "New lamp"
+actor = "actors.recovery.respawn:Respawn"
+kind = "masking"
+claims = ["lamp"]
+[[mechanism]]
+name = "FTM1"
+detect = "DM1"
+recover = "RM1"
+event = "dark"
+against = { within_s = 3.0, hazard = "night" }
+[[event]]
+name = "dark"
+gate = { at_least = 1 }
+of = ["bulb", "wire"]
+[[event]]
+name = "bulb"
+[[event]]
+name = "wire"
+[orders.safer]
+"""
+
+
+@cache
+def _kept() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="rampart-fuzz-")
+
+
+def folder() -> Path:
+    """Return a folder of this process; a worker's lies in memory."""
+    return Path(_kept().name)
+
+
+def written(name: str, data: bytes) -> Path:
+    """Return the path of a file with this content."""
+    path = folder() / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(data)
+    return path
+
+
+# -- airports and missions -------------------------------------------------------------------------
+
+
+@target("airport-toml", refuses=(AirportError,), kind="toml", says_one_line=True, suite_runs=100,
+        samples=lambda: [TOML.encode(), (
+            "fillet_radius_m = 1.0\n" + TOML + '[[prohibited]]\nname = "P"\n'
+            'polygon = [[20, -1], [22, -1], [22, -3]]\n[[building]]\nname = "B"\nx_m = 5.0\n'
+            'y_m = 9.0\nlength_m = 2.0\nwidth_m = 2.0\nheight_m = 3.0\n').encode()])
+def airport_toml(data: bytes) -> None:
+    load_airport(written("airport/field.toml", data))
+
+
+@target("mission-toml", refuses=(AirportError,), kind="toml", says_one_line=True,
+        samples=lambda: [b'name = "M"\ngoals = [{ x_m = 4, y_m = 0, mode = "taxi" }]\n'])
+def mission_toml(data: bytes) -> None:
+    load_mission(written("mission.toml", data), _field())
+
+
+@target("mission-miss", refuses=(AirportError,), kind="text", says_one_line=True,
+        words=("x=", "y=", "taxi=", ","),
+        samples=lambda: [b"x=9.5,y=0,taxi=1\n\nx=3,y=0.25,taxi=0\n"])
+def mission_miss(data: bytes) -> None:
+    load_mission(written("MISSION_A.miss", data), _field())
+
+
+@cache
+def _field() -> Any:
+    return load_airport(written("airport/field.toml", TOML.encode()))
+
+
+@target("graph", refuses=(AirportError,), kind="json", says_one_line=True, suite_runs=100,
+        samples=lambda: [json.dumps(GRAPH).encode(), json.dumps({
+            "nodes": [*GRAPH["nodes"], {"id": "N3", "x": 5, "y": 4}],
+            "edges": [["N1", "N2"], ["N2", "N3"]]}).encode()])
+def graph(data: bytes) -> None:
+    if not (folder() / "foreign/field.png").exists():
+        written("foreign/field.png", _image("PNG"))
+    load_airport(written("foreign/field.graph", data), SCALE)
+
+
+@target("mask", refuses=(AirportError,), kind="png", says_one_line=True, suite_runs=100,
+        samples=lambda: [_image("PNG"), _image("PNG", "P"), _image("PNG", "RGBA"),
+                         _image("JPEG")])
+def mask(data: bytes) -> None:
+    allowed_area(written("mask.png", data), SCALE)
+
+
+def _image(form: str, mode: str = "RGB") -> bytes:
+    pixels = np.zeros((48, 48, 3), dtype=np.uint8)
+    pixels[..., 0] = 255
+    pixels[8:40, 8:40] = (0, 255, 0)
+    out = io.BytesIO()
+    Image.fromarray(np.kron(pixels, np.ones((2, 2, 1), dtype=np.uint8))).convert(mode).save(
+        out, form)
+    return out.getvalue()
+
+
+# -- systems ---------------------------------------------------------------------------------------
+
+_WORDS = ("[[node]]\n", "[[event]]\n", "enabled = false\n", "parameters = {}\n", 'watch = ["a"]\n',
+          "[orders.b]\n", "timeout_s = 1e-9\n", "at_least", "nan", "[robot]\n", "latched = true\n")
+
+
+@target("toml", refuses=(FileError,), kind="toml", says_one_line=True,
+        samples=lambda: [b'a.b = [1, {c = "x"}, 1979-05-27]\n[t]\ns = \'\'\'x\'\'\'\n"q" = """y"""',
+                         TOML.encode()])
+def toml_document(data: bytes) -> None:
+    toml.parse(data.decode(errors="replace"))
+
+
+@target("system", refuses=(SpecificationError,), kind="toml", says_one_line=True, suite_runs=60,
+        words=_WORDS, samples=lambda: [_SMALL.encode()] * 9 + [_CELL.encode()])
+def system(data: bytes) -> None:
+    spec = parse_specification(data.decode(errors="replace"), "system.toml")
+    formula_of(spec.build_fault_tree())
+    write_open_psa(spec)
+
+
+@cache
+def _document() -> dict[str, Any]:
+    return read_document(_PAPER, "paper.toml")
+
+
+@target("adaptation", refuses=(ChangeError, SpecificationError, ValueError, RecursionError),
+        kind="json", suite_runs=60, samples=lambda: [json.dumps(change).encode() for change in (
+            {"action": "disable", "name": "FTM7"},
+            {"action": "retune", "name": "RM3", "values": {"deadline_s": 2.5}},
+            {"action": "retune", "name": "DM1", "values": {"margin_m": 0.7}},
+            {"action": "retune", "name": "FTM2", "values": {"detect": "DM2 or DM6"}},
+            {"action": "replace", "name": "FTM7", "values": {
+                "detect": "DM7", "recover": "RM4", "event": "localization_crash"}},
+            {"action": "set", "name": "order", "values": {"value": ["safer"]}},
+            {"action": "set", "name": "strategy", "values": {"value": "guarded-repair"}})])
+def adaptation(data: bytes) -> None:
+    adapt(_document(), msgspec.json.decode(data, type=Change), "paper.toml")
+
+
+@target("system-json", refuses=(SpecificationError, ValueError, RecursionError), kind="json",
+        suite_runs=60, samples=lambda: [msgspec.json.encode(read_document(text, "small.toml"))
+                                        for text in [_SMALL] * 9 + [_CELL]])
+def system_json(data: bytes) -> None:
+    """A changed system, as `manager/system` carries it."""
+    check_document(msgspec.json.decode(data, type=dict[str, Any]), "cell.toml")
+
+
+@target("value", refuses=(ChangeError,), kind="text", says_one_line=True,
+        samples=lambda: [b"0.5", b"true", b"'text'", b"[1, {a = 2}]", b"guarded-repair"])
+def value(data: bytes) -> None:
+    parse_value(data.decode(errors="replace"))
+
+
+@target("gate", refuses=(GateError,), kind="text", says_one_line=True,
+        words=(" and ", " or ", "not ", "2 of (", "(", ")", ",", "DM1", "DM2"),
+        samples=lambda: [b"DM1 or (DM2 and not DM3)", b"2 of (DM1, DM2, DM3)", b"RM4 or RM3",
+                         b"(A or B) and (C or D) and (E or F)"])
+def gate(data: bytes) -> None:
+    text = data.decode(errors="replace")
+    refused = None
+    for read in (detection_gate, recovery_gate):
+        try:
+            found = read.__wrapped__(text)
+        except GateError as error:
+            refused = error
+        else:
+            str(found)
+            if read is recovery_gate:
+                list(found.alternatives())
+    if refused is not None:
+        raise refused
+
+
+@target("open-psa", refuses=(OpenPsaError,), kind="text", says_one_line=True,
+        words=("<and>", "</and>", "<not>", '<event name="a"/>', "<!DOCTYPE x>", "<![CDATA[",
+               '<define-gate name="g">', "&lt;", "<house-event name='h'/>",
+               "<constant value='true'/>",
+               '<atleast min="2">', "xmlns='x'", "<define-component name='c'>"),
+        samples=lambda: [(
+            b'<?xml version="1.0"?><opsa-mef><define-fault-tree name="t">'
+            b'<define-gate name="top"><or><gate name="g"/><event name="b"/></or></define-gate>'
+            b'<define-gate name="g"><atleast min="2"><event name="a"/><event name="b"/>'
+            b'<not><event name="c"/></not></atleast></define-gate>'
+            b'<define-component name="k" role="private"><define-house-event name="h">'
+            b'<constant value="true"/></define-house-event></define-component></define-fault-tree>'
+            b'</opsa-mef>')])
+def open_psa(data: bytes) -> None:
+    read_open_psa(data, "tree.xml")
+
+
+@target("fault", refuses=(ScenarioError, UnknownFaultError), kind="text",
+        words=("@", "+", "goal", "inf", ":", "kill", "corrupt:", "localization/pose"),
+        samples=lambda: [b"kill:osmosis_control@30", b"gps-bias@goal2+5",
+                         b"weak-wheel:front-left:0.2", b"corrupt:localization/pose@goal1:3+inf",
+                         b"obstacle-ahead:3",
+                         b"slow:hmi:0.1@5+2", b"restamp:plan/route"])
+def fault(data: bytes) -> None:
+    planned = parse_fault(data.decode(errors="replace"))
+    planned.text()
+    action_of(planned, "f1", ("osmosis_control", "hmi"))
+
+
+# -- recordings, results ---------------------------------------------------------------------------
+
+
+def _recordings() -> list[bytes]:
+    made = [_foreign(kind) for kind in (
+        CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD)]
+    path = folder() / "own.mcap"
+    writer = BagWriter(path.open("wb"), msgspec.structs.replace(documents(), files=()))
+    for number in range(6):
+        writer.take(*pose(number + 1, number / 20))
+    writer.close()
+    return [*made, path.read_bytes()[:1 << 16]]
+
+
+def _foreign(compression: CompressionType) -> bytes:
+    out = io.BytesIO()
+    writer = Writer(out, compression=compression, enable_crcs=False, use_statistics=False)
+    writer.start("rampart", "fuzz")
+    writer.add_metadata("rampart.run", {"title": "t", "time_zero_s": "-3", "nodes": '["a"]'})
+    writer.add_attachment(0, 0, "system.toml", "application/toml",
+                          b"[robot]\nlength_m = 1.0\nwidth_m = 0.5\n")
+    schema = writer.register_schema("Pose", "jsonschema", b"{}")
+    channel = writer.register_channel("pose", "json", schema, {"key": "rampart/localization/pose"})
+    for number in range(5):
+        writer.add_message(channel, number * 10**8, b'{"source":"l","incarnation":1,"sequence":1,'
+                           b'"stamp":1.0,"body":{"x_m":0,"y_m":0,"yaw_rad":0}}', number)
+    writer.add_metadata("rampart.end", {"lost": '{"a": 1}', "ended": "over"})
+    writer.finish()
+    return out.getvalue()
+
+
+@target("mcap-info", refuses=(BagError,), kind="mcap", says_one_line=True, samples=_recordings)
+def mcap_info(data: bytes) -> None:
+    summary = Summary(BagReader(written("bag.mcap", data)))
+    msgspec.json.encode(described(summary))
+    footprint_m(summary.files)
+    restore([file for file in summary.files if len(file[2]) < 1 << 16], folder())
+
+
+@target("mcap-repair", refuses=(BagError,), kind="mcap", says_one_line=True, samples=_recordings,
+        suite_runs=100)
+def mcap_repair(data: bytes) -> None:
+    reader = BagReader(written("torn.mcap", data))
+    whole = folder() / "whole.mcap"
+    copied = repair(reader, whole, overwrite=True)
+    if Summary(BagReader(whole)).messages != copied:
+        raise AssertionError(f"{copied} messages were copied, and not found again")
+
+
+_KEYS = ("rampart/localization/pose", "rampart/detection/DM1", "rampart/world/strange")
+
+
+@target("recorded-json", refuses=(ValueError, RecursionError), kind="json", samples=lambda: [
+        b'{"source":"l","incarnation":1,"sequence":1,"stamp":1.0,"body":{"x_m":0.0,"y_m":0.0,'
+        b'"yaw_rad":null}}', b'{"source":"","incarnation":0,"sequence":0,"stamp":null,'
+        b'"raw":"wQ==","error":"x"}'])
+def recorded_json(data: bytes) -> None:
+    """A message of a recording that is played: JSON in, payload out."""
+    refused = None
+    for key in _KEYS:
+        try:
+            payload = MessageForm(topic_of(key)).payload(data)
+        except (ValueError, RecursionError) as error:
+            refused = error
+        else:
+            header_of(payload)
+            renumbered(payload, 2, 1.5)
+    if refused is not None:
+        raise refused
+
+
+@target("stored-run", refuses=_NO_RUN, kind="msgpack", samples=lambda: [
+        msgspec.msgpack.encode([msgspec.to_builtins(sample(kind)) for kind in (Job, RunResult)])])
+def stored_run(data: bytes) -> None:
+    """A row of a campaign's store: a job and its result."""
+    job, result = msgspec.msgpack.decode(data, type=tuple[msgspec.Raw, msgspec.Raw])
+    run = _run(bytes(job), bytes(result))
+    run.job.text()
+    _ = run.job.key, run.result.margin_m

@@ -1,0 +1,156 @@
+"""Targets: what arrives from buses, sockets, devices, the kernel, browsers, and from the past."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from actors import topics
+from actors.control.control_checkpoint import CONTROL_STATE
+from actors.control.graph_planner import ROUTE_STATE
+from actors.control.mission_checkpoint import MISSION_STATE
+from actors.operator.hmi_wishes import WishError, read_wish
+from actors.operator.joystick_device import EVENT, ForeignDeviceError, StickDecoder, StickMapping
+from actors.recording.message_form import form_of
+from actors.runtime.checkpoint import StateError
+from actors.runtime.envelope import UNREADABLE, ArrivalGuard, Header, encode
+from actors.runtime.tap import frame, parse_frame
+from actors.runtime.web_access import Access, page_url, shown_token
+from actors.supervision.process_title import parse_title
+from actors.supervision.process_usage import parse_stat
+from actors.supervision.run_info import RunInfo, read_info
+from actors.supervision.spawner import Adapt, ForkRequest, Ping, Reply, Request, SetOrigin
+from fuzz.samples import sample
+from fuzz.target import target
+from manager.actor import MANAGER_STATE
+
+# -- the bus ---------------------------------------------------------------------------------------
+
+TOPICS = {topic.at("a") if topic.is_family else topic.at(): topic for topic in topics.ALL}
+
+
+def payloads() -> list[bytes]:
+    """Return a message of every type."""
+    return [encode(Header("a", 1, 1, 0.5), sample(topic.type)) for topic in topics.ALL]
+
+
+@target("envelope", refuses=(), kind="msgpack", samples=payloads, suite_runs=200)
+def envelope(data: bytes) -> None:
+    """A payload, on every key: refused with a reason or handed over, twice for what is kept."""
+    guard = ArrivalGuard(lambda: 1.0)
+    heard: list[Any] = []
+    for key, topic in TOPICS.items():
+        receive = guard.receiver(topic, lambda _key, message: heard.append(message),
+                                 lambda _key, reason: heard.append(reason))
+        receive(key, data)
+        receive(key, data)
+    if not heard:
+        raise AssertionError("neither handed over nor refused")
+
+
+@target("recorded", refuses=(), kind="msgpack", samples=payloads, suite_runs=100)
+def recorded(data: bytes) -> None:
+    """A payload on its way into a recording, and back."""
+    for key in (*TOPICS, "rampart/world/strange"):
+        text, header, _ = form_of(key).recorded(data)
+        if header is not None and form_of(key).payload(text) != data:
+            raise AssertionError(f"{key}: another payload came back")
+
+
+@target("tap-frame", refuses=(ValueError,),
+        samples=lambda: [frame(1.5, "rampart/localization/pose", b"payload"), frame(0, "", b"")])
+def tap_frame(data: bytes) -> None:
+    parse_frame(data)
+    parse_frame(memoryview(data))
+
+
+# -- processes -------------------------------------------------------------------------------------
+
+
+@target("process-title", refuses=(), kind="text", words=("rampart[", "/", "] ", " #", "+"),
+        samples=lambda: [b"rampart[7400/123] osmosis_control #1", b"rampart[7400/1] a+b #42 x"])
+def process_title(data: bytes) -> None:
+    parse_title(1, data.rstrip(b"\0").decode(errors="replace"))
+
+
+@target("proc-stat", refuses=(), kind="text", samples=lambda: [
+        b"1 (a b) S 1 1 1 0 -1 4194560 1 2 3 4 5 6 7 8 20 0 1 0 99 1000 250 18446744073709551615"])
+def proc_stat(data: bytes) -> None:
+    parse_stat(data.decode(errors="replace"))
+
+
+@target("run-info", refuses=UNREADABLE, kind="json",
+        samples=lambda: [msgspec.json.encode(sample(RunInfo))])
+def run_info(data: bytes) -> None:
+    _ = read_info(data).endpoints
+
+
+@target("spawner-request", refuses=UNREADABLE, kind="json", samples=lambda: [
+        msgspec.json.encode(sample(kind)) for kind in (ForkRequest, Ping, Adapt, SetOrigin, Reply)])
+def spawner_request(data: bytes) -> None:
+    msgspec.json.decode(data, type=Request)
+
+
+# -- operators -------------------------------------------------------------------------------------
+
+
+@target("joystick", refuses=(ForeignDeviceError,), samples=lambda: [
+        b"".join(EVENT.pack(5, *event) for event in (
+            (0, 0x82, 0), (0, 0x81, 4), (1, 0x01, 4), (-32767, 0x02, 1), (32767, 0x02, 0)))])
+def joystick(data: bytes) -> None:
+    decoder = StickDecoder(StickMapping())
+    for at in range(0, len(data), 13):
+        decoder.feed(data[at:at + 13])
+        stick = decoder.stick
+        if not (-1 <= stick.forward <= 1 and -1 <= stick.left <= 1):
+            raise AssertionError(f"beyond the end of the stick: {stick}")
+
+
+@target("page-wish", refuses=(WishError,), kind="json", samples=lambda: [
+        b'{"type":"reset","recovery":"RM1"}', b'{"type":"order","action":"pause","reason":"x"}',
+        b'{"type":"stick","held":true,"ticket":3,"forward":0.5,"left":-1}',
+        b'{"type":"inject","fault":"gps-bias","duration_s":5,"permanent":false}',
+        b'{"type":"signal","node":"hmi","signal":"KILL"}', b'{"type":"strategy","name":"x"}'])
+def page_wish(data: bytes) -> None:
+    read_wish(data)
+    read_wish(data.decode(errors="replace"))
+
+
+_ACCESS = (Access("127.0.0.1", 8080), Access("0.0.0.0", 8080, "t" * 20, ("robot",)))
+
+
+@target("page-headers", refuses=(), kind="text",
+        words=("@", "[::1]", ":", "http://", "token=", "Bearer ", "localhost", "127.0.0.1"),
+        samples=lambda: [b"127.0.0.1:8080", b"http://localhost:8080", b"[::1]:8080",
+                         b"Bearer tttttttttttttttttttt", b"token.tttttttttttttttttttt"])
+def page_headers(data: bytes) -> None:
+    """Host, origin, authorization, query and subprotocol, as HTTP hands them over: latin-1."""
+    text = data.decode("latin-1")
+    for access in _ACCESS:
+        access.own_host(text)
+        access.own_origin(text)
+        access.permits(shown_token(text, text, text.split(",")))
+        access.permits(shown_token(None, text))
+    page_url("127.0.0.1", 8080, data.decode(errors="replace"))
+
+
+# -- a node's own past -----------------------------------------------------------------------------
+
+_STATES = (CONTROL_STATE, MISSION_STATE, ROUTE_STATE, MANAGER_STATE)
+
+
+@target("checkpoint", refuses=(StateError,), kind="msgpack",
+        samples=lambda: [msgspec.msgpack.encode(sample(form.kind)) for form in _STATES])
+def checkpoint(data: bytes) -> None:
+    """Bytes of a state with a sound checksum, of this version, an older and a newer one."""
+    refused = []
+    for form in _STATES:
+        for version in (0, form.version + 1, -1, form.version):
+            try:
+                form.encode(form.decode(version, data))
+            except StateError as error:
+                refused.append(error)
+    if len(refused) == 4 * len(_STATES):
+        raise refused[-1]
+
