@@ -438,7 +438,7 @@ async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -
         await run.run()
     if options.json:
         _print_result(run.summary())
-    return EXIT_FAILED if run.launcher.failure else EXIT_SUCCESS
+    return EXIT_FAILED if run.failure else EXIT_SUCCESS
 
 
 def _directory(options: argparse.Namespace, name: str) -> Path:

@@ -44,6 +44,7 @@ class WatchedRun:
                  stream: TextIO) -> None:
         self.launcher = Launcher(plan, spec.title)
         self.interrupted = ""
+        self.failure = ""
         self._spec = spec
         self._duration_s = duration_s
         self._console = Console(stream)
@@ -92,8 +93,9 @@ class WatchedRun:
             while not (self.interrupted or self.launcher.failure  # noqa: ASYNC110 three ends
                        or self._is_over(clock.now())):
                 await asyncio.sleep(0.05)
-            if self.launcher.failure:
-                self._console.line(clock.now(), self.launcher.failure)
+            self.failure = self.launcher.failure  # before its observer is told to end
+            if self.failure:
+                self._console.line(clock.now(), self.failure)
         finally:
             self._lasted_s = clock.now()
             observer.stop()
