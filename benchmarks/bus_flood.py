@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import itertools
 import json
 import statistics
 import subprocess
@@ -80,7 +81,7 @@ class Watch:
         self._session = session
         self.reported_s: float | None = None
         self.braked_s: float | None = None
-        self._released = False
+        self._released = 0
         session.listen(topics.DETECTION, topics.DETECTION.at("DM1"), self._report)
         session.listen(topics.BRAKE, topics.BRAKE.at(), self._brake)
 
@@ -92,7 +93,7 @@ class Watch:
     def _brake(self, _key: str, header: Header, body: m.BrakeCommand) -> None:
         if header.source != "RM1":
             return
-        self._released = self._released or not body.engaged
+        self._released = 0 if body.engaged else self._released + 1
         if body.engaged and self.braked_s is None:
             self.braked_s = header.stamp
 
@@ -110,14 +111,15 @@ class Watch:
         found = (None if self.reported_s is None or self.braked_s is None
                  else self.braked_s - self.reported_s)
         await asyncio.sleep(0.8)
-        self._released = False
-        for _ in range(50):
-            if self._released:
-                break
-            self._session.publish(topics.RESET, m.Reset("RM1", "benchmark"))
-            await asyncio.sleep(0.1)
-        await asyncio.sleep(0.5)
         return found
+
+    async def release(self) -> None:
+        """Have the operator release the brake, until RM1 has said several times that it is."""
+        self._released = 0
+        while self._released < 3:
+            if not self._released:
+                self._session.publish(topics.RESET, m.Reset("RM1", "benchmark"))
+            await asyncio.sleep(0.1)
 
 
 @contextlib.contextmanager
@@ -141,7 +143,7 @@ async def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
         await asyncio.sleep(0.1)
     rows = []
     async with connect(PORT) as session:
-        watch = Watch(session)
+        watch, numbers = Watch(session), itertools.count()
         await asyncio.sleep(max(0.0, 3.0 - session.clock.now()))
         for kind in ("none", *(options.kind or KINDS)):
             flood = None
@@ -150,7 +152,10 @@ async def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
                     sys.executable, "-c", _FLOOD, kind, str(options.per_s), "100000",
                     *session.run.endpoints, cwd=ROOT)
                 await asyncio.sleep(3.0)
-            samples = [await watch.once(i) for i in range(options.brakes)]
+            samples = []
+            for _ in range(options.brakes):
+                samples.append(await watch.once(next(numbers)))
+                await asyncio.wait_for(watch.release(), 30.0)
             if flood is not None:
                 flood.terminate()
                 await flood.wait()

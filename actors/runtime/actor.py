@@ -51,6 +51,9 @@ _REPEATED_SOON_HZ = 7.0
 _HELLOS_PER_S = 100
 """More newcomers in a simulated second than a system has nodes are no newcomers."""
 
+_STRANGE_HELLOS_PER_S = 5
+"""Of those that are no nodes of the system."""
+
 # What an actor is doing. Numbers, because they are compared and set for each message.
 _RESTING = 0
 """Nothing, and what comes goes through the mailbox."""
@@ -169,6 +172,7 @@ class Actor:
         self._tickers: list[_Ticker] = []
         self._reports = ReportLimit()
         self._hellos = RateLimit(_HELLOS_PER_S)
+        self._strange_hellos = RateLimit(_STRANGE_HELLOS_PER_S)
         self._answer_due = False
         self._states: dict[str, tuple[Topic[Any], msgspec.Struct, float]] = {}
         self._outlets: dict[str | tuple[str, str], tuple[str, bool]] = {}
@@ -537,7 +541,9 @@ class Actor:
     def _on_hello(self, _hello: Hello, header: Header) -> None:
         if header.source == self.name or self._answer_due:
             return
-        if self._hellos.allows(self.clock.now()):
+        members = self.context.members
+        known = not members or header.source in members
+        if (self._hellos if known else self._strange_hellos).allows(self.clock.now()):
             self._repeat_states()
         else:  # one answer for all of them, when the flood has lasted a second
             self._answer_due = True

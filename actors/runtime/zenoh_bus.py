@@ -45,7 +45,7 @@ HANDSHAKE_MS = 300
 """A handshake that takes longer is given up on either side: what connects and says nothing holds
 one of the hundred places that Zenoh has for handshakes no longer than this."""
 
-_HELLOS_PER_S = 1000
+_HELLOS_PER_S = 200
 """From one partner, which publishes one when it starts. Zenoh leaves out what is above, before it
 costs a node anything: for each hello all partners repeat their states, so such a flood is worst."""
 
