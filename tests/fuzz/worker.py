@@ -145,7 +145,9 @@ def go_on(worker: Worker, target: Any, runs: int, seed: int) -> None:
     mutated = Mutator(target.kind, target.words)
     own = len(pool)
     for _ in range(runs):
-        data = mutated(draw.choice(pool), draw.choice(pool), draw)
+        # Half of them from what is read: most of what is new is a new way to be refused.
+        base = pool[draw.randrange(own)] if draw.random() < 0.5 else draw.choice(pool)
+        data = mutated(base, draw.choice(pool), draw)
         if worker.try_one(data):
             if len(pool) < own + _KEPT:
                 pool.append(data)
