@@ -24,7 +24,9 @@ import systems
 from actors.recording.bag_writer import BagError, check_target
 from actors.recording.process import Order, RecorderProcess
 from actors.recording.virtual import VirtualRecording
-from actors.runtime import working_folder
+from actors.runtime import streams, working_folder
+from actors.runtime.plain_text import one_line
+from actors.runtime.token_file import SecretError, read_secret
 from actors.runtime.topic import Topic
 from actors.runtime.web_access import Access, AccessError, is_loopback, new_token
 from actors.runtime.wiring import load_class
@@ -40,7 +42,7 @@ from sim.mission_run import MissionRun, summary
 from sim.network import NETWORKS, find_network
 from sim.offered_faults import offered_faults
 from sim.process_run import ProcessRun
-from sim.report import write_report
+from sim.report import in_words, try_report
 from sim.report_record import RunRecord
 from sim.scenario import action_of, parse_fault
 from sim.virtual_run import LEAD_S, VirtualRun
@@ -49,6 +51,7 @@ from sim.watched_run import WatchedRun
 ROOT = Path(__file__).resolve().parent
 LAST_PORT = 32_000
 ERROR_LOG = "errors.log"
+TOKEN_VARIABLE = "RAMPART_HMI_TOKEN"  # noqa: S105 the name of one
 HMI = "actors.operator.hmi:Hmi"
 TELEOPERATION = "actors.operator.teleoperation:Teleoperation"
 EXIT_SUCCESS, EXIT_FAILED, EXIT_USAGE, EXIT_UNSAFE, EXIT_NOT_KNOWN = 0, 1, 2, 3, 4
@@ -59,6 +62,7 @@ examples:
   python launch.py --mission A --obstacles 2        two obstacles on the way
   python launch.py --rate 4 --no-hmi --json         four times real time, result as JSON
   python launch.py --hmi-host 0.0.0.0               the page for other machines too, with a token
+  python launch.py --hmi-token-file FILE            the page for others, with a token of yours
   python launch.py --record run.mcap                keep everything that is said; `rampart replay`
   python launch.py --no-ftm                         the paper's baseline, without fault tolerance
   python launch.py --joystick                       drive by hand: hold the left shoulder button
@@ -72,7 +76,8 @@ while it runs, from another shell:
   rampart inject localization-not-updated           inject one of the paper's faults
   rampart status                                    what the robot and its nodes are doing
 exit code: 0 success and safe, 1 mission failed but safe, 2 bad usage or spec, 3 unsafe,
-4 safety not known: no ground truth ever came
+4 safety not known: no ground truth ever came. A report that cannot be written and output that
+nobody reads change none of them; with --json, "report_error" says why there is no "report"
 """
 
 
@@ -110,9 +115,11 @@ def parser() -> argparse.ArgumentParser:
                    help="address of the operator's page (default: 127.0.0.1, this machine only). "
                    "Any other makes it need a token, which is printed with the page's address "
                    "when the run starts")
-    p.add_argument("--hmi-token", metavar="TOKEN", default="",
-                   help="that token, 16 characters or more, to keep it over several runs "
-                   "(default: a random one; on this machine none is needed)")
+    p.add_argument("--hmi-token-file", metavar="FILE", default="",
+                   help="a file of yours, of mode 0600, with that token, 16 characters or more, to "
+                   f"keep it over several runs; or set {TOKEN_VARIABLE} to it (default: a random "
+                   "one; for yourself on this machine none is needed)")
+    p.add_argument("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS)  # refused
     p.add_argument("--port", metavar="PORT", type=int, default=DEFAULT_PORT,
                    help="number that tells runs on this machine apart; no port is opened "
                    f"(default: {DEFAULT_PORT})")
@@ -230,28 +237,45 @@ class Run:
         finally:
             self._console.close()
             if recording is not None:
-                print(f"launch.py: {recording.close()}", file=sys.stderr)
+                _say(recording.close())
         self._console.speed(result.speed, result.messages, result.trace)
         for name, error in result.failures:
-            print(f"launch.py: {name} failed: {error}", file=sys.stderr)
+            _say(f"{name} failed: {one_line(error)}")
         if result.tracebacks:
-            with Path(self._plan.error_log).open("a", encoding="utf-8") as log:
-                log.write(result.tracebacks)
+            try:
+                with Path(self._plan.error_log).open("a", encoding="utf-8") as log:
+                    log.write(result.tracebacks)
+            except OSError as error:
+                _say(f"{self._plan.error_log}: tracebacks are lost: {in_words(error)}")
         return self._conclude(result.record, trace=result.trace)
 
     def _conclude(self, record: RunRecord, **more: str) -> int:
-        html, data = write_report(record, self._directory)
-        self._console.conclusion(record, html)
+        """Tell what came of the run; no disk and no reader that fails changes the verdict."""
+        report = try_report(record, self._directory)
+        self._console.conclusion(record, report.html)
+        if report.problem:
+            _say(f"report: {report.problem}")
         for fault in record.faults:
             if not fault.effective:
-                print(f"launch.py: fault {fault.fault} had no effect: {fault.reason}",
-                      file=sys.stderr)
+                _say(f"fault {fault.fault} had no effect: {one_line(fault.reason)}")
         if self._options.json:
-            print(json.dumps(summary(record, report=str(html), record=str(data), **more)),
-                  flush=True)
+            _print_result(summary(
+                record, report=str(report.html) if report.html else None,
+                record=str(report.data) if report.data else None,
+                report_error=report.problem or None, **more))
         if record.safety != "safe":
             return EXIT_UNSAFE if record.safety == "unsafe" else EXIT_NOT_KNOWN
         return EXIT_SUCCESS if record.mission == "success" else EXIT_FAILED
+
+
+def _say(text: str) -> None:
+    print("launch.py: " + " ".join(text.split()), file=sys.stderr, flush=True)
+
+
+def _print_result(result: dict[str, Any]) -> None:
+    print(json.dumps(result), flush=True)
+    if why := streams.lost_result():
+        _say(f"stdout: {why}: the result is lost")
 
 
 @contextlib.contextmanager
@@ -269,15 +293,22 @@ def _kept(directory: Path) -> Iterator[None]:
     except OSError as error:
         raise UsageError(f"--report {directory}: no directory that can be written "
                          f"({error.strerror})") from None
-    before = log.stat().st_size if log.exists() else 0
+    before = _size(log)
     try:
         yield
     finally:
-        if log.exists() and log.stat().st_size > before:
-            print(f"launch.py: tracebacks of what failed: {log}", file=sys.stderr)
+        if _size(log) > before:
+            _say(f"tracebacks of what failed: {log}")
         if made:
             with contextlib.suppress(OSError):  # there is something in it
                 directory.rmdir()
+
+
+def _size(file: Path) -> int:
+    try:
+        return file.stat().st_size
+    except OSError:
+        return 0
 
 
 @contextlib.contextmanager
@@ -296,7 +327,7 @@ def _recorded(options: argparse.Namespace) -> Iterator[None]:
 
 
 def _interruptible(run: ProcessRun | WatchedRun) -> None:
-    """Have SIGINT and SIGTERM end a run in order; the second one is meant."""
+    """Have SIGINT, SIGTERM, and the end of the terminal, end a run; the second one is meant."""
 
     def interrupt(name: str) -> None:
         if run.interrupted:
@@ -304,9 +335,15 @@ def _interruptible(run: ProcessRun | WatchedRun) -> None:
             raise SystemExit(EXIT_FAILED)
         run.interrupted = f"interrupted by {name}"
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in _ends():
         asyncio.get_running_loop().add_signal_handler(
             number, interrupt, signal.Signals(number).name)
+
+
+def _ends() -> list[signal.Signals]:
+    """Return the signals that end a run; under nohup the end of the terminal does not."""
+    ends = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    return [number for number in ends if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 @contextlib.contextmanager
@@ -318,11 +355,7 @@ def _interruptible_between_bytecodes(run: VirtualRun) -> Iterator[None]:
             raise KeyboardInterrupt
         run.interrupted = f"interrupted by {signal.Signals(number).name}"
 
-    ends = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.getsignal(number) for number in ends}
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:  # as SIGHUP is under nohup
-            signal.signal(number, interrupt)
+    before = {number: signal.signal(number, interrupt) for number in _ends()}
     try:
         yield
     finally:
@@ -337,12 +370,14 @@ def _plan(options: argparse.Namespace) -> tuple[RunPlan, SystemSpec]:
         what = "is a directory" if system_file.is_dir() else "no such file"
         raise UsageError(f"--system {options.system}: {what}; a spec is right, or the name of a "
                          f"shipped one: {systems.names()}")
+    token, token_is_new = _token(options)
     plan = RunPlan(
         run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
         airport="", mission="", obstacles=options.obstacles, ftm=not options.no_ftm,
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
-        joystick=_joystick(options), hmi_host=options.hmi_host, hmi_token=_token(options),
+        joystick=_joystick(options), hmi_host=options.hmi_host, hmi_token=token,
+        hmi_token_is_new=token_is_new,
         faults=() if options.no_hmi else offered_faults(), waits=options.wait)
     spec = load_system(plan)
     return _fitting(options, plan, spec), spec
@@ -355,7 +390,7 @@ def _fitting(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> Ru
         UsageError: an option needs a node that the system has not.
     """
     if not _has_actor(plan, spec, HMI):
-        _refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token"),
+        _refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token_file"),
                 f"no node of {spec.name} serves an operator's page")
         plan = msgspec.structs.replace(plan, hmi_port=0)
     if options.joystick and not _has_actor(plan, spec, TELEOPERATION):
@@ -402,8 +437,8 @@ async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -
         _interruptible(run)
         await run.run()
     if options.json:
-        print(json.dumps(run.summary()), flush=True)
-    return EXIT_FAILED if run.launcher.failure else EXIT_SUCCESS
+        _print_result(run.summary())
+    return EXIT_FAILED if run.failure else EXIT_SUCCESS
 
 
 def _directory(options: argparse.Namespace, name: str) -> Path:
@@ -440,21 +475,32 @@ def _check(options: argparse.Namespace) -> None:
             raise UsageError(f"{option} {name}: unknown strategy; known: {', '.join(STRATEGIES)}")
 
 
-def _token(options: argparse.Namespace) -> str:
-    """Return what the operator's page asks for: the token given, or a new one where it needs it."""
+def _token(options: argparse.Namespace) -> tuple[str, bool]:
+    """Return what the operator's page asks for, and whether it is new and has to be printed.
+
+    It comes from a file or the environment, which other users cannot read as they can read a
+    command line; where none is given and one is needed it is made.
+    """
     host: str = options.hmi_host
-    token: str = options.hmi_token
+    own = os.environ.pop(TOKEN_VARIABLE, "")  # not for whatever is started
+    if options.hmi_token is not None:
+        raise UsageError("--hmi-token: a command line is read by every user of this machine; put "
+                         "another token into a file of mode 0600 for --hmi-token-file FILE, or "
+                         f"into the variable {TOKEN_VARIABLE}")
     if options.no_hmi or options.virtual:
         if options.wait:
             raise UsageError("--wait: the mission is started from the operator's page, which there "
                              f"is not with --{'no-hmi' if options.no_hmi else 'virtual'}")
-        return ""
-    if not token and not is_loopback(host):
-        token = new_token()
+        return "", False
+    source = TOKEN_VARIABLE
     try:
+        if options.hmi_token_file:
+            source = f"--hmi-token-file {options.hmi_token_file}"
+            own = read_secret(Path(options.hmi_token_file))
+        token = own or ("" if is_loopback(host) else new_token())
         Access(host, options.hmi_port, token)
-    except AccessError as error:
-        raise UsageError(f"--hmi-token: {error}") from None
+    except (AccessError, SecretError) as error:
+        raise UsageError(f"{source}: {error}") from None
     try:
         family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, number) as probe:
@@ -463,7 +509,7 @@ def _token(options: argparse.Namespace) -> str:
         why = getattr(error, "strerror", None) or str(error)
         raise UsageError(f"--hmi-host {host}: no address of this machine ({why}); 0.0.0.0 stands "
                          "for all it has") from None
-    return token
+    return token, bool(token) and not own
 
 
 def _joystick(options: argparse.Namespace) -> str:
@@ -478,7 +524,7 @@ def _joystick(options: argparse.Namespace) -> str:
         raise UsageError(f"--joystick {name}: neither a device nor a FIFO; joysticks are "
                          "/dev/input/js0, /dev/input/js1 …")
     if not device.exists():
-        print(f"launch.py: --joystick {name}: not there yet, waiting for it", file=sys.stderr)
+        _say(f"--joystick {name}: not there yet, waiting for it")
     return str(device.resolve())
 
 
@@ -489,6 +535,7 @@ def _existing_path(name: str) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line, run, and return the exit code."""
+    streams.secure()
     options = parser().parse_args(arguments)
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
@@ -499,12 +546,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         run = Run(options, plan, spec)
         return run.in_virtual_time() if options.virtual else run.on_processes()
     except (UsageError, LaunchError, BagError, ValueError, OSError) as error:
-        print("launch.py: " + " ".join(str(error).split()), file=sys.stderr)
+        _say(str(error))
         return EXIT_USAGE
     except KeyboardInterrupt:
         return EXIT_FAILED
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(BrokenPipeError):
-        sys.exit(main())
+    sys.exit(main())

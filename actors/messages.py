@@ -3,12 +3,36 @@
 Header data (source, incarnation, sequence, stamp) is not in these structs: the bus puts it
 round them (see `actors.runtime.envelope`). Angles are in (-pi, pi], x forward, y left, yaw
 counter-clockwise. A field named `*_f32` is a little-endian float32 array as bytes.
+
+Every field but a measurement or a command is bounded, by the types of `actors.runtime.bounds`: a
+payload beyond the bounds never reaches an actor. Those that are plain `float` may be anything, NaN
+and infinity included: to judge them is the business of whoever reads them.
 """
 
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Annotated
 
+import msgspec
+
+from actors.runtime.bounds import (
+    MANY,
+    MOST,
+    Count,
+    Document,
+    Duration,
+    Explained,
+    Floats32,
+    Incarnation,
+    Lasting,
+    Name,
+    Names,
+    Pid,
+    Seconds,
+    Text,
+    Texts,
+)
 from actors.runtime.messages import (  # noqa: F401
     Diagnostic,
     Heartbeat,
@@ -72,7 +96,7 @@ class LaserScan(Message, frozen=True):
     angle_min_rad: float
     angle_increment_rad: float
     range_max_m: float
-    ranges_f32: bytes
+    ranges_f32: Floats32
     reference_m: float = -1.0
 
 
@@ -96,7 +120,7 @@ class BrakeCommand(Message, frozen=True):
     """
 
     engaged: bool
-    reason: str
+    reason: Text
 
 
 class BaseStatus(Message, frozen=True):
@@ -126,12 +150,15 @@ class Goal(Message, frozen=True):
     mode: Mode
 
 
+Goals = Annotated[tuple[Goal, ...], msgspec.Meta(max_length=MANY)]
+
+
 class MissionRequest(Message, frozen=True):
     """A mission for the Mission Manager. The same `mission_id` twice is one mission."""
 
-    mission_id: str
-    name: str
-    goals: tuple[Goal, ...]
+    mission_id: Name
+    name: Name
+    goals: Goals
 
 
 class MissionPhase(StrEnum):
@@ -157,10 +184,14 @@ class LightVerdict(StrEnum):
 class LightMeasurement(Message, frozen=True):
     """One light measured in passing."""
 
-    light: str
+    light: Name
     intensity_cd: float
     ratio: float
     verdict: LightVerdict
+
+
+_Lights = Annotated[tuple[LightMeasurement, ...], msgspec.Meta(max_length=MOST)]
+_LightNames = Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST)]
 
 
 class MissionAction(StrEnum):
@@ -180,19 +211,24 @@ class MissionOrder(Message, frozen=True):
     `by` is who asks, `reason` why: both are kept with what comes of it.
     """
 
-    order: str
+    order: Name
     action: MissionAction
-    reason: str
-    by: str
+    reason: Text
+    by: Name
 
 
 class MissionOrderAnswer(Message, frozen=True):
     """Whether an order was obeyed, and why not; `plan` is the number of the plan it led to."""
 
-    order: str
+    order: Name
     accepted: bool
-    reason: str
-    plan: int = 0
+    reason: Text
+    plan: Count = 0
+
+
+_StepTimes = Annotated[tuple[Seconds, ...], msgspec.Meta(max_length=MANY)]
+_Steps = Annotated[tuple[Count, ...], msgspec.Meta(max_length=MANY)]
+_Actions = Annotated[tuple[MissionAction, ...], msgspec.Meta(max_length=16)]
 
 
 class MissionStatus(Message, frozen=True):
@@ -203,17 +239,17 @@ class MissionStatus(Message, frozen=True):
     be obeyed now.
     """
 
-    mission_id: str
-    name: str
+    mission_id: Name
+    name: Name
     phase: MissionPhase
-    step: int
-    goals: tuple[Goal, ...]
-    step_times_s: tuple[float, ...]
-    lights: tuple[LightMeasurement, ...]
-    reason: str
-    skipped: tuple[int, ...] = ()
-    unmeasured: tuple[str, ...] = ()
-    orders: tuple[MissionAction, ...] = ()
+    step: Count
+    goals: Goals
+    step_times_s: _StepTimes
+    lights: _Lights
+    reason: Text
+    skipped: _Steps = ()
+    unmeasured: _LightNames = ()
+    orders: _Actions = ()
 
 
 class GoalOrder(Message, frozen=True):
@@ -222,11 +258,14 @@ class GoalOrder(Message, frozen=True):
     On the way home `step` is the number of goals. `plan` grows with each wish for another plan.
     """
 
-    mission_id: str
-    step: int
+    mission_id: Name
+    step: Count
     goal: Goal
     active: bool
-    plan: int = 0
+    plan: Count = 0
+
+
+_Waypoints = Annotated[tuple[tuple[float, float], ...], msgspec.Meta(max_length=MOST)]
 
 
 class Route(Message, frozen=True):
@@ -235,13 +274,13 @@ class Route(Message, frozen=True):
     `plan` is that of the goal it was made for. Of a way round something blocked the reason says so.
     """
 
-    mission_id: str
-    step: int
+    mission_id: Name
+    step: Count
     mode: Mode
     active: bool
-    waypoints: tuple[tuple[float, float], ...]
-    reason: str
-    plan: int = 0
+    waypoints: _Waypoints
+    reason: Text
+    plan: Count = 0
 
 
 class ControlPhase(StrEnum):
@@ -259,7 +298,10 @@ class Blockage(Message, frozen=True):
 
     x_m: float
     y_m: float
-    since_s: float
+    since_s: Seconds
+
+
+_Blockages = Annotated[tuple[Blockage, ...], msgspec.Meta(max_length=MANY)]
 
 
 class ControlStatus(Message, frozen=True):
@@ -274,15 +316,15 @@ class ControlStatus(Message, frozen=True):
     learnt.
     """
 
-    mission_id: str
-    step: int
+    mission_id: Name
+    step: Count
     phase: ControlPhase
-    waypoint: int
+    waypoint: Count
     distance_to_go_m: float
-    blocked: tuple[Blockage, ...] = ()
-    reason: str = ""
-    unmeasured: tuple[str, ...] = ()
-    back_to: tuple[tuple[float, float], ...] = ()
+    blocked: _Blockages = ()
+    reason: Text = ""
+    unmeasured: _LightNames = ()
+    back_to: _Waypoints = ()
     passing: bool = False
     aside_m: float = 0.0
     turn_added_radps: float = 0.0
@@ -295,8 +337,8 @@ class LocalizationStatus(Message, frozen=True):
     independent sources last agreed on the position.
     """
 
-    in_use: tuple[str, ...]
-    excluded: tuple[tuple[str, str], ...]
+    in_use: Names
+    excluded: Explained
     position_sd_m: float
     heading_sd_rad: float
     bridged_m: float
@@ -329,7 +371,7 @@ class PilotOrder(Message, frozen=True):
 
     engaged: bool
     mode: PilotMode
-    reason: str
+    reason: Text
     top_speed_mps: float = 0.0
 
 
@@ -342,10 +384,20 @@ class PilotStatus(Message, frozen=True):
 
     mode: PilotMode
     stopped: bool
-    reason: str
-    refused_commands: int
+    reason: Text
+    refused_commands: Count
     top_speed_mps: float = 0.0
-    forbids: str = ""
+    forbids: Text = ""
+
+
+class Holds(Message, frozen=True):
+    """Who holds the brake, or an order to the pilot, and is no recovery module of the system.
+
+    `what` is held; `holders` are obeyed until they let go, or an operator does for them.
+    """
+
+    what: Name
+    holders: Names
 
 
 class DetectionState(StrEnum):
@@ -359,9 +411,9 @@ class DetectionReport(Message, frozen=True):
     """State of one detection module; `nodes` names the failed nodes where that is the subject."""
 
     state: DetectionState
-    reason: str
-    nodes: tuple[str, ...]
-    since_s: float
+    reason: Text
+    nodes: Names
+    since_s: Seconds
 
 
 class RecoveryState(StrEnum):
@@ -385,9 +437,9 @@ class RecoveryCommand(Message, frozen=True):
     """The manager's wish for one recovery module, repeated until it is reported fulfilled."""
 
     activate: bool
-    decision: int
-    nodes: tuple[str, ...]
-    reason: str
+    decision: Count
+    nodes: Names
+    reason: Text
 
 
 class RecoveryReport(Message, frozen=True):
@@ -395,21 +447,21 @@ class RecoveryReport(Message, frozen=True):
 
     state: RecoveryState
     phase: RecoveryPhase
-    decision: int
-    reason: str
+    decision: Count
+    reason: Text
 
 
 class DecisionRecord(Message, frozen=True):
     """A decision with its certificate: rule is the block 1 to 4 of safety-first, 0 for no fault."""
 
-    decision: int
-    strategy: str
-    active: tuple[str, ...]
-    rule: int
-    recoveries: tuple[str, ...]
-    path: tuple[str, ...]
-    rejected: tuple[tuple[str, str], ...]
-    detected_s: float
+    decision: Count
+    strategy: Name
+    active: Names
+    rule: Count
+    recoveries: Names
+    path: Texts
+    rejected: Explained
+    detected_s: Seconds
 
 
 class AdaptationRequest(Message, frozen=True):
@@ -418,76 +470,79 @@ class AdaptationRequest(Message, frozen=True):
     `values` is a JSON object. The answer carries the same `request`.
     """
 
-    request: str
-    action: str
-    name: str
-    values: str
-    by: str
+    request: Name
+    action: Name
+    name: Name
+    values: Document
+    by: Name
 
 
 class AdaptationAnswer(Message, frozen=True):
     """Whether a change was made, and why not; `version` counts the changes made in this run."""
 
-    request: str
+    request: Name
     accepted: bool
-    reason: str
-    version: int
+    reason: Text
+    version: Count
 
 
 class AdaptedSystem(Message, frozen=True):
     """The system as it was changed; `document` is its whole spec as a JSON object."""
 
-    version: int
-    change: str
-    by: str
-    document: str
+    version: Count
+    change: Text
+    by: Name
+    document: Document
 
 
 class StubTrigger(Message, frozen=True):
     """Makes the stand-in for detection module `name` active or idle."""
 
-    name: str
+    name: Name
     active: bool
-    reason: str
+    reason: Text
 
 
 class ShadowRecord(Message, frozen=True):
     """A decision that the strategy in shadow would have taken instead of decision `decision`."""
 
-    decision: int
-    strategy: str
-    active: tuple[str, ...]
-    rule: int
-    recoveries: tuple[str, ...]
-    taken: tuple[str, ...]
+    decision: Count
+    strategy: Name
+    active: Names
+    rule: Count
+    recoveries: Names
+    taken: Names
 
 
 class DetectionView(Message, frozen=True):
     """What the manager believes about a detection module (it holds a flapping one active)."""
 
-    name: str
+    name: Name
     active: bool
-    reason: str
-    nodes: tuple[str, ...]
+    reason: Text
+    nodes: Names
+
+
+_Views = Annotated[tuple[DetectionView, ...], msgspec.Meta(max_length=MANY)]
 
 
 class ManagerStatus(Message, frozen=True):
     """The manager's view, and by its regularity the proof that it lives."""
 
-    active: tuple[str, ...]
-    silent: tuple[str, ...]
-    activated: tuple[str, ...]
-    latched: tuple[str, ...]
-    strategy: str
-    decision: int
-    detections: tuple[DetectionView, ...] = ()
+    active: Names
+    silent: Names
+    activated: Names
+    latched: Names
+    strategy: Name
+    decision: Count
+    detections: _Views = ()
 
 
 class Reset(Message, frozen=True):
     """Operator's word to release a latched recovery, e.g. the emergency stop."""
 
-    recovery: str
-    by: str
+    recovery: Name
+    by: Name
 
 
 # ---- runtime and supervision -----------------------------------------------------------------
@@ -507,38 +562,41 @@ class NodeState(StrEnum):
 class NodeInfo(Message, frozen=True):
     """One row of the supervisor's table."""
 
-    name: str
-    kind: str
-    pid: int
+    name: Name
+    kind: Name
+    pid: Pid
     state: NodeState
-    incarnation: int
-    restarts: int
+    incarnation: Incarnation
+    restarts: Count
+
+
+_Rows = Annotated[tuple[NodeInfo, ...], msgspec.Meta(max_length=MANY)]
 
 
 class NodeTable(Message, frozen=True):
     """All nodes of the system."""
 
-    nodes: tuple[NodeInfo, ...]
+    nodes: _Rows
 
 
 class RespawnRequest(Message, frozen=True):
     """A wish of a recovery module or the manager: kill a process, if it lives, and restart it."""
 
-    request: int
-    node: str
-    failed_incarnation: int
-    by: str
+    request: Count
+    node: Name
+    failed_incarnation: Incarnation
+    by: Name
 
 
 class ProcessEvent(Message, frozen=True):
     """Something happened to a process: crashed, stopped, wedged, respawned, refused, given up."""
 
-    node: str
-    event: str
-    pid: int
-    incarnation: int
-    by: str
-    detail: str
+    node: Name
+    event: Name
+    pid: Pid
+    incarnation: Incarnation
+    by: Name
+    detail: Text
 
 
 # ---- world: for the judge and the tests, never for the controller ----------------------------
@@ -549,8 +607,8 @@ class GroundTruth(Message, frozen=True):
 
     pose: Pose
     twist: Twist
-    collisions: int
-    prohibited_s: float
+    collisions: Count
+    prohibited_s: Duration
     obstacle_clearance_m: float
     prohibited_clearance_m: float
     real_time_factor: float
@@ -559,11 +617,14 @@ class GroundTruth(Message, frozen=True):
 class ObstacleCommand(Message, frozen=True):
     """Makes a named obstacle of the airport appear at (x, y) in `map`, or go away."""
 
-    name: str
+    name: Name
     present: bool
     x_m: float
     y_m: float
     radius_m: float
+
+
+_Obstacles = Annotated[tuple[ObstacleCommand, ...], msgspec.Meta(max_length=MANY)]
 
 
 class ActuatorFaultKind(StrEnum):
@@ -583,11 +644,15 @@ class ActuatorFault(Message, frozen=True):
     it. `InjectionReport.affected` counts the 10 ms ticks in which the fault changed something.
     """
 
-    injection: str
+    injection: Name
     kind: ActuatorFaultKind
-    wheel: str
+    wheel: Name
     strength: float
-    duration_s: float
+    duration_s: Lasting
+
+
+_ActuatorFaults = Annotated[tuple[ActuatorFault, ...], msgspec.Meta(max_length=64)]
+_Injections = Annotated[tuple[Injection, ...], msgspec.Meta(max_length=64)]
 
 
 class NamedFault(Message, frozen=True):
@@ -597,15 +662,15 @@ class NamedFault(Message, frozen=True):
     orders are filled in when it is ordered.
     """
 
-    name: str
-    title: str
-    group: str
-    duration_s: float
-    injections: tuple[Injection, ...] = ()
-    actuator_faults: tuple[ActuatorFault, ...] = ()
+    name: Name
+    title: Text
+    group: Name
+    duration_s: Lasting
+    injections: _Injections = ()
+    actuator_faults: _ActuatorFaults = ()
 
 
 class ObstacleList(Message, frozen=True):
     """The obstacles that are there now, for the map on the operator's page."""
 
-    obstacles: tuple[ObstacleCommand, ...]
+    obstacles: _Obstacles

@@ -64,6 +64,9 @@ PILOT_ORDER = Topic("pilot/order/{name}", m.PilotOrder, Qos.STATE, 5, "",
                     "Order of the recovery module {name} to the Safety Pilot.")
 PILOT_STATUS = Topic("pilot/status", m.PilotStatus, Qos.STATE, 5, "",
                      "What the Safety Pilot does, and why.")
+HOLDS = Topic("holds/{name}", m.Holds, Qos.STATE, 5, "",
+              "Who makes {name} stand and is no recovery module of the system; silent while "
+              "nobody does. `rampart reset` lets go in its place.")
 DETECTION = Topic("detection/{name}", m.DetectionReport, Qos.STATE, 5, "",
                   "State of detection module {name}.")
 RECOVERY_COMMAND = Topic("recovery/{name}/command", m.RecoveryCommand, Qos.STATE, 5, "",

@@ -56,16 +56,16 @@ class AirportDrawing(msgspec.Struct, frozen=True):
     start: tuple[float, float]
 
 
-def draw(airport: Airport) -> AirportDrawing:
-    """Return the drawing of an airport."""
+def draw(airport: Airport, tolerance_m: float = 0.02) -> AirportDrawing:
+    """Return the drawing of an airport; what is rounder than the tolerance has more points."""
     x0, y0, x1, y1 = airport.bounds_m
     return AirportDrawing(
         name=airport.name,
         bounds_m=(x0 - FRAME_M, y0 - FRAME_M, x1 + FRAME_M, y1 + FRAME_M),
-        prohibited=svg_path(airport.prohibited_polygon(FRAME_M)),
-        surfaces=tuple((s.kind, svg_path(s.polygon)) for s in sorted(
+        prohibited=svg_path(airport.prohibited_polygon(FRAME_M), tolerance_m),
+        surfaces=tuple((s.kind, svg_path(s.polygon, tolerance_m)) for s in sorted(
             airport.surfaces, key=lambda surface: surface.kind == "runway")),
-        buildings=tuple((b.name, svg_path(b.polygon)) for b in airport.buildings),
+        buildings=tuple((b.name, svg_path(b.polygon, tolerance_m)) for b in airport.buildings),
         nodes={name: (float(x), float(y)) for name, (x, y) in airport.nodes.items()},
         edges=tuple((*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges),
         lights=tuple(DrawnLight(light.name, light.row, light.x_m, light.y_m, light.nominal_cd)
@@ -74,13 +74,13 @@ def draw(airport: Airport) -> AirportDrawing:
     )
 
 
-def svg_path(shape: Any) -> str:
+def svg_path(shape: Any, tolerance_m: float = 0.02) -> str:
     """Return SVG path data, in metres, of a shapely geometry made of polygons.
 
     Parts without area (a union may leave lines) are not drawn.
     """
     rings: list[str] = []
-    for part in shapely.get_parts(shapely.simplify(shape, 0.02)):
+    for part in shapely.get_parts(shapely.simplify(shape, tolerance_m)):
         if part.geom_type != "Polygon" or part.is_empty:
             continue
         rings += [_ring(ring) for ring in (part.exterior, *part.interiors)]

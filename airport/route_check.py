@@ -23,6 +23,9 @@ from airport.model import Airport
 Point = tuple[float, float]
 Points = npt.NDArray[np.float64]
 
+_ABSURD_M = 1e7
+"""No coordinate is as large."""
+
 
 @dataclass(frozen=True, slots=True)
 class RouteLimits:
@@ -79,8 +82,8 @@ class RouteCheck:
         """
         if not waypoints:
             return "the route has no waypoints"
-        if not all(map(math.isfinite, itertools.chain.from_iterable(waypoints))):
-            return "a waypoint is not finite"
+        if not all(abs(value) < _ABSURD_M for value in itertools.chain.from_iterable(waypoints)):
+            return "a waypoint is not finite, or farther away than anything can be"
         limits = self._limits
         if goal is not None and not math.dist(waypoints[-1], goal) <= limits.end_m:
             return (f"the route ends at {_show(waypoints[-1])},"

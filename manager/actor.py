@@ -21,6 +21,7 @@ import msgspec
 from actors import messages as m
 from actors import topics
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import DOCUMENT_CHARS, clip
 from actors.runtime.checkpoint import StateFormat
 from actors.runtime.topic import Topic
 from actors.runtime.wiring import load_class
@@ -116,8 +117,9 @@ class FtmManager(Actor):
 
     @on(topics.RESET)
     def reset(self, message: m.Reset, _header: Header) -> None:
-        """Hear the operator release a latched recovery."""
-        self._step(ResetAsked(message.recovery, message.by))
+        """Hear the operator release a latched recovery; strangers are let go by who obeys them."""
+        if any(recovery.name == message.recovery for recovery in self._system.recoveries):
+            self._step(ResetAsked(message.recovery, message.by))
 
     @on(topics.ADAPT)
     def adapt(self, message: m.AdaptationRequest, _header: Header) -> None:
@@ -129,7 +131,7 @@ class FtmManager(Actor):
         except Exception as error:  # whatever was typed, this manager guards a robot
             reason = " ".join(str(error).split()) or type(error).__name__
         self.publish(topics.ADAPTATION, m.AdaptationAnswer(
-            message.request, not reason, reason, self._version))
+            message.request, not reason, clip(reason), self._version))
 
     @every(1.0)
     def repeat_system(self) -> None:
@@ -169,6 +171,10 @@ class FtmManager(Actor):
         if busy:
             return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"
         check_modules(self._system, system)
+        text = msgspec.json.encode(document).decode()
+        if len(text) > DOCUMENT_CHARS:
+            return (f"the system would have {len(text)} characters, at most {DOCUMENT_CHARS} are "
+                    "right")
         for detection in system.detections:
             load_class(detection.actor, topics.DETECTION)
         for recovery in system.recoveries:
@@ -178,7 +184,7 @@ class FtmManager(Actor):
         self._arbiter, self._document, self._system = arbiter, document, system
         self._strategy = system.strategy
         self._adapted = m.AdaptedSystem(
-            self._version + 1, describe(change), by, msgspec.json.encode(document).decode())
+            self._version + 1, clip(describe(change)), by, text)
         self.publish(topics.ADAPTED_SYSTEM, self._adapted)
         self._step(Tick())
         return ""
@@ -223,14 +229,15 @@ class FtmManager(Actor):
 
     def _command(self, command: Command) -> None:
         self.publish(topics.RECOVERY_COMMAND, m.RecoveryCommand(
-            command.activate, command.decision, command.nodes, command.reason),
+            command.activate, command.decision, command.nodes, clip(command.reason)),
             name=command.recovery)
 
     def _publish_decision(self, made: DecisionMade) -> None:
         decision = self._arbiter.explain(made)  # the commands are on their way already
         self.publish(topics.DECISION, m.DecisionRecord(
             made.number, self._strategy, decision.active, decision.rule, decision.recoveries,
-            decision.path, decision.rejected, made.detected_s))
+            tuple(map(clip, decision.path)),
+            tuple((name, clip(why)) for name, why in decision.rejected), made.detected_s))
 
     def _status(self) -> m.ManagerStatus:
         state = self.arbiter_state

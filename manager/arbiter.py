@@ -69,8 +69,9 @@ __all__ = [
 ]
 
 
-LARGEST_NUMBER = 1 << 53
-"""A decision number beyond it was never given, whoever reports or remembers it."""
+LARGEST_NUMBER = 1 << 52
+"""A decision number beyond it was never given, whoever reports or remembers it. What may follow
+still fits into a message (`actors.runtime.bounds.Count`)."""
 
 _is_at_rest = attrgetter("is_at_rest")
 

@@ -22,8 +22,11 @@ from manager.gates import detection_gate, recovery_gate
 from manager.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
 from manager.order import PartialOrder, Tree, refine
 
-OptionalName = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z][A-Za-z0-9_]{0,99})?\Z")]
-Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,99}\Z")]
+OptionalName = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z][A-Za-z0-9_]{0,63})?\Z")]
+Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
+"""As long as the address of a node's socket has room for (`actors.runtime.run_folder`), and well
+below what a message takes as a name (`actors.runtime.bounds`), which may add to it."""
+
 ClassPath = Annotated[str, msgspec.Meta(pattern=r"^[a-z_]\w*(\.[a-z_]\w*)*:[A-Z]\w*\Z")]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]

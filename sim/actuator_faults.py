@@ -31,11 +31,19 @@ from dataclasses import dataclass
 from typing import Any
 
 from actors.messages import ActuatorFault, ActuatorFaultKind
+from actors.runtime.limits import Remembered
 from sim.robot import WHEEL_NAMES, WHEEL_RADIUS_M, DriveLimits, WheelSpeeds
 from sim.scene import WorldError
 
 STANDING_RADPS = 0.05
 """A wheel slower than this, 6 mm/s at its tread, stands: there is nothing to brake or to block."""
+
+
+MAX_IN_FORCE = 64
+"""Faults at a time."""
+
+_REMEMBERED = 256
+"""Faults that are over, of which the count is told again when somebody asks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +125,7 @@ class ActuatorFaults:
     def __init__(self, motor: Motor) -> None:
         self._motor = motor
         self._in_force: dict[str, _InForce] = {}
-        self._over: dict[str, int] = {}
+        self._over: Remembered[str, int] = Remembered(_REMEMBERED)
         self._news: list[FaultNews] = []
         self._weigh()
 
@@ -132,7 +140,8 @@ class ActuatorFaults:
         Ending one that is over already repeats the news of its end.
 
         Raises:
-            WorldError: a value is impossible, or a fault to be ended was never in force.
+            WorldError: a value is impossible, a fault to be ended was never in force, or there are
+                too many.
         """
         injection = order.injection
         if not order.duration_s >= 0:
@@ -151,6 +160,8 @@ class ActuatorFaults:
         if order.kind != ActuatorFaultKind.BRAKE_FAILURE and order.wheel not in WHEEL_NAMES:
             raise WorldError(f"wheel = {order.wheel!r}: must be one of {', '.join(WHEEL_NAMES)}")
         before = self._in_force.get(injection)
+        if before is None and len(self._in_force) >= MAX_IN_FORCE:
+            raise WorldError(f"{MAX_IN_FORCE} faults are in force; wait for one to end")
         affected_ticks = before.affected_ticks if before else 0
         self._in_force[injection] = _InForce(order, now_s + order.duration_s, affected_ticks)
         self._weigh()

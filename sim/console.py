@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -21,6 +23,9 @@ from actors.messages import (
     ShadowRecord,
 )
 from actors.runtime.actor import Header
+from actors.runtime.bounds import MANY, MOST, clip
+from actors.runtime.limits import RateLimit, Remembered
+from actors.runtime.plain_text import LINE_CHARS, printable
 from actors.runtime.topic import Topic
 from actors.supervision.run_plan import SUPERVISOR, RunPlan
 from airport.model import Mission
@@ -34,17 +39,37 @@ _EXAMPLE = "osmosis_control"
 _QUIET_EVENTS = frozenset({"started", "running", "adopted"})
 
 
-class Console:
-    """Writes the story of a run to a stream as it happens."""
+REPORTS_PER_S = 10
+"""Error reports shown in a real second."""
 
-    def __init__(self, stream: TextIO) -> None:
+LINES_PER_S = 50
+"""Other lines shown in a real second."""
+
+
+class Console:
+    """Writes the story of a run to a stream as it happens.
+
+    What it is told comes from the bus, and from anybody: each line is made printable and clipped,
+    and of more lines than can be read the number is told instead. In virtual time nobody else is
+    there, and a second may be a whole mission: there all lines are shown.
+
+    Args:
+        stream: where to.
+        clock: real seconds.
+    """
+
+    def __init__(self, stream: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
         self._stream = stream
+        self._clock = clock
+        self._is_limited = True
+        self._reports = RateLimit(REPORTS_PER_S)
+        self._others = RateLimit(LINES_PER_S)
         self._live = stream.isatty()
         self._live_text = ""
         self._step = -1
         self._phase: MissionPhase | None = None
-        self._lights: dict[str, LightVerdict] = {}
-        self._detections: dict[str, DetectionState] = {}
+        self._lights: dict[str, LightVerdict] = Remembered(MOST)
+        self._detections: dict[str, DetectionState] = Remembered(MANY)
         self._silent: tuple[str, ...] = ()
         self._mission: MissionStatus | None = None
         self._pilot = ""
@@ -58,7 +83,7 @@ class Console:
         self._print(f"Rampart: mission {mission.name} ({len(mission.goals)} goals) on {airport}, "
                     f"{mode}, rate {plan.rate:g}")
         if plan.hmi_port:
-            self._print(f"Operator's page: {plan.hmi_page}")
+            self._print(f"Operator's page: {plan.hmi_page_to_open}")
         comes_back = [node.name for node in spec.nodes if node.respawn != SUPERVISOR]
         if comes_back:
             example = _EXAMPLE if _EXAMPLE in comes_back else comes_back[0]
@@ -68,6 +93,7 @@ class Console:
         self, airport: str, mission: Mission, plan: RunPlan, strategy: str
     ) -> None:
         """Say what is about to run in virtual time."""
+        self._is_limited = False
         mode = strategy if plan.ftm else "no fault tolerance"
         self._print(f"Rampart: mission {mission.name} ({len(mission.goals)} goals) on {airport}, "
                     f"{mode}, virtual time, seed {plan.seed}")
@@ -79,6 +105,7 @@ class Console:
     def take(self, _topic: Topic[Any], message: Any, header: Header) -> None:
         """Take one message of the run."""
         at = header.stamp
+        self._tell_left_out(at)
         if isinstance(message, MissionStatus):
             self._take_mission(message, at)
         elif isinstance(message, ProcessEvent):
@@ -101,28 +128,40 @@ class Console:
                           f"{' and '.join(message.recoveries) or 'nothing'}")
         elif isinstance(message, Diagnostic):
             self.line(at, f"{message.node}: {message.context}: {message.reason} "
-                      f"[{message.offender}]")
+                      f"[{message.offender}]", self._reports)
         elif isinstance(message, PilotStatus):
             self._pilot = message.reason if message.stopped else ""
         elif isinstance(message, GroundTruth):
             self._show_live(message, at)
 
-    def line(self, at_s: float, text: str) -> None:
-        """Write one line with its simulated time."""
-        self._print(f"[{at_s:7.2f} s] {text}")
+    def line(self, at_s: float, text: str, limit: RateLimit | None = None) -> None:
+        """Write one line with its simulated time, unless there are too many of its kind."""
+        if not self._is_limited or (limit or self._others).allows(self._clock()):
+            self._print(f"[{at_s:7.2f} s] {clip(text, LINE_CHARS)}")
+
+    def _tell_left_out(self, at_s: float) -> None:
+        now_s = self._clock()
+        count = self._reports.left_out(now_s) + self._others.left_out(now_s)
+        if count:
+            self._print(f"[{at_s:7.2f} s] {count} more lines were left out")
+
+    def trouble(self, text: str) -> None:
+        """Write a line of what went wrong at no time of the run."""
+        self._print(f"launch.py: {' '.join(text.split())}")
 
     def close(self) -> None:
         """Take the live line away."""
         self._clear()
 
-    def conclusion(self, record: RunRecord, report: Path) -> None:
-        """Say how it ended."""
+    def conclusion(self, record: RunRecord, report: Path | None) -> None:
+        """Say how it ended, and where the report is, if there is one."""
         self._print(f"Mission {record.mission_name}: {record.mission}, {record.safety}, "
                     f"{record.duration_s:.1f} s simulated, {record.distance_m:.0f} m driven.")
         self._print(headline(record))
         for reason in record.reasons:
             self._print(f"  {reason}")
-        self._print(f"Report: {report}")
+        if report is not None:
+            self._print(f"Report: {report}")
 
     def _take_mission(self, status: MissionStatus, at: float) -> None:
         self._mission = status
@@ -163,7 +202,7 @@ class Console:
         unsafe = (truth.collisions, truth.prohibited_s > 0)
         if unsafe != self._unsafe:
             self._unsafe = unsafe
-            self.line(at, "UNSAFE: " + ("in the prohibited area" if unsafe[1] else "")
+            self._print(f"[{at:7.2f} s] UNSAFE: " + ("in the prohibited area" if unsafe[1] else "")
                       + (f" {unsafe[0]} collisions" if unsafe[0] else ""))
         if not self._live or at - self._last_live_s < 0.25:
             return
@@ -173,7 +212,7 @@ class Console:
         self._clear()
         text = (f"{at:7.1f} s  {step}  ({truth.pose.x_m:6.1f}, {truth.pose.y_m:6.1f})  "
                 f"{truth.twist.linear_mps:4.2f} m/s  {len(self._lights)} lights  {self._pilot}")
-        self._live_text = text[: shutil.get_terminal_size().columns - 1]
+        self._live_text = printable(text)[:shutil.get_terminal_size().columns - 1]
         self._stream.write(self._live_text)
         self._stream.flush()
 
@@ -184,5 +223,5 @@ class Console:
 
     def _print(self, text: str) -> None:
         self._clear()
-        self._stream.write(text + "\n")
+        self._stream.write(printable(text) + "\n")
         self._stream.flush()

@@ -22,6 +22,8 @@ from actors.messages import (
     Pose,
 )
 from actors.runtime.actor import Actor, Context, Header, on
+from actors.runtime.bounds import MANY
+from actors.runtime.limits import Remembered
 from actors.supervision.run_plan import SUPERVISOR
 from manager.specification import Kind, SystemSpec
 from sim.scenario import (
@@ -69,7 +71,7 @@ class _Planned:
     ids: tuple[str, ...] = ()
     obstacle: str = ""
     injected_s: float | None = None
-    affected: dict[str, int] = field(default_factory=dict)
+    affected: dict[str, int] = field(default_factory=lambda: Remembered(MANY))
     reason: str = ""
 
     def outcome(self) -> FaultOutcome:

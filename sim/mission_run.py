@@ -101,7 +101,7 @@ class MissionRun:
         return self.judge.verdict()
 
 
-def summary(record: RunRecord, /, **more: str) -> dict[str, Any]:
+def summary(record: RunRecord, /, **more: str | None) -> dict[str, Any]:
     """Return what scripts rely on: the last line of stdout with --json."""
     return {
         "mission": record.mission, "safety": record.safety, "reasons": list(record.reasons),

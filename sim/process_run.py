@@ -58,7 +58,11 @@ class ProcessRun:
             await self.launcher.start()
             return await self._observe()
         finally:
-            await self.launcher.end()
+            try:
+                await self.launcher.end()
+            except Exception as error:  # the verdict stands; the lifeline ends who is left
+                if self._mission.console:
+                    self._mission.console.trouble(f"at the end: {type(error).__name__}: {error}")
 
     async def _observe(self) -> RunRecord:
         launcher, mission = self.launcher, self._mission
@@ -74,15 +78,16 @@ class ProcessRun:
 
         bus = launcher.observers_bus()
         sinks: list[Sink] = [to_launcher, *mission.sinks(clock)]
-        register = register_of(plan.folder)
+        of_the_run: dict[str, Any] = {
+            "register": register_of(plan.folder), "members": frozenset(launcher.names)}
         actors: list[Actor] = [Observer(Context(
-            OBSERVER, 1, clock, bus, {}, {"sinks": sinks}, register=register))]
+            OBSERVER, 1, clock, bus, {}, {"sinks": sinks}, **of_the_run))]
         injector = None
         if self._scenario:
             shared = {"scenario": self._scenario, "hand": ProcessHand(plan.base_port),
                       "nodes": can_be_hit(self._spec), "topics": system_topics(self._spec)}
             injector = Injector(Context(
-                INJECTOR, 1, clock, SharedBus(bus), {}, shared, register=register))
+                INJECTOR, 1, clock, SharedBus(bus), {}, shared, **of_the_run))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         for task, actor in zip(tasks, actors, strict=True):

@@ -10,9 +10,9 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import msgspec
@@ -20,7 +20,8 @@ import msgspec
 from sim.clearance import EXACT_BELOW_M
 from sim.report_record import Interval, LightResult, RunRecord, RunRecorder
 
-__all__ = ["RunRecord", "RunRecorder", "render", "write_report"]
+__all__ = ["RunRecord", "RunRecorder", "Written", "in_words", "render", "try_report",
+           "write_report"]
 
 BELIEVED_APART_M = 1.0
 """Where localization reported the robot is drawn too if it was this far from the truth."""
@@ -43,13 +44,56 @@ def write_report(run: RunRecord, directory: str | Path) -> tuple[Path, Path]:
     Raises:
         OSError: the directory cannot be written.
     """
-    folder = Path(directory)
-    folder.mkdir(parents=True, exist_ok=True)
-    stem = "inspection-" + (re.sub(r"[^A-Za-z0-9._-]+", "-", run.run_id) or "run")
-    html, data = folder / f"{stem}.html", folder / f"{stem}.json"
-    write_atomically(data, msgspec.json.format(msgspec.json.encode(run), indent=2))
+    html, data = _paths(run, directory)
+    html.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(data, _as_json(run))
     write_atomically(html, render(run).encode())
     return html, data
+
+
+class Written(NamedTuple):
+    """What there is of a report, and in one line why the rest is missing; "" if it is whole."""
+
+    html: Path | None
+    data: Path | None
+    problem: str
+
+
+def try_report(run: RunRecord, directory: str | Path) -> Written:
+    """Write as much of a report as can be written; whatever goes wrong is told, not raised."""
+    problems: dict[str, list[str]] = {}
+
+    def written(path: Path, content: Callable[[], bytes]) -> Path | None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, content())
+        except Exception as error:  # of disk, template or chart alike: the verdict stands
+            problems.setdefault(in_words(error), []).append(path.name)
+            return None
+        return path
+
+    html, data = _paths(run, directory)
+    kept = written(data, lambda: _as_json(run))
+    page = written(html, lambda: render(run).encode())
+    return Written(page, kept, "; ".join(
+        f"{' and '.join(names)} cannot be written to {html.parent}: {why}"
+        for why, names in problems.items()))
+
+
+def in_words(error: Exception) -> str:
+    """Return an error in a few words, for a line that names the file."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
+
+
+def _paths(run: RunRecord, directory: str | Path) -> tuple[Path, Path]:
+    stem = "inspection-" + (re.sub(r"[^A-Za-z0-9._-]+", "-", run.run_id) or "run")
+    return Path(directory, f"{stem}.html"), Path(directory, f"{stem}.json")
+
+
+def _as_json(run: RunRecord) -> bytes:
+    return msgspec.json.format(msgspec.json.encode(run), indent=2)
 
 
 def write_atomically(path: Path, content: bytes) -> None:

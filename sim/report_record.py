@@ -11,6 +11,7 @@ import msgspec
 from actors import messages as m
 from actors import topics
 from actors.runtime.actor import Header
+from actors.runtime.limits import Remembered
 from actors.runtime.topic import Topic
 from airport.drawing import AirportDrawing, draw
 from airport.model import Airport, Mission
@@ -19,6 +20,12 @@ from sim.scenario import FaultOutcome
 
 TRACK_STEP_M = 0.2
 """A track point is kept when the robot has moved this far."""
+
+KEPT = 10_000
+"""Most events, intervals, decisions or names of a kind that are kept of a run."""
+
+TRACK_KEPT = 100_000
+"""Most points of a track: twenty kilometres and more."""
 
 Safety = Literal["safe", "unsafe", "not known"]
 
@@ -179,19 +186,21 @@ class RunRecorder:
         self._believed: list[tuple[float, float, float]] = []
         self._lights: dict[str, m.LightMeasurement] = {}
         self._reached: tuple[float, ...] = ()
-        self._obstacles: dict[str, ObstacleSeen] = {}
+        self._known_lights = frozenset(light.name for light in airport.lights)
+        self._left_out = 0
+        self._obstacles: dict[str, ObstacleSeen] = Remembered(KEPT)
         self._events: list[EventLine] = []
         self._intervals: list[Interval] = []
         self._open: dict[tuple[str, str], tuple[float, str]] = {}
-        self._decisions: dict[tuple[int, int], DecisionLine] = {}
-        self._restarts: dict[str, int] = {}
-        self._lives: dict[str, set[int]] = {}
+        self._decisions: Remembered[tuple[int, int], DecisionLine] = Remembered(KEPT)
+        self._restarts: dict[str, int] = Remembered(KEPT)
+        self._lives: Remembered[tuple[str, int], None] = Remembered(KEPT)
         self._collisions = 0
         self._prohibited_s = 0.0
         self._obstacle_clearance_m = math.inf
         self._prohibited_clearance_m = math.inf
         self._narrowest_s: float | None = None
-        self._injections: dict[str, str] = {}
+        self._injections: dict[str, str] = Remembered(KEPT)
         self._take: dict[str, Callable[[Any, Header], None]] = {
             topics.TRUTH.key: self._truth,
             topics.POSE.key: self._pose,
@@ -242,7 +251,8 @@ class RunRecorder:
                            self._reached[i] if i < len(self._reached) else None)
                 for i, goal in enumerate(self._mission.goals)),
             obstacles=tuple(self._obstacles.values()),
-            events=tuple(sorted(self._events, key=lambda event: event.t_s)),
+            events=(*sorted(self._events, key=lambda event: event.t_s),
+                    *self._crowd(duration_s)),
             intervals=tuple(sorted((*self._intervals, *still), key=lambda bar: bar.from_s)),
             decisions=tuple(self._decisions.values()),
             restarts=dict(self._restarts),
@@ -253,10 +263,16 @@ class RunRecorder:
             narrowest_s=self._narrowest_s,
         )
 
+    def _crowd(self, now_s: float) -> tuple[EventLine, ...]:
+        """Return a line about what there was no room for, if anything."""
+        count = self._left_out + self._decisions.forgotten
+        return (EventLine(now_s, "fault", f"{count} more events, intervals, decisions or points of "
+                          "the way were not kept"),) if count else ()
+
     # -- one method per topic -------------------------------------------------------------------
 
     def _truth(self, truth: m.GroundTruth, header: Header) -> None:
-        _append(self._track, header.stamp, truth.pose)
+        self._append(self._track, header.stamp, truth.pose)
         self._collisions = max(self._collisions, truth.collisions)
         self._prohibited_s = max(self._prohibited_s, truth.prohibited_s)
         if min(truth.obstacle_clearance_m, truth.prohibited_clearance_m) < min(
@@ -267,16 +283,17 @@ class RunRecorder:
             self._prohibited_clearance_m, truth.prohibited_clearance_m)
 
     def _pose(self, pose: m.Pose, header: Header) -> None:
-        _append(self._believed, header.stamp, pose)
+        self._append(self._believed, header.stamp, pose)
 
     def _mission_status(self, status: m.MissionStatus, header: Header) -> None:
         for light in status.lights:
-            self._lights[light.light] = light
+            self._light(light, header)
         newly = len(status.step_times_s) - len(self._reached)  # negative: it forgot, we do not
         self._reached += (header.stamp,) * newly
 
     def _light(self, light: m.LightMeasurement, _header: Header) -> None:
-        self._lights[light.light] = light
+        if light.light in self._known_lights:
+            self._lights[light.light] = light
 
     def _obstacle_list(self, listed: m.ObstacleList, _header: Header) -> None:
         for o in listed.obstacles:
@@ -326,9 +343,10 @@ class RunRecorder:
             by = f" by {event.by}" if event.by else ""
             self._note(header.stamp, "clear", f"{event.node} {event.event}{by}")
         if event.event == "respawned":
-            lives = self._lives.setdefault(event.node, set())
-            lives.add(event.incarnation)
-            self._restarts[event.node] = len(lives)
+            life = event.node, event.incarnation
+            if life not in self._lives:
+                self._lives[life] = None
+                self._restarts[event.node] = self._restarts.get(event.node, 0) + 1
 
     def _injection(self, order: m.Injection, _header: Header) -> None:
         self._injections[order.injection] = f"{order.mode} {order.topic}"
@@ -350,15 +368,34 @@ class RunRecorder:
         slot = (lane, name)
         if on == (slot in self._open):
             return False
+        if on and len(self._open) >= KEPT:
+            self._left_out += 1
+            return False
         if on:
             self._open[slot] = (t_s, reason)
-        else:
-            from_s, why = self._open.pop(slot)
+            return True
+        from_s, why = self._open.pop(slot)
+        if self._has_room(self._intervals, KEPT):
             self._intervals.append(Interval(lane, name, from_s, max(from_s, t_s), why))
         return True
 
     def _note(self, t_s: float, kind: str, text: str) -> None:
-        self._events.append(EventLine(t_s, kind, text))
+        if self._has_room(self._events, KEPT):
+            self._events.append(EventLine(t_s, kind, text))
+
+    def _has_room(self, kept: list[Any], most: int) -> bool:
+        """Whether one more may be kept; if not it is counted."""
+        if len(kept) < most:
+            return True
+        self._left_out += 1
+        return False
+
+    def _append(self, track: list[tuple[float, float, float]], t_s: float, pose: m.Pose) -> None:
+        if not (math.isfinite(pose.x_m) and math.isfinite(pose.y_m)):
+            return
+        moved = not track or math.dist(track[-1][1:], (pose.x_m, pose.y_m)) >= TRACK_STEP_M
+        if moved and self._has_room(track, TRACK_KEPT):
+            track.append((round(t_s, 2), round(pose.x_m, 3), round(pose.y_m, 3)))
 
     def _light_result(self, light: Any) -> LightResult:
         known = (light.name, light.row, light.x_m, light.y_m, light.nominal_cd)
@@ -366,13 +403,6 @@ class RunRecorder:
         if seen is None:
             return LightResult(*known)
         return LightResult(*known, seen.verdict.value, seen.intensity_cd, seen.ratio)
-
-
-def _append(track: list[tuple[float, float, float]], t_s: float, pose: m.Pose) -> None:
-    if not (math.isfinite(pose.x_m) and math.isfinite(pose.y_m)):
-        return
-    if not track or math.dist(track[-1][1:], (pose.x_m, pose.y_m)) >= TRACK_STEP_M:
-        track.append((round(t_s, 2), round(pose.x_m, 3), round(pose.y_m, 3)))
 
 
 def _finite(value: float) -> float | None:

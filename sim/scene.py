@@ -25,6 +25,7 @@ OBSTACLE_HALF_HEIGHT_M = 0.6
 PRESENT_GROUP, ABSENT_GROUP, SOLID_GROUP = 3, 4, 3
 COLLIDES_WITH_CHASSIS = 2
 NOTHING_M = 1000.0
+FARTHEST_M = 1e6
 """Clearance where there is nothing at all: finite, so that it can be written as JSON."""
 
 _PARKED_Z_M = -10.0
@@ -123,10 +124,14 @@ class Scene:
             footprint: the robot's, as a shapely polygon; nothing can appear on it.
 
         Raises:
-            WorldError: not finite, a radius out of bounds, on the robot, or no room in the pool.
+            WorldError: not finite, too far away, a radius out of bounds, on the robot, or no room
+                in the pool.
         """
         if not all(map(math.isfinite, (solid.x_m, solid.y_m, solid.radius_m))):
             raise WorldError(f"obstacle {solid.name}: {solid}: position and radius must be finite")
+        if not max(abs(solid.x_m), abs(solid.y_m)) <= FARTHEST_M:
+            raise WorldError(f"obstacle {solid.name}: ({solid.x_m:g}, {solid.y_m:g}): must be "
+                             f"within {FARTHEST_M:g} m of the origin")
         if not 0.05 <= solid.radius_m <= 5.0:
             raise WorldError(
                 f"obstacle {solid.name}: radius_m: {solid.radius_m:g}: must be in 0.05 to 5 m"

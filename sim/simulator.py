@@ -14,10 +14,14 @@ import numpy as np
 
 from actors import messages as m
 from actors import topics
+from actors.holders import Holders
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
+from actors.runtime.timer import Timer
 from actors.runtime.topic import Topic
 from airport.formats import load_world
 from airport.model import Airport
+from manager.schema import SystemSpec
 from sim.scene import WorldError
 from sim.schedule import Schedule
 from sim.sensors import LaserSpec
@@ -42,7 +46,7 @@ class Simulator(Actor):
     Shared: `airport`; `world` (`airport.world.WorldTruth`), read from the airport's file if absent.
     """
 
-    outputs = _JOBS
+    outputs = (*_JOBS, topics.HOLDS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -56,7 +60,10 @@ class Simulator(Actor):
         self._dead_man_s = timeout_s if parameters.get("dead_man", True) else None
         self._asked_s = self._skipped_s = 0.0
         self._real_time_factor = 1.0
-        self._brakes: set[str] = set()
+        system: SystemSpec | None = context.shared.get("system")
+        self._brakes: Holders[bool] = Holders(
+            [recovery.name for recovery in system.recoveries] if system else None, True)
+        self._holds_timer: Timer | None = None
 
     def on_start(self) -> None:
         """Build the world at the present time."""
@@ -107,11 +114,37 @@ class Simulator(Actor):
     def brake(self, message: m.BrakeCommand, header: Header) -> None:
         """Have the source hold the brake or let go of it; nobody lets go for another."""
         self._advance()
+        unknown = self._brakes.unknown
         if message.engaged:
-            self._brakes.add(header.source)
+            self._brakes.hold(header.source, True)
+            if self._brakes.is_unknown(header.source):
+                self.report_diagnostic("brake", f"held by {header.source!r}, no recovery module of "
+                                       "this system; rampart reset lets go", header.source)
         else:
-            self._brakes.discard(header.source)
+            self._brakes.let_go(header.source)
+        self._braked(unknown)
+
+    @on(topics.RESET)
+    def reset(self, message: m.Reset, _header: Header) -> None:
+        """Let go of the brake in the place of a holder that is no recovery module."""
+        self._advance()
+        unknown = self._brakes.unknown
+        if self._brakes.reset(message.recovery):
+            self._braked(unknown)
+
+    def _braked(self, unknown_before: tuple[str, ...]) -> None:
         self._world.brake(bool(self._brakes))
+        if self._brakes.unknown != unknown_before:
+            self._tell_holds()
+
+    def _tell_holds(self) -> None:
+        """Tell who holds the brake and should not, again and again as long as somebody does."""
+        unknown = self._brakes.unknown
+        self.publish(topics.HOLDS, m.Holds("brake", unknown))
+        if self._holds_timer is not None:
+            self._holds_timer.cancel()
+        self._holds_timer = self.call_later(
+            1.0 / topics.HOLDS.rate_hz, self._tell_holds) if unknown else None
 
     @on(topics.OBSTACLE)
     def obstacle(self, message: m.ObstacleCommand, header: Header) -> None:
@@ -169,7 +202,7 @@ class Simulator(Actor):
     def _report_fault(
         self, injection: str, affected: int, *, finished: bool, reason: str = ""
     ) -> None:
-        report = m.InjectionReport(injection, self.name, affected, finished, reason)
+        report = m.InjectionReport(injection, self.name, affected, finished, clip(reason))
         self.publish(topics.INJECTION_REPORT, report)
 
     def _measure_speed(self, now_s: float) -> None:

@@ -24,6 +24,7 @@ from typing import Any
 import msgspec
 
 from actors import topics
+from actors.runtime.bounds import bare
 from actors.runtime.corruption import is_array
 from actors.runtime.injection import MODES, UNTOUCHED
 from actors.runtime.topic import ROOT, Topic
@@ -154,6 +155,7 @@ def stamp_error_s(draw: Random) -> float:
 
 def _numbers(kind: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield path and type of each number in a type, through structs and sequences."""
+    kind = bare(kind)
     if getattr(kind, "__origin__", None) in (tuple, list):
         yield from _numbers(kind.__args__[0], path)
     elif isinstance(kind, type) and issubclass(kind, msgspec.Struct):

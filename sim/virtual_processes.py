@@ -18,6 +18,7 @@ from actors.runtime.actor import Actor, Context
 from actors.runtime.checkpoint import CheckpointStore, MemoryCheckpoints, NoCheckpoints, Shelf
 from actors.runtime.clock import Clock
 from actors.runtime.virtual_bus import Hub, VirtualBus
+from actors.supervision.patience import AT_LEISURE, Usage
 from actors.supervision.processes import Living, SpawnerUnavailableError
 from actors.supervision.run_plan import SUPERVISOR, Layout, adapted_system
 from sim.timing import Timing, draw, measured
@@ -73,6 +74,9 @@ class _Handle:
 
     def stopped(self) -> bool:
         return self._process.condition is Condition.STOPPED
+
+    def usage(self) -> Usage:
+        return AT_LEISURE
 
     def ignore(self) -> None:
         if self._ended in self._process.holders:
@@ -281,7 +285,8 @@ class VirtualMachine:
                 actor = member.actor(Context(
                     name, process.incarnation, self._clock, bus, member.parameters, self._shared,
                     process.pid, self._store(name, process.incarnation),
-                    self._layout.spec.timing.heartbeat_period_s, register=self._known.get))
+                    self._layout.spec.timing.heartbeat_period_s, register=self._known.get,
+                    members=frozenset(self._layout.members)))
             except Exception as error:
                 self._failed(process, name, error)
                 return

@@ -182,7 +182,8 @@ class VirtualRun:
 
         sinks: list[Sink] = [to_machine, *self.mission.sinks(clock)]
         observer = Observer(Context(
-            OBSERVER, 1, clock, VirtualBus(hub, OBSERVER), {}, {"sinks": sinks}, pid=1))
+            OBSERVER, 1, clock, VirtualBus(hub, OBSERVER), {}, {"sinks": sinks}, pid=1,
+            members=frozenset(self._layout.members)))
         actors: list[Actor] = [observer]
         injector = None
         if self._scenario:
@@ -190,7 +191,7 @@ class VirtualRun:
                 INJECTOR, 1, clock, VirtualBus(hub, INJECTOR), {},
                 {"scenario": self._scenario, "hand": machine, "nodes": self._nodes,
                  "topics": system_topics(self._layout.spec)},
-                pid=1))
+                pid=1, members=frozenset(self._layout.members)))
             actors.append(injector)
         watching = [asyncio.create_task(actor.run()) for actor in actors]
         machine.start()

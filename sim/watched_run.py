@@ -6,6 +6,7 @@ For systems that are being specified, and for those whose world is not simulated
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from typing import Any, TextIO
 
 import msgspec
@@ -13,7 +14,9 @@ import msgspec
 from actors import topics
 from actors.messages import DecisionRecord, NodeTable, ProcessEvent
 from actors.runtime.actor import Context, Header
+from actors.runtime.bounds import MANY
 from actors.runtime.clock import Clock
+from actors.runtime.limits import Remembered
 from actors.runtime.run_folder import register_of
 from actors.runtime.topic import Topic
 from actors.supervision.launcher import Launcher
@@ -22,6 +25,9 @@ from actors.supervision.unseen import watch
 from manager.schema import SystemSpec
 from sim.console import Console
 from sim.observer import Observer
+
+KEPT_DECISIONS = 10_000
+"""The last so many decisions of a run are kept."""
 
 
 class WatchedRun:
@@ -38,11 +44,12 @@ class WatchedRun:
                  stream: TextIO) -> None:
         self.launcher = Launcher(plan, spec.title)
         self.interrupted = ""
+        self.failure = ""
         self._spec = spec
         self._duration_s = duration_s
         self._console = Console(stream)
-        self._decisions: list[DecisionRecord] = []
-        self._restarts: dict[str, int] = {}
+        self._decisions: deque[DecisionRecord] = deque(maxlen=KEPT_DECISIONS)
+        self._restarts: Remembered[str, int] = Remembered(MANY)
         self._lasted_s = 0.0
 
     async def run(self) -> None:
@@ -75,19 +82,20 @@ class WatchedRun:
         observer = Observer(Context(
             OBSERVER, 1, clock, self.launcher.observers_bus(), {},
             {"sinks": [self._take, self._console.take]},
-            register=register_of(plan.folder)))
+            register=register_of(plan.folder), members=frozenset(self.launcher.names)))
         task = asyncio.create_task(observer.run())
         watch(task, "the launcher's observer", self.launcher.failed)
         self._console.line(clock.now(), f"{self._spec.title} ({self._spec.name}), "
                            f"{self._spec.strategy}, rate {plan.rate:g}; ctrl-C ends it")
         if plan.hmi_port:
-            self._console.line(clock.now(), f"operator's page: {plan.hmi_page}")
+            self._console.line(clock.now(), f"operator's page: {plan.hmi_page_to_open}")
         try:
             while not (self.interrupted or self.launcher.failure  # noqa: ASYNC110 three ends
                        or self._is_over(clock.now())):
                 await asyncio.sleep(0.05)
-            if self.launcher.failure:
-                self._console.line(clock.now(), self.launcher.failure)
+            self.failure = self.launcher.failure  # before its observer is told to end
+            if self.failure:
+                self._console.line(clock.now(), self.failure)
         finally:
             self._lasted_s = clock.now()
             observer.stop()

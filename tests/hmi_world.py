@@ -147,8 +147,8 @@ async def served(hmi: Hmi) -> str:
     return f"127.0.0.1:{hmi.page_port}"
 
 
-async def hear(page, kind: str) -> dict:
-    """Return the next message of a kind; of a state, all that the page knows by then."""
+async def hear(page, *kinds: str) -> dict:
+    """Return the next message of some kinds; of a state, all that the page knows by then."""
     async with asyncio.timeout(5):
         while True:
             message = json.loads(await page.recv())
@@ -158,5 +158,5 @@ async def hear(page, kind: str) -> dict:
                     message[log] = [*known.get(log, ()), *message.get(log, ())]
                 known |= message
                 message = dict(known)
-            if message["type"] == kind:
+            if message["type"] in kinds:
                 return message

@@ -13,6 +13,7 @@ import sys
 import time
 from collections import Counter
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -206,6 +207,88 @@ def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
         "kill:mission_manager", 12, 12, 0)
     assert row["ineffective"] == 0
     assert (tmp_path / "report.html").read_text().startswith("<!")
+
+
+FULL_DISK = """
+import msgspec, resource, sys
+from pathlib import Path
+from sim.campaign.job import Job, RunResult
+from sim.campaign.store import Store, StoreError
+result = msgspec.json.decode(sys.argv[2], type=RunResult)
+store = Store(Path(sys.argv[1]))
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
+added = []
+try:
+    for seed in range(10_000):
+        job = Job(row="x", seed=seed)
+        store.add(job, result)
+        added.append(job.key)
+except StoreError as error:
+    print(error)
+assert store.keys() == set(added), "what was kept is there"
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+store.add(job, result)
+store.close()
+print(len(added))
+"""
+
+
+def test_a_disk_that_fills_up_costs_none_of_the_runs_before(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, str(tmp_path), msgspec.json.encode(result())], cwd=ROOT,
+        capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    error, added = done.stdout.splitlines()
+    assert error.startswith(f"{tmp_path / 'runs.sqlite'}: ")
+    store = Store(tmp_path)
+    assert 10 < int(added) == len(store.keys()) - 1
+    store.close()
+
+
+def test_a_campaign_whose_disk_fills_up_says_so_in_one_line_and_goes_on_from_there(tmp_path):
+    command = [sys.executable, "-m", "toolbox.main", "campaign", "--system", "paper", "--fault",
+               "kill:mission_manager@3", "--seeds", "6", "--obstacles", "0", "--jobs", "1",
+               "--out", str(tmp_path), "--json"]
+    code = ("import resource, sys; from sim.campaign.store import Store; kept = Store.add\n"
+            "def add(self, *run):\n"
+            "    kept(self, *run)\n"
+            "    if len(self.keys()) == 2: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, -1))\n"
+            "Store.add = add\n"
+            "from toolbox.main import main; sys.exit(main(sys.argv[1:]))")
+    full = subprocess.run([sys.executable, "-c", code, *command[3:]], cwd=ROOT,
+                          capture_output=True, text=True, check=False)
+    assert (full.returncode, full.stdout) == (2, "")
+    told = [line for line in full.stderr.splitlines() if line.startswith("rampart: ")]
+    assert len(told) == 1
+    assert told[0].startswith(f"rampart: {tmp_path / 'runs.sqlite'}: ")
+    assert told[0].endswith("and the same command goes on from there")
+    assert "Traceback" not in full.stderr
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    row, = json.loads(done.stdout)
+    assert row["runs"] == 6
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), ValueError("a chart")])
+def test_a_campaign_keeps_its_verdict_though_its_report_cannot_be_written(
+        tmp_path, made_up, monkeypatch, capsys, error):
+    def broken(*_):
+        raise error
+
+    monkeypatch.setattr(campaigning, "write_campaign_report", broken)
+    lost = full_jobs()[0]
+    made_up[lost.key] = result(safe=False)
+    assert rampart(["campaign", "--paper", "--full", "--json", "--out", str(tmp_path)]) == 1
+    told = capsys.readouterr()
+    assert len(json.loads(told.out)) == 12
+    assert told.err.splitlines()[-1].startswith(f"rampart: report: {tmp_path}: ")
+
+
+def test_a_campaign_without_a_place_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert rampart(["campaign", "--paper", "--out", str(tmp_path / "file" / "out")]) == 2
+    assert capsys.readouterr().err == (
+        f"rampart: {tmp_path / 'file' / 'out'}: no directory that can be written "
+        "(Not a directory)\n")
 
 
 def test_the_same_jobs_run_on_a_dask_cluster(tmp_path):

@@ -7,6 +7,7 @@ import os
 import random
 import signal
 import sqlite3
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -313,7 +314,7 @@ def test_a_newest_checkpoint_that_is_torn_gives_way_to_the_one_before(short, tam
     run = fly(short, ["kill:mission_manager@goal2:0.02", "kill:graph_planner@goal1:0.1",
                       "kill:osmosis_control@45", "kill:mission_manager@47"])
     assert_nothing_lost_or_doubled(run, SHORT_LIGHTS)
-    assert sorted(d.node for d in run.diagnostics if "taking the one before" in d.reason) == [
+    assert sorted(d.node for d in run.diagnostics if "taking the newest sound one" in d.reason) == [
         "graph_planner", "mission_manager", "mission_manager", "osmosis_control"]
 
 
@@ -347,6 +348,52 @@ def test_an_emergency_stop_outlives_recovery_module_and_manager(short):
 
 
 # -- real processes ------------------------------------------------------------------------------
+
+
+def nulls(file: Path) -> None:
+    """Have an owner of nothing but NULLs, which the table's definition forbids."""
+    change = "UPDATE sqlite_schema SET sql = ? WHERE name = 'owner'"
+    connection = sqlite3.connect(file, isolation_level=None, timeout=5.0)
+    (sql,) = connection.execute("SELECT sql FROM sqlite_schema WHERE name = 'owner'").fetchone()
+    connection.execute("PRAGMA writable_schema = ON")
+    connection.execute(change, (sql.replace("NOT NULL", ""),))
+    connection.close()
+    connection = sqlite3.connect(file, isolation_level=None, timeout=5.0)
+    connection.execute("UPDATE owner SET run = NULL, incarnation = NULL, failures = NULL")
+    connection.execute("PRAGMA writable_schema = ON")
+    connection.execute(change, (sql,))
+    connection.close()
+
+
+def fifo(file: Path) -> None:
+    file.unlink()
+    os.mkfifo(file)
+
+
+def noise(file: Path) -> None:
+    file.write_bytes(random.Random(16).randbytes(4000))
+
+
+@pytest.mark.processes
+@pytest.mark.timeout(180)
+def test_real_nodes_come_back_on_damaged_checkpoints_and_keep_new_ones(tmp_path):
+    files = tmp_path / "report" / "checkpoints"
+    nodes = {"mission_manager": nulls, "graph_planner": fifo, "osmosis_control": noise,
+             "ftm_manager": nulls}
+    with RealRun(tmp_path, "--system", str(with_checkpoints(tmp_path)), "--mission",
+                 str(write_short_mission(tmp_path)), "--rate", "2") as run:
+        for index, (node, damage) in enumerate(nodes.items()):
+            run.sleep_until(10.0 + 5 * index)
+            damage(files / f"{node}.sqlite")
+            run.kill(node)
+        code, result = run.result(120)
+    assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), run.story
+    assert {node: result["restarts"].get(node) for node in nodes} == dict.fromkeys(nodes, 1)
+    assert "kept as graph_planner.damaged, begun anew" in run.story
+    for node in nodes:
+        with sqlite3.connect(files / f"{node}.sqlite") as connection:
+            assert connection.execute("SELECT count(*) FROM checkpoint").fetchone()[0] > 0
+        connection.close()
 
 
 @pytest.mark.slow

@@ -24,10 +24,7 @@ RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
 async def ask(page, **wish) -> dict:
     """Send a wish and return what the page is told."""
     await page.send(json.dumps(wish))
-    async with asyncio.timeout(5):
-        while (told := json.loads(await page.recv()))["type"] not in ("done", "error", "stick"):
-            pass
-    return told
+    return await hear(page, "done", "error", "stick")
 
 
 async def operating(page, shown) -> dict:

@@ -369,3 +369,4 @@ async def test_the_token_of_the_address_is_kept_by_the_tab_and_hidden(world):
         await tab.value("window.before = true")
         await tab.call("Page.reload")
         await tab.until(f"{LIVE} && window.before === undefined")
+        assert [url for url in tab.requests if TOKEN in url.partition("#")[0]] == []

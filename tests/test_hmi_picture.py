@@ -123,6 +123,11 @@ def scan(ranges: list[float], **changed: float) -> m.LaserScan:
     return m.LaserScan(**values, ranges_f32=np.array(ranges, dtype="<f4").tobytes())
 
 
+def test_ranges_beyond_all_measure_are_no_echoes():
+    thinned = thin(scan([3e38, float("nan"), -1.0, 2.5, 1e30, 5.0], range_max_m=1e308))
+    assert thinned["cm"] == [-1, -1, -1, 250, -1, 500]
+
+
 def test_an_obstacle_that_a_single_ray_has_hit_stays_in_the_thinned_sweep():
     for hit in range(181):
         ranges = [8.0] * 181

@@ -8,6 +8,7 @@ import re
 import sys
 from types import SimpleNamespace
 
+import httpx
 import msgspec
 import pytest
 from stub_actors import ROOT
@@ -18,6 +19,8 @@ from actors import topics
 from actors.recording.views import Views
 from actors.runtime.clock import Clock
 from actors.runtime.envelope import Header
+from actors.runtime.web_guests import ROOM
+from actors.runtime.web_server import WebServer
 from actors.supervision.process_usage import ProcessCount
 from actors.supervision.run_info import RunInfo
 from airport.formats import load_airport
@@ -154,6 +157,26 @@ async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a
     assert len(looks) == seen
     stop.set()
     await following
+
+
+async def test_prometheus_is_answered_however_many_connections_idle_at_its_port():
+    pytest.importorskip("prometheus_client")
+    from toolbox import metrics_server
+
+    listening = metrics_server.listen("127.0.0.1", 0)
+    port = listening.getsockname()[1]
+    server = WebServer(metrics_server._app(metrics_server.Exporter()), listening)
+    await server.start()
+    idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(3 * ROOM)]
+    async with httpx.AsyncClient() as client:
+        answer = await client.get(f"http://127.0.0.1:{port}/metrics")
+    assert (answer.status_code, answer.text.splitlines()[-1]) == (200, "rampart_up 0.0")
+    assert len(server.reception) <= ROOM
+    for _, writer in idle:
+        writer.close()
+    server.stop()
+    while len(server.reception):
+        await asyncio.sleep(0.01)
 
 
 def test_live_views_show_the_robot_as_large_as_the_system_says(tmp_path):

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from actors.supervision.patience import Patience, Usage, usage
+from actors.supervision.patience import AT_LEISURE, Patience, Usage, usage
 
 
 def rounds(state: str, ran_s: float, waited_s: float, count: int = 100, every_s: float = 0.25
@@ -22,9 +22,9 @@ def rounds(state: str, ran_s: float, waited_s: float, count: int = 100, every_s:
         ran_s: what the process has run between two looks.
         waited_s: and waited for a processor, as far as the kernel has counted it.
     """
-    patience = Patience(1.0, 0.5)
+    patience = Patience(0.5)
     for i in range(count):
-        if patience.over(i * every_s, 7, Usage(state, i * ran_s, i * waited_s)):
+        if patience.look(i * every_s, 7, Usage(state, i * ran_s, i * waited_s)) >= 1.0:
             return i * every_s
     return None
 
@@ -45,21 +45,21 @@ def test_only_time_in_which_it_could_have_run_counts(how, over_s):
 
 
 def test_whoever_stood_still_himself_blames_no_other_for_it():
-    patience = Patience(1.0, 0.5)
-    assert not patience.over(0.0, 7, Usage("S", 0, 0))
-    assert not patience.over(60.0, 7, Usage("S", 0, 0))
-    assert patience.over(60.5, 7, Usage("S", 0, 0))
+    patience = Patience(0.5)
+    assert [patience.look(at, 7, AT_LEISURE) for at in (0.0, 60.0, 60.25)] == [0.0, 0.5, 0.75]
+
+
+def test_what_it_owes_for_longer_counts_from_then():
+    patience = Patience(0.5)
+    assert [patience.look(at, 7, AT_LEISURE, 8.0) for at in (10.0, 10.25)] == [2.0, 2.25]
 
 
 def test_an_answer_and_another_process_begin_anew():
-    for begin in (lambda p: p.answered(), lambda p: p.over(1.0, 8, Usage("T", 0, 0))):
-        patience = Patience(1.0, 0.5)
-        for now_s in (0.0, 0.5):
-            assert not patience.over(now_s, 7, Usage("T", 0, 0))
+    for begin, pid in ((lambda p: p.answered(), 7), (lambda _: None, 8)):
+        patience = Patience(0.5)
+        assert [patience.look(at, 7, AT_LEISURE) for at in (0.0, 0.5)] == [0.0, 0.5]
         begin(patience)
-        for now_s in (1.0, 1.5):
-            assert not patience.over(now_s, 8, Usage("T", 0, 0))
-        assert patience.over(2.0, 8, Usage("T", 0, 0))
+        assert [patience.look(at, pid, AT_LEISURE) for at in (1.0, 1.5)] == [0.0, 0.5]
 
 
 def test_the_kernel_tells_who_runs_and_who_is_stopped():

@@ -23,6 +23,7 @@ from actors.recording.message_form import (
     renumbered,
     topic_of,
 )
+from actors.runtime.bounds import bare
 from actors.runtime.envelope import Header, encode, pack
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
@@ -31,13 +32,16 @@ ANYTHING = st.recursive(
     st.none() | st.booleans() | WHOLE | st.floats() | TEXT | st.binary(max_size=4),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(TEXT | WHOLE, inner, max_size=3),
     max_leaves=5)
-HEADS = st.builds(Header, TEXT, st.integers(0, 2**40), st.integers(0, 2**40), st.floats())
+HEADS = st.builds(Header, TEXT, st.integers(0, 2**31 - 1), st.integers(0, 2**40),
+                  st.floats(-1e12, 1e12))
 
 
 def values(kind: typing.Any) -> st.SearchStrategy[typing.Any]:
     """Anything that a field of a type may hold, numbers that are none included."""
-    simple = {float: st.floats(), int: WHOLE, str: TEXT, bytes: st.binary(max_size=12),
-              bool: st.booleans(), typing.Any: ANYTHING}
+    bounds = kind.__metadata__[0] if hasattr(kind, "__metadata__") else msgspec.Meta()
+    kind = bare(kind)
+    simple = {float: st.floats(bounds.ge, bounds.le), int: st.integers(bounds.ge, bounds.le),
+              str: TEXT, bytes: st.binary(max_size=12), bool: st.booleans(), typing.Any: ANYTHING}
     if kind in simple:
         return simple[kind]
     if isinstance(kind, type) and issubclass(kind, Enum):

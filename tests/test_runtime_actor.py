@@ -175,7 +175,7 @@ async def test_a_superseded_incarnation_is_refused(make_bus):
 @pytest.mark.parametrize("forged", [1, 3, 77, 2 ** 31 - 1])
 def test_an_incarnation_that_was_not_issued_last_makes_nobody_deaf_to_the_real_one(forged):
     taken, refused = [], []
-    guard = ArrivalGuard(lambda: 10.0, {"talker": 2}.get)
+    guard = ArrivalGuard(lambda: 10.0, register={"talker": 2}.get)
     receive = guard.receiver(topics.POSE, lambda _key, message: taken.append(message.incarnation),
                              lambda _key, reason: refused.append(reason))
     for life, source in ((forged, "talker"), (2, "talker"), (forged, "talker"), (5, "a tool")):

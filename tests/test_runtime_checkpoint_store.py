@@ -40,7 +40,8 @@ from actors.runtime.checkpoint import (
     SupersededError,
     newest_sound,
 )
-from actors.runtime.checkpoint_store import APPLICATION, STORE_FORMAT, SqliteCheckpoints
+from actors.runtime.checkpoint_file import APPLICATION, LARGEST_STATE_BYTES, STORE_FORMAT
+from actors.runtime.checkpoint_store import SqliteCheckpoints
 
 Open = Callable[[int], CheckpointStore]
 
@@ -291,21 +292,6 @@ def test_a_torn_log_costs_the_states_in_its_tail(sqlite_store, file, tmp_path):
     assert {3, 2, 1} & set(seen)
 
 
-@pytest.mark.parametrize(("pragma", "words"), [
-    (f"user_version = {STORE_FORMAT + 1}", "newer than this program's"),
-    ("application_id = 7", "no checkpoints of a node"),
-])
-def test_a_file_of_another_format_is_left_as_it_is(sqlite_store, file, pragma, words):
-    saved(sqlite_store)
-    edit(file, f"PRAGMA {pragma}")
-    before = file.read_bytes()
-    with pytest.raises(CheckpointError, match=words):
-        sqlite_store(2).load()
-    with pytest.raises(CheckpointError, match=words):
-        sqlite_store(2).save(1, b"x")
-    assert file.read_bytes() == before
-
-
 def test_the_states_of_another_run_are_not_taken(tmp_path):
     file = tmp_path / "node.sqlite"
     for run, incarnation in (("first", 7), ("second", 1)):
@@ -522,6 +508,14 @@ def test_the_thread_syncs_and_cuts_the_log(file):
     second.close()
 
 
+def test_a_state_that_is_far_too_large_is_refused_and_the_one_before_stays(sqlite_store):
+    store = sqlite_store(1)
+    store.save(1, b"x" * LARGEST_STATE_BYTES)
+    with pytest.raises(CheckpointError, match=r"a state of \d+ bytes is too large"):
+        store.save(1, b"y" * (LARGEST_STATE_BYTES + 1))
+    assert states(sqlite_store(2)) == [b"x" * LARGEST_STATE_BYTES]
+
+
 def test_a_sync_that_fails_is_told(file):
     store = SqliteCheckpoints(file, "run", 1, sync_period_s=0.001)
     store.save(1, b"x")
@@ -676,6 +670,19 @@ def test_a_store_that_is_locked_for_a_moment_while_it_is_read_is_read_again():
     assert desk.told == ["n.sqlite: database is locked; starting without a checkpoint"]
 
 
+@pytest.mark.parametrize("error", [ValueError("what nobody thought of"), RecursionError("deep")])
+def test_a_store_that_raises_whatever_it_likes_ends_nobody(error):
+    store = Broken(Shelf())
+    store.error = error
+    desk = Desk(store, expected=True)
+    assert desk.keeper.kept(COUNTER) is None
+    desk.keeper.keep(COUNTER, Counter(1, 0))
+    desk.keeper.failed()
+    told = f"{type(error).__name__}: {error}"
+    assert desk.told == [f"{told}; starting without a checkpoint",
+                         f"{told}; going on without checkpoints", told]
+
+
 def test_a_superseded_keeper_is_told_so_and_tries_no_more():
     store = Broken(Shelf())
     store.error = SupersededError("n.sqlite: incarnation 1 was superseded")
@@ -701,7 +708,7 @@ def test_a_keeper_names_what_it_passed_over():
     desk = Desk(MemoryCheckpoints(shelf, 2), expected=True)
     assert desk.keeper.kept(COUNTER) == Counter(4, 0)
     assert desk.told == ["generation 2: a Counter that makes no sense: it is negative; "
-                         "taking the one before"]
+                         "taking the newest sound one"]
 
 
 def test_a_state_that_lives_fail_with_soon_is_given_up_and_one_that_works_is_not():

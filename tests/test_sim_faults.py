@@ -13,6 +13,7 @@ from virtual_loop import shipped_system
 
 from actors import messages as m
 from actors import topics
+from actors.runtime.bounds import bare
 from actors.runtime.envelope import Header, decode, encode
 from actors.runtime.injection import MODES, FaultGate, flaw
 from actors.runtime.topic import ROOT, Topic
@@ -46,6 +47,7 @@ SIMPLE = {
 
 def sample(kind: Any, n: int) -> Any:
     """Return a value of a type; another one for each n, as a node that lives would publish."""
+    kind = bare(kind)
     if kind in SIMPLE:
         return SIMPLE[kind](n)
     if getattr(kind, "__origin__", None) is tuple:

@@ -52,8 +52,9 @@ def test_every_topic_of_the_summit_xl_layer_and_the_world_comes_at_its_rate():
     bench = Bench(upper_laser=True)
     bench.run(2.0)
     counts = Counter(key for key, _, _ in bench.sent)
-    assert set(counts) == {topic.key for topic in Simulator.outputs}
-    for topic in Simulator.outputs:
+    readings = [topic for topic in Simulator.outputs if topic is not topics.HOLDS]
+    assert set(counts) == {topic.key for topic in readings}
+    for topic in readings:
         assert counts[topic.key] == pytest.approx(2 * topic.rate_hz, abs=1)
 
 

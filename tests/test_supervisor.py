@@ -27,6 +27,7 @@ from actors.runtime.clock import Clock
 from actors.runtime.envelope import decode, pack
 from actors.runtime.topic import Topic
 from actors.runtime.virtual_bus import Hub, VirtualBus
+from actors.supervision.patience import Usage
 from actors.supervision.processes import Living, SpawnerUnavailableError
 from actors.supervision.run_plan import (
     SUPERVISOR,
@@ -67,6 +68,9 @@ class Handle:
     def stopped(self) -> bool:
         return False
 
+    def usage(self) -> Usage:
+        return self._machine.usage(self._process)
+
     def ignore(self) -> None:
         if self._ended in self._process.holders:
             self._process.holders.remove(self._ended)
@@ -86,8 +90,14 @@ class Machine:
         self.hold_error: Exception | None = None
         self.look_error: Exception | None = None
         self.ended: list[str] = []
+        self.starving: set[str] = set()
+        self.starves_from_s = 0.0
         self.questions = 0
         self.searches = 0
+
+    def usage(self, process: Process) -> Usage:
+        return Usage("S", 0.0, max(0.0, asyncio.get_running_loop().time() - self.starves_from_s)
+                     if process.names[0] in self.starving else 0.0)
 
     def add(self, names: tuple[str, ...], incarnation: int, *, bound: bool = False) -> Process:
         self.issued |= dict.fromkeys(names, incarnation)
@@ -302,6 +312,45 @@ def test_a_manager_that_beats_and_whose_status_is_not_heard_is_replaced(way):
             status(world, life)  # nor does its old life speak for it
             await asyncio.sleep(2.0)
             assert world.row("ftm_manager")[:2] == ("running", life + 1)
+
+    run(scenario)
+
+
+def test_who_waits_for_a_processor_is_not_taken_for_wedged_and_who_waits_for_nothing_is():
+    async def scenario() -> None:
+        async with running() as world:
+            (starved,), (wedged,) = world.machine.of("DM1"), world.machine.of("DM2")
+            world.machine.starving = {"DM1"}
+            world.machine.starves_from_s = asyncio.get_running_loop().time()
+            world.silent |= {starved.pid, wedged.pid}
+            await until(lambda: wedged.killed, 0.8)
+            await asyncio.sleep(3.0)
+            assert not starved.killed
+            assert world.row("DM1") == ("running", 1, starved.pid)
+            world.machine.starving.clear()  # it has a processor, and says nothing all the same
+            await until(lambda: starved.killed, 0.8)
+
+    run(scenario)
+
+
+def test_a_process_that_waits_for_a_processor_has_longer_to_start():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.starving = {"DM1"}
+            world.machine.starves_from_s = asyncio.get_running_loop().time()
+            bound = world.machine.add
+            world.machine.add = lambda names, life: mute(bound(names, life))
+
+            def mute(process: Process) -> Process:
+                world.silent.add(process.pid)
+                return process
+
+            for name in ("DM1", "DM2"):
+                world.kill(name)
+            await until(lambda: ("DM2", "wedged", 2) in world.events, 5.0)
+            assert ("DM1", "wedged", 2) not in world.events
+            world.silent.clear()
+            await until(lambda: world.row("DM1")[:2] == ("running", 2))
 
     run(scenario)
 

@@ -29,12 +29,14 @@ class Everything(Actor):
     """Publishes what verbs look at; one node that plays them all."""
 
     outputs = (topics.POSE, topics.ROUTE, topics.MISSION_STATUS, topics.PILOT_STATUS,
-               topics.MANAGER_STATUS, topics.NODES, topics.OBSTACLES, topics.DETECTION, LOAD, AXLE)
+               topics.MANAGER_STATUS, topics.NODES, topics.OBSTACLES, topics.DETECTION, LOAD, AXLE,
+               topics.HOLDS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.latched: tuple[str, ...] = ("RM1",)
         self.obstinate = False
+        self.holders: tuple[str, ...] = ()
         self.obstacles: dict[str, m.ObstacleCommand] = {}
         self.resets = 0
         self.orders: list[m.Injection] = []
@@ -56,6 +58,8 @@ class Everything(Actor):
             m.NodeInfo("hmi", "non-control", 42, m.NodeState.CRASHED, 3, 2),
             m.NodeInfo("DM1", "detection", 43, m.NodeState.RUNNING, 1, 0))))
         self.list_obstacles()
+        if self.holders:
+            self.publish(topics.HOLDS, m.Holds("brake", self.holders))
 
     def list_obstacles(self) -> None:
         self.publish(topics.OBSTACLES, m.ObstacleList(tuple(self.obstacles.values())))
@@ -65,6 +69,8 @@ class Everything(Actor):
         self.resets += 1
         if not self.obstinate:
             self.latched = ()
+            self.holders = tuple(name for name in self.holders if name != message.recovery)
+            self.publish(topics.HOLDS, m.Holds("brake", self.holders))
 
     @on(topics.OBSTACLE)
     def obstacle(self, message: m.ObstacleCommand, header: Header) -> None:
@@ -373,6 +379,22 @@ async def test_reset_releases_a_latched_recovery_once(run, capsys):
     code, _, err = await run.call(capsys, "reset", "RM9")
     assert code == 2
     assert "unknown recovery 'RM9'; known: RM1, RM2" in err
+
+
+async def test_status_names_who_holds_the_brake_and_reset_lets_go_in_its_place(run, capsys):
+    run.node.holders = ("x\x1b", "y")
+    _, out, _ = await run.call(capsys, "status")
+    assert "held      brake by x\\u001b, no recovery module of this system" in out
+    _, out, _ = await run.call(capsys, "status", "--json")
+    assert json.loads(out)["holders"] == {"x\x1b": ["brake"], "y": ["brake"]}
+    code, _, err = await run.call(capsys, "reset", "z")
+    assert code == 2
+    assert err.endswith(", x\\u001b, y\n")
+    assert (await run.call(capsys, "reset", "y"))[:2] == (0, "y holds no longer: brake\n")
+    run.node.obstinate = True
+    code, _, err = await run.call(capsys, "reset", "x\x1b")
+    assert code == 1
+    assert "was not made to let go of brake" in err
 
 
 async def test_a_reset_while_the_cause_is_there_says_that_nothing_was_released(run, capsys):

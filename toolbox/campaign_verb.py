@@ -22,7 +22,7 @@ The same command goes on where it was interrupted; each run is made once. Result
 are in --out.
 
 exit code: 0 no unsafe run with fault tolerance, 1 there was one, or with --full one that failed,
-2 bad usage"""
+2 bad usage, or it could not be finished, as on a full disk"""
 
 
 def add(verbs: Any, formatter: Any) -> None:

@@ -34,12 +34,21 @@ from sim.campaign.store import Run, Store, StoreError
 from sim.disturbance import UnknownFaultError
 from sim.injector import can_be_hit
 from sim.network import NETWORKS
-from sim.report import write_report
+from sim.report import in_words, write_report
 from sim.report_record import RunRecord
 from sim.scenario import PlannedFault, ScenarioError, action_of, parse_fault
 from toolbox import systems
 from toolbox.hunting import hunt
-from toolbox.output import NoEffectError, UsageError, print_json, print_table, say, unknown
+from toolbox.output import (
+    NoEffectError,
+    UsageError,
+    print_json,
+    print_table,
+    say,
+    say_text,
+    unknown,
+    warn,
+)
 
 
 def campaign(options: argparse.Namespace) -> int:
@@ -60,18 +69,27 @@ def campaign(options: argparse.Namespace) -> int:
     directory = _directory(options, name)
     try:
         store = Store(directory)
+    except StoreError as error:
+        raise UsageError(str(error)) from None
+    try:
         made = _execute(options, jobs, store)
         keys = {job.key for job in jobs}
         runs = _in_order(store.runs(keys), jobs)
         store.close()
-    except (StoreError, BackendError) as error:
+    except BackendError as error:
         raise UsageError(str(error)) from None
-    except JobError as error:
-        raise UsageError(f"{error}; what was finished is in {directory}") from None
+    except (StoreError, JobError) as error:
+        raise UsageError(f"{error}; what was finished is in {directory}, and the same command "
+                         "goes on from there") from None
     _show(options, spec, runs, made)
-    page = _write_report(options, spec, directory, runs)
-    if not options.json:
-        say(f"\nReport: {page}")
+    try:
+        page = _write_report(options, spec, directory, runs)
+    except Exception as error:  # of disk, template or chart alike: the verdict stands
+        warn(f"report: {directory}: {in_words(error)}")
+    else:
+        if not options.json:
+            say()
+            say(f"Report: {page}")
     unsafe = any(r.job.ftm and not r.result.safe for r in runs)
     failed = options.full and not all(cell.agrees for cell in cells(runs))
     return 1 if unsafe or failed else 0
@@ -289,7 +307,7 @@ def _replay(options: argparse.Namespace) -> int:
         print_json({"run": found.job.key, "job": found.job, "same_trace": same,
                     "report": str(html), "record": str(data)})
     else:
-        say(f"{found.job.key}: {found.job.text()}\n"
+        say_text(f"{found.job.key}: {found.job.text()}\n"
             f"{again.record.mission}, {again.record.safety}; "
             f"{'; '.join(again.record.reasons) or 'as it should be'}\n"
             f"{'the same run, to the byte' if same else 'NOT the same run: the program changed'}\n"
@@ -321,7 +339,8 @@ def _show(options: argparse.Namespace, spec: SystemSpec, runs: Sequence[Run], ma
             [_cells(row) for row in shown[:60]])
         if len(shown) > 60:
             say(f"... and {len(shown) - 60} rows more, in the report")
-    say(f"\n{len(runs)} runs, {made} of them made now")
+    say()
+    say(f"{len(runs)} runs, {made} of them made now")
     protected = [run for run in runs if run.job.ftm and run.job.faults]
     if protected:
         all_of_them = total(protected, "all")
@@ -351,13 +370,16 @@ def _milliseconds(found: Spread | None) -> str:
 
 
 def _show_paper(spec: SystemSpec, runs: Sequence[Run]) -> None:
-    say("Table III: what is executed\n")
+    say("Table III: what is executed")
+    say()
     print_table(("active", "block", "paper", "ours", ""), [
         (", ".join(row.active), row.block, ", ".join(row.paper), ", ".join(row.ours),
          "agrees" if row.agrees else f"DIFFERS: block {row.our_block}")
         for row in table_iii(spec)])
     for title in ("IV", "V"):
-        say(f"\nTable {title}: mission and safety, worst run of each row\n")
+        say()
+        say(f"Table {title}: mission and safety, worst run of each row")
+        say()
         print_table(("condition", "fault", "obst.", "paper", "ours", "runs", "no effect",
                      "success", "safe", ""),
                     [(c.condition, c.fault, c.obstacles, c.paper, c.ours, c.runs, c.ineffective,
@@ -380,7 +402,8 @@ def _show_full(runs: Sequence[Run]) -> None:
 def _show_differing(found: Iterable[Cell]) -> None:
     for cell in found:
         if not cell.agrees:
-            say(f"\n{cell.condition}, {cell.fault}, {cell.obstacles} obstacles: paper "
+            say()
+            say(f"{cell.condition}, {cell.fault}, {cell.obstacles} obstacles: paper "
                 f"{cell.paper}, ours {cell.ours}; worst run {cell.worst_key}, "
                 f"{cell.worst_fault}\n  "
                 f"{cell.story or 'no decision'}\n  {'; '.join(cell.reasons) or 'nothing amiss'}")

@@ -133,7 +133,8 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
                     [(len(g.barriers), " ".join(g.events), " ".join(g.barriers)) for g in guarded])
         bare = [g for g in guarded if len(g.barriers) < 2]
         if bare:
-            say("\nfewer than two barriers:")
+            say()
+            say("fewer than two barriers:")
             for g in bare:
                 behind = f"only {g.barriers[0]}" if g.barriers else "none"
                 say(f"  {' and '.join(g.events)}: {behind}")
@@ -141,7 +142,8 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
         for events in sets:
             say("  " + (" ".join(events) or "(the empty set: the top occurs by itself)"))
     if len(sets) < found.count:
-        say(f"\n{len(sets)} shown; --limit N shows more")
+        say()
+        say(f"{len(sets)} shown; --limit N shows more")
     return 0
 
 
@@ -175,7 +177,8 @@ def _say_outlook(spec: SystemSpec, view: Outlook) -> None:
         event = next(m.event for m in spec.mechanisms if m.name == name)
         say(f"{event} has occurred ({name} is active); left before {top}: "
             f"{', '.join(barriers) or 'nothing'}")
-    say(f"\nsingle events that would now lead to {top}, and the idle barriers left on the way:")
+    say()
+    say(f"single events that would now lead to {top}, and the idle barriers left on the way:")
     print_table(("barriers", "event", "mechanisms, nearest to the top first"),
                 [(len(g.barriers), " ".join(g.events), " ".join(g.barriers))
                  for g in view.next_events])

@@ -15,7 +15,7 @@ from manager.schema import SystemSpec
 from manager.strategies import UnknownStrategyError, decide
 from manager.words import decision_in_words
 from toolbox import systems
-from toolbox.output import UsageError, print_json, print_table, say
+from toolbox.output import UsageError, print_json, print_table, say, say_text
 
 
 def add(verbs: Any, formatter: Any) -> None:
@@ -121,7 +121,7 @@ def _print_comparison(rows: Sequence[Sequence[Decision]], strategies: Sequence[s
 def _print_csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([head, *rows])
-    say(text.getvalue().rstrip("\n"))
+    say_text(text.getvalue().rstrip("\n"))
 
 
 class _Arbiter:

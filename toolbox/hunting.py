@@ -16,7 +16,7 @@ from tqdm import tqdm
 from sim.campaign.job import Job, RunResult, run_job
 from sim.campaign.search import Space, margin, search, shrink
 from sim.campaign.store import Store, StoreError
-from toolbox.output import UsageError, print_json, print_table, say
+from toolbox.output import UsageError, print_json, print_table, say, warn
 
 _SHRUNK_AT_MOST = 3
 
@@ -41,7 +41,10 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
 
         def seen(job: Job, result: RunResult) -> None:
             nonlocal smallest
-            store.add(job, result)
+            try:
+                store.add(job, result)
+            except StoreError as error:
+                raise UsageError(f"{error}; what was finished is in {directory}") from None
             if margin(result) < smallest:
                 smallest = margin(result)
                 bar.write(f"{smallest:8.3f} m  {job.key}  {job.text()}", file=sys.stderr)
@@ -54,25 +57,32 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
             raise UsageError("--search: Optuna is not installed; pip install 'rampart[search]'"
                              ) from None
     unsafe = [job for job, result in made if not result.safe]
-    shrunk = [_shrunk(job, directory) for job in unsafe[:_SHRUNK_AT_MOST]]
     store.close()
+    shrunk = [_shrunk(job, directory) for job in unsafe[:_SHRUNK_AT_MOST]]
     if options.json:
         print_json({"runs": len(made), "unsafe": len(unsafe), "smallest_margin_m": smallest,
-                    "counterexamples": [{"file": str(path), "job": job} for job, path in shrunk]})
+                    "counterexamples": [{"file": str(path) if path else None, "job": job}
+                                        for job, path in shrunk]})
     else:
         print_table(("margin", "run", "faults"), [
             (f"{margin(result):.3f} m", job.key, job.text()) for job, result in made[:10]])
-        say(f"\n{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} m")
+        say()
+        say(f"{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} m")
         for job, path in shrunk:
-            say(f"counterexample: {job.text()}, {job.obstacles} obstacles, seed {job.seed}: {path}")
+            say(f"counterexample: {job.text()}, {job.obstacles} obstacles, seed {job.seed}: "
+                f"{path or 'not written'}")
     return 1 if unsafe else 0
 
 
-def _shrunk(job: Job, directory: Path) -> tuple[Job, Path]:
+def _shrunk(job: Job, directory: Path) -> tuple[Job, Path | None]:
+    """Return what is left of a job, and its file; None if that cannot be written."""
     small = shrink(job, tried=lambda tried, found: print(
         f"shrinking {'to' if found else 'not to'} {tried.text()}", file=sys.stderr))
-    folder = directory / "counterexamples"
-    folder.mkdir(exist_ok=True)
-    path = folder / f"{small.key}.toml"
-    path.write_bytes(msgspec.toml.encode(small))
+    path = directory / "counterexamples" / f"{small.key}.toml"
+    try:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(msgspec.toml.encode(small))
+    except OSError as error:
+        warn(f"{path}: {error.strerror}")
+        return small, None
     return small, path

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from actors import topics
+from actors.runtime.bounds import bare
 from actors.runtime.corruption import InjectionError, field_type, is_array
 from actors.runtime.injection import MODES, flaw
 from actors.runtime.topic import ROOT, Topic
@@ -194,7 +195,7 @@ def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
     name, value, kind = _split("--set", text, topic)
     if is_array(name, kind):
         kind = float  # it fills the array
-    if kind is str:
+    if bare(kind) is str:
         return name, value
     try:
         found = msgspec.convert(msgspec.json.decode(value), kind)

@@ -11,7 +11,9 @@ import msgspec
 
 from actors import topics
 from actors.messages import Injection, InjectionReport
+from actors.runtime.bounds import MANY
 from actors.runtime.envelope import Header
+from actors.runtime.limits import Remembered
 from actors.supervision.system_topics import find_topic
 from sim.faults import Fault
 from toolbox.output import NoEffectError, print_json, say, unknown
@@ -29,7 +31,7 @@ class _Watch:
 
     def __init__(self, order: Injection) -> None:
         self.order = order
-        self.reports: dict[str, InjectionReport] = {}
+        self.reports: dict[str, InjectionReport] = Remembered(MANY)
 
     def hear(self, report: InjectionReport) -> None:
         if report.injection == self.order.injection:

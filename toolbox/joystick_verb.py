@@ -12,6 +12,7 @@ from actors import messages as m
 from actors import topics
 from actors.operator.joystick_device import AUTO, JoystickDevice, mapping_of
 from actors.runtime.envelope import Header
+from actors.runtime.plain_text import printable
 from toolbox import systems
 from toolbox.following import is_over, stopped_by_signals
 from toolbox.keyboard_stick import KeyboardStick
@@ -193,7 +194,7 @@ class _Drive:
         if pilot is not None:
             text += f"  pilot {pilot.mode.value}, {'stopped' if pilot.stopped else 'driving'}"
             text += f": {pilot.reason}" if pilot.reason else ""
-        sys.stdout.write(f"\r{''.join(c if c.isprintable() else ' ' for c in text)[:78]:<78}")
+        sys.stdout.write(f"\r{printable(text)[:78]:<78}")
         sys.stdout.flush()
 
     def _hear_pilot(self, _key: str, _header: Header, status: m.PilotStatus) -> None:
@@ -205,4 +206,5 @@ class _Drive:
     def _hear_diagnostic(self, _key: str, _header: Header, report: m.Diagnostic) -> None:
         if report.offender == self._session.name:
             self.answered = True
-            say(f"\r{report.node}: {report.reason.replace(self._session.name, 'you')}")
+            sys.stdout.write("\r")
+            say(f"{report.node}: {report.reason.replace(self._session.name, 'you')}")

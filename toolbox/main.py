@@ -1,17 +1,16 @@
 """`rampart`: the toolbox's command line.
 
 Exit codes: 0 it worked; 1 it was asked for and had no effect, or nothing answered; 2 bad usage,
-unknown name, or no run found.
+unknown name, no run found, or the answer could not be written.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 
-from actors.runtime import working_folder
+from actors.runtime import streams, working_folder
 from toolbox import (
     adapt_verb,
     bag_verbs,
@@ -84,6 +83,15 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code."""
+    streams.secure()
+    code = _run(arguments)
+    if code == 0 and (why := streams.lost_result()):
+        warn(f"stdout: {why}")
+        return 2
+    return code
+
+
+def _run(arguments: Sequence[str] | None) -> int:
     options = build_parser().parse_args(arguments)
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
@@ -96,9 +104,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # `rampart ... | head` has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    except OSError as error:  # of a disk; what the user named wrongly was refused above
+        warn(" ".join(str(error).split()))
+        return 2
 
 
 if __name__ == "__main__":

@@ -9,9 +9,7 @@ import argparse
 import asyncio
 import contextlib
 import socket
-from collections.abc import Iterator
 
-import uvicorn
 from prometheus_client.exposition import choose_encoder
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -20,6 +18,7 @@ from starlette.routing import Route
 
 from actors import topics
 from actors.operator.hmi_processes import ProcessObserver
+from actors.runtime.web_server import WebServer
 from actors.supervision.process_usage import read_count
 from toolbox.following import LOOK_S, draw, is_over, sessions, stopped_by_signals
 from toolbox.metrics_families import Collector, Exposition
@@ -36,18 +35,15 @@ async def metrics(options: argparse.Namespace) -> int:
     stop = asyncio.Event()
     listening = listen(options.host, options.port)
     exporter = Exporter()
-    server = _Server(uvicorn.Config(
-        _app(exporter), log_level="error", access_log=False, lifespan="off", ws="none"))
+    server = WebServer(_app(exporter), listening)
     with stopped_by_signals(stop):
-        serving = asyncio.create_task(server.serve(sockets=[listening]))
+        await server.start()
         host = f"[{options.host}]" if ":" in options.host else options.host
         say(f"metrics at http://{host}:{listening.getsockname()[1]}/metrics")
         try:
             await exporter.follow(options.of, stop)
         finally:
-            server.should_exit = True
-            await serving
-            listening.close()
+            server.stop()
     return 0
 
 
@@ -108,15 +104,6 @@ class Exporter:
         return Exposition(
             session.run, session.clock.now(), picture,
             {name: count for name, pid in pids.items() if (count := read_count(pid)) is not None})
-
-
-class _Server(uvicorn.Server):
-    """Uvicorn without signal handlers: the verb has its own."""
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Do not."""
-        yield
 
 
 def _app(exporter: Exporter) -> Starlette:

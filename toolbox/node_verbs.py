@@ -8,6 +8,7 @@ from typing import Any
 
 from actors import messages as m
 from actors import topics
+from toolbox.holdings import Holdings
 from toolbox.output import NoEffectError, print_json, print_table, say
 from toolbox.session import Session, connect
 from toolbox.state_words import manager_in_words, mission_in_words, pilot_in_words
@@ -62,7 +63,9 @@ async def node_list(options: argparse.Namespace) -> int:
 async def status(options: argparse.Namespace) -> int:
     """Print the state of the run."""
     async with connect(options.port) as session:
-        found = await session.latest(_STATUS, session.real_s(_WAIT_S))
+        held = Holdings(session)
+        found, _ = await asyncio.gather(
+            session.latest(_STATUS, session.real_s(_WAIT_S)), held.settle())
         time_s = session.clock.now()
     mission: m.MissionStatus | None = found.get(topics.MISSION_STATUS.key)
     pilot: m.PilotStatus | None = found.get(topics.PILOT_STATUS.key)
@@ -73,7 +76,7 @@ async def status(options: argparse.Namespace) -> int:
         print_json({
             "run_id": run.run_id, "title": run.title, "port": run.base_port, "pid": run.pid,
             "rate": run.rate, "system": run.system_file, "time_s": round(time_s, 3),
-            "mission": mission, "pilot": pilot, "manager": manager,
+            "mission": mission, "pilot": pilot, "manager": manager, "holders": held.holders,
             "nodes": nodes.nodes if nodes else None})
         return 0
     _print_run(session, time_s)
@@ -84,6 +87,9 @@ async def status(options: argparse.Namespace) -> int:
         say(f"pilot     {pilot_in_words(pilot)}")
     if manager is not None or "manager" in kinds:
         say(f"manager   {manager_in_words(manager)}")
+    for name, what in held.holders.items():
+        say(f"held      {' and '.join(what)} by {name}, no recovery module of this system; "
+            f"rampart reset {name} lets go")
     say(f"nodes     {_nodes(nodes)}")
     return 0
 

@@ -14,6 +14,7 @@ from actors import topics
 from actors.runtime.envelope import Header
 from toolbox import systems
 from toolbox.following import stopped_by_signals
+from toolbox.holdings import Holdings
 from toolbox.output import NoEffectError, UsageError, print_json, print_table, say, unknown
 from toolbox.session import Session, connect
 
@@ -34,9 +35,11 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
         "reset", parents=[common], formatter_class=formatter,
         help="release a latched recovery, e.g. the emergency stop",
         description="Release a recovery that stays in force until an operator resets it. Nothing\n"
-                    "happens while its cause is still there; the verb then says so and exits 1.",
-        epilog="examples:\n  rampart reset RM1")
-    parser.add_argument("recovery", metavar="RM", help="e.g. RM1")
+                    "happens while its cause is still there; the verb then says so and exits 1.\n"
+                    "Also lets go of the brake, or ends an order to the Safety Pilot, in place of\n"
+                    "somebody who is no recovery module of the system; rampart status says who.",
+        epilog="examples:\n  rampart reset RM1\n  rampart reset rampart-4711")
+    parser.add_argument("recovery", metavar="NAME", help="e.g. RM1")
     parser.set_defaults(run=lambda options: asyncio.run(reset(options)))
 
     parser = verbs.add_parser(
@@ -83,7 +86,7 @@ async def reset(options: argparse.Namespace) -> int:
     async with connect(options.port) as session:
         known = [r.name for r in systems.load(session.run.system_file).recoveries]
         if options.recovery not in known:
-            raise unknown("recovery", options.recovery, known)
+            return await _let_go(session, options.recovery, known)
         latched = _Latest[m.ManagerStatus]()
         session.listen(topics.MANAGER_STATUS, topics.MANAGER_STATUS.at(), latched.keep)
         status = await latched.first(session.real_s(1.0))
@@ -100,6 +103,25 @@ async def reset(options: argparse.Namespace) -> int:
         active = ", ".join(latched.value.active) if latched.value else ""
         raise NoEffectError(f"{options.recovery} was not released; active: {active or 'none'}")
     say(f"{options.recovery} released")
+    return 0
+
+
+async def _let_go(session: Session, name: str, known: list[str]) -> int:
+    """Let go in the place of a holder that is no recovery module.
+
+    Raises:
+        UsageError: nobody of that name holds anything.
+    """
+    held = Holdings(session)
+    await held.settle()
+    what = held.by(name)
+    if not what:
+        raise unknown("recovery", name, [*known, *held.holders])
+    if not await session.command(topics.RESET, m.Reset(name, session.name),
+                                 lambda: not held.by(name), session.real_s(_RESET_WAIT_S)):
+        raise NoEffectError(f"{name} was not made to let go of {' and '.join(held.by(name))}; it "
+                            "orders it again and again")
+    say(f"{name} holds no longer: {' and '.join(what)}")
     return 0
 
 

@@ -8,6 +8,10 @@ from typing import Any
 
 import msgspec
 
+from actors.runtime.plain_text import one_line, printable
+
+_WARNING_CHARS = 4000
+
 
 class UsageError(Exception):
     """The user asked for something that cannot be; one line. Exit code 2."""
@@ -23,24 +27,29 @@ def unknown(what: str, value: str, known: Iterable[str]) -> UsageError:
 
 
 def say(text: str = "") -> None:
-    """Print a line now, also into a pipe."""
-    print(text, flush=True)
+    """Print one line now, also into a pipe; whoever it quotes cannot make it two."""
+    print(printable(text), flush=True)
+
+
+def say_text(text: str) -> None:
+    """Print a text of several lines."""
+    print(printable(text, keep="\n"), flush=True)
 
 
 def warn(text: str) -> None:
     """Print a line on stderr."""
-    print(f"rampart: {text}", file=sys.stderr, flush=True)
+    print(f"rampart: {one_line(text, _WARNING_CHARS)}", file=sys.stderr, flush=True)
 
 
 def print_json(data: Any, *, indent: bool = True) -> None:
     """Print data as JSON; NaN and infinity become null."""
     text = msgspec.json.encode(data)
-    say((msgspec.json.format(text, indent=2) if indent else text).decode())
+    say_text((msgspec.json.format(text, indent=2) if indent else text).decode())
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print rows in aligned columns; numbers to the right."""
-    table = [[str(cell) for cell in row] for row in (head, *rows)]
+    table = [[printable(str(cell)) for cell in row] for row in (head, *rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(head))]
     right = [bool(rows) and all(isinstance(row[i], (int, float)) for row in rows)
              for i in range(len(head))]

@@ -12,6 +12,7 @@ from typing import Any
 from actors import messages as m
 from actors import topics
 from actors.runtime.envelope import Header
+from actors.runtime.limits import Remembered
 from actors.runtime.topic import Topic
 
 DECODED: tuple[Topic[Any], ...] = (
@@ -27,6 +28,15 @@ STALE_S = 2.0
 
 _KEPT = 50
 _SAMPLES = 13
+_NAMES = 1024
+_OTHERS = "others"
+
+
+def _count(counter: Counter[Any], key: Any) -> None:
+    """Count for a name, or for all others when there are too many names."""
+    if key not in counter and len(counter) >= _NAMES:
+        key = (_OTHERS,) * len(key) if isinstance(key, tuple) else _OTHERS
+    counter[key] += 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +65,9 @@ class RunPicture:
 
     def __init__(self) -> None:
         self.messages: Counter[str] = Counter()
-        self.detections: dict[str, m.DetectionReport] = {}
-        self.recoveries: dict[str, m.RecoveryReport] = {}
-        self.beats: dict[str, Beat] = {}
+        self.detections: dict[str, m.DetectionReport] = Remembered(_NAMES)
+        self.recoveries: dict[str, m.RecoveryReport] = Remembered(_NAMES)
+        self.beats: dict[str, Beat] = Remembered(_NAMES)
         self.decisions: deque[tuple[float, m.DecisionRecord]] = deque(maxlen=_KEPT)
         self.decisions_total: Counter[str] = Counter()
         self.detections_total: Counter[str] = Counter()
@@ -79,19 +89,19 @@ class RunPicture:
             before = self.detections.get(header.source)
             if body.state is m.DetectionState.ACTIVE and (
                     before is None or before.state is not body.state):
-                self.detections_total[header.source] += 1
+                _count(self.detections_total, header.source)
             self.detections[header.source] = body
         elif topic is topics.RECOVERY:
             was = self.recoveries.get(header.source)
             if body.state is m.RecoveryState.ACTIVATED and (
                     was is None or was.state is not body.state):
-                self.recoveries_total[header.source] += 1
+                _count(self.recoveries_total, header.source)
             self.recoveries[header.source] = body
         elif topic is topics.DECISION:
             self.decisions.append((header.stamp, body))
-            self.decisions_total[body.strategy] += 1
+            _count(self.decisions_total, body.strategy)
         elif topic is topics.PROCESS_EVENT:
-            self.process_events_total[body.node, body.event] += 1
+            _count(self.process_events_total, (body.node, body.event))
         else:
             self._latest[topic.key] = (body, now_s)
 

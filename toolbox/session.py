@@ -118,13 +118,15 @@ class Session:
         """Send a command until `effect` holds; return False if it did not within real seconds.
 
         Raises:
-            UsageError: the run is a replay, where nobody obeys.
+            UsageError: the run is a replay, where nobody obeys, or the message has a value that
+                every reader would refuse.
         """
         if self.run.replay_of:
             raise UsageError(f"port {self.run.base_port} is a replay of {self.run.replay_of}: "
                              "nobody is there to obey")
         self._sequence += 1
-        payload = encode(Header(self.name, 1, self._sequence, self.clock.now()), body)
+        payload = _checked(
+            topic, encode(Header(self.name, 1, self._sequence, self.clock.now()), body))
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout_s
         resend = loop.time()
@@ -137,6 +139,19 @@ class Session:
                 resend = now + RESEND_S
             await asyncio.sleep(0.01)
         return True
+
+
+def _checked(topic: Topic[Any], payload: bytes) -> bytes:
+    """Return a payload that the topic's readers will take.
+
+    Raises:
+        UsageError: they will not; field and bound are named.
+    """
+    try:
+        decode(topic, payload)
+    except UNREADABLE as error:
+        raise UsageError(f"not a {topic.type.__name__} that can be sent: {error}") from None
+    return payload
 
 
 @contextlib.asynccontextmanager

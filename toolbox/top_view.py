@@ -16,6 +16,7 @@ from rich.text import Text
 
 from actors import messages as m
 from actors import topics
+from actors.runtime.plain_text import printable
 from manager.words import decision_in_words
 from toolbox.run_picture import RunPicture
 from toolbox.state_words import manager_in_words, mission_in_words, pilot_in_words
@@ -96,16 +97,11 @@ def _fit(line: Text, width: int) -> Text:
     return line
 
 
-def _printable(text: str) -> str:
-    """Return a text that moves no cursor: what nodes say is not always fit for a terminal."""
-    return "".join(c if c.isprintable() else " " for c in text)
-
-
 # -- the state, one line each -------------------------------------------------------------------
 
 
 def _title(frame: Frame, width: int) -> Text:
-    left = f" rampart top  {_printable(frame.title)}"
+    left = f" rampart top  {printable(frame.title)}"
     right = f"port {frame.port}  {frame.time_s:.1f} s x{frame.rate:g} "
     gap = max(2, width - cell_len(left) - cell_len(right))
     return Text(left + " " * gap + right, style="reverse")
@@ -131,7 +127,7 @@ def _state(frame: Frame, width: int) -> list[Text]:
         silent_s = picture.silence_s(topic, now_s) if topic else 0.0
         if silent_s:
             line.append(f"SILENT for {silent_s:.0f} s; last: ", style="bold yellow")
-        shown.append(line.append(_printable(text), style=style))
+        shown.append(line.append(printable(text), style=style))
     return shown
 
 
@@ -196,7 +192,7 @@ def _words(record: m.DecisionRecord) -> str:
 def _decisions(frame: Frame, count: int) -> list[Text]:
     newest = list(frame.picture.decisions)[::-1][:count]
     return [Text(f"{'decisions' if not i else '':<{_LABEL}}", style="bold").append(
-        _printable(f"{stamp_s:.1f} s  {record.decision}: {_words(record)}"), style="not bold")
+        printable(f"{stamp_s:.1f} s  {record.decision}: {_words(record)}"), style="not bold")
         for i, (stamp_s, record) in enumerate(newest)]
 
 
@@ -243,7 +239,7 @@ def _processes(frame: Frame, width: int, height: int) -> list[Text]:
         used = frame.usage.get(row["name"])
         figures = (f"{_age(used['age_s']):>6} {used['cpu']:>3.0f}% {used['mb']:>5.0f}"
                    if used else f"{'-':>6} {'-':>4} {'-':>5}")
-        name = set_cell_size(_printable(row["name"]), 18)
+        name = set_cell_size(printable(row["name"]), 18)
         text = (f"{name} {row['state']:<8} {row['incarnation']:>4} {row['restarts']:>5} "
                 f"{figures}")
         trouble = row["state"] != m.NodeState.RUNNING.value

@@ -11,6 +11,7 @@ import msgspec
 
 from actors import topics
 from actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
+from actors.runtime.bounds import MAX_PAYLOAD_BYTES
 from actors.runtime.topic import ROOT, Qos, Topic
 from actors.runtime.wiring import topics_of
 from actors.supervision.run_info import NoRunError, find_run
@@ -126,7 +127,10 @@ def markdown(spec: SystemSpec) -> str:
         "sequence, stamp, body]`: which node, which life of it, how many-th message of that life, "
         "the simulated time in seconds at which the content was true, and the message. Units are "
         "SI and stand in the field names; frames follow REP-105, axes REP-103. Rates are in "
-        "simulated time; 0 means on event.",
+        "simulated time; 0 means on event. Bounds stand in braces: `{0..9}` of a number, `{<=9}` "
+        "of the characters of a text, the bytes of an array or the elements of a sequence. What is "
+        f"beyond them, or longer than {MAX_PAYLOAD_BYTES} bytes, is refused by every reader. A "
+        "`float` without bounds may be anything, NaN and infinity included.",
         "",
         "- **sensor**: the newest sample counts; at the reader the latest wins.",
         "- **state**: like sensor, and repeated at its rate even without change.",
@@ -197,11 +201,22 @@ def _messages(used: Iterable[Topic[Any]]) -> list[type[msgspec.Struct]]:
     return list(found)
 
 
+def _limits(meta: msgspec.Meta) -> str:
+    """Return the bounds of a field: least and greatest value, or how long it may be."""
+    if meta.max_length is not None:
+        return f"{{<={meta.max_length}}}"
+    least, most = ("" if bound is None else str(bound) if isinstance(bound, int) else f"{bound:g}"
+                   for bound in (meta.ge, meta.le))
+    return f"{{{least}..{most}}}"
+
+
 def _summary(kind: type[Any]) -> str:
     return " ".join((kind.__doc__ or "").split())
 
 
 def _type_name(kind: Any) -> str:
+    if hasattr(kind, "__metadata__"):
+        return _type_name(kind.__origin__) + "".join(map(_limits, kind.__metadata__))
     arguments = getattr(kind, "__args__", ())
     if not arguments:
         if isinstance(kind, type) and issubclass(kind, Enum):

@@ -14,11 +14,23 @@ from typing import Any
 import msgspec
 
 from actors import topics
+from actors.runtime import streams
+from actors.runtime.bounds import MANY
 from actors.runtime.envelope import Header
+from actors.runtime.limits import Remembered
 from actors.runtime.topic import Topic
 from toolbox import systems
 from toolbox.following import LOOK_S, is_over
-from toolbox.output import NoEffectError, UsageError, print_json, print_table, say, unknown, warn
+from toolbox.output import (
+    NoEffectError,
+    UsageError,
+    print_json,
+    print_table,
+    say,
+    say_text,
+    unknown,
+    warn,
+)
 from toolbox.session import Session, connect
 from toolbox.topic_catalogue import MAILBOX, fields, markdown, resolve, topics_for, uses
 
@@ -87,7 +99,7 @@ def topic_list(options: argparse.Namespace) -> int:
     """Print all topics."""
     spec = systems.load(options.system)
     if options.markdown:
-        say(markdown(spec).rstrip("\n"))
+        say_text(markdown(spec).rstrip("\n"))
         return 0
     table = uses(spec)
     if options.json:
@@ -162,7 +174,8 @@ async def topic_echo(options: argparse.Namespace) -> int:
         session.listen(topic, key, heard, garbage)
         loop = asyncio.get_running_loop()
         end = math.inf if options.duration is None else loop.time() + options.duration
-        while not (done.is_set() or is_over(session.run)) and (left := end - loop.time()) > 0:
+        while not (done.is_set() or is_over(session.run) or streams.lost()) and (
+                left := end - loop.time()) > 0:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(done.wait(), min(LOOK_S, left))
         _tell_end(session)
@@ -175,7 +188,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
     """Measure rates."""
     topic, key = resolve(options.key, topics_for(options.key, options.port))
     _positive("--duration", options.duration)
-    arrivals: dict[str, deque[float]] = {}
+    arrivals: Remembered[str, deque[float]] = Remembered(MANY)
     duration_s = options.duration
     if options.json and duration_s is None:
         duration_s = 3.0
@@ -183,12 +196,15 @@ async def topic_hz(options: argparse.Namespace) -> int:
         _check_member(session, topic, key)
 
         def heard(short: str, _header: Header, _body: Any) -> None:
-            arrivals.setdefault(short, deque(maxlen=_WINDOW)).append(session.clock.now())
+            times = arrivals.get(short)
+            if times is None:
+                times = arrivals[short] = deque(maxlen=_WINDOW)
+            times.append(session.clock.now())
 
         session.listen(topic, key, heard)
         loop = asyncio.get_running_loop()
         end = math.inf if duration_s is None else loop.time() + duration_s
-        while (left := end - loop.time()) > 0 and not is_over(session.run):
+        while (left := end - loop.time()) > 0 and not (is_over(session.run) or streams.lost()):
             await asyncio.sleep(min(_HZ_REPORT_S, left))
             if not options.json:
                 for short in sorted(arrivals):

@@ -90,14 +90,17 @@ def _show(spec: SystemSpec, report: Report, seconds: float) -> None:
             ("in which a repair that is needed never runs while the last resort keeps the robot "
              "stopped;\nit cannot be reset until somebody repairs by hand, and repairs-run exempts "
              "them", report.stuck_behind_last_resort)):
-        say(f"\nactive sets {words}:")
+        say()
+        say(f"active sets {words}:")
         for strategy, count in counts.items():
             say(f"  {strategy:<16} {count:>5} of {report.active_sets}")
-    say("\nnot explored: the start of a manager, until it has heard every module or its grace has "
+    say()
+    say("not explored: the start of a manager, until it has heard every module or its grace has "
         "passed")
     for checked in report.properties:
         for trace in checked.counterexamples[:1]:
-            say(f"\n{checked.name} fails{f' under {checked.strategy}' if checked.strategy else ''},"
+            say()
+            say(f"{checked.name} fails{f' under {checked.strategy}' if checked.strategy else ''},"
                 f" in {checked.count} of {checked.cases} cases; the shortest:")
             for number, step in enumerate(trace, 1):
                 say(f"  {number}. {step}")

@@ -14,6 +14,9 @@ from dataclasses import dataclass, field
 from actors.control.polyline import Point
 from actors.control.route_search import Edge
 
+MOST_PLACES = 32
+"""That are closed at a time; with one more, the one closed first is tried again."""
+
 _LEAST_STUB_M = 0.05
 """A shorter rest of an edge is none."""
 
@@ -37,6 +40,8 @@ class Closures:
             if math.dist(known, place) <= self.gap_m:
                 self._until_s[known] = now_s + self.lasts_s
                 return
+        if len(self._until_s) >= MOST_PLACES:
+            del self._until_s[next(iter(self._until_s))]
         self._until_s[place] = now_s + self.lasts_s
 
     def reopen(self) -> None:

@@ -12,6 +12,7 @@ from actors.control.plausible import is_sane
 from actors.control.route_search import PlannedRoute, plan_route
 from actors.messages import Blockage, ControlStatus, GoalOrder, Mode, Pose, Route
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
 from actors.runtime.checkpoint import StateFormat
 from actors.runtime.parameters import amount
 from airport.model import Airport
@@ -177,5 +178,5 @@ class GraphPlanner(Actor):
 
 
 def _route(order: GoalOrder, plan: PlannedRoute, reason: str) -> Route:
-    return Route(order.mission_id, order.step, order.goal.mode, True, plan.waypoints, reason,
-                 order.plan)
+    return Route(order.mission_id, order.step, order.goal.mode, True, plan.waypoints,
+                 clip(reason), order.plan)

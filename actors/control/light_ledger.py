@@ -72,6 +72,7 @@ class LightLedger:
         self._lights = tuple(lights)
         self._limits = limits or InspectionLimits()
         self._places = np.array([(li.x_m, li.y_m) for li in self._lights]).reshape(-1, 2)
+        self._names = frozenset(light.name for light in self._lights)
         self._sent_s: dict[str, float] = {}
         self._shown: frozenset[str] | None = None
         self._gone_back_for = ""
@@ -107,7 +108,7 @@ class LightLedger:
         """Take note of what the Mission Manager has."""
         self._shown = None
         if status.mission_id == self.kept.mission_id:
-            self._shown = frozenset(light.light for light in status.lights)
+            self._shown = self._names.intersection(light.light for light in status.lights)
 
     def to_send_again(self, now: float) -> list[LightMeasurement]:
         """Return what the Mission Manager should have and does not show."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import msgspec
+
 from actors import topics
 from actors.control import mission_state
 from actors.control.mission_checkpoint import MISSION_STATE, catch_up
@@ -18,7 +20,9 @@ from actors.messages import (
     Route,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
 from actors.runtime.parameters import names
+from airport.model import Airport
 
 UNCERTAIN_S = 1.0
 """A Mission Manager that comes back waits so long for word of the step that others are at. They
@@ -46,6 +50,8 @@ class MissionManager(Actor):
         self.state = MissionState()
         self._held_by = names(self.parameters, "held_by")
         self._uncertain_until_s = -math.inf
+        airport: Airport | None = context.shared.get("airport")
+        self._lights = frozenset(light.name for light in airport.lights) if airport else None
 
     @on(topics.MISSION_REQUEST)
     def request(self, message: MissionRequest, _header: Header) -> None:
@@ -69,6 +75,9 @@ class MissionManager(Actor):
     def progress(self, message: ControlStatus, _header: Header) -> None:
         """Step on when the current goal is reached."""
         self._compare(message.mission_id, message.step)
+        if self._lights is not None and not self._lights.issuperset(message.unmeasured):
+            message = msgspec.structs.replace(message, unmeasured=tuple(
+                name for name in message.unmeasured if name in self._lights))
         self._become(mission_state.progress(self.state, message, self.clock.now()))
 
     @on(topics.ROUTE)
@@ -79,7 +88,10 @@ class MissionManager(Actor):
 
     @on(topics.LIGHT_MEASURED)
     def light(self, message: LightMeasurement, _header: Header) -> None:
-        """Keep a light's measurement."""
+        """Keep a light's measurement, if it is one of the airport's."""
+        if self._lights is not None and message.light not in self._lights:
+            self.report_diagnostic("light", "no light of this airport", message.light)
+            return
         self._become(mission_state.measured(self.state, message))
 
     def on_start(self) -> None:
@@ -151,4 +163,4 @@ def hold_reason(status: ManagerStatus, holding: tuple[str, ...]) -> str:
     if not held_by:
         return ""
     causes = [f"{view.name}: {view.reason}" for view in status.detections if view.active]
-    return f"held by {' and '.join(held_by)}" + (f": {'; '.join(causes)}" if causes else "")
+    return clip(f"held by {' and '.join(held_by)}" + (f": {'; '.join(causes)}" if causes else ""))

@@ -32,6 +32,7 @@ from actors.messages import (
     Mode,
     Route,
 )
+from actors.runtime.bounds import clip
 
 P = MissionPhase
 
@@ -51,6 +52,9 @@ ACTIVE = frozenset({P.RUNNING, P.PAUSED, P.RETURNING})
 
 DRIVING = frozenset({P.RUNNING, P.RETURNING})
 """Phases in which the robot has a goal."""
+
+ACCEPTED_KEPT = 256
+"""A mission that is sent again is not accepted again as long as it is among the last so many."""
 
 ANSWERS_KEPT = 32
 """An order that is repeated gets its old answer as long as it is among the last so many."""
@@ -84,7 +88,7 @@ class MissionState(msgspec.Struct, frozen=True):
         step_times_s: duration of each finished step in simulated seconds.
         lights: the first measurement of each light, in order of arrival.
         reason: why it failed, was cancelled or paused, or goes another way than the shortest.
-        accepted: ids of all missions ever accepted.
+        accepted: ids of the last missions that were accepted.
         plan: how often another plan was asked for in this mission.
         paused: on whose order it is paused and why; empty without such an order.
         held: which recovery holds the robot and why; empty if none does.
@@ -144,7 +148,7 @@ def accept(state: MissionState, request: MissionRequest, now: float) -> MissionS
         step_started_s=now,
         step_times_s=(),
         lights=(),
-        accepted=(*state.accepted, request.mission_id),
+        accepted=(*state.accepted, request.mission_id)[-ACCEPTED_KEPT:],
         plan=0,
         paused="",
         home=None,
@@ -227,11 +231,11 @@ def obey(
     for answer in state.answers:
         if answer.order == order.order:
             return state, answer
-    outcome = _OBEDIENCE[order.action](state, f"{order.by}: {order.reason}", now)
+    outcome = _OBEDIENCE[order.action](state, clip(f"{order.by}: {order.reason}"), now)
     after = state if isinstance(outcome, str) else outcome
     answer = MissionOrderAnswer(
-        order.order, not isinstance(outcome, str), outcome if isinstance(outcome, str) else "",
-        after.plan)
+        order.order, not isinstance(outcome, str),
+        clip(outcome) if isinstance(outcome, str) else "", after.plan)
     kept = (*state.answers, answer)[-ANSWERS_KEPT:]
     return msgspec.structs.replace(after, answers=kept), answer
 
@@ -353,7 +357,7 @@ def status(state: MissionState) -> MissionStatus:
         goals=state.goals,
         step_times_s=state.step_times_s,
         lights=state.lights,
-        reason=state.reason,
+        reason=clip(state.reason),
         skipped=tuple(index for index, _ in state.skipped),
         unmeasured=tuple(
             name for name in state.unmeasured

@@ -21,6 +21,7 @@ from actors.control.light_ledger import LightLedger
 from actors.control.light_row import LightRow, RowLimits
 from actors.control.motion_loop import MotionLoop
 from actors.control.path_follower import Motion, PathFollower
+from actors.control.plausible import is_sane
 from actors.control.polyline import Array, Polyline
 from actors.control.settings import hull_of, motion_of, reach_of
 from actors.messages import (
@@ -39,6 +40,7 @@ from actors.messages import (
     Twist,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
 from actors.runtime.parameters import amount, switch
 from actors.runtime.topic import Topic
 from airport.model import Airport
@@ -125,7 +127,7 @@ class OsmosisControl(Actor):
     @on(topics.POSE)
     def pose(self, message: Pose, header: Header) -> None:
         """Keep the latest pose."""
-        if all(map(math.isfinite, (message.x_m, message.y_m, message.yaw_rad))):
+        if is_sane(message.x_m, message.y_m, message.yaw_rad):
             self._pose = message
             self._inspection.pose(header.stamp, message.x_m, message.y_m, message.yaw_rad)
             if self._loop is not None:
@@ -168,11 +170,11 @@ class OsmosisControl(Actor):
         if message == previous:
             self._why_refused, self._refused = "", None
             return
-        finite = all(math.isfinite(v) for waypoint in message.waypoints for v in waypoint)
-        if not finite:
-            self.report_diagnostic("route", "a waypoint is not finite", message.mission_id)
+        if not all(is_sane(*waypoint) for waypoint in message.waypoints):
+            self.report_diagnostic("route", "a waypoint is not finite, or farther away than "
+                                   "anything can be", message.mission_id)
             return
-        self._why_refused = self._fault_of(message)
+        self._why_refused = clip(self._fault_of(message))
         self._refused = message if self._why_refused else None
         if self._refused is not None:
             self.report_diagnostic("route refused", self._why_refused, message.mission_id)

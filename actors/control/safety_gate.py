@@ -14,7 +14,9 @@ command is kept and repeated, obstacles stop the robot, the joystick pre-empts.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import msgspec
 
@@ -22,13 +24,18 @@ from actors.control.command_pair import CommandPair, PairLimits
 from actors.control.plausible import AHEAD_S
 from actors.control.polyline import NO_POINTS, Array
 from actors.control.swept_path import StoppingRoom, limited
+from actors.holders import Holders
 from actors.messages import PilotMode
+from actors.runtime.limits import Remembered
 
 STRICTNESS = (PilotMode.AUTO, PilotMode.TELEOPERATION, PilotMode.STOP)
 """Modes from the most permissive to the strictest; declared here, once."""
 
 _STANDING_MPS = 1e-3
 """What a computer of the command may round to."""
+
+_SOURCES = 64
+"""Of commands, of which the newest one's place in the sequence is remembered."""
 
 _SLOWED = 0.999
 """Below this share of the command the reason says that obstacles slow the robot."""
@@ -104,6 +111,14 @@ class GateOutput(msgspec.Struct, frozen=True, gc=False):
     reason: str
 
 
+class _Order(NamedTuple):
+    """What a recovery module has ordered; `top_speed_mps` 0 for no bound."""
+
+    mode: PilotMode
+    reason: str
+    top_speed_mps: float
+
+
 @dataclass(slots=True)
 class _Line:
     """State of one command source: auto, its standby, or joystick."""
@@ -111,7 +126,8 @@ class _Line:
     twist: tuple[float, float] | None = None
     stamp_s: float = -math.inf
     heard_s: float = -math.inf
-    newest: dict[str, tuple[int, int]] = field(default_factory=dict)
+    newest: dict[str, tuple[int, int]] = field(
+        default_factory=lambda: Remembered(_SOURCES))
     fault: str = ""
 
 
@@ -122,14 +138,16 @@ class SafetyGate:
         limits: bounds and ages.
         checks: which of them are in force.
         started_s: now.
+        recoveries: names of the modules that may give orders; others are obeyed, and named.
     """
 
-    def __init__(self, limits: GateLimits, checks: Checks, started_s: float) -> None:
+    def __init__(self, limits: GateLimits, checks: Checks, started_s: float,
+                 recoveries: Collection[str] | None = None) -> None:
         self._limits = limits
         self._checks = checks
         self._started_s = started_s
-        self._orders: dict[str, tuple[PilotMode, str]] = {}
-        self._bounds_mps: dict[str, float] = {}
+        self._orders: Holders[_Order] = Holders(
+            recoveries, _Order(PilotMode.STOP, "too many unknown modules order something", 0.0))
         self._auto = _Line()
         self._standby = _Line()
         self._pair = CommandPair(limits.pair)
@@ -146,13 +164,20 @@ class SafetyGate:
 
         `top_speed_mps` bounds the speed meanwhile, whoever drives; 0 or nonsense does not.
         """
-        self._bounds_mps.pop(recovery, None)
         if engaged:
-            self._orders[recovery] = (mode, reason)
-            if top_speed_mps > 0:
-                self._bounds_mps[recovery] = top_speed_mps
+            self._orders.hold(recovery, _Order(
+                mode, reason, top_speed_mps if top_speed_mps > 0 else 0.0))
         else:
-            self._orders.pop(recovery, None)
+            self._orders.let_go(recovery)
+
+    def reset(self, name: str) -> bool:
+        """End the order of one that is no recovery module; return whether there was one."""
+        return self._orders.reset(name)
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Who gives orders and is no recovery module of the system."""
+        return self._orders.unknown
 
     def manager_alive(self, stamp_s: float) -> None:
         """Take note of the manager's sign of life, given at `stamp_s`."""
@@ -245,7 +270,7 @@ class SafetyGate:
         """The strictest engaged order's mode, auto without any."""
         if not self._orders:
             return PilotMode.AUTO
-        return max((mode for mode, _ in self._orders.values()), key=STRICTNESS.index)
+        return max((order.mode for order in self._orders.values()), key=STRICTNESS.index)
 
     def output(self, now: float) -> GateOutput:
         """Return what the base is to do now."""
@@ -276,7 +301,8 @@ class SafetyGate:
     @property
     def top_speed_mps(self) -> float:
         """The lowest speed that an order in force allows at most; 0 if none bounds it."""
-        return min(self._bounds_mps.values(), default=0.0)
+        return min((order.top_speed_mps for order in self._orders.values() if order.top_speed_mps),
+                   default=0.0)
 
     def _bounded(self, wanted: tuple[float, float], passing: str
                  ) -> tuple[tuple[float, float], str]:
@@ -329,4 +355,4 @@ class SafetyGate:
     def _why(self, mode: PilotMode) -> str:
         """The reasons of the orders for a mode."""
         named = sorted(self._orders.items())
-        return "; ".join(f"{name}: {why}" for name, (wanted, why) in named if wanted is mode)
+        return "; ".join(f"{name}: {order.reason}" for name, order in named if order.mode is mode)

@@ -10,14 +10,17 @@ from actors.control.safety_gate import GateOutput, SafetyGate, Stamped
 from actors.control.settings import checks_of, gate_of, reach_of
 from actors.messages import (
     BaseCommand,
+    Holds,
     LaserScan,
     ManagerStatus,
     PilotMode,
     PilotOrder,
     PilotStatus,
+    Reset,
     Twist,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
 
 _PERIOD_S = 0.05
 
@@ -29,12 +32,14 @@ class SafetyPilot(Actor):
     dead man is fed and everything that expires does.
     """
 
-    outputs = (topics.BASE_COMMAND, topics.PILOT_STATUS)
+    outputs = (topics.BASE_COMMAND, topics.PILOT_STATUS, topics.HOLDS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         system = context.shared["system"]
-        self._gate = SafetyGate(gate_of(system), checks_of(system), context.clock.now())
+        self._recoveries = frozenset(recovery.name for recovery in system.recoveries)
+        self._gate = SafetyGate(
+            gate_of(system), checks_of(system), context.clock.now(), self._recoveries)
         self._lasers = LaserPair(reach_of(system))
         self._laser_fault = ""
         self._sent_s = -math.inf
@@ -74,13 +79,35 @@ class SafetyPilot(Actor):
 
     @on(topics.PILOT_ORDER)
     def order(self, message: PilotOrder, header: Header) -> None:
-        """Obey a recovery module; a change acts at once."""
-        before = self._gate.mode, self._gate.top_speed_mps
+        """Obey a recovery module, and others as well; a change acts at once."""
+        before = self._orders_in_force()
         self._gate.order(header.source, message.engaged, message.mode, message.reason,
                          message.top_speed_mps)
-        if (self._gate.mode, self._gate.top_speed_mps) != before:
+        if message.engaged and header.source not in self._recoveries:
+            self.report_diagnostic("pilot order", f"given by {header.source!r}, no recovery module "
+                                   "of this system; rampart reset ends it", header.source)
+        self._follow(before)
+
+    @on(topics.RESET)
+    def reset(self, message: Reset, _header: Header) -> None:
+        """End the order of one that is no recovery module of the system."""
+        before = self._orders_in_force()
+        if self._gate.reset(message.recovery):
+            self._follow(before)
+
+    def _orders_in_force(self) -> tuple[PilotMode, float, tuple[str, ...]]:
+        return self._gate.mode, self._gate.top_speed_mps, self._gate.unknown
+
+    def _follow(self, before: tuple[PilotMode, float, tuple[str, ...]]) -> None:
+        if self._orders_in_force()[:2] != before[:2]:
             self._act()
             self._tell()
+        if self._gate.unknown != before[2]:
+            self._tell_holds()
+
+    def _tell_holds(self) -> None:
+        """Tell who orders something and should not."""
+        self.publish(topics.HOLDS, Holds("pilot", self._gate.unknown))
 
     @on(topics.MANAGER_STATUS)
     def manager(self, _message: ManagerStatus, header: Header) -> None:
@@ -97,6 +124,8 @@ class SafetyPilot(Actor):
     def repeat_status(self) -> None:
         """Repeat the status for whoever joined late."""
         self._tell()
+        if self._gate.unknown:
+            self._tell_holds()
 
     def _see(self, laser: int, message: LaserScan, header: Header) -> None:
         view = self._lasers.take(laser, message, header.stamp, self.clock.now())
@@ -120,8 +149,8 @@ class SafetyPilot(Actor):
     def _tell(self) -> None:
         last = self._last
         self.publish(topics.PILOT_STATUS, PilotStatus(
-            last.mode, last.stopped, last.reason, self._gate.refused, self._gate.top_speed_mps,
-            self._gate.forbidden(self.clock.now())))
+            last.mode, last.stopped, clip(last.reason), self._gate.refused,
+            self._gate.top_speed_mps, clip(self._gate.forbidden(self.clock.now()))))
 
     def _note(self, refused: str, header: Header) -> None:
         if refused:

@@ -19,6 +19,8 @@ from dataclasses import dataclass
 
 import msgspec
 
+from actors.detection.plausible import is_sane
+
 ProhibitedDistance = Callable[[float, float], float]
 """Signed distance (m) from a point in `map` to the prohibited area, negative inside it."""
 
@@ -60,9 +62,9 @@ class Fix(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def is_usable(self) -> bool:
-        """Whether all of it are numbers, and the speed is one that can be."""
+        """Whether all of it are numbers, and ones that can be."""
         return self.accuracy_m >= 0 \
-            and all(map(math.isfinite, (self.x_m, self.y_m, self.accuracy_m))) \
+            and is_sane(self.x_m, self.y_m, self.accuracy_m) \
             and math.hypot(self.velocity_x_mps, self.velocity_y_mps) <= _FASTEST_MPS
 
 

@@ -22,6 +22,7 @@ from typing import Any, ClassVar, Protocol
 from actors import topics
 from actors.messages import DetectionReport, DetectionState
 from actors.runtime.actor import Actor, Context, every
+from actors.runtime.bounds import NAME_CHARS, clip
 from actors.runtime.parameters import amount
 from actors.runtime.topic import Topic
 
@@ -111,6 +112,8 @@ class DetectionModule(Actor):
 
     def activate(self, reason: str, nodes: tuple[str, ...] = ()) -> None:
         """Go from idle to active; when active already, renew reason and nodes. Report changes."""
+        reason = clip(reason)
+        nodes = tuple(clip(name, NAME_CHARS) for name in nodes)
         if self.state is DetectionState.ACTIVE:
             if (reason, nodes) != (self._report.reason, self._report.nodes):
                 self._tell(DetectionReport(self.state, reason, nodes, self._report.since_s))

@@ -17,7 +17,9 @@ import msgspec
 from actors import messages as m
 from actors import topics
 from actors.operator.camera_eye import CameraEye, renderer
+from actors.operator.hmi_bounds import MAX_NAME, clip
 from actors.operator.hmi_feed import Feed
+from actors.operator.hmi_map import PageMap, lights_shown, page_map
 from actors.operator.hmi_operating import OUTPUTS, SHOWN, Operating
 from actors.operator.hmi_orders import NoSenseError, Orders
 from actors.operator.hmi_processes import ProcessObserver
@@ -39,9 +41,9 @@ from actors.operator.hmi_wishes import (
     Wish,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.envelope import UNREADABLE
 from actors.runtime.topic import Topic
 from actors.supervision.run_plan import RunPlan
-from airport.drawing import AirportDrawing, draw
 from airport.model import Airport, Mission
 from manager.specification import SystemSpec, check_document
 
@@ -65,6 +67,7 @@ class Hmi(Actor):
         super().__init__(context)
         shared = context.shared
         self._airport: Airport | None = shared.get("airport")
+        self._port: int = self.parameters.get("port", shared.get("hmi_port")) or 0
         mission: Mission | None = shared.get("mission")
         run_id = str(shared.get("run_id", "run"))
         waits = bool(shared.get("waits"))
@@ -75,10 +78,9 @@ class Hmi(Actor):
             else self._airport.missions if self._airport else {})
         self._submission = Submission(run_id, context.incarnation, self.clock.now(), first)
         self._orders = Orders(f"{run_id}/{context.name}.{context.incarnation}", "operator")
-        self._state = HmiState()
+        self._state = HmiState(lights_shown(self._airport) if self._airport else None)
         self._operating = Operating(self, self._state)
         self._table: m.NodeTable | None = None
-        self._port: int = self.parameters.get("port", shared.get("hmi_port")) or 0
         self._server: PageServer | None = None
         self._starting: asyncio.Task[None] | None = None
         plan: RunPlan | None = shared.get("plan")
@@ -198,10 +200,11 @@ class Hmi(Actor):
             "type": "hello",
             "run_id": str(self.context.shared.get("run_id", "run")),
             "rate": self.clock.rate,
-            "map": self._map,
+            "map": self._map.encoded if self._map else None,
+            "left_out": self._map.left_out if self._map else {},
             "footprint_m": self._footprint_m,
             "camera": self._camera is not None,
-            "missions": list(self._missions),
+            "missions": [name for name in self._missions if name == clip(name, MAX_NAME)][:200],
             "track": list(self._state.track),
         }
 
@@ -225,8 +228,8 @@ class Hmi(Actor):
         return (robot.length_m, robot.width_m) if robot else None
 
     @cached_property
-    def _map(self) -> AirportDrawing | None:
-        return draw(self._airport) if self._airport else None
+    def _map(self) -> PageMap | None:
+        return page_map(self._airport) if self._airport else None
 
     def _look(self) -> None:
         self._state.usage(self._observer.look(self._table))
@@ -240,9 +243,15 @@ class Hmi(Actor):
 
     @on(topics.ADAPTED_SYSTEM)
     def _adapted(self, message: m.AdaptedSystem, _header: Header) -> None:
-        if message.version > self._version:
-            document = msgspec.json.decode(message.document)
-            self._show_system(check_document(document, "changed system"), message.version)
+        if message.version <= self._version:
+            return
+        try:
+            document = msgspec.json.decode(message.document, type=dict[str, Any])
+            system = check_document(document, "changed system")
+        except UNREADABLE as error:
+            self.report_diagnostic("changed system", clip(f"not shown: {error}"), self.name)
+            return
+        self._show_system(system, message.version)
 
     @on(topics.MISSION_STATUS)
     def _mission_status(self, message: m.MissionStatus, _header: Header) -> None:

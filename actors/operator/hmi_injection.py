@@ -39,6 +39,9 @@ MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp")
 """Modes that fit any topic; what to corrupt in a message is for the catalogue."""
 
 MAX_WAITING = 16
+MAX_PUBLISHERS = 100
+"""Of so many nodes reports on one injection are kept."""
+
 _KEPT = 20
 
 
@@ -199,6 +202,8 @@ class Injections:
             if o.outcome or report.injection not in {x.injection for x in o.orders}:
                 continue
             nodes = o.affected.setdefault(report.injection, {})
+            if len(nodes) >= MAX_PUBLISHERS and report.node not in nodes:
+                continue
             nodes[report.node] = max(nodes.get(report.node, 0), report.affected)
             o.reason = o.reason or report.reason
             if report.finished:

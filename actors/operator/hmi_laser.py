@@ -16,6 +16,9 @@ from actors.messages import LaserScan
 POINTS = 91
 """At most so many are shown of a sweep."""
 
+MAX_RANGE_M = 1000.0
+"""Beyond, no laser of a robot has an echo; what says so is wrong."""
+
 
 def thin(scan: LaserScan | None) -> dict[str, Any] | None:
     """Return a sweep for the page, in `base_link`.
@@ -37,7 +40,7 @@ def thin(scan: LaserScan | None) -> dict[str, Any] | None:
     padded = np.full(-(-len(ranges) // rays) * rays, np.inf)
     padded[:len(ranges)] = ranges
     nearest = padded.reshape(-1, rays).min(axis=1)
-    echo = nearest < scan.range_max_m - 0.005
+    echo = nearest < min(scan.range_max_m, MAX_RANGE_M) - 0.005
     centimetres = np.where(echo, np.round(100 * np.where(echo, nearest, 0)), -1).astype(int)
     return {
         "from_rad": round(scan.angle_min_rad + scan.angle_increment_rad * (rays - 1) / 2, 5),

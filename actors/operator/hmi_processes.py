@@ -17,6 +17,9 @@ from actors.supervision.process_usage import ProcessUsage, UsageMeter
 SEARCH_EVERY = 5
 """Looks between two searches of /proc for the guards: a search reads a file of every process."""
 
+MAX_NODES = 200
+"""So many rows of a table are looked up in /proc; the page shows no more."""
+
 GUARD_KIND = "supervision"
 LAUNCHER = "launch.py"
 _STATES = {"T": "stopped", "t": "stopped", "Z": "crashed", "X": "crashed"}
@@ -54,7 +57,7 @@ class ProcessObserver:
             process that is in no table: name, kind, pid, state, incarnation, restarts, and
             whether it can be sent signals by its name. The usage of a guard is among the nodes'.
         """
-        nodes = table.nodes if table else ()
+        nodes = table.nodes[:MAX_NODES] if table else ()
         known = {node.name for node in nodes}
         if self._port and self._looks % SEARCH_EVERY == 0:
             self._guards = {

@@ -1,12 +1,11 @@
 """The web side of the HMI: static files and a WebSocket, on loopback unless asked otherwise.
 
-It runs on the actor's own event loop and costs nothing while no page is open: uvicorn is used
-for its protocols, without its main loop (ten wake-ups a second) and without its signal handlers
-(a node's signals are its process's business).
+It runs on the actor's own event loop and costs nothing while no page is open
+(`actors.runtime.web_server`, where connections are also let in and seen out).
 
-Who is let in is decided in `actors.runtime.web_access`, how much one may say in `hmi_limits`, and
+Who may do what is decided in `actors.runtime.web_access`, how much one may say in `hmi_limits`, and
 what may be said in `hmi_wishes`. The files are the same for everybody; everything else needs the
-token where there is one.
+token where there is one. Where there is none, only this process's user is let in at all.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import uvicorn
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import HTTPConnection, Request
@@ -34,6 +32,7 @@ from actors.operator.hmi_feed import SEND_TIMEOUT_S, Feed, PageFeed
 from actors.operator.hmi_limits import MessageBudget, Verdict
 from actors.operator.hmi_wishes import RefusedError, Wish, WishError, read_wish
 from actors.runtime.web_access import SUBPROTOCOL, Access, AccessError, is_loopback, shown_token
+from actors.runtime.web_server import WebServer, is_known, served
 
 LOOPBACK = "127.0.0.1"
 NO_TOKEN = 4401
@@ -62,10 +61,14 @@ _FILES = {
     "/app.js": ("app.js", "text/javascript"),
 }
 _CAMERA = "/camera.jpg"
+_REFUSAL = ("This page is for the user who runs the robot; you are another one of this machine. "
+            "With a token others get in too: launch.py --hmi-token-file FILE.")
 _HEADERS = {
     "cache-control": "no-cache",
     "content-security-policy": (
-        "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'"),
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; "
+        "require-trusted-types-for 'script'; trusted-types 'none'"),  # no text becomes HTML
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
 }
@@ -128,7 +131,7 @@ class PageServer:
         names = () if is_loopback(host) else (socket.gethostname(),)
         self._access = Access(host, self.port, token, names)
         self.pages = 0
-        self._server: uvicorn.Server | None = None
+        self._server: WebServer | None = None
 
     async def start(self) -> None:
         """Begin to serve; to be awaited on the actor's loop."""
@@ -143,26 +146,17 @@ class PageServer:
                     WebSocketRoute("/ws", self._page)],
             middleware=[Middleware(_Door, access=self._access)],
         )
-        config = uvicorn.Config(
-            app, log_config=None, log_level="critical", access_log=False, lifespan="off",
-            server_header=False, date_header=False, ws="websockets-sansio", http="h11",
-            ws_max_size=MAX_MESSAGE_BYTES, ws_per_message_deflate=False, limit_concurrency=64,
-        )
-        config.load()
-        self._server = uvicorn.Server(config)
-        self._server.lifespan = config.lifespan_class(config)
-        await self._server.startup(sockets=[self._socket])
+        self._server = WebServer(
+            app, self._socket, refusal="" if self._access.token else _REFUSAL,
+            known=not self._access.token, ws_max_size=MAX_MESSAGE_BYTES)
+        await self._server.start()
 
     def stop(self) -> None:
         """Stop listening and say goodbye to the pages; harmless when not started."""
-        listening = getattr(self._server, "servers", [])
-        if self._server is None or not listening:
+        if self._server is None:
             self._socket.close()
-            return
-        for server in listening:
-            server.close()  # closes the socket too
-        for connection in list(self._server.server_state.connections):
-            connection.shutdown()
+        else:
+            self._server.stop()
 
     async def _picture(self, request: Request) -> Response:
         if request.headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
@@ -170,8 +164,9 @@ class PageServer:
         try:
             if self._camera is None:
                 raise CameraError("this system has no camera")
-            return Response(await self._camera.picture(), media_type="image/jpeg",
-                            headers={"cache-control": "no-store"})
+            with served(request.scope):
+                return Response(await self._camera.picture(), media_type="image/jpeg",
+                                headers={"cache-control": "no-store"})
         except CameraError as error:
             return PlainTextResponse(str(error), 503)
 
@@ -188,7 +183,7 @@ class PageServer:
         self._visitors += 1
         visitor = Visitor(self._visitors)
         try:
-            with self._feed.page() as page:
+            with served(socket_.scope), self._feed.page() as page:
                 await _send(socket_, self._handlers.came(visitor))
                 await _until_one_ends(self._talk(socket_, page, visitor),
                                       self._push(socket_, page))
@@ -258,9 +253,12 @@ class _Door:
 
 
 def _has_token(connection: HTTPConnection, access: Access) -> bool:
-    return access.permits(shown_token(
+    permitted = access.permits(shown_token(
         connection.headers.get("authorization"), connection.query_params.get("token"),
         connection.scope.get("subprotocols", ())))
+    if permitted:
+        is_known(connection.scope)
+    return permitted
 
 
 async def _until_one_ends(*parts: Coroutine[Any, Any, None]) -> None:

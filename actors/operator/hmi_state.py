@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import msgspec
 
 from actors import messages as m
+from actors.operator.hmi_bounds import MAX_NAME, SHOWN, Bounds, clip
 from actors.operator.hmi_laser import thin
 from actors.operator.hmi_picture import Picture
 from manager.strategies import STRATEGIES
@@ -23,11 +24,18 @@ TRACK_STEP_M = 0.25
 """A track point is kept when the robot has moved this far."""
 
 TRACK_POINTS = 4000
+MAX_LIGHTS = 1500
+"""So many lights are shown of an airport: an SVG with more is slow on a telephone."""
+
 STALE_S = 1.5
 """A state that was not heard for so long is shown as stale (simulated seconds)."""
 
 _AGED = ("pose", "mission", "control", "pilot", "manager", "nodes", "laser", "upper_laser")
 """Sections that are stale if nothing has been heard for a while."""
+
+_ROUTE = Bounds(items=1000, room=30_000)
+_SYSTEM = Bounds(text=40_000, items=1000, room=100_000)
+"""Of what was laid out here, of up to 300 boxes (`hmi_system`)."""
 
 _ROUTINE = ("started", "running")
 _GOOD_NEWS = ("respawned", "resumed", "adopted")
@@ -45,29 +53,33 @@ class _Heard(msgspec.Struct):
 class HmiState:
     """The operator's picture of the system, as far as the HMI has heard of it.
 
+    Args:
+        lights: names of the lights that are shown; None for any, up to `MAX_LIGHTS`.
+
     Attributes:
         picture: what pages are shown.
         track: where the robot was, (x, y) in `map`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, lights: Collection[str] | None = None) -> None:
+        self._lights = None if lights is None else frozenset(lights)
         self.track: deque[tuple[float, float]] = deque(maxlen=TRACK_POINTS)
         self.picture = picture = Picture()
         self._heard_s: dict[str, float] = {}
         self._detections: dict[str, m.DetectionView] = {}
         self._mission_id = ""
         self._outcomes = 0
-        picture.section("system")
+        picture.section("system", bounds=_SYSTEM)
         picture.section("pose", show=_with_time)
         for name in ("laser", "upper_laser"):
             picture.section(name, show=_sweep)
         picture.section("mission", show=_mission)
         picture.section("order", {"number": 0, "text": ""})
-        picture.section("route", ())
+        picture.section("route", (), _route, _ROUTE)
         for name in ("control", "pilot", "manager", "nodes"):
             picture.section(name, show=_aged)
         picture.section("detections", [])
-        picture.section("lights", {}, _lights)
+        picture.table("lights", MAX_LIGHTS)
         picture.section("obstacles", ())
         picture.section("usage", {})
         picture.journal("decisions")
@@ -105,22 +117,27 @@ class HmiState:
 
     def mission(self, status: m.MissionStatus, now_s: float) -> None:
         """Keep the mission's state; a new mission starts with unmeasured lights."""
-        lights = dict(self.picture.value("lights"))
         if status.mission_id and status.mission_id != self._mission_id:
             self._mission_id = status.mission_id
-            lights.clear()
+            for name in self.picture.rows("lights"):
+                self.picture.put_row("lights", name, None)
         self._heard_s["mission"] = now_s
         self.picture.put("mission", _Heard(status))
-        self.picture.put("lights", lights | {light.light: light for light in status.lights})
+        for light in status.lights:
+            self.light(light)
 
     def light(self, measured: m.LightMeasurement) -> None:
-        """Keep the measurement of a light."""
-        self.picture.put("lights", self.picture.value("lights") | {measured.light: measured})
+        """Keep the measurement of a light that is shown."""
+        name = measured.light
+        if len(name) <= MAX_NAME and (self._lights is None or name in self._lights):
+            self.picture.put_row("lights", name, {
+                "verdict": measured.verdict, "ratio": round(measured.ratio, 3),
+                "intensity_cd": round(measured.intensity_cd, 1)})
 
     def manager(self, status: m.ManagerStatus, now_s: float) -> None:
         """Keep the manager's view, and log which detections have come and gone."""
         before = self._detections
-        self._detections = {view.name: view for view in status.detections}
+        self._detections = {view.name: view for view in status.detections[:SHOWN.items]}
         self._heard_s["manager"] = now_s
         self.picture.put("manager", _Heard(status))
         self._show_detections(False)
@@ -177,7 +194,7 @@ class HmiState:
 
     def log(self, now_s: float, kind: str, text: str) -> None:
         """Add a line to the event log; `kind` is fault, clear or note."""
-        self.picture.add("events", {"t": round(now_s, 2), "kind": kind, "text": text})
+        self.picture.add("events", {"t": round(now_s, 2), "kind": kind, "text": clip(text)})
 
     def system(self, drawing: Mapping[str, Any] | None) -> None:
         """Keep the drawing of the system's fault tree and order (`hmi_system`)."""
@@ -229,10 +246,8 @@ def _sweep(heard: _Heard | None) -> dict[str, Any] | None:
     return None if heard is None or heard.stale else thin(heard.value)
 
 
-def _lights(lights: Mapping[str, m.LightMeasurement]) -> dict[str, Any]:
-    return {name: {"verdict": light.verdict, "ratio": round(light.ratio, 3),
-                   "intensity_cd": round(light.intensity_cd, 1)}
-            for name, light in lights.items()}
+def _route(waypoints: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    return [(round(x, 2), round(y, 2)) for x, y in waypoints]
 
 
 def _mission(heard: _Heard | None) -> dict[str, Any] | None:

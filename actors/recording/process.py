@@ -20,6 +20,8 @@ import setproctitle
 
 from actors.recording.bag_writer import BagError
 from actors.recording.recorder import RUN_ENDED, Recorder
+from actors.runtime import streams
+from actors.runtime.plain_text import one_line
 
 _ROOT = Path(__file__).resolve().parents[2]
 _READY = "ready"
@@ -83,7 +85,8 @@ class RecorderProcess:
             process.wait(_END_S)
         except subprocess.TimeoutExpired:
             process.kill()
-            process.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):  # as one that waits for its disk
+                process.wait(_END_S)
 
 
 def stop_pipe() -> int:
@@ -130,6 +133,8 @@ def told(recorder: Recorder) -> str:
     writer = recorder.writer
     if writer is None:
         return f"{recorder.path}: nothing was recorded"
+    if not recorder.path.exists():
+        return f"{recorder.path}: was taken away while it was written: nothing is recorded"
     lost = sum(writer.gaps.lost().values())
     parts = [f"{writer.messages} messages in {recorder.path}",
              *([f"{writer.garbage} of them garbage"] if writer.garbage else []),
@@ -144,8 +149,9 @@ def _answer(text: str) -> None:
 
 
 def _say(text: str) -> None:
-    print("rampart: " + " ".join(text.split()), file=sys.stderr, flush=True)
+    print(f"rampart: {one_line(text)}", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":
+    streams.secure()
     sys.exit(record(msgspec.json.decode(sys.argv[1], type=Order)))

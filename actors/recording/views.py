@@ -18,7 +18,9 @@ from actors import messages as m
 from actors import topics
 from actors.recording import foxglove as fg
 from actors.recording import scene
+from actors.runtime.bounds import MANY, MOST
 from actors.runtime.envelope import Header
+from actors.runtime.limits import Remembered
 from actors.runtime.topic import Topic
 from airport.model import Airport
 from manager.words import decision_in_words
@@ -50,8 +52,8 @@ class Views:
         self._airport = airport
         self._footprint_m = footprint_m or scene.FOOTPRINT_M
         self._odom = m.Pose(0.0, 0.0, 0.0)
-        self._lights: dict[str, m.LightMeasurement] = {}
-        self._seen: dict[str, Any] = {}
+        self._lights: dict[str, m.LightMeasurement] = Remembered(MOST)
+        self._seen: dict[str, Any] = Remembered(MANY)
         self._translators: dict[str, Callable[[str, Header, Any, int], list[View]]] = {
             topics.POSE.key: self._pose, topics.ODOMETRY.key: self._odometry,
             topics.SCAN.key: self._scan, topics.UPPER_SCAN.key: self._upper_scan,
@@ -139,7 +141,8 @@ class Views:
         new = {light.light: light for light in lights if self._lights.get(light.light) != light}
         if not new or self._airport is None:
             return []
-        self._lights.update(new)
+        for name, light in new.items():
+            self._lights[name] = light
         return [("view/lights", scene.lights_scene(
             self._airport, self._lights, fg.time_of(at_ns)))]
 
@@ -228,7 +231,8 @@ def _sweep(channel: str, sweep: m.LaserScan, at_ns: int) -> list[View]:
     count = len(sweep.ranges_f32) // 4
     ranges = np.frombuffer(sweep.ranges_f32, dtype="<f4", count=count)
     # No echo: at the laser itself, where the robot hides it. JSON has no number that says "none".
-    echo = np.isfinite(ranges) & (ranges < sweep.range_max_m)
+    with np.errstate(over="ignore", invalid="ignore"):  # a range may be anything
+        echo = np.isfinite(ranges) & (ranges < sweep.range_max_m)
     seen = np.round(np.where(echo, ranges, 0.0).astype(np.float64), 3)
     end_rad = sweep.angle_min_rad + max(0, count - 1) * sweep.angle_increment_rad
     if not (math.isfinite(sweep.angle_min_rad) and math.isfinite(end_rad)):

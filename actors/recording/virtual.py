@@ -56,7 +56,7 @@ class VirtualRecording:
             if at_s >= self._next_flush_s:
                 self._next_flush_s = at_s + FLUSH_S
                 self._writer.flush()
-        except OSError as error:
+        except Exception as error:  # whatever it is: the run goes on
             self._fail(error)
 
     def close(self) -> str:
@@ -64,11 +64,14 @@ class VirtualRecording:
         if not self._failed:
             try:
                 self._writer.close({"ended": "the run has ended"})
-            except OSError as error:
+            except Exception as error:
                 self._fail(error)
+        if not self._failed and not self._path.exists():
+            return f"{self._path}: was taken away while it was written: nothing is recorded"
         return self._failed or f"recorded {self._writer.messages} messages in {self._path}"
 
-    def _fail(self, error: OSError) -> None:
+    def _fail(self, error: Exception) -> None:
         self._writer.abandon()
-        self._failed = (f"{self._path}: {error.strerror or error}: the recording ends after "
+        why = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+        self._failed = (f"{self._path}: {why}: the recording ends after "
                         f"{self._writer.messages} messages")

@@ -22,6 +22,8 @@ from typing import Any, ClassVar
 from actors import topics
 from actors.messages import RecoveryCommand, RecoveryPhase, RecoveryReport, RecoveryState
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
+from actors.runtime.timer import Timer
 from actors.runtime.topic import Topic
 from manager.schema import SystemSpec
 
@@ -71,6 +73,7 @@ class RecoveryModule(Actor):
         self.deadline_s = self._contract_deadline_s()
         self._reason = ""
         self._due_s = math.inf
+        self._deadline: Timer | None = None
         self._excused = False
         self._release: RecoveryCommand | None = None
         self._told: RecoveryReport | None = None
@@ -147,7 +150,7 @@ class RecoveryModule(Actor):
     def _begin(self, reason: str) -> None:
         self._excused = False
         self._due_s = self.clock.now() + self.deadline_s
-        self.call_later(self.deadline_s, self._check_deadline)
+        self._look_at(self.deadline_s)
         if self.phase is not RecoveryPhase.ACTING:
             self._enter(RecoveryPhase.ACTING, reason)
 
@@ -201,17 +204,22 @@ class RecoveryModule(Actor):
             return
         if late_s > LATE_S and not self._excused:  # it was stopped itself: read the mail first
             self._excused = True
-            self.call_later(LATE_S, self._check_deadline)
+            self._look_at(LATE_S)
         else:
             rest = self.unfinished()
             self.fail(f"not done within {self.deadline_s:g} s{f': {rest}' if rest else ''}")
+
+    def _look_at(self, in_s: float) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+        self._deadline = self.call_later(in_s, self._check_deadline)
 
     def _enter(self, phase: RecoveryPhase, reason: str) -> None:
         if phase not in TRANSITIONS[self.phase]:
             raise IllegalTransitionError(
                 f"{self.name}: no transition from {self.phase} to {phase}")
         self.phase = phase
-        self._reason = reason
+        self._reason = clip(reason)
 
     # -- reports --------------------------------------------------------------------------------
 

@@ -14,7 +14,6 @@ process and its liveliness token live on.
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -22,11 +21,13 @@ from typing import Any, ClassVar, TypeVar
 
 import msgspec
 
+from actors.runtime.bounds import MAX_PAYLOAD_BYTES, clip
 from actors.runtime.bus import Bus
 from actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
 from actors.runtime.clock import Clock
-from actors.runtime.envelope import ArrivalGuard, Envelope, Header, pack
+from actors.runtime.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from actors.runtime.injection_desk import InjectionDesk
+from actors.runtime.limits import RateLimit, ReportLimit
 from actors.runtime.mailbox import Mailbox
 from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection
 from actors.runtime.run_folder import Register
@@ -47,7 +48,8 @@ BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT, HELLO)
 _REPEATED_SOON_HZ = 7.0
 """A state that is repeated this often anyway is not repeated for a newcomer."""
 
-_DIAGNOSTIC_PERIOD_S = 1.0
+_HELLOS_PER_S = 100
+"""More newcomers in a simulated second than a system has nodes are no newcomers."""
 
 # What an actor is doing. Numbers, because they are compared and set for each message.
 _RESTING = 0
@@ -74,6 +76,7 @@ class Context:
         heartbeat_period_s: simulated seconds between two heartbeats.
         failed: told of the error that ends the actor, while its peers still believe that it lives.
         register: returns the incarnation of a node that was issued last, None if it is not known.
+        members: names of all nodes of the system; what others make it remember is bounded.
     """
 
     name: str
@@ -87,6 +90,7 @@ class Context:
     heartbeat_period_s: float = 0.1
     failed: Callable[[Exception], None] = lambda _error: None
     register: Register = lambda _node: None
+    members: frozenset[str] = frozenset()
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:
@@ -141,7 +145,8 @@ class Actor:
         self.clock = context.clock
         self.parameters = context.parameters
         self._bus = context.bus
-        self._guard = ArrivalGuard(context.clock.now, context.register)
+        self._guard = ArrivalGuard(
+            context.clock.now, context.members, self._crowded, context.register)
         self._injections = InjectionDesk(self)
         self._in_force = self._injections.gate.in_force
         self._last_sent = self._injections.gate.last
@@ -162,7 +167,9 @@ class Actor:
         self._abandoned = False
         self._timers: set[asyncio.TimerHandle] = set()
         self._tickers: list[_Ticker] = []
-        self._diagnostics: dict[str, tuple[float, int]] = {}
+        self._reports = ReportLimit()
+        self._hellos = RateLimit(_HELLOS_PER_S)
+        self._answer_due = False
         self._states: dict[str, tuple[Topic[Any], msgspec.Struct, float]] = {}
         self._outlets: dict[str | tuple[str, str], tuple[str, bool]] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
@@ -280,15 +287,11 @@ class Actor:
         self._keeper.keep(form, state)
 
     def report_diagnostic(self, context: str, reason: str, offender: str) -> None:
-        """Publish an error report, at most one a second per context and offender."""
-        slot = f"{context} {offender}"
-        last, count = self._diagnostics.get(slot, (-math.inf, 0))
-        now = self.clock.now()
-        if now - last < _DIAGNOSTIC_PERIOD_S:
-            self._diagnostics[slot] = (last, count + 1)
-            return
-        self._diagnostics[slot] = (now, 0)
-        self.publish(DIAGNOSTIC, Diagnostic(self.name, context, reason, offender, count + 1))
+        """Publish an error report: one a second per context and offender, and few in all."""
+        count = self._reports.stands_for(f"{context} {offender}", self.clock.now())
+        if count:
+            self.publish(DIAGNOSTIC, Diagnostic(
+                self.name, clip(context), clip(reason), clip(offender), count))
 
     def stop(self) -> None:
         """End the actor after the items that already wait."""
@@ -428,7 +431,7 @@ class Actor:
 
     def _fail(self, error: Exception) -> None:
         try:
-            self._diagnostics.clear()
+            self._reports.clear()
             self.report_diagnostic("handler failed", f"{type(error).__name__}: {error}", self.name)
             self._keeper.failed()
             self.on_failure(error)
@@ -442,6 +445,7 @@ class Actor:
         self, topic: Topic[Any], handler: Callable[[Any, Header], None]
     ) -> Callable[[str, bytes], None]:
         command, name, waiting = topic.qos is Qos.COMMAND, handler.__name__, self._waiting
+        members, mailbox = self.context.members, self._mailbox
 
         def take(key: str, message: Envelope[Any]) -> None:
             if self._stance == _IDLE:  # as `_handle`, once more because it is run so often
@@ -457,10 +461,11 @@ class Actor:
                 else:
                     self._stance = _IDLE
             elif command:
-                self._mailbox.put(lambda: handler(message.body, message))
+                mailbox.put(lambda: handler(message.body, message),
+                            reserved=not members or message.source in members)
             else:
-                self._mailbox.put_latest(
-                    f"{key} {name}", lambda: handler(message.body, message))
+                mailbox.put_message(f"{key} {name}", lambda: handler(message.body, message),
+                                    reserved=not members or message.source in members)
 
         return self._guard.receiver(topic, take, self._reject)
 
@@ -469,11 +474,15 @@ class Actor:
         self.report_diagnostic("payload rejected", reason, key)
 
     def _peer_changed(self, node: str, incarnation: int, alive: bool) -> None:
-        self._mailbox.put_latest(
+        self._mailbox.put_message(
             f"peer {node} {incarnation} {alive}", lambda: self.on_peer(node, incarnation, alive))
 
     def _overflowed(self, _item: Any) -> None:
-        self.report_diagnostic("mailbox full", "a command was refused", self.name)
+        self.report_diagnostic("mailbox full", "a message was refused", self.name)
+
+    def _crowded(self) -> None:
+        self.report_diagnostic("many sources", f"more than {STRANGERS} that are no nodes of the "
+                               "system; those heard first are forgotten", self.name)
 
     def send(
         self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float, copies: int = 1
@@ -482,6 +491,9 @@ class Actor:
         self._sequence = sequence = self._sequence + 1
         self._last_sent[key] = (body, stamp)
         payload = pack((self.name, self._incarnation, sequence, stamp, body))
+        if len(payload) > MAX_PAYLOAD_BYTES:  # no reader would take it
+            self.report_diagnostic("not sent", too_long(payload), key)
+            return
         for _ in range(copies):
             self._bus.publish(topic, key, payload)
 
@@ -515,12 +527,24 @@ class Actor:
         self.publish(HEARTBEAT, Heartbeat(
             context.pid, self._progress, context.heartbeat_period_s, self._rejected,
             self._mailbox.overflowed))
+        left_out = self._reports.left_out(self.clock.now())
+        if left_out:
+            self.report_diagnostic(
+                "diagnostics", f"{left_out} more reports were left out", self.name)
 
     # -- newcomers ------------------------------------------------------------------------------
 
     def _on_hello(self, _hello: Hello, header: Header) -> None:
-        if header.source == self.name:
+        if header.source == self.name or self._answer_due:
             return
+        if self._hellos.allows(self.clock.now()):
+            self._repeat_states()
+        else:  # one answer for all of them, when the flood has lasted a second
+            self._answer_due = True
+            self.call_later(1.0, self._repeat_states)
+
+    def _repeat_states(self) -> None:
+        self._answer_due = False
         for key, (topic, body, stamp) in list(self._states.items()):
             if self._in_force:
                 self._injections.send(topic, key, body, stamp)

@@ -282,11 +282,14 @@ class Keeper:
         self._used = True
         self._began_s = self._now()
         try:
-            loaded = self._load()
-        except CheckpointError as error:
+            return self._find(form)
+        except Exception as error:  # of whatever a disk may hold; nothing of it ends a node
             self._superseded = isinstance(error, SupersededError)
-            self._report(f"{error}; starting without a checkpoint")
+            self._report(f"{_in_words(error)}; starting without a checkpoint")
             return None
+
+    def _find(self, form: StateFormat[S]) -> S | None:
+        loaded = self._load()
         self._failures = loaded.failures
         if loaded.failures >= FAILED_LIVES:
             self._report(f"{loaded.failures} lives in a row have failed with the state kept; "
@@ -296,7 +299,8 @@ class Keeper:
         state, problems = newest_sound(form, loaded.records)
         problems = (*loaded.problems, *problems)
         if problems or (state is None and self._expected):
-            start = "starting without a checkpoint" if state is None else "taking the one before"
+            start = ("starting without a checkpoint" if state is None
+                     else "taking the newest sound one")
             self._report(f"{'; '.join(problems) or 'no checkpoint was found'}; {start}")
         return state
 
@@ -310,7 +314,7 @@ class Keeper:
         self._used = True
         try:
             self._store.save(form.version, data)
-        except CheckpointError as error:
+        except Exception as error:
             self._kept = None
             self._busy += 1
             if isinstance(error, BusyError) and self._busy < BUSY_TIMES:
@@ -319,7 +323,7 @@ class Keeper:
             self._superseded = isinstance(error, SupersededError)
             self._retry_at_s = self._now() + self._pause_s
             self._pause_s = min(2 * self._pause_s, RETRY_S[1])
-            self._tell(f"{error}; going on without checkpoints")
+            self._tell(f"{_in_words(error)}; going on without checkpoints")
             return
         self._kept = data
         self._busy = 0
@@ -355,13 +359,17 @@ class Keeper:
         self._failures = failures
         try:
             self._store.note_failures(failures)
-        except CheckpointError as error:
-            self._tell(str(error))
+        except Exception as error:
+            self._tell(_in_words(error))
 
     def _tell(self, problem: str) -> None:
         if problem != self._problem:
             self._problem = problem
             self._report(problem)
+
+
+def _in_words(error: Exception) -> str:
+    return str(error) if isinstance(error, CheckpointError) else f"{type(error).__name__}: {error}"
 
 
 def newest_sound(

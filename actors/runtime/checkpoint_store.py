@@ -15,9 +15,9 @@ it. (It is synced without the lock. A loss of power before that finds the old lo
 that was cut to nothing is not written over in place.) A save that falls into the moment of the cut,
 once in `log_limit_bytes`, waits for it: 15 to 25 ms were measured.
 
-*Checked.* Each record has a SHA-256 over all that is in it. A CRC would find the same accidents;
-this costs two microseconds and leaves no rate of missed ones to argue about. A file that SQLite
-finds damaged is set aside, and what could still be read of it is used.
+*Checked.* Whatever lies there is read by `checkpoint_file`, which believes nothing. If any of it is
+damaged, the file is set aside and begun anew with what is sound of it: a file is either whole or
+replaced, and there is no kind of damage that is dealt with in a way of its own.
 
 *Claimed.* Whoever loads claims the file for its incarnation, and every save asks, in the same
 transaction, whether the claim still stands: an older process that lives on is refused. What can be
@@ -31,14 +31,12 @@ over most network ones), and the disk keeps what it has acknowledged to have syn
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import sqlite3
-import struct
 import threading
 from pathlib import Path
-from typing import Any
 
+from actors.runtime import checkpoint_file as disk
 from actors.runtime.checkpoint import (
     GENERATIONS,
     BusyError,
@@ -48,41 +46,17 @@ from actors.runtime.checkpoint import (
     SupersededError,
 )
 
-STORE_FORMAT = 1
-"""Version of the tables, in the file's `user_version`."""
-
-APPLICATION = 0x52504350
-"""`application_id` of the files ("RPCP")."""
-
-LOCK_PATIENCE_S = 0.1
-"""A save waits at most so long for a lock that somebody else holds."""
-
 _COPIES = 3
 """So often the log is copied, in the hope that no save has come meanwhile, before it is cut."""
 
 _FAR = 8
 """At so many times its limit the log is cut whatever comes."""
 
-_DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
-
 _LOCKED = frozenset({sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED})
 
-_PAGE_BYTES = 1024
-"""A save writes the pages that it touches, whole; states are some hundreds of bytes long."""
-
-_TABLES = (
-    "CREATE TABLE checkpoint (slot INTEGER PRIMARY KEY, generation INTEGER NOT NULL,"
-    " incarnation INTEGER NOT NULL, version INTEGER NOT NULL, state BLOB NOT NULL,"
-    " checksum BLOB NOT NULL)",
-    "CREATE TABLE owner (id INTEGER PRIMARY KEY CHECK (id = 0), run TEXT NOT NULL,"
-    " incarnation INTEGER NOT NULL, failures INTEGER NOT NULL, cuts INTEGER NOT NULL)",
-    f"PRAGMA application_id = {APPLICATION}",
-    f"PRAGMA user_version = {STORE_FORMAT}",
-)
-
-_SAVE = ("REPLACE INTO checkpoint (slot, generation, incarnation, version, state, checksum)"
-         " SELECT ?, ?, ?, ?, ?, ? WHERE EXISTS"
-         " (SELECT 1 FROM owner WHERE run = ? AND incarnation = ?)")
+_PUT = ("REPLACE INTO checkpoint (slot, generation, incarnation, version, state, checksum)"
+        " SELECT ?, ?, ?, ?, ?, ? WHERE EXISTS"
+        " (SELECT 1 FROM owner WHERE run = ? AND incarnation = ?)")
 
 
 class SqliteCheckpoints:
@@ -121,21 +95,18 @@ class SqliteCheckpoints:
 
     def save(self, version: int, state: bytes) -> None:
         """Keep a state; see `CheckpointStore`."""
+        if len(state) > disk.LARGEST_STATE_BYTES:
+            raise CheckpointError(f"{self._file}: a state of {len(state)} bytes is too large; "
+                                  f"{disk.LARGEST_STATE_BYTES} can be kept")
         self._check_place()
         try:
-            self._ready()
-            saved = self._insert(version, state)
-        except sqlite3.Error as error:
-            if not _is_damage(error):
-                raise self._error(error) from None
-            self._trouble = self._set_aside(error) + "; begun anew"
-            self._begin_anew()
+            self._insert(version, state)
+        except Exception as error:
+            self._trouble = self._replace(disk.Found(problems=[self._damage(error)]))
             try:
-                saved = self._insert(version, state)
-            except sqlite3.Error as second:
+                self._insert(version, state)
+            except Exception as second:
                 raise self._error(second) from None
-        if not saved:
-            raise self._superseded()
         self._unsynced = True
         if self._thread is None and self._period_s > 0:
             self._thread = threading.Thread(target=self._keep_synced, daemon=True,
@@ -145,10 +116,11 @@ class SqliteCheckpoints:
     def note_failures(self, failures: int) -> None:
         """Keep how many lives in a row have failed."""
         try:
+            owner = disk.Owner(self._run, self._incarnation, failures)
             self._ready().execute(
-                "UPDATE owner SET failures = ? WHERE run = ? AND incarnation = ?",
-                (failures, self._run, self._incarnation))
-        except sqlite3.Error as error:
+                "UPDATE owner SET failures = ?, checksum = ? WHERE run = ? AND incarnation = ?",
+                (failures, disk.owner_checksum(owner), self._run, self._incarnation))
+        except Exception as error:
             raise self._error(error) from None
 
     def trouble(self) -> str:
@@ -172,7 +144,7 @@ class SqliteCheckpoints:
             sqlite3.Error: the log could not be copied into the database.
         """
         self._unsynced = False
-        log = self._beside("-wal")
+        log = disk.beside(self._file, "-wal")
         _sync_to_disk(log)
         if not self._listed:
             # The database by way of SQLite: to close a descriptor of it would drop SQLite's locks.
@@ -197,85 +169,59 @@ class SqliteCheckpoints:
 
     def _load_and_claim(self) -> tuple[Loaded, CheckpointError | None]:
         """Return what was kept, and why the file could not be claimed; then it is not open."""
-        problems: list[str] = []
-        records: list[Record] = []
-        failures = 0
+        found = disk.Found()
         was_read = False
+        problem = ""
         unclaimed: CheckpointError | None = None
         try:
-            self._open()
-            owner = self._owner()
-            if owner is not None and owner[0] == self._run:
-                if owner[1] > self._incarnation:
-                    raise self._superseded()
-                failures = owner[2]
-                records, problems = self._read()
+            connection = self._open()
+            found = disk.read(connection, self._file, self._run)
+            self._refuse_if_superseded(found)
             was_read = True
-            self._claim()
-        except sqlite3.Error as error:
-            if _is_damage(error):
-                problems.append(self._set_aside(error))
-                self._begin_anew()
+            if not found.problems:
+                self._claim(found)
+        except Exception as error:
+            if isinstance(error, SupersededError):
+                raise
+            if disk.is_damage(error, self._file):
+                found.problems.append(disk.words(error))
             else:
                 self._close_connection()
                 unclaimed = self._error(error)
                 if not was_read:
                     raise unclaimed from None
-        records.sort(key=lambda record: -record.generation)
-        self._generation = max((record.generation for record in records), default=0)
-        return Loaded(tuple(records), tuple(problems), failures), unclaimed
+        if found.problems:
+            try:
+                problem = self._replace(found)
+            except CheckpointError as error:
+                unclaimed, problem = error, str(error)
+        self._generation = max((record.generation for record in found.records), default=0)
+        return Loaded(tuple(found.records), (problem,) if problem else (),
+                      found.owner.failures if found.owner else 0), unclaimed
 
-    def _open(self) -> None:
-        if self._connection is not None:
-            return
-        try:
-            self._file.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise CheckpointError(f"{self._file.parent}: {error.strerror}") from None
-        self._connection = connection = self._connect()
-        (form,) = connection.execute("PRAGMA user_version").fetchone()
-        (application,) = connection.execute("PRAGMA application_id").fetchone()
-        if (form, application) == (0, 0) and not self._tables():
-            connection.execute("PRAGMA synchronous = OFF")  # nothing in it that could be lost yet
-            connection.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
-            connection.execute("PRAGMA journal_mode = WAL")
-            with _transaction(connection):
-                for statement in _TABLES:
-                    connection.execute(statement)
-            connection.execute("PRAGMA synchronous = NORMAL")
-        elif application != APPLICATION or form > STORE_FORMAT:
-            self._close_connection()
-            what = "no checkpoints of a node" if application != APPLICATION else (
-                f"format {form} is newer than this program's {STORE_FORMAT}")
-            raise CheckpointError(f"{self._file}: {what}; the file is left as it is")
-        self._inode = self._file.stat().st_ino
+    def _open(self) -> sqlite3.Connection:
+        """Return the connection to a file that has tables; what is in them is not known yet.
 
-    def _connect(self) -> sqlite3.Connection:
-        try:
-            connection = sqlite3.connect(
-                self._file, timeout=LOCK_PATIENCE_S, isolation_level=None,
-                check_same_thread=False)
-        except sqlite3.Error as error:
-            raise self._error(error) from None
-        try:
-            connection.execute("PRAGMA wal_autocheckpoint = 0")
-            connection.execute("PRAGMA synchronous = NORMAL")
-        except sqlite3.Error:
-            connection.close()
-            raise
-        return connection
-
-    def _tables(self) -> int:
-        assert self._connection is not None  # noqa: S101
-        (count,) = self._connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
-        return int(count)
+        Raises:
+            Exception: it cannot be had, or the file is damaged.
+        """
+        if self._connection is None:
+            try:
+                self._file.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise CheckpointError(f"{self._file.parent}: {error.strerror}") from None
+            disk.inspect(self._file)
+            self._connection = disk.connect(self._file)
+            disk.make_tables(self._connection)
+            self._inode = self._file.lstat().st_ino
+        return self._connection
 
     def _check_place(self) -> None:
         """Notice that the file was taken away: SQLite would go on writing into nowhere."""
         if self._connection is None:
             return
         try:
-            same = self._file.stat().st_ino == self._inode
+            same = self._file.lstat().st_ino == self._inode
         except OSError:
             same = False
         if not same:
@@ -288,90 +234,91 @@ class SqliteCheckpoints:
             with contextlib.suppress(sqlite3.Error):
                 connection.close()
 
-    # -- reading and writing --------------------------------------------------------------------
+    # -- writing --------------------------------------------------------------------------------
 
-    def _owner(self) -> tuple[str, int, int] | None:
-        assert self._connection is not None  # noqa: S101
-        row = self._connection.execute("SELECT run, incarnation, failures FROM owner").fetchone()
-        return row and (str(row[0]), int(row[1]), int(row[2]))
-
-    def _claim(self) -> None:
-        """Claim the file; the failures noted in it stay, the states of another run do not."""
-        assert self._connection is not None  # noqa: S101
-        failures = 0
+    def _claim(self, found: disk.Found) -> None:
+        """Claim the file; the states of another run do not stay, those that were saved do."""
+        assert self._connection is not None  # noqa: S101 for the type checker
+        failures = found.owner.failures if found.owner else 0
         with _transaction(self._connection) as connection:
-            owner = self._owner()
-            if owner is None or owner[0] != self._run:
+            owner = disk.read_owner(connection)
+            if owner is None or owner.run != self._run:
                 connection.execute("DELETE FROM checkpoint")
-            elif owner[1] > self._incarnation:
+            elif owner.incarnation > self._incarnation:
                 raise self._superseded()
             else:
-                failures = owner[2]
-            connection.execute("REPLACE INTO owner VALUES (0, ?, ?, ?, 0)",
-                               (self._run, self._incarnation, failures))
+                failures = owner.failures
+            claimed = disk.Owner(self._run, self._incarnation, failures)
+            connection.execute("REPLACE INTO owner VALUES (0, ?, ?, ?, ?)", (
+                self._run, self._incarnation, failures, disk.owner_checksum(claimed)))
+            for record in found.records if found.problems else ():
+                self._put(connection, record)
 
-    def _read(self) -> tuple[list[Record], list[str]]:
-        """Return the sound records and what is wrong with others; each is read by itself."""
-        assert self._connection is not None  # noqa: S101
-        records, problems = [], []
-        for slot in range(GENERATIONS):
-            try:
-                row = self._connection.execute(
-                    "SELECT generation, incarnation, version, state, checksum FROM checkpoint"
-                    " WHERE slot = ?", (slot,)).fetchone()
-            except sqlite3.Error as error:
-                if not _is_damage(error):
-                    raise
-                problems.append(f"{self._file}: slot {slot}: {error}")
-                continue
-            if row is None:
-                continue
-            if not _is_sound(row):
-                problems.append(f"{self._file}: generation {row[0]}: its checksum is wrong")
-                continue
-            records.append(Record(*row[:4]))
-        return records, problems
+    def _insert(self, version: int, state: bytes) -> None:
+        """Keep a state as the next generation.
 
-    def _insert(self, version: int, state: bytes) -> bool:
-        generation = self._generation + 1
-        cursor = self._ready().execute(_SAVE, (
-            generation % GENERATIONS, generation, self._incarnation, version, state,
-            _checksum(generation, self._incarnation, version, state), self._run,
-            self._incarnation))
-        if cursor.rowcount != 1:
-            return False
-        self._generation = generation
-        return True
+        Raises:
+            Exception: it could not be kept.
+        """
+        connection = self._ready()
+        record = Record(self._generation + 1, self._incarnation, version, state)
+        if self._put(connection, record) != 1:
+            if disk.read_owner(connection) is None:
+                raise disk.Unsound("owner: its row is missing")
+            raise self._superseded()
+        self._generation = record.generation
+
+    def _put(self, connection: sqlite3.Connection, record: Record) -> int:
+        return connection.execute(_PUT, (
+            record.generation % GENERATIONS, record.generation, record.incarnation, record.version,
+            record.state, disk.record_checksum(self._run, record), self._run, self._incarnation,
+        )).rowcount
 
     # -- damage ---------------------------------------------------------------------------------
 
-    def _set_aside(self, error: sqlite3.Error) -> str:
-        """Move a damaged file out of the way and return a line about it."""
-        self._close_connection()
-        aside = self._file.with_suffix(".damaged")
-        try:
-            self._file.replace(aside)
-            for suffix in ("-wal", "-shm"):
-                self._beside(suffix).unlink(missing_ok=True)
-        except OSError as second:
-            raise CheckpointError(f"{self._file}: {error}, and cannot be set aside: "
-                                  f"{second.strerror}") from None
-        return f"{self._file}: {error}; kept as {aside.name}"
+    def _replace(self, found: disk.Found) -> str:
+        """Set a damaged file aside, begin anew with what is sound of it, and return a line.
 
-    def _begin_anew(self) -> None:
+        Raises:
+            CheckpointError: that is not possible.
+        """
+        line = f"{self._file}: {'; '.join(found.problems)}"
+        try:
+            aside = disk.set_aside(self._file)  # before it is closed, which would change it
+        except OSError as error:
+            raise CheckpointError(f"{line}; it cannot be set aside: {error.strerror}") from None
+        finally:
+            self._close_connection()
         try:
             self._open()
-            self._claim()
-        except sqlite3.Error as error:
+            self._claim(found)
+        except Exception as error:
             self._close_connection()
             raise self._error(error) from None
+        return f"{line}; kept as {aside}, begun anew"
 
-    def _beside(self, suffix: str) -> Path:
-        return self._file.with_name(self._file.name + suffix)
+    def _damage(self, error: Exception) -> str:
+        """Return in words what is damaged.
 
-    def _error(self, error: sqlite3.Error) -> CheckpointError:
-        kind = BusyError if _code(error) in _LOCKED else CheckpointError
-        return kind(f"{self._file}: {' '.join(str(error).split())}")
+        Raises:
+            CheckpointError: nothing is, it was something else.
+        """
+        if not disk.is_damage(error, self._file):
+            raise self._error(error) from None
+        return disk.words(error)
+
+    def _error(self, error: Exception) -> CheckpointError:
+        if isinstance(error, CheckpointError):
+            return error
+        kind = BusyError if disk.primary_code(error) in _LOCKED else CheckpointError
+        why = getattr(error, "strerror", None) or disk.words(error)
+        return kind(f"{self._file}: {why}")
+
+    def _refuse_if_superseded(self, found: disk.Found) -> None:
+        incarnations = [record.incarnation for record in found.records]
+        if (found.owner.incarnation if found.owner else max(incarnations, default=0)
+                ) > self._incarnation:
+            raise self._superseded()
 
     def _superseded(self) -> SupersededError:
         return SupersededError(f"{self._file}: incarnation {self._incarnation} was superseded")
@@ -383,12 +330,12 @@ class SqliteCheckpoints:
             if self._unsynced:
                 try:
                     self.sync()
-                except (OSError, sqlite3.Error) as error:
-                    self._trouble = f"{self._file}: not synced to the disk: {error}"
+                except Exception as error:  # whatever it is, the thread tries again
+                    self._trouble = f"{self._file}: not synced to the disk: {disk.words(error)}"
 
     def _cut_log(self) -> None:
-        log = self._beside("-wal")
-        connection = self._connect()
+        log = disk.beside(self._file, "-wal")
+        connection = disk.connect(self._file)
         try:
             for _ in range(_COPIES):  # syncs, while saves go on
                 _, entries, copied = connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
@@ -399,7 +346,7 @@ class SqliteCheckpoints:
                     return  # a busy moment; there will be others
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             connection.execute("PRAGMA synchronous = OFF")  # the lock is not held during the sync
-            connection.execute("UPDATE owner SET cuts = cuts + 1")
+            connection.execute("UPDATE owner SET checksum = checksum")
         finally:
             connection.close()
         _sync_to_disk(log)
@@ -432,31 +379,8 @@ class _transaction:  # noqa: N801 used as a statement
 
 
 def _sync_to_disk(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _checksum(generation: int, incarnation: int, version: int, state: bytes) -> bytes:
-    numbers = struct.pack(">qqq", generation, incarnation, version)
-    return hashlib.sha256(numbers + state).digest()
-
-
-def _is_sound(row: tuple[Any, ...]) -> bool:
-    """Tell whether a row of the table is what was written; its types may be wrong as well."""
-    generation, incarnation, version, state, checksum = row
-    if not (isinstance(state, bytes) and all(
-            isinstance(number, int) for number in (generation, incarnation, version))):
-        return False
-    return bool(_checksum(generation, incarnation, version, state) == checksum)
-
-
-def _is_damage(error: sqlite3.Error) -> bool:
-    return _code(error) in _DAMAGED
-
-
-def _code(error: sqlite3.Error) -> int:
-    """Return SQLite's primary result code; 0 for an error of the Python module's own."""
-    return getattr(error, "sqlite_errorcode", 0) & 0xFF

@@ -18,6 +18,7 @@ from typing import Any
 
 import msgspec
 
+from actors.runtime.bounds import bare
 from actors.runtime.messages import Injection
 
 Change = Callable[[float], float]
@@ -45,7 +46,7 @@ def field_type(kind: type[Any], path: str) -> Any:
 
 def is_array(name: str, kind: Any) -> bool:
     """Whether a field is a float32 array as bytes."""
-    return kind is bytes and name.endswith("_f32")
+    return bare(kind) is bytes and name.endswith("_f32")
 
 
 def check_fields(kind: type[Any], order: Injection) -> None:
@@ -63,7 +64,7 @@ def check_fields(kind: type[Any], order: Injection) -> None:
     for path in order.noise_fields:
         _check_number(kind, path, "noise_fields", whole=False)
     for path in order.keep_ends:
-        if getattr(field_type(kind, path), "__origin__", None) not in (tuple, list):
+        if getattr(bare(field_type(kind, path)), "__origin__", None) not in (tuple, list):
             raise InjectionError(f"keep_ends {path!r}: not a list")
 
 
@@ -170,9 +171,10 @@ def _flat(value: Any) -> Iterator[Any]:
 
 
 def _element(kind: Any) -> Any:
-    """Return what a (nested) sequence type holds, or the type itself."""
+    """Return what a (nested) sequence type holds, or the type itself, without its bounds."""
+    kind = bare(kind)
     while getattr(kind, "__origin__", None) in (tuple, list):
-        kind = kind.__args__[0]
+        kind = bare(kind.__args__[0])
     return kind
 
 

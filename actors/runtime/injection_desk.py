@@ -6,10 +6,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from actors.runtime.bounds import clip
 from actors.runtime.injection import FaultGate, News
 from actors.runtime.messages import Injection, InjectionReport
 from actors.runtime.timer import Timer
@@ -18,6 +20,13 @@ from actors.runtime.topics import INJECTION_REPORT
 
 if TYPE_CHECKING:
     from actors.runtime.actor import Actor
+
+
+MAX_IN_FORCE = 64
+"""Injections of one actor at a time."""
+
+MAX_DELAYED = 10_000
+"""Messages of one actor that an injection may hold back at a time; more are lost, and reported."""
 
 
 class InjectionDesk:
@@ -31,6 +40,7 @@ class InjectionDesk:
         self.gate = FaultGate()
         self._actor = actor
         self._ends: dict[str, Timer] = {}
+        self._delayed = 0
 
     def order(self, order: Injection) -> None:
         """Put an injection in force, if it concerns a topic that the actor publishes."""
@@ -38,9 +48,13 @@ class InjectionDesk:
         topic = actor.published(order.topic)
         if topic is None:
             return
-        reason = self.gate.order(order, actor.clock.now(), topic.type)
+        in_force = self.gate.in_force
+        if len(in_force) >= MAX_IN_FORCE and order.injection not in in_force:
+            reason = f"{MAX_IN_FORCE} injections are in force; wait for one to end"
+        else:
+            reason = self.gate.order(order, actor.clock.now(), topic.type)
         actor.publish(INJECTION_REPORT, InjectionReport(
-            order.injection, actor.name, 0, bool(reason), reason))
+            order.injection, actor.name, 0, bool(reason), clip(reason)))
         if reason:
             return
         self._forget_end(order.injection)  # of an earlier order with the same id
@@ -55,12 +69,26 @@ class InjectionDesk:
         actor = self._actor
         out = self.gate.apply(key, body, stamp, actor.clock.now())
         if out is not None and out.delay_s > 0:
-            actor.call_later(
-                out.delay_s, lambda: actor.send(topic, key, out.body, out.stamp, out.copies))
+            self._send_later(out.delay_s, lambda: actor.send(
+                topic, key, out.body, out.stamp, out.copies))
         elif out is not None:
             actor.send(topic, key, out.body, out.stamp, out.copies)
         for news in self.gate.take_news():
             self._tell(news)
+
+    def _send_later(self, delay_s: float, send: Callable[[], None]) -> None:
+        if self._delayed >= MAX_DELAYED:
+            self._actor.report_diagnostic(
+                "fault injection", f"more than {MAX_DELAYED} messages are delayed; one was dropped",
+                self._actor.name)
+            return
+
+        def due() -> None:
+            self._delayed -= 1
+            send()
+
+        self._delayed += 1
+        self._actor.call_later(delay_s, due)
 
     def _over(self, injection: str) -> None:
         self._forget_end(injection)
@@ -75,7 +103,7 @@ class InjectionDesk:
             self._forget_end(news.injection)
             actor.report_diagnostic("fault injection", news.reason, news.topic)
         actor.publish(INJECTION_REPORT, InjectionReport(
-            news.injection, actor.name, news.affected, news.finished, news.reason))
+            news.injection, actor.name, news.affected, news.finished, clip(news.reason)))
 
     def _forget_end(self, injection: str) -> None:
         timer = self._ends.pop(injection, None)

@@ -2,9 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+
+from actors.runtime.bounds import (
+    Count,
+    Duration,
+    Lasting,
+    Name,
+    Names,
+    Pid,
+    Seconds,
+    Text,
+    Whole,
+    oversized,
+)
+
+_Changes = Annotated[dict[Name, float], msgspec.Meta(max_length=64)]
+_Values = Annotated[dict[Name, Any], msgspec.Meta(max_length=64)]
+
+_VALUES_BYTES = 300_000
+"""The longest value there is to set is a whole sweep of a laser."""
+
+_VALUES_DEPTH = 6
 
 
 class Message(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True):
@@ -14,11 +35,11 @@ class Message(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True)
 class Heartbeat(Message, frozen=True):
     """Sent from the actor's own loop; `progress` counts what the mailbox has handled."""
 
-    pid: int
-    progress: int
-    period_s: float
-    rejected_payloads: int
-    overflowed: int
+    pid: Pid
+    progress: Count
+    period_s: Duration
+    rejected_payloads: Count
+    overflowed: Count
 
 
 class Hello(Message, frozen=True):
@@ -28,11 +49,11 @@ class Hello(Message, frozen=True):
 class Diagnostic(Message, frozen=True):
     """An error report: who, in what context, why, and what offended (OTP's four fields)."""
 
-    node: str
-    context: str
-    reason: str
-    offender: str
-    count: int
+    node: Name
+    context: Text
+    reason: Text
+    offender: Text
+    count: Count
 
 
 class Injection(Message, frozen=True):
@@ -55,28 +76,38 @@ class Injection(Message, frozen=True):
     `seed`.
     """
 
-    injection: str
-    topic: str
-    mode: str
-    duration_s: float
-    delay_s: float = 0.0
-    set_fields: dict[str, Any] = {}
-    ramp_fields: dict[str, float] = {}
-    keep_ends: tuple[str, ...] = ()
-    add_fields: dict[str, float] = {}
-    noise_fields: dict[str, float] = {}
+    injection: Name
+    topic: Name
+    mode: Name
+    duration_s: Lasting
+    delay_s: Duration = 0.0
+    set_fields: _Values = {}
+    ramp_fields: _Changes = {}
+    keep_ends: Names = ()
+    add_fields: _Changes = {}
+    noise_fields: _Changes = {}
     share: float = 1.0
-    on_s: float = 0.0
-    off_s: float = 0.0
-    seed: int = 0
-    stamp_s: float = 0.0
+    on_s: Duration = 0.0
+    off_s: Duration = 0.0
+    seed: Whole = 0
+    stamp_s: Seconds = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse values to set that are larger than any message; `Any` has no bound of its own.
+
+        Raises:
+            ValueError: they are.
+        """
+        if self.set_fields and oversized(self.set_fields, _VALUES_BYTES, _VALUES_DEPTH):
+            raise ValueError(f"set_fields: more than {_VALUES_BYTES} bytes, or nested more than "
+                             f"{_VALUES_DEPTH} deep")
 
 
 class InjectionReport(Message, frozen=True):
     """Where an injection took hold and how many messages it has changed so far."""
 
-    injection: str
-    node: str
-    affected: int
+    injection: Name
+    node: Name
+    affected: Count
     finished: bool
-    reason: str
+    reason: Text

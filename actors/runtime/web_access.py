@@ -3,9 +3,10 @@
 Whoever reaches the operator's page can drive the robot, kill its nodes and release its emergency
 stop. So:
 
-* On loopback, whoever has an account on this machine may. Other people's *web pages* must not, in
-  the browser of somebody who has: the `Host` header must name this page (against DNS rebinding),
-  and a WebSocket's `Origin` must be the page's own. Programs that are no browsers send no Origin.
+* On loopback the user may whose process serves it; other users of this machine need a token
+  (`web_server` asks the kernel whose connection it is). Other people's *web pages* must not, in the
+  user's own browser: the `Host` header must name this page (against DNS rebinding), and a
+  WebSocket's `Origin` must be the page's own. Programs that are no browsers send no Origin.
 * On any other address a token is needed as well, for everything but the files of the page, which
   are the same for everybody. An address literal cannot be rebound, so it is a fine `Host`.
 

@@ -32,6 +32,7 @@ from actors.runtime.bus import BusError, Deliver, PeerChange
 from actors.runtime.run_folder import socket_path
 from actors.runtime.tap import Tap
 from actors.runtime.topic import ROOT, Qos, Topic
+from actors.runtime.topics import HELLO
 from actors.runtime.unix_peer import peer
 
 LEASE_MS = 2000
@@ -43,6 +44,10 @@ PATIENCE_S = 0.25
 HANDSHAKE_MS = 300
 """A handshake that takes longer is given up on either side: what connects and says nothing holds
 one of the hundred places that Zenoh has for handshakes no longer than this."""
+
+_HELLOS_PER_S = 1000
+"""From one partner, which publishes one when it starts. Zenoh leaves out what is above, before it
+costs a node anything: for each hello all partners repeat their states, so such a flood is worst."""
 
 _REDIAL_MS = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2.0}
 _LOOK_S = 0.001
@@ -83,6 +88,8 @@ def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
         "transport/unicast/open_timeout": HANDSHAKE_MS,
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
         "transport/link/tx/lease": LEASE_MS,
+        "downsampling": [{"messages": ["put"], "flows": ["ingress"], "rules": [
+            {"key_expr": HELLO.pattern, "freq": _HELLOS_PER_S}]}],
     }
     if listen:
         settings["id"] = _mark(listen) + secrets.token_hex(8)

@@ -65,9 +65,8 @@ class Guard:
         self._load = load
         self._loaded: subprocess.Popen[bytes] | None = None
         self._patience = {
-            **{f"spawner_{n}": Patience(SPAWNER_PATIENCE_S, 2 * PERIOD_S) for n in NAMES},
-            SUPERVISOR: Patience(SUPERVISOR_PATIENCE_S / min(1.0, plan.rate), 2 * PERIOD_S)}
-        self._load_patience = Patience(LOAD_PATIENCE_S, 2 * PERIOD_S)
+            name: Patience(2 * PERIOD_S) for name in (SUPERVISOR, *(f"spawner_{n}" for n in NAMES))}
+        self._load_patience = Patience(2 * PERIOD_S)
         self._hung: set[str] = set()
         self._supervisor_due_s: float | None = None
         self._trouble = ""
@@ -182,7 +181,10 @@ class Guard:
     # -- inside ---------------------------------------------------------------------------------
 
     def _is_hung(self, name: str, pid: int) -> bool:
-        return self._patience[name].over(time.monotonic(), pid, usage(pid))
+        limit_s = SPAWNER_PATIENCE_S
+        if name == SUPERVISOR:
+            limit_s = SUPERVISOR_PATIENCE_S / min(1.0, self._plan.rate)
+        return self._patience[name].look(time.monotonic(), pid, usage(pid)) >= limit_s
 
     def _judge(self, name: str, pid: int, turning: Mapping[str, bool]) -> bool:
         """Replace a spawner that hangs, if that leaves one; whether all is well so far."""
@@ -215,7 +217,7 @@ class Guard:
         """
         if self._loaded is not None and self._loaded.poll() is None:
             pid = self._loaded.pid
-            if self._load_patience.over(time.monotonic(), pid, usage(pid)):
+            if self._load_patience.look(time.monotonic(), pid, usage(pid)) >= LOAD_PATIENCE_S:
                 self._loaded.kill()
             return False
         if self._loaded is not None and self._loaded.stdout is not None:

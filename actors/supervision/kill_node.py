@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 
+from actors.runtime import streams
 from actors.supervision.process_title import RunProcess, find_processes
 
 SIGNALS = {
@@ -62,6 +63,7 @@ def signal_node(node: str, name: str, port: int | None = None) -> RunProcess:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code: 0 signalled, 2 bad usage or no such node."""
+    streams.secure()
     try:
         _run(_parser().parse_args(arguments))
     except SignalError as refusal:

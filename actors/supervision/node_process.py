@@ -22,6 +22,7 @@ from actors.runtime.bus import BusError
 from actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from actors.runtime.checkpoint_store import SqliteCheckpoints
 from actors.runtime.clock import Clock
+from actors.runtime.plain_text import one_line
 from actors.runtime.run_folder import register_of
 from actors.runtime.tap import Tap
 from actors.runtime.zenoh_bus import ZenohBus
@@ -52,7 +53,8 @@ def make_actor(
         name, incarnation, clock, bus, member.parameters, shared,
         register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
-        heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed))
+        heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
+        members=frozenset(layout.members)))
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
@@ -146,7 +148,7 @@ def wedge(_signal: int, _frame: Any) -> None:
 
 
 def _complain(line: str) -> None:
-    print("rampart: " + " ".join(line.split()), file=sys.stderr, flush=True)
+    print(f"rampart: {one_line(line)}", file=sys.stderr, flush=True)
 
 
 def _log_traceback(layout: Layout, names: tuple[str, ...], incarnation: int,

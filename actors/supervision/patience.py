@@ -30,7 +30,8 @@ class Usage(NamedTuple):
     waited_s: float
 
 
-_NOTHING = Usage("X", 0.0, 0.0)
+AT_LEISURE = Usage("S", 0.0, 0.0)
+"""Of who waits for nothing."""
 
 
 def usage(pid: int) -> Usage:
@@ -48,29 +49,36 @@ class Patience:
     """With one process that owes an answer. Pure; times are seconds of the caller's clock.
 
     Args:
-        limit_s: How long it may have had the chance to answer.
         look_s: The longest time between two looks that counts.
     """
 
-    limit_s: float
     look_s: float
     _pid: int = 0
     _at_s: float = 0.0
-    _used: Usage = _NOTHING
+    _used: Usage = AT_LEISURE
     _counted_s: float = 0.0
 
     def answered(self) -> None:
         """It owes nothing: begin anew."""
         self._pid = 0
 
-    def over(self, now_s: float, pid: int, used: Usage) -> bool:
-        """Look at a process that has not answered: whether it has had enough time by now."""
+    def look(self, now_s: float, pid: int, used: Usage, owes_since_s: float | None = None) -> float:
+        """Return for how many seconds a process that has not answered could have.
+
+        Args:
+            now_s: Now.
+            pid: Of the process; another one than at the last look begins anew.
+            used: By it.
+            owes_since_s: Since when it owes the answer, if not since the first look; all of that
+                counts.
+        """
         if pid != self._pid:
-            self._pid, self._counted_s = pid, 0.0
+            self._pid = pid
+            self._counted_s = 0.0 if owes_since_s is None else now_s - owes_since_s
         elif used.state != "D":
             could_s = now_s - self._at_s - (used.waited_s - self._used.waited_s)
             if used.state == "R":
                 could_s = min(could_s, used.ran_s - self._used.ran_s)
             self._counted_s += min(max(0.0, could_s), self.look_s)
         self._at_s, self._used = now_s, used
-        return self._counted_s >= self.limit_s
+        return self._counted_s

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 from actors.messages import AdaptedSystem
+from actors.supervision.patience import Usage, usage
 from actors.supervision.process_title import find_processes, is_stopped
 from actors.supervision.spawner_client import (
     SpawnerBusyError,
@@ -46,6 +47,9 @@ class ProcessHandle(Protocol):
 
     def stopped(self) -> bool:
         """Whether it was stopped from outside (SIGSTOP) and runs nothing."""
+
+    def usage(self) -> Usage:
+        """Return what it has run, and waited for a processor."""
 
     def ignore(self) -> None:
         """Do not report its end any more."""
@@ -121,6 +125,9 @@ class _OsHandle:
 
     def stopped(self) -> bool:
         return is_stopped(self._pid)
+
+    def usage(self) -> Usage:
+        return usage(self._pid)
 
     def ignore(self) -> None:
         if self.pidfd >= 0:

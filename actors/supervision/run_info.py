@@ -28,7 +28,7 @@ class RunInfo(msgspec.Struct, frozen=True):
     """One run: where it is, what it runs, and when its simulated time began.
 
     `folder` holds the sockets of its nodes, `nodes`; `origin_s` is a reading of the machine's
-    monotonic clock. `page` is where an operator opens the page, its token included. `plan` is
+    monotonic clock. `page` is where the operator's page is, without its token. `plan` is
     what a recording keeps of the run's plan. `replay_of` names the file of a replay.
     """
 

@@ -65,6 +65,7 @@ class RunPlan(msgspec.Struct, frozen=True):
         checkpoints: directory for the nodes' checkpoints; "" keeps none, whatever the spec says.
         hmi_host: address at which the operator's page is served.
         hmi_token: what everybody has to show there; "" for nothing, on loopback.
+        hmi_token_is_new: it was made for this run, so that nobody has it yet who needs it.
         faults: what the page offers to inject by name.
         waits: True has the mission wait until the operator starts it from the page.
         joystick: device to drive with, "auto" for the first; "" for what the spec says.
@@ -90,6 +91,7 @@ class RunPlan(msgspec.Struct, frozen=True):
     joystick: str = ""
     hmi_host: str = "127.0.0.1"
     hmi_token: str = ""
+    hmi_token_is_new: bool = False
     faults: tuple[NamedFault, ...] = ()
     waits: bool = False
 
@@ -101,8 +103,15 @@ class RunPlan(msgspec.Struct, frozen=True):
 
     @property
     def hmi_page(self) -> str:
-        """Where an operator opens the page, "" if there is none; its token stays in the browser."""
-        return page_url(self.hmi_host, self.hmi_port, self.hmi_token) if self.hmi_port else ""
+        """Where the operator's page is, "" if there is none, for everybody: without the token."""
+        return page_url(self.hmi_host, self.hmi_port) if self.hmi_port else ""
+
+    @property
+    def hmi_page_to_open(self) -> str:
+        """The same, once, for who has started the run: with the token, if it is new."""
+        if self.hmi_token and not self.hmi_token_is_new:
+            return f"{self.hmi_page} (open it with #token= and your token behind)"
+        return page_url(self.hmi_host, self.hmi_port, self.hmi_token)
 
 
 class Unit(msgspec.Struct, frozen=True):
@@ -234,7 +243,10 @@ def adapted_system(
         ValueError: the changed system is unsound, has other processes, or names a module that the
             system as it was started does not. The manager lets none of this happen; a message may.
     """
-    document = msgspec.json.decode(adapted.document, type=dict[str, Any])
+    try:
+        document = msgspec.json.decode(adapted.document, type=dict[str, Any])
+    except RecursionError:
+        raise ValueError("the changed system is nested too deep") from None
     spec = tailor(layout.plan, check_document(document, layout.plan.system_file))
     check_modules(layout.spec, spec)
     if spec.processes().keys() != layout.units.keys():

@@ -26,7 +26,7 @@ from typing import Any, NoReturn
 import msgspec
 
 from actors.messages import AdaptedSystem
-from actors.runtime import working_folder
+from actors.runtime import streams, working_folder
 from actors.runtime.run_folder import issue, issued, remove, socket_path
 from actors.runtime.unix_peer import is_same_user
 from actors.supervision.lifeline import kill_leftovers
@@ -275,6 +275,7 @@ def main() -> int:
         spawner.open()
         print(msgspec.json.encode(tuple(layout.members)).decode(), flush=True)
         os.dup2(2, 1)  # nobody reads the pipe from here on
+        streams.secure()  # and perhaps nobody stderr: that ends no node
         spawner.serve()
     except BrokenPipeError:  # the launcher ended while this was loading: nobody to tell
         os._exit(2)

@@ -6,6 +6,9 @@
 * *Wedged*: no heartbeat although the process runs: its event loop turns no more. Of the manager,
   whose silence stops the robot, the status counts as much as the heartbeat.
 
+Who waits for a processor is neither (see `patience`): on a machine that stands still for half a
+second all are silent, and replacing them all would keep it busy for longer.
+
 What a recovery module owns (RM3, RM4) is respawned on that module's request, so that the FTM
 Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order,
 stop in reverse, SIGTERM before SIGKILL, a bounded restart intensity. What is given up on is not
@@ -39,8 +42,11 @@ from actors.messages import (
     RespawnRequest,
 )
 from actors.runtime.actor import Actor, Context, Header, every, on
+from actors.runtime.bounds import clip
+from actors.runtime.limits import RateLimit
 from actors.runtime.timer import Timer
 from actors.runtime.topic import Topic
+from actors.supervision.patience import AT_LEISURE, Patience
 from actors.supervision.processes import (
     Living,
     OsProcesses,
@@ -59,6 +65,9 @@ STOP_GRACE_S = 0.5
 
 START_TIMEOUT_S = 3.0
 """Wall seconds in which a new process must have sent its first heartbeat."""
+
+PASSED_ON_PER_S = 200
+"""Error reports, orders and results of injections that are passed on in a simulated second."""
 
 _CHECK_S = 0.1
 """Simulated seconds between two looks at who is silent."""
@@ -88,6 +97,7 @@ class _Process:
 
     unit: Unit
     policy: RestartPolicy
+    patience: Patience
     pid: int = 0
     handle: ProcessHandle | None = None
     unheld: bool = False
@@ -120,7 +130,8 @@ class Supervisor(Actor):
         self._machine: Processes = context.shared.get("processes") or OsProcesses(
             self._plan.base_port, self._plan.launcher_pid, self._plan.folder)
         self._processes = {
-            u.name: _Process(u, RestartPolicy()) for u in self._layout.units.values()}
+            u.name: _Process(u, RestartPolicy(), Patience(2 * _CHECK_S / self._plan.rate))
+            for u in self._layout.units.values()}
         for node, incarnation in context.shared.get("known_incarnations", {}).items():
             if node in self._layout.unit_of:
                 process = self._processes[self._layout.unit_of[node]]
@@ -130,6 +141,7 @@ class Supervisor(Actor):
         if adapted is not None:
             self._machine.adapt(adapted)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
+        self._passed_on = RateLimit(PASSED_ON_PER_S)
         self._loop = asyncio.get_running_loop()
         self._checked_s = self._loop.time()
 
@@ -205,18 +217,21 @@ class Supervisor(Actor):
 
     @on(topics.DIAGNOSTIC)
     def diagnostic(self, message: Diagnostic, _header: Header) -> None:
-        """Pass a node's error report on to whoever shows it."""
-        self.publish(topics.ERROR_REPORT, message)
+        """Pass a node's error report on to whoever shows it, unless there are too many."""
+        if self._passed_on.allows(self.clock.now()):
+            self.publish(topics.ERROR_REPORT, message)
 
     @on(topics.INJECTION_REQUEST)
     def inject(self, message: Injection, _header: Header) -> None:
         """Order a fault for the operator's page; whoever publishes the topic hears it."""
-        self.publish(topics.INJECT, message)
+        if self._passed_on.allows(self.clock.now()):
+            self.publish(topics.INJECT, message)
 
     @on(topics.INJECTION_REPORT)
     def injected(self, message: InjectionReport, _header: Header) -> None:
         """Pass on what came of a fault."""
-        self.publish(topics.INJECTION_RESULT, message)
+        if self._passed_on.allows(self.clock.now()):
+            self.publish(topics.INJECTION_RESULT, message)
 
     @on(topics.ADAPTED_SYSTEM)
     def adapted(self, message: AdaptedSystem, header: Header) -> None:
@@ -247,7 +262,8 @@ class Supervisor(Actor):
         unit = self._layout.unit_of.get(request.node)
         if unit is None:
             self.publish(topics.PROCESS_EVENT, ProcessEvent(
-                request.node, "refused", 0, 0, request.by, f"no such node: {request.node!r}"))
+                request.node, "refused", 0, 0, request.by,
+                clip(f"no such node: {request.node!r}")))
             return
         process = self._processes[unit]
         if process.state in _HEALTHY and process.incarnation > request.failed_incarnation:
@@ -265,18 +281,32 @@ class Supervisor(Actor):
         self._discount_own_stall(now)
         for process in self._processes.values():
             if process.state is NodeState.STARTING:
-                if now - process.started_s > START_TIMEOUT_S:
+                if self._has_been_silent(process, process.started_s, START_TIMEOUT_S):
                     self._event(process, "wedged", self.name, "no heartbeat after its start")
                     self._lost(process, NodeState.WEDGED)
             elif process.state is NodeState.RUNNING:
                 silent = [n for n, at in process.heard_s.items() if now - at > self._timeout_s]
-                if silent:
+                heard_s = min(process.heard_s.values(), default=now)
+                if self._has_been_silent(process, heard_s, self._timeout_s) and silent:
                     self._silent(process, silent)
+
+    def _has_been_silent(self, process: _Process, since_s: float, limit_s: float) -> bool:
+        """Whether a process that is silent since then could have been heard for so long."""
+        now = self._loop.time()
+        if now - since_s <= limit_s / 2:  # not worth a look into /proc
+            process.patience.answered()
+            return False
+        used = process.handle.usage() if process.handle is not None else AT_LEISURE
+        return process.patience.look(now, process.pid, used, since_s) > limit_s
 
     @every(0.5)
     def repeat(self) -> None:
         """Repeat the node table for whoever joined late."""
         self._publish_table()
+        left_out = self._passed_on.left_out(self.clock.now())
+        if left_out:
+            self.report_diagnostic(
+                "passing on", f"{left_out} more messages were not passed on", self.name)
 
     def _discount_own_stall(self, now: float) -> None:
         # Who was stopped, starved or waiting for a hung spawner has heard nobody meanwhile. What
@@ -470,7 +500,7 @@ class Supervisor(Actor):
     def _event(self, process: _Process, event: str, by: str, detail: str = "") -> None:
         for node in process.unit.nodes:
             self.publish(topics.PROCESS_EVENT, ProcessEvent(
-                node.name, event, process.pid, process.incarnation, by, detail))
+                node.name, event, process.pid, process.incarnation, by, clip(detail)))
 
     def _publish_table(self) -> None:
         rows = [NodeInfo(self.name, Kind.SUPERVISION.value, self.context.pid, NodeState.RUNNING,

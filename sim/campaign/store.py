@@ -28,7 +28,7 @@ MAX_VALUE_BYTES = 16 << 20
 
 
 class StoreError(ValueError):
-    """The file cannot be used; the message is one line."""
+    """The file cannot be used, or not any more; the message is one line."""
 
 
 class Run(NamedTuple):
@@ -41,6 +41,9 @@ class Run(NamedTuple):
 class Store:
     """Results by the keys of their jobs.
 
+    A run is kept whole or not at all: a disk that fills up costs none of those before it. Every
+    method raises `StoreError` when the file cannot be read or written.
+
     Args:
         directory: Of the campaign; it is made if need be.
 
@@ -49,8 +52,12 @@ class Store:
     """
 
     def __init__(self, directory: Path) -> None:
-        directory.mkdir(parents=True, exist_ok=True)
         self.path = directory / FILE_NAME
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StoreError(f"{directory}: no directory that can be written ({error.strerror})"
+                             ) from None
         try:
             self._database = sqlite3.connect(self.path, timeout=30.0)
             self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
@@ -116,13 +123,14 @@ class Store:
 
     def close(self) -> None:
         """Close the file."""
-        self._database.close()
+        with self._using():
+            self._database.close()
 
     @contextlib.contextmanager
     def _using(self) -> Iterator[None]:
         try:
             yield
-        except (sqlite3.Error, *_NO_RUN) as error:
+        except (sqlite3.Error, OSError, *_NO_RUN) as error:
             raise StoreError(f"{self.path}: cannot be used: {' '.join(str(error).split())}; "
                              "choose another --out") from None
 

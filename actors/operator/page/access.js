@@ -19,7 +19,7 @@ export const token = () => sessionStorage.getItem(KEY) || "";
 /** Subprotocols of the WebSocket: a browser sends no header of ours, but these. */
 export const protocols = () => (token() ? ["rampart", `token.${token()}`] : ["rampart"]);
 
-/** Address of anything on the HMI that is not one of its files. */
-export const withToken = (path) => (token() ? `${path}?token=${encodeURIComponent(token())}` : path);
+/** Headers with which to ask the HMI for what is not one of its files: no address holds the token. */
+export const headers = () => (token() ? { authorization: `Bearer ${token()}` } : {});
 
 export const NO_TOKEN = 4401;

@@ -10,6 +10,7 @@ import { Operating } from "./operate.js";
 import { FaultTree, Order } from "./tree.js";
 
 const LOGS = ["decisions", "events"];
+const TABLES = ["lights"];   // of which the rows arrive that changed, null for one that is gone
 const map = new AirportMap($("map"));
 const tree = new FaultTree($("tree"));
 const order = new Order($("order"));
@@ -25,6 +26,7 @@ let picture = {};            // all that was heard, by section
 let fresh = { decisions: [], events: [] };  // lines of the logs that are not shown yet
 const changed = new Set();   // sections that are not shown yet
 let frame = 0;
+let notOnMap = {};           // what the map has not room for, and how many
 let socket = null;           // null between two attempts
 let retryMs = 500;
 let lastHeard = 0;
@@ -40,7 +42,7 @@ function connect() {
   socket = new WebSocket(`ws://${location.host}/ws`, protocols());
   socket.onmessage = (event) => { lastHeard = Date.now(); receive(JSON.parse(event.data)); };
   socket.onclose = (event) => lost(
-    event.code === NO_TOKEN ? "token missing: open the address that the run has printed"
+    event.code === NO_TOKEN ? "token missing: open the address that the run has printed, or #token=… with yours"
       : event.reason ? `closed by the HMI: ${event.reason}; reconnecting`
         : "HMI not reachable, reconnecting");
 }
@@ -87,11 +89,16 @@ function take(message) {
   link("good", "live");
   for (const [name, value] of Object.entries(message)) {
     if (LOGS.includes(name)) fresh[name] = [...fresh[name], ...value].slice(-LINES);
+    else if (TABLES.includes(name)) picture[name] = merged(picture[name], value);
     else picture[name] = value;
     changed.add(name);
   }
   if (document.hidden) seen();
   else if (!frame) frame = requestAnimationFrame(draw);
+}
+
+function merged(rows, news) {
+  return new Map([...(rows || []), ...Object.entries(news)].filter(([name]) => news[name] !== null));
 }
 
 function draw() {
@@ -132,6 +139,8 @@ function hello(message) {
   map.begin(message.map, message.track, message.footprint_m);
   camera.begin(message.camera);
   system(null);
+  notOnMap = message.left_out || {};
+  leftOut({});
   $("airport").textContent = message.map ? message.map.name : "";
   $("rate").textContent = message.rate === 1 ? "" : `× ${message.rate}`;
   $("mission-name").replaceChildren(...message.missions.map((name) => {
@@ -148,6 +157,7 @@ const PARTS = [
   [["mission", "control"], mission],
   [["mission"], (s) => orders(s.mission)],
   [["order"], (s) => told(s.order)],
+  [["left_out"], (s) => leftOut(s.left_out)],
   [["pose"], (s) => where(s.pose)],
   [["lights"], (s) => lights(s.lights)],
   [["system"], (s) => system(s.system)],
@@ -182,6 +192,13 @@ function where(pose) {
   say($("where"), [x, y, yaw].every(Number.isFinite)
     ? `Robot at ${x.toFixed(1)} m east, ${y.toFixed(1)} m north, heading ${heading.toFixed(0).padStart(3, "0")}°${pose.stale ? " (not heard any more)" : ""}`
     : "The robot's pose is not known.");
+}
+
+/** Say what is not shown, because there is more of it than a page can hold. */
+function leftOut(counts) {
+  const missing = [...Object.entries(notOnMap), ...Object.entries(counts)];
+  $("left-out").hidden = !missing.length;
+  say($("left-out"), `Too much to show: ${missing.map(([what, n]) => `${n} of the ${what}`).join(", ")} left out.`);
 }
 
 function told(outcome) {
@@ -269,7 +286,7 @@ function unsure(button) {
 
 function lights(measured) {
   const count = { ok: 0, dim: 0, out: 0 };
-  for (const light of Object.values(measured)) count[light.verdict] += 1;
+  for (const light of measured.values()) count[light.verdict] += 1;
   const all = count.ok + count.dim + count.out;
   $("light-count").textContent = all
     ? `${all} of ${map.lights.size} lights measured: ${count.ok} ok, ${count.dim} dim, ${count.out} out`

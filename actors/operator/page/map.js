@@ -158,7 +158,7 @@ export class AirportMap {
 
   showLights(measured) {
     for (const [name, shown] of this.lights) {
-      const light = measured[name];
+      const light = measured.get(name);
       const verdict = light ? light.verdict : "none";
       if (verdict === shown.verdict) continue;
       shown.verdict = verdict;

@@ -37,7 +37,7 @@ export class ProcessTable {
         if (this.body.children[i + 1] === row.line) this.body.append(there);
         else this.body.insertBefore(row.line, there || null);
       }
-      const used = usage && usage.nodes ? usage.nodes[node.name] : undefined;
+      const used = usage && usage.nodes && Object.hasOwn(usage.nodes, node.name) ? usage.nodes[node.name] : undefined;
       row.dot.className = `dot ${STATES[node.state] || ""}`;
       row.line.classList.toggle("troubled", node.state !== "running");
       row.line.title = `${node.kind}, incarnation ${node.incarnation}`;

@@ -1,0 +1,39 @@
+r"""Text of others, made fit for a terminal, a log or a line of a report.
+
+What comes from the bus may hold anything: an escape sequence that clears the screen or retitles
+the window, a line feed that forges a line, an override that shows it backwards. None of it is shown
+as what it is: each character that is not printable (`str.isprintable`: controls C0 and C1,
+bidirectional overrides, separators of lines, unassigned ones) is written as `\uXXXX`, which is also
+how JSON writes it.
+"""
+
+from __future__ import annotations
+
+LINE_CHARS = 400
+"""Longest line of a console."""
+
+
+def printable(text: str, keep: str = "") -> str:
+    r"""Return a text with all that is not printable escaped.
+
+    Args:
+        text: of anybody.
+        keep: characters that are left, such as "\n" in a text that was put together of safe lines.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in keep else _escaped(c) for c in text)
+
+
+def one_line(text: str, chars: int = LINE_CHARS) -> str:
+    """Return a text as one printable line of at most so many characters; white space is joined."""
+    line = printable(" ".join(text.split()))
+    return line if len(line) <= chars else f"{line[:chars - 3]}..."
+
+
+def _escaped(character: str) -> str:
+    code = ord(character)
+    if code < 0x10000:
+        return f"\\u{code:04x}"
+    code -= 0x10000
+    return f"\\u{0xD800 + (code >> 10):04x}\\u{0xDC00 + (code & 0x3FF):04x}"

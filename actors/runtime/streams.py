@@ -1,0 +1,100 @@
+"""stdout and stderr that may be gone: what a program decides never depends on who reads it.
+
+A terminal is closed, a pipe's reader has seen enough, the disk under a log is full, a descriptor
+was never open. Python raises then, wherever something is printed, and once more at exit, where that
+changes the exit code. After `secure` nothing is raised: what cannot be written is lost, `lost` says
+why, and the program goes on. A descriptor that is closed is opened on /dev/null, so that no file or
+socket takes its number and gets the story written into it.
+
+Nor does the loop of a program wait for somebody who does not read: stderr that takes nothing for
+`PATIENCE_S` loses lines until it does again. stdout is waited for; it is the result.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+import select
+import sys
+from typing import Any
+
+PATIENCE_S = 0.5
+"""Real seconds that stderr may take nothing, before lines are lost."""
+
+
+class _Unfailing(io.FileIO):
+    """A file descriptor that takes everything; why it kept something from nobody is `failure`."""
+
+    def __init__(self, descriptor: int, patience_s: float | None) -> None:
+        super().__init__(descriptor, "wb", closefd=False)
+        self.failure: OSError | None = None
+        self._patience_s = patience_s
+        self._stuck = False
+
+    def write(self, data: Any, /) -> int:
+        left = memoryview(data).cast("B")
+        size = len(left)
+        try:
+            while left and self._takes():
+                left = left[super().write(left[:select.PIPE_BUF]) or 0:]
+        except OSError as error:
+            self.failure = error
+        return size
+
+    def _takes(self) -> bool:
+        if self._patience_s is None:
+            wait_ms = None
+        else:
+            wait_ms = 0.0 if self._stuck else 1000 * self._patience_s
+        poll = select.poll()
+        poll.register(self.fileno(), select.POLLOUT)
+        self._stuck = not poll.poll(wait_ms)
+        return not self._stuck
+
+
+def secure() -> None:
+    """Have nothing that is written to stdout or stderr raise, from now on and at exit.
+
+    Streams that are not the process's own, a test's for example, stay as they are.
+    """
+    for descriptor, flags in ((0, os.O_RDONLY), (1, os.O_WRONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(descriptor)
+        except OSError:  # those below it are open, so it gets this number
+            os.open(os.devnull, flags)
+            os.set_inheritable(descriptor, True)
+    for name, descriptor, patience_s in (("stdout", 1, None), ("stderr", 2, PATIENCE_S)):
+        before = getattr(sys, name)
+        if before is not getattr(sys, f"__{name}__") or _raw(before) is not None:
+            continue
+        with contextlib.suppress(OSError, AttributeError):
+            before.flush()
+        raw = _Unfailing(descriptor, patience_s)
+        made = io.TextIOWrapper(
+            io.BufferedWriter(raw), encoding=getattr(before, "encoding", None) or "utf-8",
+            errors="backslashreplace", line_buffering=name == "stderr" or raw.isatty())
+        setattr(sys, name, made)
+        setattr(sys, f"__{name}__", made)
+
+
+def lost(stream: Any = None) -> OSError | None:
+    """Return why something of a secured stream, or of stdout, was lost; None if nothing was."""
+    raw = _raw(sys.stdout if stream is None else stream)
+    return raw.failure if raw else None
+
+
+def lost_result() -> str:
+    """Return in words why stdout was lost; "" if it was not, or if its reader has seen enough."""
+    with contextlib.suppress(OSError, ValueError):
+        sys.stdout.flush()
+    failure = lost()
+    if failure is None or failure.errno == errno.EPIPE:
+        return ""
+    return failure.strerror or str(failure)
+
+
+def _raw(stream: Any) -> _Unfailing | None:
+    raw = getattr(getattr(stream, "buffer", None), "raw", None)
+    return raw if isinstance(raw, _Unfailing) else None

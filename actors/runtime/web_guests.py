@@ -1,0 +1,144 @@
+"""Who is connected to a web server, and who has to go so that others get in. Pure.
+
+A server has room for so many connections, and a stranger can hold one without saying a word. So
+
+* whoever comes is let in. If that is one too many, somebody goes: of those who only wait, of the
+  source that has most of them, the one that has waited longest. A flood from one source thus ends
+  its own connections; a flood from many ends nobody who is being served;
+* whoever has shown a token goes after all who have not;
+* who is being served, a page that is open for instance, is never made to go by others;
+* who waits longer than `PATIENCE_S` goes, however busy: a request that comes byte by byte, a body
+  without end, a goodbye that nobody answers;
+* who sends more than a page ever would goes, served or not; so does who asks for more files than
+  all pages would, of whoever has not shown a token.
+
+A *source* is an address; within this machine, where all have the same one, a user. How many come in
+a second is bounded as well: who is there already drives.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable
+from typing import Generic, TypeVar
+
+K = TypeVar("K", bound=Hashable)
+
+ROOM = 64
+"""Connections at once."""
+
+WAITING_ROOM = 24
+"""Of which so many of one source may wait: a browser opens six to load a page."""
+
+PATIENCE_S = 5.0
+"""Real seconds in which a request has to be made and answered."""
+
+BYTES_AT_ONCE = 256_000
+BYTES_PER_S = 64_000
+"""A page that drives sends some 3,000; a hundred wishes of the greatest length are 400,000."""
+
+
+REQUESTS_AT_ONCE = 400
+REQUESTS_PER_S = 100
+"""Of a source that has shown no token; a page that opens makes some twenty."""
+
+COMING_AT_ONCE = 150
+COMING_PER_S = 400
+"""Connections that are taken; others wait in the kernel's queue."""
+
+REFUSED_COST = 0.2
+"""What one that is sent away at once counts among them."""
+
+
+class Bucket:
+    """Something of which so much may be had at once, and so much more each second."""
+
+    __slots__ = ("_at_s", "_left", "_most", "_per_s")
+
+    def __init__(self, most: float, per_s: float, now_s: float) -> None:
+        self._most = most
+        self._per_s = per_s
+        self._left = most
+        self._at_s = now_s
+
+    def take(self, count: float, now_s: float) -> float:
+        """Take some, and return after how many seconds that will be allowed: 0 if it is now."""
+        gained = max(now_s - self._at_s, 0.0) * self._per_s
+        self._at_s = now_s
+        self._left = min(self._left + gained, self._most) - count
+        return max(-self._left / self._per_s, 0.0)
+
+
+class Guest:
+    """One connection.
+
+    Attributes:
+        source: whom it is counted with.
+        known: whether it has shown that it may be here.
+        served: how many things are being done for it; 0 while it waits.
+        since_s: since when it waits.
+    """
+
+    __slots__ = ("_bytes", "_requests", "known", "served", "since_s", "source")
+
+    def __init__(self, source: str, known: bool, requests: Bucket, now_s: float) -> None:
+        self.source = source
+        self.known = known
+        self.served = 0
+        self.since_s = now_s
+        self._bytes = Bucket(BYTES_AT_ONCE, BYTES_PER_S, now_s)
+        self._requests = requests
+
+    def sends(self, count: int, now_s: float) -> bool:
+        """Count bytes that it sends; False if that is more than it may."""
+        return self._bytes.take(count, now_s) == 0
+
+    def answered(self, now_s: float) -> bool:
+        """Count a request that was answered; False if those of its source are too many."""
+        self.since_s = now_s
+        return self.known or self._requests.take(1, now_s) == 0
+
+
+class Guests(Generic[K]):
+    """All connections, by whatever stands for one; times are real seconds."""
+
+    def __init__(self) -> None:
+        self._guests: dict[K, Guest] = {}
+        self._requests: dict[str, Bucket] = {}
+
+    def __len__(self) -> int:
+        return len(self._guests)
+
+    def came(self, key: K, source: str, *, known: bool, now_s: float) -> tuple[Guest, list[K]]:
+        """Let somebody in; return the guest, and who has to go for that: itself, at worst."""
+        requests = self._requests.setdefault(
+            source, Bucket(REQUESTS_AT_ONCE, REQUESTS_PER_S, now_s))
+        guest = self._guests[key] = Guest(source, known, requests, now_s)
+        waiting = Counter(g.source for g in self._guests.values() if not g.served)
+        go: list[K] = []
+        if waiting[source] > WAITING_ROOM or len(self._guests) > ROOM:
+            crowded = waiting[source] > WAITING_ROOM
+            candidates = [k for k, g in self._guests.items() if not g.served and k != key
+                          and (g.source == source or not crowded)]
+            go.append(min(candidates, default=key, key=lambda k: self._rank(k, waiting)))
+        for gone in go:
+            self.left(gone)
+        return guest, go
+
+    def left(self, key: K) -> None:
+        """Forget a connection that is closed; harmless if it was made to go."""
+        gone = self._guests.pop(key, None)
+        if gone is not None and all(g.source != gone.source for g in self._guests.values()):
+            del self._requests[gone.source]
+
+    def overdue(self, now_s: float) -> list[K]:
+        """Return who has waited for too long and has to go."""
+        go = [k for k, g in self._guests.items()
+              if not g.served and now_s - g.since_s > PATIENCE_S]
+        for key in go:
+            self.left(key)
+        return go
+
+    def _rank(self, key: K, waiting: Counter[str]) -> tuple[bool, int, float]:
+        guest = self._guests[key]
+        return guest.known, -waiting[guest.source], guest.since_s
