@@ -12,6 +12,9 @@ MAX_LINE = 600
 """Characters of a message; a value in it may be as long as the file."""
 
 
+_PART_BYTES = 1 << 18
+
+
 class FileError(ValueError):
     """Content that is refused. The text says why; which file it is, the caller knows."""
 
@@ -23,10 +26,12 @@ def read_bytes(path: Path, most: int) -> bytes:
         FileError: it is longer.
         OSError: it cannot be read.
     """
+    data = bytearray()
     with path.open("rb") as file:
-        data = file.read(most + 1)
+        while len(data) <= most and (part := file.read(_PART_BYTES)):  # no more memory than needed
+            data += part
     check_size(data, most)
-    return data
+    return bytes(data)
 
 
 def read_text(path: Path, most: int) -> str:
@@ -42,7 +47,7 @@ def read_text(path: Path, most: int) -> str:
         raise FileError("not UTF-8 text") from None
 
 
-def check_size(data: bytes | str, most: int) -> None:
+def check_size(data: bytes | bytearray | str, most: int) -> None:
     """Refuse content that is longer than it may be.
 
     Raises:

@@ -59,9 +59,10 @@ def parse_stat(text: str) -> ProcessCount | None:
     fields = text.rpartition(")")[2].split()
     try:
         user, system, start, pages = (int(fields[i]) for i in (11, 12, 19, 21))
-    except (IndexError, ValueError):
+        return ProcessCount(
+            (user + system) / _TICKS_PER_S, pages * _PAGE_BYTES, start / _TICKS_PER_S)
+    except (IndexError, ValueError, OverflowError):
         return None
-    return ProcessCount((user + system) / _TICKS_PER_S, pages * _PAGE_BYTES, start / _TICKS_PER_S)
 
 
 def read_count(pid: int) -> ProcessCount | None:

@@ -89,7 +89,7 @@ class Fuzzing:
                 raise SystemExit(f"{self._target.name}: the worker does not start: "
                                  f"exit code {code}")
             if code is not None:
-                self._found(_name_of(code), data, alone=self._alone(data) != 0)
+                self._found(_name_of(code), data)
                 self.result.inputs += 1
             if code is None or self.result.inputs >= self._runs:
                 break
@@ -123,11 +123,12 @@ class Fuzzing:
         result.inputs = max(result.inputs, run)
         return code, data
 
-    def _alone(self, data: bytes) -> int:
-        """Run one input in a worker of its own; return its exit code."""
+    def _alone(self, data: bytes) -> bool:
+        """Run one input in a worker of its own; return whether it finds something again."""
         with tempfile.TemporaryDirectory(prefix="rampart-fuzz-", dir=_memory()) as name:
             (Path(name) / "one").write_bytes(data)
-            return self._start(Path(name), 0, "one").wait()
+            code = self._start(Path(name), 0, "one").wait()
+            return code != 0 or any(Path(name).glob("found-*"))
 
     def _start(self, folder: Path, seed: int, engine: str) -> subprocess.Popen[bytes]:
         path = [str(ROOT), str(ROOT / "tests"), *filter(None, sys.path)]
@@ -142,15 +143,15 @@ class Fuzzing:
     def _collect(self, folder: Path) -> None:
         for path in sorted(folder.glob("found-*.json")):
             self._found(json.loads(path.read_text())["what"],
-                        path.with_suffix("").read_bytes(), alone=True)
+                        path.with_suffix("").read_bytes())
 
-    def _found(self, what: str, data: bytes, *, alone: bool) -> None:
+    def _found(self, what: str, data: bytes) -> None:
         if any(found["what"] == what and what[0].isupper() for found in self.result.findings):
             return
         path = self._keep / self._target.name / hashlib.sha256(data).hexdigest()[:12]
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
-        if not alone:
+        if not self._alone(data):
             what += ", but not when it is run alone: something gathers"
         shown = path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
         self.result.findings.append({"what": what, "input": str(shown)})

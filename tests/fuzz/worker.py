@@ -30,6 +30,12 @@ STATUS = struct.Struct("<QQQQ")
 ROOMS = ("actors", "airport", "files", "manager", "sim", "toolbox")
 _KEPT = 2000
 _COLLECT_EVERY = 1000
+_GATHERED = 4
+"""Times an input's share, that all of them together may leave behind; libFuzzer needs some."""
+
+
+def _memory_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
 
 class Board:
@@ -78,11 +84,16 @@ class Worker:
         self._outcomes: set[str] = set()
         self._found: set[str] = set()
         self.board = board
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-        most = pages * resource.getpagesize() + LIMIT_BYTES
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+        self._limit_bytes = LIMIT_BYTES
+        self._most_bytes = _memory_bytes() + _GATHERED * LIMIT_BYTES
+        self._bound_memory()
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         signal.signal(signal.SIGPROF, signal.SIG_DFL)  # which ends the process
+
+    def _bound_memory(self) -> None:
+        """Allow an input its share on top of what has gathered; that has a bound of its own."""
+        most = min(_memory_bytes() + self._limit_bytes, self._most_bytes)
+        resource.setrlimit(resource.RLIMIT_AS, (most, self._most_bytes))
 
     def try_one(self, data: bytes) -> bool:
         """Run one input and return whether its outcome was new."""
@@ -102,6 +113,7 @@ class Worker:
         board.refused += outcome != "read"
         if board.run % _COLLECT_EVERY == 0:
             gc.collect()
+            self._bound_memory()
         if outcome in self._outcomes:
             return False
         self._outcomes.add(outcome)
@@ -145,7 +157,9 @@ def go_on(worker: Worker, target: Any, runs: int, seed: int) -> None:
     mutated = Mutator(target.kind, target.words)
     own = len(pool)
     for _ in range(runs):
-        data = mutated(draw.choice(pool), draw.choice(pool), draw)
+        # Half of them from what is read: most of what is new is a new way to be refused.
+        base = pool[draw.randrange(own)] if draw.random() < 0.5 else draw.choice(pool)
+        data = mutated(base, draw.choice(pool), draw)
         if worker.try_one(data):
             if len(pool) < own + _KEPT:
                 pool.append(data)
