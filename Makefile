@@ -49,8 +49,10 @@ chaos-pairs: setup
 
 # 100,000 inputs into each decoder of what others write; half an hour. FUZZ="--runs 1000000" makes
 # more, FUZZ=--help says what else there is. Coverage guides it where `rampart[fuzz]` is installed.
+# Then 100,000 messages, as extreme as their types allow, into the handlers of all actors.
 fuzz: setup
 	PYTHONPATH=tests $(BIN)/python -m fuzz.run $(FUZZ)
+	$(BIN)/python tests/handler_fuzz.py 25
 
 setup: .venv/installed
 
