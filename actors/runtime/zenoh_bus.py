@@ -49,7 +49,8 @@ _HELLOS_PER_S = 200
 """From one partner, which publishes one when it starts. Zenoh leaves out what is above, before it
 costs a node anything: for each hello all partners repeat their states, so such a flood is worst."""
 
-_REDIAL_MS = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2.0}
+# Not sooner: a second handshake by each partner would meet the one of a node that is coming back.
+_REDIAL_MS = {"period_init_ms": 1000, "period_max_ms": 2000, "period_increase_factor": 2.0}
 _LOOK_S = 0.001
 _FIRST_LOOKS = 5
 """So many looks, a millisecond each, before a partner that is missing is looked at more closely."""
