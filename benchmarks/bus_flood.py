@@ -28,12 +28,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.envelope import Header
-from actors.supervision.run_info import find_runs
-from airport.formats import load_airport
-from toolbox.session import Session, connect
+from rampart.actors.bus.envelope import Header
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.run.run_info import find_runs
+from rampart.cli.session import Session, connect
 
 ROOT = Path(__file__).resolve().parents[1]
 PORT = 8680
@@ -45,9 +45,9 @@ _GRASS = (_POINT.x, _POINT.y)
 _FLOOD = """
 import sys, time, zenoh
 from actors import messages as m, topics
-from actors.runtime.envelope import Header, encode
-from actors.runtime.messages import Hello
-from actors.runtime.zenoh_bus import session_config
+from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.bus.messages import Hello
+from rampart.actors.bus.zenoh_bus import session_config
 kind, per_s, seconds, dial = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), sys.argv[4:]
 report = m.DetectionReport(m.DetectionState.IDLE, "", (), 0.0)
 def message(i):

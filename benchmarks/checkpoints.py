@@ -17,13 +17,20 @@ from pathlib import Path
 
 import msgspec
 
-from actors.control.control_checkpoint import CONTROL_STATE, ControlKept
-from actors.control.light_ledger import LightsKept
-from actors.control.mission_checkpoint import MISSION_STATE
-from actors.control.mission_state import MissionState
-from actors.messages import Goal, LightMeasurement, LightVerdict, MissionPhase, Mode, Route
-from actors.runtime.checkpoint import Keeper
-from actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE, ControlKept
+from rampart.actors.osmosis.control.following.light_ledger import LightsKept
+from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE
+from rampart.actors.osmosis.control.mission.mission_state import MissionState
+from rampart.actors.osmosis.messages import (
+    Goal,
+    LightMeasurement,
+    LightVerdict,
+    MissionPhase,
+    Mode,
+    Route,
+)
+from rampart.actors.runtime.checkpoint import Keeper
+from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 
 SAVES = 1500
 PACE_S = 0.02

@@ -33,9 +33,9 @@ from pathlib import Path
 import httpx
 import websockets
 
-from actors.supervision.process_title import find_processes
-from actors.supervision.process_usage import read_count
-from actors.supervision.run_info import find_runs
+from rampart.actors.run.run_info import find_runs
+from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_usage import read_count
 
 ROOT = Path(__file__).resolve().parents[1]
 PORT, PAGE_PORT = 8660, 8760

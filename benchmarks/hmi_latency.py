@@ -35,11 +35,11 @@ from typing import Any
 import msgspec
 import websockets
 
-from actors import topics
-from actors.supervision.process_title import find_processes
-from actors.supervision.process_usage import read_count
-from actors.supervision.run_info import RunInfo, find_runs
-from toolbox.session import Session, connect
+from rampart.actors.osmosis import topics
+from rampart.actors.run.run_info import RunInfo, find_runs
+from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_usage import read_count
+from rampart.cli.session import Session, connect
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 
-from actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_title import find_processes
 
 ROOT = Path(__file__).resolve().parents[1]
 PORT = 8450

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import psutil
 
-from actors.recording.bag_reader import BagReader, Summary
-from actors.supervision.process_title import find_processes
+from rampart.actors.recording.bag_reader import BagReader, Summary
+from rampart.actors.supervision.process_title import find_processes
 
 ROOT = Path(__file__).resolve().parents[1]
 PORT = 8650

@@ -20,14 +20,19 @@ import time
 from collections import deque
 from typing import Any
 
-from actors import topics
-from actors.messages import DecisionRecord, DetectionReport, DetectionState, NodeTable
-from actors.runtime.actor import Actor, Context, Header, on
-from actors.runtime.clock import Clock
-from actors.runtime.topic import Topic
-from actors.supervision.launcher import Launcher
-from actors.supervision.process_title import find_processes
-from actors.supervision.run_plan import OBSERVER, RunPlan
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import (
+    DecisionRecord,
+    DetectionReport,
+    DetectionState,
+    NodeTable,
+)
+from rampart.actors.run.run_plan import OBSERVER, RunPlan
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.launcher import Launcher
+from rampart.actors.supervision.process_title import find_processes
 
 OUTPUT: dict[str, Topic[Any]] = {
     "graph_planner": topics.ROUTE,

@@ -29,7 +29,7 @@ corridor_clearance_m = 1.5
 
 [[node]]
 name = "manager"
-actor = "manager.actor:FtmManager"
+actor = "rampart.manager.actor:FtmManager"
 kind = "manager"
 '''
 

@@ -16,14 +16,14 @@ from itertools import combinations
 
 import pytest
 
-import systems
 from benchmarks.synthetic_system import synthetic_system
-from manager.arbiter import DetectionHeard, Tick, build_arbiter
-from manager.arrangement import Arrangement
-from manager.schema import SystemSpec
-from manager.specification import parse_specification
-from manager.strategies import STRATEGIES, Decider, find_strategy
-from manager.verification import verify
+from rampart import systems
+from rampart.manager.analysis.verification import verify
+from rampart.manager.arbitration.arbiter import DetectionHeard, Tick, build_arbiter
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.specification import parse_specification
+from rampart.manager.strategies.arrangement import Arrangement
+from rampart.manager.strategies.registry import STRATEGIES, Decider, find_strategy
 
 OSMOSIS = (systems.SHIPPED / "paper.toml").read_text(encoding="utf-8")
 NAMES = sorted(STRATEGIES)

@@ -1,8 +1,8 @@
 """How long do messages, deaths and starts take between real processes? For virtual time.
 
 Runs the real system with a mission under way, listens to every heartbeat, and kills nodes and the
-supervisor again and again. Prints `sim/timing.toml`: each distribution as 21 quantiles, in
-milliseconds. `python -m benchmarks.timing > sim/timing.toml` renews it; two minutes.
+supervisor again and again. Prints `sim/virtual/timing.toml`: each distribution as 21 quantiles, in
+milliseconds. `python -m benchmarks.timing > sim/virtual/timing.toml` renews it; two minutes.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from actors import topics
-from actors.messages import NodeTable, ProcessEvent
-from actors.runtime.actor import Actor, Context, Header, on
-from actors.runtime.clock import Clock
-from actors.supervision.launcher import Launcher
-from actors.supervision.process_title import find_processes
-from actors.supervision.run_plan import OBSERVER, SUPERVISOR, RunPlan
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import NodeTable, ProcessEvent
+from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.launcher import Launcher
+from rampart.actors.supervision.process_title import find_processes
 
 NODES = ("graph_planner", "osmosis_control", "localization", "teleoperation", "hmi",
          "safety_pilot", "ftm_manager", "DM2", "DM4", "RM2", "RM3")
@@ -144,7 +144,7 @@ def main() -> int:
     options = parser.parse_args()
     found = asyncio.run(measure(options.port, options.kills))
     print("# Measured on real processes by `python -m benchmarks.timing`; milliseconds, evenly\n"
-          "# spaced quantiles from minimum to maximum. See sim/timing.py for what each one is.")
+          "# spaced quantiles from minimum to maximum. See sim/virtual/timing.py for what each one is.")
     for name, samples in found.items():
         print(f"\n# {len(samples)} samples\n{name} = {quantiles_ms(samples)}")
     return 0

@@ -11,7 +11,7 @@ import argparse
 import statistics
 import time
 
-from sim.campaign.job import Job, run_virtually
+from rampart.sim.campaign.job import Job, run_virtually
 
 RUNS = 4
 SYSTEMS = ("paper", "osmosis")

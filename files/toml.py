@@ -11,7 +11,7 @@ import re
 import tomllib
 from typing import Any
 
-from files.reading import FileError, check_size
+from rampart.files.reading import FileError, check_size
 
 MAX_SIZE = 1 << 19
 """Bytes of a file, characters of a text; the shipped ones have 16,000 at most."""

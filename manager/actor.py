@@ -7,7 +7,7 @@ in force, show that the manager lives, and let the arbiter notice silence.
 
 One that was killed finds out what is in force from the recovery modules themselves, and adopts it;
 until it knows, it releases nothing. What they cannot tell it has from its checkpoint
-(`manager.arbiter_memory`). That is kept *after* the commands are on their way, unlike elsewhere: an
+(`rampart.manager.arbitration.arbiter_memory`). That is kept *after* the commands are on their way, unlike elsewhere: an
 emergency stop does not wait for a disk, and what a command says its module knows as well.
 """
 
@@ -18,15 +18,14 @@ from typing import Any
 
 import msgspec
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Actor, Context, Header, every, on
-from actors.runtime.bounds import DOCUMENT_CHARS, clip
-from actors.runtime.checkpoint import StateFormat
-from actors.runtime.topic import Topic
-from actors.runtime.wiring import load_class
-from manager.adaptation import Action, Change, Document, adapt, describe
-from manager.arbiter import (
+from rampart.actors.bus.bounds import DOCUMENT_CHARS, clip
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.checkpoint import StateFormat
+from rampart.actors.runtime.wiring import load_class
+from rampart.manager.arbitration.arbiter import (
     DecisionMade,
     DetectionHeard,
     Input,
@@ -38,11 +37,12 @@ from manager.arbiter import (
     Tick,
     build_arbiter,
 )
-from manager.arbiter_memory import Memory, objection, recall, remember
-from manager.detection_track import overdue
-from manager.recovery_track import Command, Phase
-from manager.schema import SystemSpec
-from manager.specification import check_modules
+from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
+from rampart.manager.arbitration.detection_track import overdue
+from rampart.manager.arbitration.recovery_track import Command, Phase
+from rampart.manager.spec.adaptation import Action, Change, Document, adapt, describe
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.specification import check_modules
 
 MANAGER_STATE = StateFormat(Memory, version=1, objection=objection)
 

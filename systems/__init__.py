@@ -1,12 +1,15 @@
 """The systems that ship with Rampart, as data: one TOML file each, and their airports.
 
-`manager.specification` reads them.
+`rampart.manager.spec.specification` reads them.
 """
 
 from __future__ import annotations
 
 import os.path
 from pathlib import Path
+
+if __name__ != "rampart.systems":
+    raise ImportError("import it as rampart.systems: everything of Rampart has this one name")
 
 SHIPPED = Path(__file__).resolve().parent
 DEFAULT = SHIPPED / "osmosis.toml"

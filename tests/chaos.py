@@ -27,15 +27,15 @@ from typing import Any
 
 from real_run import RealRun
 
-from actors.control.control_checkpoint import CONTROL_STATE
-from actors.control.mission_checkpoint import MISSION_STATE
-from actors.runtime.checkpoint import StateFormat
-from actors.runtime.checkpoint_store import SqliteCheckpoints
-from actors.supervision.kill_node import SIGNALS
-from actors.supervision.process_title import find_processes, process_state
-from actors.supervision.run_plan import SUPERVISOR
-from actors.supervision.spawner import NAMES
-from manager.specification import Kind, SystemSpec
+from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE
+from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE
+from rampart.actors.run.run_plan import SUPERVISOR
+from rampart.actors.runtime.checkpoint import StateFormat
+from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.supervision.kill_node import SIGNALS
+from rampart.actors.supervision.process_title import find_processes, process_state
+from rampart.actors.supervision.spawner import NAMES
+from rampart.manager.spec.specification import Kind, SystemSpec
 
 WAYS = ("KILL", "STOP", "SEGV", "WEDGE")
 SPAWNERS = tuple(f"spawner_{name}" for name in NAMES)

@@ -27,14 +27,14 @@ from typing import Any
 from chaos import SPAWNERS, WORLD_PAUSE_S, Targets, tells_end
 from real_run import RealRun
 
-from actors import topics
-from actors.messages import NodeState, NodeTable
-from actors.runtime.actor import HEARTBEAT
-from actors.supervision.kill_node import SIGNALS
-from actors.supervision.process_title import find_processes, process_state
-from actors.supervision.run_plan import SUPERVISOR
-from toolbox.output import UsageError
-from toolbox.session import connect
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import NodeState, NodeTable
+from rampart.actors.run.run_plan import SUPERVISOR
+from rampart.actors.runtime.actor import HEARTBEAT
+from rampart.actors.supervision.kill_node import SIGNALS
+from rampart.actors.supervision.process_title import find_processes, process_state
+from rampart.cli.output import UsageError
+from rampart.cli.session import connect
 
 LAUNCHER = "launcher"
 WAYS = ("KILL", "STOP", "WEDGE")

@@ -19,9 +19,9 @@ from leak_counts import Counts, count, leaks, shared_memory
 from real_run import RealRun
 from stub_actors import ROOT, free_base_port
 
-from actors.supervision.run_plan import SUPERVISOR
-from airport.formats import load_airport
-from manager.specification import SystemSpec, check_document, read_document
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.run.run_plan import SUPERVISOR
+from rampart.manager.spec.specification import SystemSpec, check_document, read_document
 
 SYSTEM = ROOT / "systems" / "osmosis.toml"
 SETTLE_S = 8.0

@@ -20,7 +20,7 @@ import sys
 import time
 from pathlib import Path
 
-from actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 
 SAVES = 400
 LOG_LIMIT = 40_000

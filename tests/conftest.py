@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from actors.runtime import run_folder
+from rampart.actors.bus import run_folder
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ async def world():
 @pytest.fixture
 def patient(monkeypatch):
     """For tests in which time is not the subject: a busy machine is no silent page."""
-    from actors.operator import hmi_stick
+    from rampart.actors.osmosis.page import stick as hmi_stick
 
     monkeypatch.setattr(hmi_stick, "SILENCE_S", 5.0)
     monkeypatch.setattr(hmi_stick, "TICKET_S", 5.0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from actors.control.polyline import Array, Hull, Polyline
+from rampart.actors.osmosis.control.polyline import Array, Hull, Polyline
 
 HULL = Hull()
 DT_S = 0.05

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from actors import messages as m
-from actors import topics
-from actors.detection.module import Monitor
-from actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.detection.module import Monitor
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Actor, Context, Header, on
 
 SLOT_S = 0.1
 Handler = Callable[[str, float], None]

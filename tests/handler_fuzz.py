@@ -31,23 +31,24 @@ from message_extremes import Drawer, all_topics
 from msgspec import inspect
 
 import systems as shipped
-from actors.recording.views import Views
-from actors.runtime.actor import BASE_OUTPUTS, Actor, Context
-from actors.runtime.checkpoint import MemoryCheckpoints, Shelf
-from actors.runtime.envelope import UNREADABLE, Header, decode
-from actors.runtime.topic import ROOT, Topic
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from actors.runtime.virtual_loop import VirtualClock, VirtualLoop
-from actors.supervision.patience import AT_LEISURE, Usage
-from actors.supervision.run_plan import Layout, RunPlan, load_shared
-from actors.supervision.system_topics import find_topic
-from manager.specification import SystemSpec
-from sim.console import Console
-from sim.mission_run import MissionRun
-from toolbox import systems, top_view
-from toolbox.metrics_families import families
-from toolbox.run_picture import DECODED, RunPicture
-from toolbox.topic_verbs import in_line
+from rampart.actors.bus.envelope import UNREADABLE, Header, decode
+from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.recording.views import Views
+from rampart.actors.run.run_plan import Layout, RunPlan, load_shared
+from rampart.actors.run.system_topics import find_topic
+from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor, Context
+from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Shelf
+from rampart.actors.supervision.patience import AT_LEISURE, Usage
+from rampart.cli import systems
+from rampart.cli.look import top_view
+from rampart.cli.look.metrics_families import families
+from rampart.cli.look.topic_verbs import in_line
+from rampart.cli.run_picture import DECODED, RunPicture
+from rampart.manager.spec.specification import SystemSpec
+from rampart.sim.runs.console import Console
+from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
 
 SYSTEMS = ("osmosis", "paper", "cell")
 
@@ -330,7 +331,7 @@ class _Run:
     run_id, title, base_port, rate = "fuzz", "fuzz", 7450, 1.0
 
     def exposition(self, now_s: float, picture: RunPicture) -> Any:
-        from toolbox.metrics_families import Exposition
+        from rampart.cli.look.metrics_families import Exposition
 
         return Exposition(self, now_s, picture)  # type: ignore[arg-type]
 

@@ -11,9 +11,9 @@ import numpy as np
 from hmi_browser import browser
 from hmi_world import AIRPORT, Others, World, free_port, served
 
-from actors import messages as m
-from actors import topics
-from manager.specification import parse_specification
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.manager.spec.specification import parse_specification
 
 ROOT = Path(__file__).resolve().parents[1]
 FILE = ROOT / "systems" / "osmosis.toml"

@@ -7,13 +7,13 @@ import json
 import socket
 from contextlib import asynccontextmanager
 
-from actors import messages as m
-from actors import topics
-from actors.operator.hmi import Hmi
-from actors.runtime.actor import Actor, Context, Header, on
-from actors.runtime.clock import Clock
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from airport.formats import load_airport
+from rampart.actors.operator.hmi import Hmi
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.clock import Clock
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 
 AIRPORT = load_airport("vallombre")
 RATE = 20.0

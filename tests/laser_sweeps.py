@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from actors.messages import LaserScan
+from rampart.actors.osmosis.messages import LaserScan
 
 RAYS = 181
 TOP_M = 8.0

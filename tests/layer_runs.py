@@ -11,8 +11,8 @@ from tempfile import TemporaryDirectory
 
 from stub_actors import ROOT
 
-from sim.campaign.job import Job, run_job
-from sim.scenario import parse_fault
+from rampart.sim.campaign.job import Job, run_job
+from rampart.sim.faults.scenario import parse_fault
 
 LAYERS = ("dead_man", "safety_pilot_checks", "manager_watch", "supervisor_respawn", "ftm",
           "checkpoints")

@@ -17,7 +17,7 @@ from pathlib import Path
 import psutil
 from real_run import RealRun
 
-from actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_title import find_processes
 
 LAUNCHER = "launch.py"
 MAX_GROWTH_MB = 15.0

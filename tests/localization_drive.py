@@ -14,15 +14,15 @@ from typing import Any
 
 from shapely.geometry import box
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.injection import FaultGate, Outgoing
-from actors.runtime.topic import Topic
-from airport.model import Airport, StartPose
-from sim.disturbance import Fault
-from sim.faults import find_fault
-from sim.schedule import Schedule
-from sim.world import World
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport, StartPose
+from rampart.actors.runtime.injection import FaultGate, Outgoing
+from rampart.sim.faults.disturbance import Fault
+from rampart.sim.faults.faults import find_fault
+from rampart.sim.osmosis.schedule import Schedule
+from rampart.sim.osmosis.world import World
 
 START_RAD = 0.7
 SOURCES = {"gps": topics.GPS, "imu": topics.IMU, "odom": topics.ODOMETRY,

@@ -6,8 +6,8 @@ from functools import cache
 
 import msgspec
 
-import systems
-from manager.arbiter import (
+from rampart import systems
+from rampart.manager.arbitration.arbiter import (
     Command,
     DecisionMade,
     DetectionHeard,
@@ -18,7 +18,7 @@ from manager.arbiter import (
     Tick,
     build_arbiter,
 )
-from manager.specification import SystemSpec, parse_specification
+from rampart.manager.spec.specification import SystemSpec, parse_specification
 
 PAPER, FULL = ((systems.SHIPPED / name).read_text(encoding="utf-8")
                for name in ("paper.toml", "osmosis.toml"))

@@ -16,11 +16,11 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
-from actors import topics
-from actors.runtime.envelope import Header
-from actors.runtime.topic import Topic
-from actors.supervision.system_topics import system_topics
-from toolbox import systems
+from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import topics
+from rampart.actors.run.system_topics import system_topics
+from rampart.cli import systems
 
 Plain = Any
 Edge = tuple[str, Plain, bool]

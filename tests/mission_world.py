@@ -8,10 +8,10 @@ from typing import Any
 from control_world import World
 from test_control_actors import NODES, Base, House, system
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Context, on
-from actors.runtime.virtual_bus import VirtualBus
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Context, on
+from rampart.sim.virtual.virtual_bus import VirtualBus
 
 PARAMETERS: dict[str, dict[str, Any]] = {
     "mission_manager": {"held_by": ["RM1", "RM2", "RM5"]},

@@ -7,9 +7,9 @@ from pathlib import Path
 import msgspec
 from stub_actors import ROOT
 
-from actors.messages import Message
-from actors.runtime.actor import Actor, Header, every, on
-from actors.runtime.topic import Qos, Topic
+from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.osmosis.messages import Message
+from rampart.actors.runtime.actor import Actor, Header, every, on
 
 
 class Load(Message, frozen=True):

@@ -27,7 +27,7 @@ class PseudoTerminal:
         self._master, self.slave = pty.openpty()
         fcntl.ioctl(self.slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
         self.before = termios.tcgetattr(self.slave)
-        self._arguments = [sys.executable, "-m", "toolbox.main", *arguments]
+        self._arguments = [sys.executable, "-m", "rampart.cli.main", *arguments]
         self._environment = {
             **{k: v for k, v in os.environ.items()
                if k not in {"NO_COLOR", "COLUMNS", "LINES", "FORCE_COLOR"}},

@@ -14,8 +14,8 @@ from typing import Any
 
 from stub_actors import ROOT, free_base_port
 
-from actors.supervision.process_title import find_processes
-from actors.supervision.run_info import RunInfo, find_runs
+from rampart.actors.run.run_info import RunInfo, find_runs
+from rampart.actors.supervision.process_title import find_processes
 
 HEEDS_SIGNALS = ("env", "--default-signal=HUP,INT")
 """Before a command: undoes what nohup, and shells with what they start in the background, do."""
@@ -103,7 +103,7 @@ class RealRun:
     def tool(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """Run `rampart` on this run."""
         return subprocess.run(
-            [sys.executable, "-m", "toolbox.main", *arguments, "--port", str(self.port)],
+            [sys.executable, "-m", "rampart.cli.main", *arguments, "--port", str(self.port)],
             check=False, capture_output=True, text=True, cwd=ROOT, timeout=60)
 
     def result(self, timeout_s: float = 200) -> tuple[int, dict[str, Any]]:

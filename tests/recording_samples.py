@@ -9,14 +9,14 @@ from pathlib import Path
 
 import msgspec
 
-from actors import messages as m
-from actors import topics
-from actors.recording.bag_writer import BagWriter
-from actors.recording.run_documents import Documents, collect
-from actors.recording.views import Views
-from actors.runtime.envelope import Header, encode
-from actors.supervision import run_info
-from airport.formats import load_airport
+from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.recording.bag_writer import BagWriter
+from rampart.actors.recording.run_documents import Documents, collect
+from rampart.actors.recording.views import Views
+from rampart.actors.run import run_info
 
 ROOT = Path(__file__).resolve().parents[1]
 PLAN = {"system_file": str(ROOT / "systems" / "paper.toml"), "airport": "vallombre",

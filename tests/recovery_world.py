@@ -8,10 +8,10 @@ from typing import Any
 
 from virtual_loop import System
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Actor, Context, Header, every, on
-from actors.runtime.topic import Topic
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 
 
 class Boss(Actor):

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from stub_actors import ROOT, Idler, write_stub_system
 
-from actors.control.osmosis_control import OsmosisControl
-from actors.control.safety_pilot import SafetyPilot
-from actors.detection.freshness import CommandFreshness
-from actors.runtime.actor import Actor
-from actors.supervision import supervisor
-from actors.supervision.restart_policy import RestartPolicy
-from manager.actor import FtmManager
+from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
+from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
+from rampart.actors.osmosis.detection.freshness import CommandFreshness
+from rampart.actors.runtime.actor import Actor
+from rampart.actors.supervision import supervisor
+from rampart.actors.supervision.restart_policy import RestartPolicy
+from rampart.manager.actor import FtmManager
 
 SICK_S = (14.0, 40.0)
 """Simulated seconds, far longer than it takes to be given up."""
@@ -63,10 +63,10 @@ class SickManager(Sick, FtmManager):
 
 
 ACTORS = {
-    "osmosis_control": ("actors.control.osmosis_control:OsmosisControl", SickControl),
-    "safety_pilot": ("actors.control.safety_pilot:SafetyPilot", SickPilot),
-    "DM2": ("actors.detection.freshness:CommandFreshness", SickModule),
-    "ftm_manager": ("manager.actor:FtmManager", SickManager),
+    "osmosis_control": ("rampart.actors.osmosis.control.following.osmosis_control:OsmosisControl", SickControl),
+    "safety_pilot": ("rampart.actors.osmosis.control.pilot.safety_pilot:SafetyPilot", SickPilot),
+    "DM2": ("rampart.actors.osmosis.detection.freshness:CommandFreshness", SickModule),
+    "ftm_manager": ("rampart.manager.actor:FtmManager", SickManager),
 }
 
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import zenoh
 
-from actors import topics
-from actors.runtime.zenoh_bus import session_config
+from rampart.actors.bus.zenoh_bus import session_config
+from rampart.actors.osmosis import topics
 
 NOBODY = 65534
 

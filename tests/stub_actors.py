@@ -12,11 +12,11 @@ from pathlib import Path
 
 import msgspec
 
-from actors import topics
-from actors.runtime.actor import Actor
-from actors.supervision import run_info
-from actors.supervision.launcher import Launcher
-from actors.supervision.run_plan import RunPlan
+from rampart.actors.osmosis import topics
+from rampart.actors.run import run_info
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.actor import Actor
+from rampart.actors.supervision.launcher import Launcher
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from airport.errors import AirportError
-from airport.formats import load_airport, load_mission, load_world
-from airport.mask import MaskScale
+from rampart.actors.osmosis.airport.errors import AirportError
+from rampart.actors.osmosis.airport.formats import load_airport, load_mission, load_world
+from rampart.actors.osmosis.airport.mask import MaskScale
 
 TOML = """
 name = "Field"

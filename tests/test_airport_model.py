@@ -10,9 +10,9 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from airport.checks import mission_problems, problems
-from airport.errors import AirportError
-from airport.model import (
+from rampart.actors.osmosis.airport.checks import mission_problems, problems
+from rampart.actors.osmosis.airport.errors import AirportError
+from rampart.actors.osmosis.airport.model import (
     Airport,
     Light,
     Mission,

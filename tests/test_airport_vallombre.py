@@ -11,8 +11,8 @@ import shapely
 from shapely.geometry import LineString
 from shapely.ops import substring
 
-from airport.formats import load_airport, load_world, shipped_airports
-from airport.photometry import (
+from rampart.actors.osmosis.airport.formats import load_airport, load_world, shipped_airports
+from rampart.actors.osmosis.airport.photometry import (
     SENSOR_FORWARD_M,
     SENSOR_HEIGHT_M,
     illuminance_lux,

@@ -2,8 +2,8 @@
 
 from manager_bench import paper
 
-from manager.barriers import guard, occurs_without, outlook
-from manager.fault_tree import Event, FaultTree
+from rampart.manager.analysis.barriers import guard, occurs_without, outlook
+from rampart.manager.model.fault_tree import Event, FaultTree
 
 
 def test_on_the_paper_s_tree_each_cause_has_the_barriers_above_it():

@@ -14,25 +14,25 @@ from handler_fuzz import Machine, cases, system
 from message_extremes import all_topics
 from msgspec import inspect
 
-import sim.console
-import sim.report_record
-from actors import messages as m
-from actors import topics
-from actors.recording.views import Views
-from actors.runtime.actor import Actor, Context, on
-from actors.runtime.checkpoint import MemoryCheckpoints, Shelf
-from actors.runtime.envelope import STRANGERS, ArrivalGuard, Header, encode
-from actors.runtime.injection_desk import MAX_DELAYED, MAX_IN_FORCE
-from actors.runtime.limits import REPORTS_PER_S, RateLimit, Remembered, ReportLimit
-from actors.runtime.mailbox import Mailbox
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from actors.runtime.virtual_loop import VirtualClock, VirtualLoop
-from actors.supervision.run_plan import SUPERVISOR
-from sim.actuator_faults import ActuatorFaults, Motor
-from sim.console import Console
-from sim.mission_run import MissionRun
-from sim.scene import WorldError
-from toolbox.run_picture import DECODED, RunPicture
+import rampart.sim.osmosis.report_record
+import rampart.sim.runs.console
+from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Header, encode
+from rampart.actors.bus.limits import REPORTS_PER_S, RateLimit, Remembered, ReportLimit
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.recording.views import Views
+from rampart.actors.run.run_plan import SUPERVISOR
+from rampart.actors.runtime.actor import Actor, Context, on
+from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Shelf
+from rampart.actors.runtime.injection_desk import MAX_DELAYED, MAX_IN_FORCE
+from rampart.actors.runtime.mailbox import Mailbox
+from rampart.cli.run_picture import DECODED, RunPicture
+from rampart.sim.osmosis.actuator_faults import ActuatorFaults, Motor
+from rampart.sim.osmosis.scene import WorldError
+from rampart.sim.runs.console import Console
+from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
 
 FLOOD = 700
 """Messages of each topic, each about other names and half of them from another source."""
@@ -158,10 +158,10 @@ def test_what_remembers_without_bound_is_found(monkeypatch):
 
 
 def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkeypatch):
-    monkeypatch.setattr(sim.report_record, "KEPT", 500)
-    monkeypatch.setattr(sim.report_record, "TRACK_KEPT", 500)
-    monkeypatch.setattr(sim.console, "MANY", 500)
-    monkeypatch.setattr(sim.console, "MOST", 500)
+    monkeypatch.setattr(rampart.sim.osmosis.report_record, "KEPT", 500)
+    monkeypatch.setattr(rampart.sim.osmosis.report_record, "TRACK_KEPT", 500)
+    monkeypatch.setattr(rampart.sim.runs.console, "MANY", 500)
+    monkeypatch.setattr(rampart.sim.runs.console, "MOST", 500)
     of = system("osmosis")
     run = MissionRun(of.plan, of.shared["airport"], of.shared["mission"], strategy="x",
                      patience_s=60.0, console=Console(io.StringIO()))

@@ -16,13 +16,13 @@ from hmi_browser import CHROMIUM, browser
 from hmi_world import AIRPORT, World, free_port, served
 from PIL import Image
 
-from actors import messages as m
-from actors import topics
-from actors.operator import camera_eye
-from actors.operator.camera_eye import CameraError, CameraEye, renderer
-from actors.operator.hmi import Hmi
-from airport.model import Airport, Building, StartPose, Surface
-from sim.camera import MARGIN_M, MAX_PIXELS, View, ground_image
+from rampart.actors.operator import camera_eye
+from rampart.actors.operator.camera_eye import CameraError, CameraEye, renderer
+from rampart.actors.operator.hmi import Hmi
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport, Building, StartPose, Surface
+from rampart.sim.osmosis.camera import MARGIN_M, MAX_PIXELS, View, ground_image
 
 ECHO = """
 import struct, sys
@@ -152,7 +152,7 @@ def test_a_large_airport_has_a_picture_of_its_ground_that_fits_into_a_texture():
 class Seen(Hmi):
     """An HMI with the camera of the shipped systems, or another."""
 
-    def __init__(self, context, module: str = "sim.camera") -> None:
+    def __init__(self, context, module: str = "rampart.sim.osmosis.camera") -> None:
         context.parameters["camera"] = module
         super().__init__(context)
 
@@ -215,4 +215,4 @@ async def test_the_renderer_starts_when_somebody_looks_and_the_page_says_what_is
 
 
 def test_the_command_of_a_renderer_is_this_python():
-    assert renderer("sim.camera") == (sys.executable, "-m", "sim.camera")
+    assert renderer("rampart.sim.osmosis.camera") == (sys.executable, "-m", "rampart.sim.osmosis.camera")

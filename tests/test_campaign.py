@@ -20,10 +20,14 @@ from hypothesis import strategies as st
 from porter_actors import write_porter_system
 from stub_actors import ROOT
 
-from sim.campaign import execute as execution
-from sim.campaign.execute import BackendError, JobError, execute
-from sim.campaign.job import Job, RunResult, run_job
-from sim.campaign.paper_tables import (
+from rampart.cli import systems
+from rampart.cli.analyse import campaigning
+from rampart.cli.analyse.campaigning import ProgressLog
+from rampart.cli.main import main as rampart
+from rampart.sim.campaign import execute as execution
+from rampart.sim.campaign.execute import BackendError, JobError, execute
+from rampart.sim.campaign.job import Job, RunResult, run_job
+from rampart.sim.campaign.paper_tables import (
     AS_THE_PAPER,
     CONDITIONS,
     FAULTS,
@@ -35,15 +39,12 @@ from sim.campaign.paper_tables import (
     paper_jobs,
     table_iii,
 )
-from sim.campaign.plan import cross, fault_groups, sample
-from sim.campaign.search import Space, margin, search, shrink
-from sim.campaign.statistics import badness, rate, spread, table, total, worst
-from sim.campaign.store import Run, Store, StoreError
-from sim.scenario import FaultOutcome, PlannedFault
-from systems import SHIPPED
-from toolbox import campaigning, systems
-from toolbox.campaigning import ProgressLog
-from toolbox.main import main as rampart
+from rampart.sim.campaign.plan import cross, fault_groups, sample
+from rampart.sim.campaign.search import Space, margin, search, shrink
+from rampart.sim.campaign.statistics import badness, rate, spread, table, total, worst
+from rampart.sim.campaign.store import Run, Store, StoreError
+from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
+from rampart.systems import SHIPPED
 
 PAPER = systems.load("paper")
 GROUPS = fault_groups(PAPER)
@@ -174,7 +175,7 @@ def test_a_job_that_makes_no_sense_is_named_and_what_was_finished_is_kept(tmp_pa
 
 
 def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
-    command = [sys.executable, "-m", "toolbox.main", "campaign", "--system", "paper", "--fault",
+    command = [sys.executable, "-m", "rampart.cli.main", "campaign", "--system", "paper", "--fault",
                "kill:mission_manager@3", "--seeds", "12", "--obstacles", "0", "--jobs", "1",
                "--out", str(tmp_path), "--json"]
 
@@ -212,8 +213,8 @@ def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
 FULL_DISK = """
 import msgspec, resource, sys
 from pathlib import Path
-from sim.campaign.job import Job, RunResult
-from sim.campaign.store import Store, StoreError
+from rampart.sim.campaign.job import Job, RunResult
+from rampart.sim.campaign.store import Store, StoreError
 result = msgspec.json.decode(sys.argv[2], type=RunResult)
 store = Store(Path(sys.argv[1]))
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
@@ -246,15 +247,15 @@ def test_a_disk_that_fills_up_costs_none_of_the_runs_before(tmp_path):
 
 
 def test_a_campaign_whose_disk_fills_up_says_so_in_one_line_and_goes_on_from_there(tmp_path):
-    command = [sys.executable, "-m", "toolbox.main", "campaign", "--system", "paper", "--fault",
+    command = [sys.executable, "-m", "rampart.cli.main", "campaign", "--system", "paper", "--fault",
                "kill:mission_manager@3", "--seeds", "6", "--obstacles", "0", "--jobs", "1",
                "--out", str(tmp_path), "--json"]
-    code = ("import resource, sys; from sim.campaign.store import Store; kept = Store.add\n"
+    code = ("import resource, sys; from rampart.sim.campaign.store import Store; kept = Store.add\n"
             "def add(self, *run):\n"
             "    kept(self, *run)\n"
             "    if len(self.keys()) == 2: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, -1))\n"
             "Store.add = add\n"
-            "from toolbox.main import main; sys.exit(main(sys.argv[1:]))")
+            "from rampart.cli.main import main; sys.exit(main(sys.argv[1:]))")
     full = subprocess.run([sys.executable, "-c", code, *command[3:]], cwd=ROOT,
                           capture_output=True, text=True, check=False)
     assert (full.returncode, full.stdout) == (2, "")

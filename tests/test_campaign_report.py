@@ -13,24 +13,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from airport.drawing import draw
-from airport.formats import load_airport
-from sim.campaign import charts, paper_tables
-from sim.campaign.grouping import KINDS, by_kind, conditions, in_common, kind_of
-from sim.campaign.job import DecisionTaken, Job, RunResult
-from sim.campaign.paper_tables import Decided
-from sim.campaign.report import (
+from rampart.actors.osmosis.airport.drawing import draw
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.sim.campaign import charts, paper_tables
+from rampart.sim.campaign.grouping import KINDS, by_kind, conditions, in_common, kind_of
+from rampart.sim.campaign.job import DecisionTaken, Job, RunResult
+from rampart.sim.campaign.paper_tables import Decided
+from rampart.sim.campaign.report import (
     Campaign,
     headline,
     render,
     worth_showing,
     write_campaign_report,
 )
-from sim.campaign.statistics import badness, rate
-from sim.campaign.store import Run
-from sim.campaign.wording import interval, metres, percent, seconds
-from sim.report_record import ObstacleSeen, RunRecord, StepResult
-from sim.scenario import FaultOutcome, PlannedFault
+from rampart.sim.campaign.statistics import badness, rate
+from rampart.sim.campaign.store import Run
+from rampart.sim.campaign.wording import interval, metres, percent, seconds
+from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
+from rampart.sim.osmosis.report_record import ObstacleSeen, RunRecord, StepResult
 
 ABOUT = Campaign("A campaign", "rampart campaign --runs 3", 7)
 OUT = Path("out/my campaign")

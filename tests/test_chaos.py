@@ -12,7 +12,7 @@ from leak_counts import Counts, leaks
 from real_run import RealRun
 from stub_actors import ROOT
 
-from manager.specification import check_document, read_document
+from rampart.manager.spec.specification import check_document, read_document
 
 SHIPPED = ROOT / "systems" / "osmosis.toml"
 PAUSE_S = (0.8, 2.0)

@@ -23,19 +23,30 @@ from control_world import World, drive
 from real_run import RealRun
 from stub_actors import ROOT
 
-from actors import messages as m
-from actors.control.control_checkpoint import CONTROL_STATE, ControlKept, whole_row
-from actors.control.light_ledger import LightsKept
-from actors.control.light_row import LightRow
-from actors.control.mission_checkpoint import MISSION_STATE, catch_up
-from actors.control.mission_state import MissionState
-from actors.control.path_follower import PathFollower
-from actors.control.polyline import NO_POINTS, Polyline
-from actors.runtime.checkpoint import Loaded, MemoryCheckpoints, Record, StateError
-from manager.arbiter import DetectionHeard, Phase, RecoveryHeard, ResetAsked, Tick, build_arbiter
-from manager.arbiter_memory import Latch, Memory, objection, recall, remember
-from manager.recovery_track import Command
-from manager.specification import parse_specification
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.control.following.control_checkpoint import (
+    CONTROL_STATE,
+    ControlKept,
+    whole_row,
+)
+from rampart.actors.osmosis.control.following.light_ledger import LightsKept
+from rampart.actors.osmosis.control.following.light_row import LightRow
+from rampart.actors.osmosis.control.following.path_follower import PathFollower
+from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE, catch_up
+from rampart.actors.osmosis.control.mission.mission_state import MissionState
+from rampart.actors.osmosis.control.polyline import NO_POINTS, Polyline
+from rampart.actors.runtime.checkpoint import Loaded, MemoryCheckpoints, Record, StateError
+from rampart.manager.arbitration.arbiter import (
+    DetectionHeard,
+    Phase,
+    RecoveryHeard,
+    ResetAsked,
+    Tick,
+    build_arbiter,
+)
+from rampart.manager.arbitration.arbiter_memory import Latch, Memory, objection, recall, remember
+from rampart.manager.arbitration.recovery_track import Command
+from rampart.manager.spec.specification import parse_specification
 
 P = m.MissionPhase
 GOALS = tuple(m.Goal(float(i), 0.0, m.Mode.TAXI) for i in range(4))
@@ -289,7 +300,7 @@ def newest_corrupt(loaded: Loaded) -> Loaded:
 def tampering(monkeypatch):
     """Change what the second and later lives of a node load: `tampering(node, change)`."""
     load, changes = MemoryCheckpoints.load, {}
-    from sim.virtual_processes import VirtualMachine
+    from rampart.sim.virtual.virtual_processes import VirtualMachine
 
     store = VirtualMachine._store
 

@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 from control_world import Circle, World
 
-from actors import messages as m
-from actors import topics
-from actors.control.graph_planner import GraphPlanner
-from actors.control.localization import Localization
-from actors.control.mission_manager import MissionManager
-from actors.control.osmosis_control import OsmosisControl
-from actors.control.safety_pilot import SafetyPilot
-from actors.messages import Mode
-from actors.operator.teleoperation import Teleoperation
-from actors.runtime.actor import Actor, Context, every, on
-from actors.runtime.clock import Clock
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from actors.runtime.virtual_loop import VirtualLoop
-from airport.formats import load_airport
-from airport.photometry import illuminance_lux, sensor_position
-from manager.specification import Layers, Robot, SystemSpec, Timing
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.airport.photometry import illuminance_lux, sensor_position
+from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
+from rampart.actors.osmosis.control.localization.localization import Localization
+from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
+from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
+from rampart.actors.osmosis.control.planning.graph_planner import GraphPlanner
+from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
+from rampart.actors.osmosis.messages import Mode
+from rampart.actors.runtime.actor import Actor, Context, every, on
+from rampart.actors.runtime.clock import Clock
+from rampart.manager.spec.specification import Layers, Robot, SystemSpec, Timing
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualLoop
 
 AIRPORT = load_airport("vallombre")
 BROKEN = {"A03": 0.0, "A06": 0.35, "A10": 0.0}

@@ -9,14 +9,14 @@ import pytest
 from localization_drive import field_airport
 from virtual_loop import System, run, shipped_system
 
-from actors import messages as m
-from actors import topics
-from actors.control.fused_localization import FusedLocalization
-from actors.control.localization import Localization
-from actors.runtime.actor import Actor, Context, Header, on
-from actors.runtime.wiring import Member, heard
-from sim.faults import find_fault
-from sim.simulator import Simulator
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.localization.fused_localization import FusedLocalization
+from rampart.actors.osmosis.control.localization.localization import Localization
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.wiring import Member, heard
+from rampart.sim.faults.faults import find_fault
+from rampart.sim.osmosis.simulator import Simulator
 
 
 class Ear(Actor):

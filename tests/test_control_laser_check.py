@@ -8,10 +8,10 @@ import random
 import msgspec
 import pytest
 
-from actors.control.laser_check import LaserCheck
-from sim.campaign.job import Job, run_job
-from sim.scenario import parse_fault
-from sim.topic_faults import topic_fault
+from rampart.actors.osmosis.control.pilot.laser_check import LaserCheck
+from rampart.sim.campaign.job import Job, run_job
+from rampart.sim.faults.scenario import parse_fault
+from rampart.sim.faults.topic_faults import topic_fault
 
 
 def judge(references, period_s=0.05):

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from laser_sweeps import full_sweep
 from virtual_loop import System, run, shipped_system
 
-from actors import messages as m
-from actors import topics
-from actors.control.laser_check import LaserReach
-from actors.control.laser_pair import LOWER, UPPER, LaserPair
-from actors.control.safety_pilot import SafetyPilot
-from actors.messages import LaserScan
-from actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.pilot.laser_check import LaserReach
+from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair
+from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
+from rampart.actors.osmosis.messages import LaserScan
+from rampart.actors.runtime.actor import Actor, Context, Header, on
 
 RAYS, TOP_M, PERIOD_S = 5, 8.0, 0.05
 ANGLE_MIN = -0.2

@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 from control_world import DT_S, Circle, World, drive
 
-from actors.control.light_inspection import LightInspection, RowLight, verdict
-from actors.control.light_row import LightRow
-from airport.photometry import illuminance_lux, sensor_position
+from rampart.actors.osmosis.airport.photometry import illuminance_lux, sensor_position
+from rampart.actors.osmosis.control.following.light_inspection import (
+    LightInspection,
+    RowLight,
+    verdict,
+)
+from rampart.actors.osmosis.control.following.light_row import LightRow
 
 ROW = ((0.0, 0.0), (20.0, 0.0))
 

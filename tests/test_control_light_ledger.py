@@ -6,10 +6,10 @@ import random
 
 import pytest
 
-from actors import messages as m
-from actors.control.light_inspection import RowLight
-from actors.control.light_ledger import LightLedger, LightsKept
-from actors.control.polyline import Polyline
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.control.following.light_inspection import RowLight
+from rampart.actors.osmosis.control.following.light_ledger import LightLedger, LightsKept
+from rampart.actors.osmosis.control.polyline import Polyline
 
 LIGHTS = tuple(RowLight(f"L{i}", 4.0 * i, 0.0, 100.0) for i in range(1, 6))
 ROW = Polyline([(0.0, 0.0), (24.0, 0.0)])

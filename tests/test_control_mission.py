@@ -5,12 +5,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors import messages as m
-from actors.control import mission_state as ms
-from actors.control.localization import is_newer
-from actors.control.mission_state import TRANSITIONS, IllegalTransitionError, MissionState
-from actors.messages import ControlPhase, ControlStatus, MissionPhase, Mode
-from actors.operator.teleoperation import stick_twist
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.control.localization.localization import is_newer
+from rampart.actors.osmosis.control.mission import mission_state as ms
+from rampart.actors.osmosis.control.mission.mission_state import (
+    TRANSITIONS,
+    IllegalTransitionError,
+    MissionState,
+)
+from rampart.actors.osmosis.control.teleoperation.teleoperation import stick_twist
+from rampart.actors.osmosis.messages import ControlPhase, ControlStatus, MissionPhase, Mode
 
 GOALS = (m.Goal(1.0, 0.0, Mode.TAXI), m.Goal(9.0, 0.0, Mode.LIGHT_VERIFICATION))
 REQUEST = m.MissionRequest("id-1", "A", GOALS)

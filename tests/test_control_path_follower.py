@@ -6,11 +6,16 @@ from control_world import HULL, Circle, World, drive
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.control.escape import Escape, EscapeLimits
-from actors.control.path_follower import PathFollower
-from actors.control.polyline import Polyline, scan_points, wrap_angle
-from actors.control.potential_field import FieldGains, clusters, field, repulsion
-from actors.control.swept_path import StoppingRoom, limited
+from rampart.actors.osmosis.control.following.escape import Escape, EscapeLimits
+from rampart.actors.osmosis.control.following.path_follower import PathFollower
+from rampart.actors.osmosis.control.following.potential_field import (
+    FieldGains,
+    clusters,
+    field,
+    repulsion,
+)
+from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
+from rampart.actors.osmosis.control.polyline import Polyline, scan_points, wrap_angle
 
 LINE = [(0.0, 0.0), (20.0, 0.0)]
 BENT = [(0.0, 0.0), (8.0, 0.0), (14.0, 6.0), (20.0, 6.0), (20.0, -2.0), (12.0, -6.0)]

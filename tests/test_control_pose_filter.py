@@ -22,13 +22,13 @@ from localization_drive import (
     mis_stamped,
 )
 
-from actors import messages as m
-from actors import topics
-from actors.control.motion_check import ImuCheck, OdometryCheck
-from actors.control.planar_ekf import PlanarEkf
-from actors.control.pose_filter import PoseFilter
-from actors.control.position_source import FilterLimits
-from sim.faults import SENSOR_FAULTS
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck
+from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
+from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
+from rampart.actors.osmosis.control.localization.position_source import FilterLimits
+from rampart.sim.faults.faults import SENSOR_FAULTS
 
 END_S = sum(leg[0] for leg in LEGS)
 FOR_EVER = math.inf

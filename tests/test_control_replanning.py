@@ -13,17 +13,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from virtual_loop import System, run
 
-from actors import messages as m
-from actors import topics
-from actors.control.blockage import BlockageLimits, BlockageWatch, nearest_ahead
-from actors.control.closures import Closures, without
-from actors.control.graph_planner import GraphPlanner
-from actors.control.light_row import LightRow, RowLimits
-from actors.control.polyline import NO_POINTS
-from actors.control.route_search import plan_route
-from actors.messages import Mode
-from actors.runtime.actor import Actor, on
-from airport.formats import load_airport
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.control.following.blockage import (
+    BlockageLimits,
+    BlockageWatch,
+    nearest_ahead,
+)
+from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
+from rampart.actors.osmosis.control.planning.closures import Closures, without
+from rampart.actors.osmosis.control.planning.graph_planner import GraphPlanner
+from rampart.actors.osmosis.control.planning.route_search import plan_route
+from rampart.actors.osmosis.control.polyline import NO_POINTS
+from rampart.actors.osmosis.messages import Mode
+from rampart.actors.runtime.actor import Actor, on
 
 AIRPORT = load_airport("vallombre")
 RING = {"A": (0.0, 0.0), "B": (20.0, 0.0), "C": (20.0, 20.0), "D": (0.0, 20.0)}

@@ -12,11 +12,11 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.control.closures import without
-from actors.control.route_search import plan_route
-from airport.formats import load_airport
-from airport.model import Airport, StartPose
-from airport.route_check import RouteCheck, RouteLimits
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.airport.model import Airport, StartPose
+from rampart.actors.osmosis.airport.route_check import RouteCheck, RouteLimits
+from rampart.actors.osmosis.control.planning.closures import without
+from rampart.actors.osmosis.control.planning.route_search import plan_route
 
 AIRPORT = load_airport("vallombre")
 CHECK = RouteCheck(AIRPORT)

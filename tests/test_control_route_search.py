@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.control.route_search import SearchLimits, plan_route
+from rampart.actors.osmosis.control.planning.route_search import SearchLimits, plan_route
 
 SQUARE = {"A": (0.0, 0.0), "B": (20.0, 0.0), "C": (20.0, 20.0), "D": (0.0, 20.0)}
 RING = [("A", "B"), ("B", "C"), ("C", "D"), ("D", "A")]

@@ -6,10 +6,10 @@ from control_world import DT_S, Circle, World
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.control.polyline import NO_POINTS
-from actors.control.safety_gate import Checks, GateLimits, SafetyGate, Stamped
-from actors.control.swept_path import StoppingRoom, is_free, limited
-from actors.messages import PilotMode
+from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate, Stamped
+from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, is_free, limited
+from rampart.actors.osmosis.control.polyline import NO_POINTS
+from rampart.actors.osmosis.messages import PilotMode
 
 LIMITS = GateLimits()
 BASELINE = Checks(bounds=False, freshness=False, sequence=False, scan=False, manager=False)

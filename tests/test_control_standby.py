@@ -8,17 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors import topics
-from actors.control.command_pair import FORGET_S, CommandPair, PairLimits
-from actors.control.light_row import LightRow, RowLimits
-from actors.control.motion_loop import LoopLimits, MotionLoop
-from actors.control.osmosis_control import OsmosisControl
-from actors.control.path_follower import PathFollower
-from actors.control.polyline import NO_POINTS
-from actors.control.safety_gate import Checks, GateLimits, SafetyGate, Stamped
-from actors.control.standby_control import StandbyControl
-from actors.messages import PilotMode
-from actors.recovery.respawn_core import Ask, RespawnCore, accused_life
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
+from rampart.actors.osmosis.control.following.motion_loop import LoopLimits, MotionLoop
+from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
+from rampart.actors.osmosis.control.following.path_follower import PathFollower
+from rampart.actors.osmosis.control.following.standby_control import StandbyControl
+from rampart.actors.osmosis.control.pilot.command_pair import FORGET_S, CommandPair, PairLimits
+from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate, Stamped
+from rampart.actors.osmosis.control.polyline import NO_POINTS
+from rampart.actors.osmosis.messages import PilotMode
+from rampart.actors.recovery.respawn_core import Ask, RespawnCore, accused_life
 
 PERIOD_S = 0.05
 LIMITS = PairLimits()

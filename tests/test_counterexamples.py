@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from sim.campaign.job import Job, run_job
+from rampart.sim.campaign.job import Job, run_job
 
 FOUND = {file.stem: msgspec.toml.decode(file.read_bytes(), type=Job)
          for file in sorted((Path(__file__).parent / "counterexamples").glob("*.toml"))}

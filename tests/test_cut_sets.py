@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manager.cut_sets import CutSets, TooLargeError
-from manager.formula import Connective, Formula, FormulaError
+from rampart.manager.analysis.cut_sets import CutSets, TooLargeError
+from rampart.manager.analysis.formula import Connective, Formula, FormulaError
 
 
 def formula(gates: dict[str, Connective], house: dict[str, bool] | None = None, top: str = ""

@@ -8,8 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import box
 
-from actors.detection.geofence import DistanceBound, FenceLimits, Fix, intrusion, reach_m
-from airport.model import Airport, StartPose
+from rampart.actors.osmosis.airport.model import Airport, StartPose
+from rampart.actors.osmosis.detection.area.geofence import (
+    DistanceBound,
+    FenceLimits,
+    Fix,
+    intrusion,
+    reach_m,
+)
 
 AIRPORT = Airport(
     name="L", nodes={}, edges=(), start=StartPose(0.0, 0.0, 0.0),

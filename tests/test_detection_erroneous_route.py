@@ -12,15 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from virtual_loop import System, run
 
-from actors import messages as m
-from actors import topics
-from actors.detection.consistency_monitor import ConsistencyLimits, ConsistencyMonitor
-from actors.detection.erroneous_route import ErroneousRoute
-from actors.detection.mission_consistency import MissionConsistency
-from actors.detection.route_monitor import RouteMonitor
-from actors.messages import ControlPhase, Goal, MissionPhase, Mode
-from actors.runtime.actor import Actor
-from airport.formats import load_airport
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.detection.consistency_monitor import (
+    ConsistencyLimits,
+    ConsistencyMonitor,
+)
+from rampart.actors.osmosis.detection.erroneous_route import ErroneousRoute
+from rampart.actors.osmosis.detection.mission_consistency import MissionConsistency
+from rampart.actors.osmosis.detection.route_monitor import RouteMonitor
+from rampart.actors.osmosis.messages import ControlPhase, Goal, MissionPhase, Mode
+from rampart.actors.runtime.actor import Actor
 
 AIRPORT = load_airport("vallombre")
 GOALS = (Goal(10.0, 0.0, Mode.TAXI), Goal(40.0, 0.0, Mode.LIGHT_VERIFICATION))

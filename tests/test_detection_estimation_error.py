@@ -19,13 +19,16 @@ from localization_drive import (
 )
 from virtual_loop import System, run, shipped_system
 
-from actors import messages as m
-from actors import topics
-from actors.detection.estimation_error import EstimationError, EstimationMonitor
-from actors.detection.geofence import Fix
-from actors.runtime.actor import Actor
-from actors.runtime.wiring import Member, heard
-from sim.faults import SENSOR_FAULTS
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.detection.area.estimation_error import (
+    EstimationError,
+    EstimationMonitor,
+)
+from rampart.actors.osmosis.detection.area.geofence import Fix
+from rampart.actors.runtime.actor import Actor
+from rampart.actors.runtime.wiring import Member, heard
+from rampart.sim.faults.faults import SENSOR_FAULTS
 
 END_S = sum(leg[0] for leg in LEGS)
 FROM_S = 4.0

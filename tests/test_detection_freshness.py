@@ -9,14 +9,14 @@ import pytest
 from detection_timeline import Ear, Source, play, table
 from virtual_loop import System, VirtualLoop, run
 
-from actors import messages as m
-from actors import topics
-from actors.detection.freshness import CommandFreshness, LocalizationFreshness
-from actors.detection.freshness_monitor import FreshnessMonitor
-from actors.detection.module import EXCUSE_S, DetectionModule, IllegalTransitionError
-from actors.runtime.actor import Header, on
-from actors.runtime.wiring import Member, heard
-from actors.stub.detection import StubDetection
+from rampart.actors.detection.module import EXCUSE_S, DetectionModule, IllegalTransitionError
+from rampart.actors.detection.stub import StubDetection
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.detection.freshness import CommandFreshness, LocalizationFreshness
+from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.runtime.actor import Header, on
+from rampart.actors.runtime.wiring import Member, heard
 
 # f fresh sample, o the first sample once more, d delayed by 1 s, + stamped 100 s ahead,
 # i infinitely far ahead, n no number

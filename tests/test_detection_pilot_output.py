@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from laser_sweeps import full_sweep
 from virtual_loop import System, run
 
-import systems
-from actors import messages as m
-from actors import topics
-from actors.control.safety_pilot import SafetyPilot
-from actors.detection.pilot_output import PilotOutput
-from actors.detection.pilot_output_monitor import PilotLimits, PilotOutputMonitor
-from actors.runtime.actor import Actor
-from manager.specification import parse_specification
+from rampart import systems
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
+from rampart.actors.osmosis.detection.pilot_output import PilotOutput
+from rampart.actors.osmosis.detection.pilot_output_monitor import PilotLimits, PilotOutputMonitor
+from rampart.actors.runtime.actor import Actor
+from rampart.manager.spec.specification import parse_specification
 
 PERIOD_S = 0.05
 HELD_S = 0.99

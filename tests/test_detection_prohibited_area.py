@@ -12,16 +12,21 @@ from hypothesis import strategies as st
 from shapely.geometry import box
 from virtual_loop import System, run, shipped_system
 
-from actors import messages as m
-from actors import topics
-from actors.detection.bounds import Bounds
-from actors.detection.fence_monitor import FenceMonitor
-from actors.detection.freshness_monitor import FreshnessMonitor
-from actors.detection.geofence import FenceLimits, Fix, intrusion, stopping_distance_m
-from actors.detection.prohibited_area import ProhibitedArea, half_diagonal_m
-from actors.runtime.actor import Actor
-from actors.runtime.wiring import Member, heard
-from airport.model import Airport, StartPose
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport, StartPose
+from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
+from rampart.actors.osmosis.detection.area.geofence import (
+    FenceLimits,
+    Fix,
+    intrusion,
+    stopping_distance_m,
+)
+from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea, half_diagonal_m
+from rampart.actors.osmosis.detection.bounds import Bounds
+from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.runtime.actor import Actor
+from rampart.actors.runtime.wiring import Member, heard
 
 LIMITS = FenceLimits(half_diagonal_m=0.473, reaction_s=0.3, braking_mps2=2.0)
 ACCURACY_M = 0.05

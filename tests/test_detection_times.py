@@ -9,9 +9,9 @@ from __future__ import annotations
 import pytest
 from manager_bench import full_system
 
-from actors.detection.actuator_failure_monitor import ActuatorMonitor
-from actors.detection.command_comparison import CommandComparison
-from actors.detection.pilot_output_monitor import PilotOutputMonitor
+from rampart.actors.osmosis.detection.actuator_failure_monitor import ActuatorMonitor
+from rampart.actors.osmosis.detection.command_comparison import CommandComparison
+from rampart.actors.osmosis.detection.pilot_output_monitor import PilotOutputMonitor
 
 PERIOD_S = 0.05
 PROMISED_S = {detection.name: detection.within_s for detection in full_system().detections}

@@ -9,11 +9,11 @@ import pytest
 from detection_timeline import Ear, play, table
 from virtual_loop import System, run
 
-from actors import messages as m
-from actors.detection.watchdog import Watchdog
-from actors.detection.watchdog_core import WatchdogCore
-from actors.runtime.actor import Actor
-from actors.runtime.wiring import Member, heard
+from rampart.actors.detection.watchdog import Watchdog
+from rampart.actors.detection.watchdog_core import WatchdogCore
+from rampart.actors.osmosis import messages as m
+from rampart.actors.runtime.actor import Actor
+from rampart.actors.runtime.wiring import Member, heard
 
 # One node. b heartbeat of the first life, B of the second, g one sent before the last change;
 # x first token vanishes, p it appears, X and P the second's.

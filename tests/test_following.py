@@ -10,9 +10,9 @@ import signal
 import msgspec
 import pytest
 
-from actors.supervision.run_info import RunInfo
-from toolbox import following
-from toolbox.output import UsageError
+from rampart.actors.run.run_info import RunInfo
+from rampart.cli import following
+from rampart.cli.output import UsageError
 
 RUN = RunInfo(os.getpid(), 7450, 1.0, 0.0, "paper.toml", "", (), "first", 0, "AB")
 

@@ -13,12 +13,12 @@ from test_supervision import eventually, running
 from test_supervisor import running as played
 from virtual_loop import run, until
 
-from actors import topics
-from actors.messages import RespawnRequest
-from actors.supervision import supervisor
-from actors.supervision.restart_policy import RestartPolicy
-from sim.campaign.job import Job, run_virtually
-from sim.scenario import parse_fault
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import RespawnRequest
+from rampart.actors.supervision import supervisor
+from rampart.actors.supervision.restart_policy import RestartPolicy
+from rampart.sim.campaign.job import Job, run_virtually
+from rampart.sim.faults.scenario import parse_fault
 
 
 def lives(policy: RestartPolicy, until_s: float, lasts_s: float = 0.0) -> list[tuple[float, bool]]:

@@ -12,7 +12,7 @@ from functools import partial
 import pytest
 from layer_runs import LAYERS, layered_job
 
-from sim.campaign.job import RunResult, run_job, run_virtually
+from rampart.sim.campaign.job import RunResult, run_job, run_virtually
 
 STALE = "command-not-updated@14+inf"
 """The robot drives on with its last command: straight off the pavement, unless somebody acts."""

@@ -8,13 +8,13 @@ import handler_fuzz
 import pytest
 from handler_fuzz import SYSTEMS, cases, fuzz_actor, fuzz_tools, system
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Actor, Context, on
-from actors.runtime.envelope import Header, encode
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from actors.runtime.virtual_loop import VirtualClock, VirtualLoop
-from actors.supervision.run_plan import SUPERVISOR, adapted_system
+from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.run.run_plan import SUPERVISOR, adapted_system
+from rampart.actors.runtime.actor import Actor, Context, on
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
 
 
 @pytest.mark.parametrize("name", SYSTEMS)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from actors.runtime.web_access import Access, AccessError, new_token, shown_token
+from rampart.actors.web.access import Access, AccessError, new_token, shown_token
 
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 TOKEN = "a" * 22

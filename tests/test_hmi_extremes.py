@@ -20,14 +20,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_hmi_operating import open_page
 
-from actors import messages as m
-from actors.operator.hmi import Hmi
-from actors.operator.hmi_bounds import SHOWN, Bounds, clip
-from actors.operator.hmi_map import MAX_GRAPH, MAX_PATHS_BYTES, page_map
-from actors.operator.hmi_state import MAX_LIGHTS, HmiState
-from actors.operator.teleoperation import Teleoperation
-from actors.runtime.envelope import Header
-from airport.model import Light, Mission
+from rampart.actors.bus.envelope import Header
+from rampart.actors.operator.bounds import SHOWN, Bounds, clip
+from rampart.actors.operator.hmi import Hmi
+from rampart.actors.operator.state import MAX_LIGHTS, HmiState
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.airport.model import Light, Mission
+from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
+from rampart.actors.osmosis.page.map import MAX_GRAPH, MAX_PATHS_BYTES, page_map
 
 FRAME_BYTES = 512_000
 HANDLED = [(kind, topic, method) for kind in (Hmi, Teleoperation)

@@ -10,10 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from porter_actors import write_porter_system
 
-from actors import messages as m
-from actors import topics
-from actors.operator.hmi_adaptation import GIVE_UP_S, ChoiceError, StrategyChoice
-from actors.operator.hmi_injection import (
+from rampart.actors.bus.envelope import AHEAD_S
+from rampart.actors.operator.adaptation import GIVE_UP_S, ChoiceError, StrategyChoice
+from rampart.actors.operator.injection import (
     FIRST_EFFECT_S,
     LATE_END_S,
     MAX_WAITING,
@@ -22,12 +21,13 @@ from actors.operator.hmi_injection import (
     Injections,
     places,
 )
-from actors.operator.hmi_operating import places_of
-from actors.runtime.envelope import AHEAD_S
-from actors.runtime.injection import MODES, flaw
-from sim.offered_faults import offered_faults
-from sim.topic_faults import modes_of
-from toolbox import systems
+from rampart.actors.operator.operating import places_of
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.injection import MODES, flaw
+from rampart.cli import systems
+from rampart.sim.faults.offered_faults import offered_faults
+from rampart.sim.faults.topic_faults import modes_of
 
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 OFFERED = offered_faults()

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from actors.operator.hmi_limits import BURST, PATIENCE, RATE_HZ, MessageBudget, Verdict
-from actors.operator.hmi_wishes import InjectWish, StickWish, WishError, read_wish
+from rampart.actors.operator.limits import BURST, PATIENCE, RATE_HZ, MessageBudget, Verdict
+from rampart.actors.operator.requests import InjectWish, StickWish, WishError, read_wish
 
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 

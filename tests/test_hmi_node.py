@@ -20,12 +20,13 @@ from hmi_world import (
     served,
 )
 
-from actors import messages as m
-from actors import topics
-from actors.operator import hmi_feed, hmi_server
-from actors.operator.hmi import Hmi
-from actors.operator.hmi_server import MAX_MESSAGE_BYTES, Visitor
-from actors.operator.hmi_wishes import OrderWish
+from rampart.actors.operator import feed as hmi_feed
+from rampart.actors.operator import server as hmi_server
+from rampart.actors.operator.hmi import Hmi
+from rampart.actors.operator.requests import OrderWish
+from rampart.actors.operator.server import MAX_MESSAGE_BYTES, Visitor
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
 
 
 async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world):

@@ -11,11 +11,11 @@ import pytest
 import websockets
 from hmi_world import eventually, free_port, hear, repeated, served
 
-from actors import messages as m
-from actors import topics
-from actors.supervision.kill_node import SignalError
-from actors.supervision.process_title import RunProcess
-from sim.offered_faults import offered_faults
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.supervision.kill_node import SignalError
+from rampart.actors.supervision.process_title import RunProcess
+from rampart.sim.faults.offered_faults import offered_faults
 
 TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)

@@ -10,12 +10,12 @@ import websockets
 from hmi_browser import CHROMIUM, browser
 from hmi_world import World, eventually, free_port, hear, repeated, served
 
-from actors import messages as m
-from actors import topics
-from actors.operator import hmi_stick
-from actors.operator.hmi_stick import Grip
-from actors.supervision.process_title import RunProcess
-from sim.offered_faults import offered_faults
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.page import stick as hmi_stick
+from rampart.actors.osmosis.page.stick import Grip
+from rampart.actors.supervision.process_title import RunProcess
+from rampart.sim.faults.offered_faults import offered_faults
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 

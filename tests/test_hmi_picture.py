@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors import messages as m
-from actors.operator import hmi_feed
-from actors.operator.hmi_feed import Feed
-from actors.operator.hmi_laser import POINTS, thin
-from actors.operator.hmi_picture import JOURNAL_LINES, Picture
-from actors.operator.hmi_state import STALE_S, HmiState
+from rampart.actors.operator import feed as hmi_feed
+from rampart.actors.operator.feed import Feed
+from rampart.actors.operator.picture import JOURNAL_LINES, Picture
+from rampart.actors.operator.state import STALE_S, HmiState
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.page.laser import POINTS, thin
 
 
 def as_json(value: object) -> dict:

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from real_run import RealRun
 from stub_actors import ROOT, free_base_port
 
-from actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_title import find_processes
 
 pytestmark = pytest.mark.processes
 TOKEN = "secret-of-the-hangar-7"

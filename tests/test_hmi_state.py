@@ -5,11 +5,11 @@ import math
 
 import msgspec
 
-from actors import messages as m
-from actors.operator.hmi_state import STALE_S, TRACK_POINTS, HmiState
-from airport.drawing import draw
-from airport.formats import load_airport
-from manager.words import decision_in_words
+from rampart.actors.operator.state import STALE_S, TRACK_POINTS, HmiState
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.airport.drawing import draw
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.manager.model.words import decision_in_words
 
 
 def shown(state: HmiState, now_s: float = 0.0) -> dict:

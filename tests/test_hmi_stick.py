@@ -6,8 +6,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from actors.operator.hmi_stick import SILENCE_S, TICKET_S, Grip, StickDesk, effect
-from actors.operator.hmi_wishes import StickWish
+from rampart.actors.operator.requests import StickWish
+from rampart.actors.osmosis.page.stick import SILENCE_S, TICKET_S, Grip, StickDesk, effect
 
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 PERIOD_S = 0.05

@@ -14,8 +14,9 @@ from hmi_world import eventually, free_port, served
 from other_user import NOBODY, as_nobody, needs_root
 from test_hmi_operating import RELEASED, TOKEN, Hand, ask, open_page
 
-from actors.runtime import web_guests, web_server
-from actors.runtime.tcp_peer import user_of_peer
+from rampart.actors.web import guests as web_guests
+from rampart.actors.web import server as web_server
+from rampart.actors.web.tcp_peer import user_of_peer
 
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
 MANY = 3 * web_guests.ROOM

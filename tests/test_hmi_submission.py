@@ -2,7 +2,7 @@
 
 import pytest
 
-from actors.messages import (
+from rampart.actors.osmosis.messages import (
     Goal,
     MissionAction,
     MissionOrderAnswer,
@@ -11,9 +11,9 @@ from actors.messages import (
     MissionStatus,
     Mode,
 )
-from actors.operator import hmi_orders
-from actors.operator.hmi_orders import NoSenseError, Orders
-from actors.operator.hmi_submission import (
+from rampart.actors.osmosis.page import orders as hmi_orders
+from rampart.actors.osmosis.page.orders import NoSenseError, Orders
+from rampart.actors.osmosis.page.submission import (
     GIVE_UP_S,
     RESPAWN_WINDOW_S,
     BusyError,

@@ -8,13 +8,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from actors import messages as m
-from actors.operator.hmi_processes import SEARCH_EVERY, ProcessObserver
-from actors.operator.hmi_system import BARRIER, MAX_BOXES, draw_system
-from actors.supervision.process_title import RunProcess
-from actors.supervision.process_usage import ProcessCount, UsageMeter
-from manager.schema import EventSpec
-from manager.specification import parse_specification
+from rampart.actors.operator.processes import SEARCH_EVERY, ProcessObserver
+from rampart.actors.operator.system import BARRIER, MAX_BOXES, draw_system
+from rampart.actors.osmosis import messages as m
+from rampart.actors.supervision.process_title import RunProcess
+from rampart.actors.supervision.process_usage import ProcessCount, UsageMeter
+from rampart.manager.spec.schema import EventSpec
+from rampart.manager.spec.specification import parse_specification
 
 SYSTEMS = Path(__file__).resolve().parents[1] / "systems"
 

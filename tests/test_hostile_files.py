@@ -24,20 +24,20 @@ from mcap.writer import CompressionType, Writer
 from PIL import Image
 from test_airport_formats import GRAPH, TOML
 
-import launch
-from actors.recording.bag_reader import BagReader, Summary
-from actors.recording.bag_repair import repair
-from actors.recording.bag_writer import BagError
-from actors.supervision.process_title import parse_title
-from airport import limits, mask
-from airport.errors import AirportError
-from files import toml
-from files.reading import FileError, plain_line, read_bytes
-from manager.adaptation import ChangeError, parse_value
-from manager.gates import GateError, detection_gate, recovery_gate
-from manager.open_psa import OpenPsaError, read_open_psa
-from sim.campaign.store import Store, StoreError
-from toolbox.main import main as rampart
+from rampart.actors.osmosis.airport import limits, mask
+from rampart.actors.osmosis.airport.errors import AirportError
+from rampart.actors.recording.bag_reader import BagReader, Summary
+from rampart.actors.recording.bag_repair import repair
+from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.supervision.process_title import parse_title
+from rampart.cli import run as launch
+from rampart.cli.main import main as rampart
+from rampart.files import toml
+from rampart.files.reading import FileError, plain_line, read_bytes
+from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa
+from rampart.manager.model.gates import GateError, detection_gate, recovery_gate
+from rampart.manager.spec.adaptation import ChangeError, parse_value
+from rampart.sim.campaign.store import Store, StoreError
 
 SPEC = (Path(__file__).resolve().parents[1] / "systems" / "paper.toml").read_text("utf-8")
 DOTTED = "a" + ".a" * 50_000 + " = 1"
@@ -261,7 +261,7 @@ def test_a_damaged_mask_is_read_or_refused_and_nothing_else_happens(tmp_path):
 
 
 def test_many_warnings_about_a_foreign_airport_are_cut_short(tmp_path):
-    from airport.formats import load_airport
+    from rampart.actors.osmosis.airport.formats import load_airport
     nodes = [{"id": f"N{i}", "x": -70 + i / 10, "y": 0} for i in range(300)]
     path = foreign(tmp_path, graph=json.dumps({"nodes": nodes, "edges": [
         [f"N{i}", f"N{i + 1}"] for i in range(299)]}), mission="x=-65,y=0,taxi=1")
@@ -403,7 +403,7 @@ def test_an_open_psa_file_is_bounded_in_bytes_elements_and_components(tmp_path, 
     f"update runs set job = x'{'91' * 5000}'", "update runs set job = zeroblob(20000000)",
 ])
 def test_a_damaged_store_of_results_is_refused_in_one_line(tmp_path, capsys, damage):
-    from sim.campaign.job import Job
+    from rampart.sim.campaign.job import Job
     store = Store(tmp_path)
     job = msgspec.msgpack.encode(Job(row="r"))
     store.close()

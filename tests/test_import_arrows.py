@@ -15,7 +15,7 @@ ALLOWED: dict[str, set[str]] = {
     "actors.runtime": set(),
     "manager": set(),
     "actors": {"actors.runtime"},  # messages.py and topics.py, the robot's contract
-    "manager.actor": {"actors.runtime", "actors", "manager"},
+    "rampart.manager.actor": {"actors.runtime", "actors", "manager"},
     "actors.control": {"actors.runtime", "actors", "airport", "manager"},
     # The page shows the processes that supervision looks after.
     "actors.operator": {"actors.runtime", "actors", "actors.supervision", "airport", "manager"},

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors import messages as m
-from actors.operator.joystick_device import (
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     AXIS,
     BUTTON,
     EVENT,

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolbox.keyboard_stick import HOLD_S, KeyboardStick
-from toolbox.terminal import KeyDecoder
+from rampart.cli.operate.keyboard_stick import HOLD_S, KeyboardStick
+from rampart.cli.terminal import KeyDecoder
 
 
 def test_a_key_counts_for_a_moment_and_its_repetition_prolongs_it():

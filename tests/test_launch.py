@@ -14,8 +14,8 @@ import pytest
 from real_run import RealRun
 from stub_actors import ROOT, free_base_port
 
-from actors.supervision.process_title import find_processes
-from airport.formats import load_world
+from rampart.actors.osmosis.airport.formats import load_world
+from rampart.actors.supervision.process_title import find_processes
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(240)]
 
@@ -155,7 +155,7 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
     script = (
         "import sys, zenoh, time\n"
         "from actors import topics\n"
-        "from actors.runtime.zenoh_bus import session_config\n"
+        "from rampart.actors.bus.zenoh_bus import session_config\n"
         "s = zenoh.open(session_config(None, sys.argv[1:]))\n"
         "time.sleep(1)\n"
         "names = ['DM1', 'RM1', 'osmosis_control', 'no/such', 'x']\n"
@@ -300,7 +300,7 @@ def test_the_paper_s_strategy_leaves_a_dead_node_dead_where_repair_under_guard_r
                      "--shadow", shadow) as run:
             run.wait_for("goal 1/3")
             freeze = subprocess.Popen(
-                [sys.executable, "-m", "toolbox.main", "inject", "command-not-updated", "--port",
+                [sys.executable, "-m", "rampart.cli.main", "inject", "command-not-updated", "--port",
                  str(run.port)], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             try:
                 run.wait_for("for FTM2")

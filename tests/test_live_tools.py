@@ -22,7 +22,7 @@ from pseudo_terminal import PseudoTerminal
 from real_run import RealRun
 from stub_actors import ROOT
 
-from actors.operator.joystick_device import AXIS, BUTTON, EVENT
+from rampart.actors.osmosis.control.teleoperation.joystick_device import AXIS, BUTTON, EVENT
 
 parser = pytest.importorskip("prometheus_client.parser")
 pytest.importorskip("foxglove")
@@ -45,7 +45,7 @@ def run(tmp_path_factory):
 def serving(*arguments: str, ready: str):
     """Run a verb that serves; yields what it says after `ready`."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "toolbox.main", *arguments], stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-m", "rampart.cli.main", *arguments], stdout=subprocess.PIPE, text=True,
         cwd=ROOT)
     try:
         line = process.stdout.readline()
@@ -62,7 +62,7 @@ def echo(run: RealRun, topic: str):
     out = run.directory / "echo"
     with out.open("w") as file:
         process = subprocess.Popen(
-            [sys.executable, "-m", "toolbox.main", "topic", "echo", topic, "--json",
+            [sys.executable, "-m", "rampart.cli.main", "topic", "echo", topic, "--json",
              "--port", str(run.port)], stdout=file, cwd=ROOT)
     try:
         yield lambda: [json.loads(line) for line in out.read_text().splitlines(keepends=True)
@@ -237,7 +237,7 @@ def test_a_port_that_is_taken_is_named():
         port = str(taken.getsockname()[1])
         for verb in (("metrics",), ("live", "foxglove")):
             told = subprocess.run(
-                [sys.executable, "-m", "toolbox.main", *verb, "--port", port], check=False,
+                [sys.executable, "-m", "rampart.cli.main", *verb, "--port", port], check=False,
                 capture_output=True, text=True, cwd=ROOT, timeout=60)
             assert (told.returncode, port in told.stderr) == (2, True), told.stderr
             assert len(told.stderr.splitlines()) == 1

@@ -14,22 +14,22 @@ from recovery_world import Base, Node, Pilot, Supervisor, hang
 from shapely.geometry import box
 from virtual_loop import System, VirtualLoop, run, shipped_system
 
-from actors import messages as m
-from actors import topics
-from actors.detection.bounds import Bounds
-from actors.detection.freshness import CommandFreshness, LocalizationFreshness
-from actors.detection.module import DetectionModule
-from actors.detection.prohibited_area import ProhibitedArea
-from actors.detection.watchdog import Watchdog
-from actors.messages import PilotMode
-from actors.recovery.controlled_stop import ControlledStop
-from actors.recovery.emergency_stop import EmergencyStop
-from actors.recovery.respawn import Respawn
-from actors.recovery.switch_teleoperation import SwitchTeleoperation
-from actors.runtime.actor import Actor, Context, Header, every, on
-from actors.runtime.wiring import Member, heard, published
-from airport.model import Airport, StartPose
-from manager.actor import DECISIONS_PER_LIFE, FtmManager
+from rampart.actors.detection.module import DetectionModule
+from rampart.actors.detection.watchdog import Watchdog
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport, StartPose
+from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea
+from rampart.actors.osmosis.detection.bounds import Bounds
+from rampart.actors.osmosis.detection.freshness import CommandFreshness, LocalizationFreshness
+from rampart.actors.osmosis.messages import PilotMode
+from rampart.actors.osmosis.recovery.controlled_stop import ControlledStop
+from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
+from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
+from rampart.actors.recovery.respawn import Respawn
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.wiring import Member, heard, published
+from rampart.manager.actor import DECISIONS_PER_LIFE, FtmManager
 
 CONTROL = ("mission_manager", "graph_planner", "osmosis_control")
 OTHERS = ("hmi", "teleoperation")

@@ -14,10 +14,10 @@ from manager_bench import PAPER, paper
 from test_manager_actor import Whole
 from virtual_loop import run, turns
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Actor, Context, Header, on
-from manager.adaptation import (
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.manager.spec.adaptation import (
     Action,
     Change,
     ChangeError,
@@ -26,8 +26,8 @@ from manager.adaptation import (
     describe,
     parse_value,
 )
-from manager.checks import find_nonsense
-from manager.specification import SpecificationError, SystemSpec, read_document
+from rampart.manager.spec.checks import find_nonsense
+from rampart.manager.spec.specification import SpecificationError, SystemSpec, read_document
 
 DOCUMENT = read_document(PAPER, "paper.toml")
 
@@ -68,7 +68,7 @@ def test_a_parameter_is_retuned_and_only_that_module_has_to_be_started_anew():
     assert changed_actors(paper(), spec) == ("DM1",)
     assert changed_actors(paper(), change("retune", "RM3", deadline_s=2.5)) == ()
     assert changed_actors(paper(), change(
-        "retune", "DM3", actor="actors.stub.detection:StubDetection")) == ("DM3",)
+        "retune", "DM3", actor="rampart.actors.detection.stub:StubDetection")) == ("DM3",)
 
 
 def test_a_gate_and_an_order_and_a_strategy_are_changed():
@@ -289,12 +289,12 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
     ("disable", "FTM7", "[]", "Expected `object`"),
     ("disable", "FTM7", "{", "Input data was truncated"),
     ("disable", "FTM1", "{}", "the FTMTree has 3 roots"),
-    ("retune", "DM1", '{"actor": "actors.detection.bounds:Nobody"}', "no such actor class"),
-    ("retune", "DM3", '{"actor": "actors.recovery.emergency_stop:EmergencyStop"}',
+    ("retune", "DM1", '{"actor": "rampart.actors.osmosis.detection.bounds:Nobody"}', "no such actor class"),
+    ("retune", "DM3", '{"actor": "rampart.actors.osmosis.recovery.emergency_stop:EmergencyStop"}',
      "it does not publish detection/{name}, as the modules of this table do"),
-    ("retune", "DM3", '{"actor": "actors.stub.detection:StubDetection"}',
+    ("retune", "DM3", '{"actor": "rampart.actors.detection.stub:StubDetection"}',
      "no actor of the system that was started is in that module"),
-    ("retune", "RM5", '{"actor": "actors.control.localization:Localization"}',
+    ("retune", "RM5", '{"actor": "rampart.actors.osmosis.control.localization.localization:Localization"}',
      "it does not publish recovery/{name}/state, as the modules of this table do"),
 ])
 def test_what_is_refused_changes_nothing(action, name, values, words):

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 from manager_bench import DMS, Bench, commands, edited
 
-from manager.arbiter import Command, Phase, State, Tick
+from rampart.manager.arbitration.arbiter import Command, Phase, State, Tick
 
 ACTING, DONE, IDLE, DEGRADED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.DEGRADED
 

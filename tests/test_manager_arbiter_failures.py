@@ -2,8 +2,8 @@
 
 from manager_bench import DMS, RMS, Bench, commands, edited, paper
 
-from manager.arbiter import Phase, build_arbiter
-from manager.arbiter_memory import Memory, objection, recall, remember
+from rampart.manager.arbitration.arbiter import Phase, build_arbiter
+from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
 
 ACTING, DONE, IDLE, FAILED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.FAILED
 

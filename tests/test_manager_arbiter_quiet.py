@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from manager_bench import DMS, RMS, paper
 
-from manager.arbiter import (
+from rampart.manager.arbitration.arbiter import (
     Arbiter,
     DetectionHeard,
     Phase,

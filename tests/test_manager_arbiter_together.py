@@ -4,7 +4,7 @@ import msgspec
 import pytest
 from manager_bench import Bench, commands, paper
 
-from manager.arbiter import Phase, ShadowDiffered
+from rampart.manager.arbitration.arbiter import Phase, ShadowDiffered
 
 ACTING, DONE, IDLE, FAILED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.FAILED
 

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from manager_bench import DMS, RMS, Bench, paper
 
-from manager.arbiter import Command, DecisionMade, Phase
+from rampart.manager.arbitration.arbiter import Command, DecisionMade, Phase
 
 MECHANISMS = paper().build_mechanisms()
 ORDER = paper().build_order()

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from manager_bench import full_system, paper
 
-from manager.budget import (
+from rampart.manager.spec.budget import (
     check,
     derive_timeouts,
     find_false_alarms,
@@ -15,7 +15,7 @@ from manager.budget import (
     time_to_obstacle_s,
     time_to_runaway_s,
 )
-from manager.schema import Timing, Within
+from rampart.manager.spec.schema import Timing, Within
 
 SPEC = paper()
 ROBOT = SPEC.robot

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manager.detection_track import (
+from rampart.manager.arbitration.detection_track import (
     DetectionRules,
     DetectionTrack,
     hear,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from manager.fault_tree import Event, FaultTree, FaultTreeError
+from rampart.manager.model.fault_tree import Event, FaultTree, FaultTreeError
 
 
 def tree(**gates: tuple[int, str]) -> FaultTree:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manager.gates import (
+from rampart.manager.model.gates import (
     MAX_DEPTH,
     MAX_NAMES,
     Gate,

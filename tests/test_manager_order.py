@@ -7,7 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from manager_bench import paper
 
-from manager.order import CycleError, PartialOrder, Tree, UnknownElementError, find_cycle
+from rampart.manager.model.order import (
+    CycleError,
+    PartialOrder,
+    Tree,
+    UnknownElementError,
+    find_cycle,
+)
 
 RM_ORDER = paper().build_order()
 FTM_TREE = paper().build_ftm_tree()

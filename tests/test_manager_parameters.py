@@ -7,26 +7,26 @@ import pkgutil
 from collections.abc import Iterator
 from typing import Any
 
+import actors.stub
 import pytest
 from virtual_loop import System, run, shipped_system
 
 import actors.detection
 import actors.recovery
-import actors.stub
-from actors import topics
-from actors.detection.module import DetectionModule
-from actors.recovery.module import RecoveryModule
-from actors.runtime.actor import Context
-from actors.runtime.virtual_bus import VirtualBus
-from airport.formats import load_airport
-from manager.parameters import NEEDS, TAKES, find_wrong
+from rampart.actors.detection.module import DetectionModule
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.recovery.module import RecoveryModule
+from rampart.actors.runtime.actor import Context
+from rampart.manager.spec.parameters import NEEDS, TAKES, find_wrong
+from rampart.sim.virtual.virtual_bus import VirtualBus
 
 BASES = {"Freshness", "HoldingRecovery", "PilotRecovery"}
 NODES = ("osmosis_control", "standby_control", "safety_pilot")
 STARTABLE = {"watch": ["osmosis_control"], "nodes": ["osmosis_control"]}
-FOR_THE_ANALYSES = {"actors.stub.detection:StubDetection": {"timeout_s", "margin_m", "watch"},
-                    "actors.detection.freshness:CommandFreshness": {"topic"},
-                    "actors.detection.freshness:LocalizationFreshness": {"topic"}}
+FOR_THE_ANALYSES = {"rampart.actors.detection.stub:StubDetection": {"timeout_s", "margin_m", "watch"},
+                    "rampart.actors.osmosis.detection.freshness:CommandFreshness": {"topic"},
+                    "rampart.actors.osmosis.detection.freshness:LocalizationFreshness": {"topic"}}
 VALUES = (-1, 0, 1, 2.5, True, "x", "done", "acting", "safety_pilot", "control/command", [], {},
           [""], [3], ["nobody"], ["safety_pilot"], ["standby_control", "osmosis_control"],
           ["osmosis_control", "osmosis_control"], ["safety_pilot", "standby_control"])

@@ -14,9 +14,13 @@ from hypothesis import strategies as st
 from manager_bench import PAPER, paper
 from stub_actors import ROOT
 
-import manager
-from manager.schema import Kind
-from manager.specification import SpecificationError, check_document, parse_specification
+from rampart import manager
+from rampart.manager.spec.schema import Kind
+from rampart.manager.spec.specification import (
+    SpecificationError,
+    check_document,
+    parse_specification,
+)
 
 FILE = "systems/paper.toml"
 
@@ -54,7 +58,7 @@ def test_each_actor_has_a_process_of_its_own_unless_told_otherwise():
         name: len(actors) for name, actors in paper().processes().items()}
     assert len(paper().actors()) == 9 + 7 + 5
     shared = parse_specification(edit((
-        'actor = "actors.operator.hmi:Hmi"', 'actor = "actors.operator.hmi:Hmi"\nprocess = "desk"'),
+        'actor = "rampart.actors.operator.hmi:Hmi"', 'actor = "rampart.actors.operator.hmi:Hmi"\nprocess = "desk"'),
         ('name = "teleoperation"', 'name = "teleoperation"\nprocess = "desk"')), FILE)
     assert [n.name for n in shared.processes()["desk"]] == ["hmi", "teleoperation"]
 
@@ -109,17 +113,17 @@ def test_a_latency_that_does_not_fit_is_refused_though_the_timeout_would():
 
 def test_modules_of_other_people_take_what_they_like():
     spec = parse_specification(edit(
-        ('"actors.detection.freshness:CommandFreshness"', '"my.own:Freshness"'),
+        ('"rampart.actors.osmosis.detection.freshness:CommandFreshness"', '"my.own:Freshness"'),
         ('topic = "control/command", ', 'topic = 3, hold_s = -1, anything = [true], ')), FILE)
     assert spec.detections[1].parameters["hold_s"] == -1
 
 
 FTM2 = 'name = "FTM2"\ndetect = "DM2"\nrecover = "RM2"\nevent = "command_not_updated"\n'
-HMI = 'name = "hmi"\nactor = "actors.operator.hmi:Hmi"\nkind = "non-control"\nrespawn = "RM4"'
+HMI = 'name = "hmi"\nactor = "rampart.actors.operator.hmi:Hmi"\nkind = "non-control"\nrespawn = "RM4"'
 RM4 = 'claims = ["other_nodes"]'
 MANAGER = """[[node]]
 name = "ftm_manager"
-actor = "manager.actor:FtmManager"
+actor = "rampart.manager.actor:FtmManager"
 kind = "manager"
 respawn = "supervisor"
 """
@@ -164,8 +168,8 @@ REFUSED = {
                                    "or { within_s = ..., hazard = '...' }"]),
     "unknown gate": ([(STALE, STALE.replace('"or"', '"xor"'))],
                      ["$.event[8].gate = 'xor': unknown gate; known: 'or', 'and', { at_least"]),
-    "actor without class": ([('"actors.operator.hmi:Hmi"', '"actors.operator.hmi"')],
-                            ["$.node[4].actor = 'actors.operator.hmi': expected 'module:Class'"]),
+    "actor without class": ([('"rampart.actors.operator.hmi:Hmi"', '"rampart.actors.operator.hmi"')],
+                            ["$.node[4].actor = 'rampart.actors.operator.hmi': expected 'module:Class'"]),
     "a name with a slash": ([('name = "hmi"', 'name = "h/mi"')],
                             ["$.node[4].name = 'h/mi': expected a name"]),
     "unknown field of a hazard in words": (
@@ -205,8 +209,8 @@ REFUSED = {
                              ["$.detection[0].parameters.margim_m = 0.6: unknown parameter; "
                               "ProhibitedArea takes margin_m, gps_timeout_s, hold_s"]),
     "a parameter of a module that has none": (
-        [('actor = "actors.recovery.emergency_stop:EmergencyStop"',
-          'actor = "actors.recovery.emergency_stop:EmergencyStop"\nparameters = { x = 1 }')],
+        [('actor = "rampart.actors.osmosis.recovery.emergency_stop:EmergencyStop"',
+          'actor = "rampart.actors.osmosis.recovery.emergency_stop:EmergencyStop"\nparameters = { x = 1 }')],
         ["$.recovery[0].parameters.x = 1: unknown parameter; EmergencyStop takes none"]),
     "a topic that the class does not hear": (
         [('topic = "control/command"', 'topic = "localization/pose"')],
@@ -326,12 +330,12 @@ REFUSED = {
          "end itself"]),
     "no manager": ([(MANAGER, "")],
                    ["$.node: no node is of kind 'manager', so no mechanism would act; add one with "
-                    "actor = 'manager.actor:FtmManager', or say ftm = false in [layers]"]),
+                    "actor = 'rampart.manager.actor:FtmManager', or say ftm = false in [layers]"]),
     "two managers": ([(MANAGER, MANAGER + MANAGER.replace("ftm_manager", "another"))],
                      ["$.node[8].kind = 'manager': ftm_manager is of this kind already; a system "
                       "has one manager at most"]),
     "a manager of another kind": ([('kind = "manager"', 'kind = "control"')],
-                                  ["$.node[7].kind = 'control': manager.actor:FtmManager has to be "
+                                  ["$.node[7].kind = 'control': rampart.manager.actor:FtmManager has to be "
                                    "of kind 'manager'"]),
     "two pilots": ([('kind = "world"', 'kind = "pilot"')],
                    ["$.node[8].kind = 'pilot': safety_pilot is of this kind already"]),
@@ -515,7 +519,7 @@ def test_the_core_of_the_manager_imports_nothing_of_the_project_but_how_files_ar
                 [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             assert {m.split(".")[0] for m in modules} <= allowed, path.name
             assert not {"time", "asyncio", "random"} & set(modules), path.name
-            assert "manager.actor" not in modules, path.name
+            assert "rampart.manager.actor" not in modules, path.name
 
 
 SHIPPED = {name: tomllib.loads((ROOT / "systems" / f"{name}.toml").read_text(encoding="utf-8"))

@@ -5,15 +5,15 @@ from itertools import combinations, pairwise
 import pytest
 from manager_bench import paper
 
-from manager.order import UnknownElementError
-from manager.safety_first import SafetyFirst
-from manager.strategies import (
+from rampart.manager.model.order import UnknownElementError
+from rampart.manager.strategies.registry import (
     STRATEGIES,
     UnknownStrategyError,
     decide,
     find_strategy,
     register,
 )
+from rampart.manager.strategies.safety_first import SafetyFirst
 
 SPEC = paper()
 MECHANISMS, TREE, ORDER = SPEC.build_mechanisms(), SPEC.build_ftm_tree(), SPEC.build_order()

@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from manager_bench import paper
 
-from manager.arrangement import Arrangement
-from manager.guarded_repair import GuardedRepair
-from manager.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
-from manager.mission_first import MissionFirst
-from manager.order import CycleError, PartialOrder, Tree, refine
-from manager.safety_first import SafetyFirst
-from manager.simultaneous import Simultaneous
-from manager.strategies import STRATEGIES, Decider
+from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
+from rampart.manager.model.order import CycleError, PartialOrder, Tree, refine
+from rampart.manager.strategies.arrangement import Arrangement
+from rampart.manager.strategies.guarded_repair import GuardedRepair
+from rampart.manager.strategies.mission_first import MissionFirst
+from rampart.manager.strategies.registry import STRATEGIES, Decider
+from rampart.manager.strategies.safety_first import SafetyFirst
+from rampart.manager.strategies.simultaneous import Simultaneous
 
 NOBODY = frozenset()
 

@@ -8,18 +8,18 @@ import msgspec
 import pytest
 from manager_bench import Bench, edited, paper
 
-from manager import active_sets, transitions
-from manager.active_sets import ActiveSets, order_agrees_with_tree
-from manager.arbiter import Arbiter, Phase
-from manager.arrangement import Arrangement
-from manager.decision import Decision
-from manager.guarded_repair import GuardedRepair
-from manager.order import PartialOrder
-from manager.safety_first import SafetyFirst
-from manager.strategies import STRATEGIES, UnknownStrategyError
-from manager.transitions import Transitions, explore
-from manager.verification import MEANING, Report, TooLargeError, _askable, verify
-from toolbox.main import main
+from rampart.cli.main import main
+from rampart.manager.analysis import active_sets, transitions
+from rampart.manager.analysis.active_sets import ActiveSets, order_agrees_with_tree
+from rampart.manager.analysis.transitions import Transitions, explore
+from rampart.manager.analysis.verification import MEANING, Report, TooLargeError, _askable, verify
+from rampart.manager.arbitration.arbiter import Arbiter, Phase
+from rampart.manager.model.order import PartialOrder
+from rampart.manager.strategies.arrangement import Arrangement
+from rampart.manager.strategies.decision import Decision
+from rampart.manager.strategies.guarded_repair import GuardedRepair
+from rampart.manager.strategies.registry import STRATEGIES, UnknownStrategyError
+from rampart.manager.strategies.safety_first import SafetyFirst
 
 SPEC = paper()
 ARRANGEMENT = Arrangement(SPEC.build_mechanisms(), SPEC.build_ftm_tree(), SPEC.build_order())
@@ -408,7 +408,7 @@ def test_the_command_refuses_nonsense_in_one_line(capsys, monkeypatch):
     assert "unknown strategy 'bold'; known: guarded-repair" in refused(
         capsys, "--strategy", "bold")
     assert "--together 0: a number from 1 up is right" in refused(capsys, "--together", "0")
-    monkeypatch.setattr("toolbox.systems.load", lambda name: large(15))
+    monkeypatch.setattr("rampart.cli.systems.load", lambda name: large(15))
     assert "at most 14 mechanisms can be verified" in refused(capsys)
 
 

@@ -10,14 +10,14 @@ import pytest
 from message_extremes import HEADER, all_topics, edges, pack, smallest, unbounded
 from msgspec import inspect
 
-from actors import messages as m
-from actors import topics
-from actors.runtime import envelope
-from actors.runtime.actor import Actor, Context, on
-from actors.runtime.bounds import MAX_PAYLOAD_BYTES, TEXT_CHARS, bare, clip, oversized
-from actors.runtime.envelope import ArrivalGuard
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from actors.runtime.virtual_loop import VirtualClock, VirtualLoop
+from rampart.actors.bus import envelope
+from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, TEXT_CHARS, bare, clip, oversized
+from rampart.actors.bus.envelope import ArrivalGuard
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Actor, Context, on
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
 
 NOW_S = 2e12
 """Later than any stamp, so that none is ahead."""

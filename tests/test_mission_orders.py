@@ -12,13 +12,13 @@ from recovery_world import Boss
 from test_control_actors import AIRPORT
 from virtual_loop import System, run
 
-from actors import messages as m
-from actors import topics
-from actors.control.mission_manager import MissionManager
-from actors.messages import MissionAction, MissionPhase, Mode, PilotMode
-from actors.recovery.replan import Replan
-from actors.runtime.actor import Actor, on
-from actors.runtime.virtual_loop import VirtualLoop
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
+from rampart.actors.osmosis.messages import MissionAction, MissionPhase, Mode, PilotMode
+from rampart.actors.osmosis.recovery.replan import Replan
+from rampart.actors.runtime.actor import Actor, on
+from rampart.sim.virtual.virtual_loop import VirtualLoop
 
 START = (AIRPORT.start.x_m, AIRPORT.start.y_m, AIRPORT.start.yaw_rad)
 DOWN = m.Goal(-29.5, -3.0, Mode.TAXI)

@@ -10,18 +10,18 @@ import msgspec
 import pytest
 from test_toolbox_live import RATE, Run
 
-from actors import messages as m
-from actors import topics
-from actors.control import mission_state
-from actors.control.mission_manager import MissionManager
-from actors.control.mission_state import MissionState, obey, status
-from actors.messages import MissionAction, MissionPhase
-from actors.runtime.actor import Actor, Context
-from actors.runtime.clock import Clock
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
-from actors.supervision.run_info import RunInfo
-from toolbox import systems
-from toolbox.main import main
+from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.mission import mission_state
+from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
+from rampart.actors.osmosis.control.mission.mission_state import MissionState, obey, status
+from rampart.actors.osmosis.messages import MissionAction, MissionPhase
+from rampart.actors.run.run_info import RunInfo
+from rampart.actors.runtime.actor import Actor, Context
+from rampart.actors.runtime.clock import Clock
+from rampart.cli import systems
+from rampart.cli.main import main
 
 GOALS = (m.Goal(1.0, 2.0, m.Mode.TAXI), m.Goal(3.0, 4.0, m.Mode.TAXI))
 REQUEST = m.MissionRequest("r1/first", "AB", GOALS)
@@ -40,7 +40,7 @@ async def run(monkeypatch, sockets):
     names = ("mission_manager", "planner")
     info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), sockets, names,
                    "r1", 0, "test run")
-    monkeypatch.setattr("toolbox.session.find_run", lambda _port: info)
+    monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: info)
     nodes, tasks = [], []
     for name, cls in (("mission_manager", MissionManager), ("planner", Planner)):
         bus = ZenohBus(name, 1, endpoint(sockets, name),
@@ -114,7 +114,7 @@ async def test_a_robot_that_a_recovery_holds_is_not_released_by_an_order(run, ca
 
 async def test_without_an_answer_the_verb_says_so(run, capsys, monkeypatch):
     monkeypatch.setattr(MissionManager, "publish", lambda *_: None)
-    monkeypatch.setattr("toolbox.mission_verb._ANSWER_S", 0.5)
+    monkeypatch.setattr("rampart.cli.operate.mission_verb._ANSWER_S", 0.5)
     code, out, err = await run.call(capsys, "mission", "pause")
     assert (code, out) == (1, "")
     assert err == "rampart: no effect: the Mission Manager did not answer within 0.5 s\n"

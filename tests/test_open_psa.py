@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from manager_bench import paper
 from stub_actors import ROOT
 
-from manager.cut_sets import CutSets
-from manager.formula import formula_of
-from manager.open_psa import OpenPsaError, read_open_psa, write_open_psa
-from manager.specification import parse_specification
+from rampart.manager.analysis.cut_sets import CutSets
+from rampart.manager.analysis.formula import formula_of
+from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa, write_open_psa
+from rampart.manager.spec.specification import parse_specification
 
 
 def mef(*definitions: str, data: str = "") -> str:

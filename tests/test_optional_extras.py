@@ -14,18 +14,18 @@ import pytest
 from stub_actors import ROOT
 from test_top_view import busy
 
-from actors import messages as m
-from actors import topics
-from actors.recording.views import Views
-from actors.runtime.clock import Clock
-from actors.runtime.envelope import Header
-from actors.runtime.web_guests import ROOM
-from actors.runtime.web_server import WebServer
-from actors.supervision.process_usage import ProcessCount
-from actors.supervision.run_info import RunInfo
-from airport.formats import load_airport
-from toolbox.live_verb import SHOWN, _watch
-from toolbox.main import main
+from rampart.actors.bus.envelope import Header
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.recording.views import Views
+from rampart.actors.run.run_info import RunInfo
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.process_usage import ProcessCount
+from rampart.actors.web.guests import ROOM
+from rampart.actors.web.server import WebServer
+from rampart.cli.look.live_verb import SHOWN, _watch
+from rampart.cli.main import main
 
 RUN = RunInfo(1, 7450, 1.0, 0.0, "paper.toml", "", (), "run", 0, 'a "title"\\ and\nmore')
 
@@ -61,7 +61,7 @@ def test_what_is_listened_to_for_viewers_is_what_is_translated_for_them():
 
 def exposed(now):
     exposition = pytest.importorskip("prometheus_client.exposition")
-    from toolbox.metrics_families import Collector
+    from rampart.cli.look.metrics_families import Collector
 
     return exposition.generate_latest(Collector(lambda: now)).decode()
 
@@ -72,7 +72,7 @@ def test_without_a_run_prometheus_is_told_so():
 
 def test_a_run_becomes_metrics_that_prometheus_reads_back():
     parser = pytest.importorskip("prometheus_client.parser")
-    from toolbox.metrics_families import Exposition
+    from rampart.cli.look.metrics_families import Exposition
 
     text = exposed(Exposition(RUN, 10.5, busy(), {"hmi": ProcessCount(2.5, 4096, 1.0)}))
     found = {s.name: s for f in parser.text_string_to_metric_families(text) for s in f.samples}
@@ -90,7 +90,7 @@ def test_a_run_becomes_metrics_that_prometheus_reads_back():
 
 def test_the_handbook_lists_every_metric_with_its_labels():
     parser = pytest.importorskip("prometheus_client.parser")
-    from toolbox.metrics_families import Exposition
+    from rampart.cli.look.metrics_families import Exposition
 
     picture = busy()
     for topic, body in (
@@ -114,10 +114,10 @@ def test_the_handbook_lists_every_metric_with_its_labels():
 
 
 def test_a_run_of_which_nothing_was_heard_yet_is_no_error():
-    from toolbox.run_picture import RunPicture
+    from rampart.cli.run_picture import RunPicture
 
     pytest.importorskip("prometheus_client")
-    from toolbox.metrics_families import Exposition
+    from rampart.cli.look.metrics_families import Exposition
 
     assert "rampart_up 1.0" in exposed(Exposition(RUN, 0.0, RunPicture()))
 
@@ -126,7 +126,7 @@ def test_a_run_of_which_nothing_was_heard_yet_is_no_error():
 async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a_replay(
         monkeypatch, replay_of):
     pytest.importorskip("prometheus_client")
-    from toolbox import metrics_server
+    from rampart.cli.look import metrics_server
 
     run = msgspec.structs.replace(RUN, pid=os.getpid(), replay_of=replay_of)
     mine = m.NodeTable((m.NodeInfo("hmi", "operator", os.getpid(), m.NodeState.RUNNING, 1, 0),))
@@ -161,7 +161,7 @@ async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a
 
 async def test_prometheus_is_answered_however_many_connections_idle_at_its_port():
     pytest.importorskip("prometheus_client")
-    from toolbox import metrics_server
+    from rampart.cli.look import metrics_server
 
     listening = metrics_server.listen("127.0.0.1", 0)
     port = listening.getsockname()[1]
@@ -202,7 +202,7 @@ def test_a_place_for_rerun_that_is_none_is_named(option, value, capsys):
 
 def test_rerun_writes_a_file_with_map_robot_laser_and_log(tmp_path):
     pytest.importorskip("rerun")
-    from toolbox.live_rerun import RerunViewer
+    from rampart.cli.look.live_rerun import RerunViewer
 
     airport = load_airport("vallombre")
     views = Views(airport)

@@ -12,7 +12,7 @@ import pytest
 from stub_actors import ROOT, free_base_port
 
 PAPER = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
-WORLD = ('[[node]]\nname = "simulator"\nactor = "sim.simulator:Simulator"\nkind = "world"\n'
+WORLD = ('[[node]]\nname = "simulator"\nactor = "rampart.sim.osmosis.simulator:Simulator"\nkind = "world"\n'
          'respawn = "supervisor"\n')
 
 
@@ -80,7 +80,7 @@ def test_a_module_of_one_s_own_that_cannot_be_imported_is_one_line_with_file_pat
     source, cause = BROKEN[what]
     (tmp_path / "own.py").write_text(source)
     (tmp_path / "own.toml").write_text(changed(
-        PAPER, ("actors.detection.bounds:Bounds", "own:Level")))
+        PAPER, ("rampart.actors.osmosis.detection.bounds:Bounds", "own:Level")))
     done = launched(tmp_path, "--system", "own.toml", how, "--no-hmi", "--port",
                     str(free_base_port()), "--report", str(tmp_path / "report"))
     assert done.returncode == 2, done.stderr
@@ -91,8 +91,8 @@ def test_a_module_of_one_s_own_that_cannot_be_imported_is_one_line_with_file_pat
 
 
 OWN_ACTOR = '''
-from actors.runtime.actor import every
-from actors.stub.node import StubNode
+from rampart.actors.runtime.actor import every
+from rampart.actors.ftm.stub_node import StubNode
 
 class Own(StubNode):
     @every(0.5)
@@ -116,7 +116,7 @@ def test_actors_beside_the_caller_are_found_in_virtual_time_and_tell_where_they_
 
 def test_actors_beside_the_caller_are_found_by_the_toolbox(tmp_path):
     (tmp_path / "own.py").write_text(OWN_ACTOR)
-    (tmp_path / "own.toml").write_text(changed(TANK, ("actors.stub.node:StubNode", "own:Own")))
+    (tmp_path / "own.toml").write_text(changed(TANK, ("rampart.actors.ftm.stub_node:StubNode", "own:Own")))
     done = subprocess.run(
         [str(Path(sys.executable).with_name("rampart")), "topic", "list", "--system",
          "own.toml"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -127,7 +127,7 @@ def test_actors_beside_the_caller_are_found_by_the_toolbox(tmp_path):
 @pytest.mark.processes
 def test_a_run_without_a_mission_tells_where_its_tracebacks_are(tmp_path):
     (tmp_path / "own.py").write_text(OWN_ACTOR)
-    (tmp_path / "own.toml").write_text(changed(TANK, ("actors.stub.node:StubNode", "own:Own")))
+    (tmp_path / "own.toml").write_text(changed(TANK, ("rampart.actors.ftm.stub_node:StubNode", "own:Own")))
     report = tmp_path / "report"
     done = launched(tmp_path, "--system", "own.toml", "--duration", "2", "--port",
                     str(free_base_port()), "--report", str(report))

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from actors.supervision.patience import AT_LEISURE, Patience, Usage, usage
+from rampart.actors.supervision.patience import AT_LEISURE, Patience, Usage, usage
 
 
 def rounds(state: str, ran_s: float, waited_s: float, count: int = 100, every_s: float = 0.25

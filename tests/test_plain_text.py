@@ -12,16 +12,16 @@ from msgspec import convert, inspect
 from rich.console import Console as RichConsole
 from test_bounded_state import told
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Header
-from actors.runtime.plain_text import one_line, printable
-from actors.supervision.node_process import _complain
-from sim.console import LINES_PER_S, REPORTS_PER_S, Console
-from toolbox import top_view
-from toolbox.output import print_json, print_table, say, say_text, warn
-from toolbox.run_picture import DECODED, RunPicture
-from toolbox.topic_verbs import in_line
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Header
+from rampart.actors.supervision.node_process import _complain
+from rampart.cli.look import top_view
+from rampart.cli.look.topic_verbs import in_line
+from rampart.cli.output import print_json, print_table, say, say_text, warn
+from rampart.cli.run_picture import DECODED, RunPicture
+from rampart.files.plain_text import one_line, printable
+from rampart.sim.runs.console import LINES_PER_S, REPORTS_PER_S, Console
 
 HOSTILE = ("\x1b[2J\x1b]0;owned\x07", "a\nb", "a\r\x1b[1A[   0.00 s] UNSAFE: forged", "\x9b31m",
            "\u202edrawkcab", "\u2028", "\x00", "\x7f", "\U000e0041", "\u2066")

@@ -14,21 +14,21 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from recording_samples import NAN, PLAN, documents, pose, sample, write
 
-from actors import messages as m
-from actors import topics
-from actors.recording import foxglove as fg
-from actors.recording.bag_reader import BagReader, Summary, key_of
-from actors.recording.bag_repair import repair
-from actors.recording.bag_writer import BagError, BagWriter, check_target, open_target
-from actors.recording.json_schema import plain_schema
-from actors.recording.message_form import form_of
-from actors.recording.run_documents import AIRPORT, footprint_m, restore
-from actors.recording.sequence_gaps import SequenceGaps
-from actors.recording.views import CHANNELS, Views
-from actors.recording.virtual import VirtualRecording
-from actors.runtime.envelope import Header, encode
-from airport.formats import load_airport
-from toolbox.main import main
+from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.recording import foxglove as fg
+from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
+from rampart.actors.recording.bag_repair import repair
+from rampart.actors.recording.bag_writer import BagError, BagWriter, check_target, open_target
+from rampart.actors.recording.json_schema import plain_schema
+from rampart.actors.recording.message_form import form_of
+from rampart.actors.recording.run_documents import AIRPORT, footprint_m, restore
+from rampart.actors.recording.sequence_gaps import SequenceGaps
+from rampart.actors.recording.views import CHANNELS, Views
+from rampart.actors.recording.virtual import VirtualRecording
+from rampart.cli.main import main
 
 
 def played(reader):

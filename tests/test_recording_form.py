@@ -12,10 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors import messages as m
-from actors import topics
-from actors.recording.json_schema import plain_schema
-from actors.recording.message_form import (
+from rampart.actors.bus.bounds import bare
+from rampart.actors.bus.envelope import Header, encode, pack
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.recording.json_schema import plain_schema
+from rampart.actors.recording.message_form import (
     MessageForm,
     Recorded,
     form_of,
@@ -23,8 +25,6 @@ from actors.recording.message_form import (
     renumbered,
     topic_of,
 )
-from actors.runtime.bounds import bare
-from actors.runtime.envelope import Header, encode, pack
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
 WHOLE = st.integers(-(2**63), 2**64 - 1)

@@ -25,15 +25,15 @@ from real_run import HEEDS_SIGNALS, RealRun
 from recording_samples import AnsweringLauncher, pose
 from stub_actors import ROOT, free_base_port
 
-from actors.recording.bag_reader import BagReader, Summary, key_of
-from actors.recording.bag_writer import BagError
-from actors.recording.message_form import form_of, header_of
-from actors.recording.process import Order, RecorderProcess
-from actors.recording.recorder import FLUSH_S, PERIOD_S, Recorder
-from actors.runtime import tap as taps
-from actors.runtime.tap import Tap, frame, parse_frame
-from actors.supervision.run_info import RunInfo
-from toolbox.main import main
+from rampart.actors.bus import tap as taps
+from rampart.actors.bus.tap import Tap, frame, parse_frame
+from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
+from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.message_form import form_of, header_of
+from rampart.actors.recording.process import Order, RecorderProcess
+from rampart.actors.recording.recorder import FLUSH_S, PERIOD_S, Recorder
+from rampart.actors.run.run_info import RunInfo
+from rampart.cli.main import main
 
 
 def until(condition, what, timeout_s=15.0):
@@ -214,7 +214,7 @@ def test_a_launcher_that_has_ended_before_its_recorder_has_begun_leaves_no_recor
     unread, answers = os.pipe()
     os.close(unread)
     order = msgspec.json.encode(Order(port, str(tmp_path / "run.mcap"), dead)).decode()
-    done = subprocess.run([sys.executable, "-m", "actors.recording.process", order], cwd=ROOT,
+    done = subprocess.run([sys.executable, "-m", "rampart.actors.recording.process", order], cwd=ROOT,
                           stdout=answers, stderr=subprocess.PIPE, check=False, timeout=60)
     os.close(answers)
     assert (done.returncode, done.stderr) == (0, b"")
@@ -248,7 +248,7 @@ def test_a_recorder_that_does_not_start_is_not_waited_for(port, tmp_path, monkey
     program.write_text("#!/bin/sh\nexec sleep 60\n")
     program.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(program))
-    monkeypatch.setattr("actors.recording.process._START_S", 0.2)
+    monkeypatch.setattr("rampart.actors.recording.process._START_S", 0.2)
     recorder = RecorderProcess(Order(port, str(tmp_path / "run.mcap"), os.getpid()))
     with pytest.raises(BagError, match=r"the recorder did not start within 0\.2 s"):
         recorder.start()
@@ -259,7 +259,7 @@ def test_a_recorder_that_does_not_start_is_not_waited_for(port, tmp_path, monkey
 def test_a_recorder_that_is_stopped_when_its_launcher_dies_is_not_left_over(port, tmp_path):
     script = (
         "import sys, os\n"
-        "from actors.recording.process import Order, RecorderProcess\n"
+        "from rampart.actors.recording.process import Order, RecorderProcess\n"
         f"r = RecorderProcess(Order({port}, {str(tmp_path / 'run.mcap')!r}, os.getpid()))\n"
         "r.start(); print('started', flush=True); input()\n")
     parent = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE,
@@ -384,7 +384,7 @@ def test_a_wish_that_makes_no_sense_is_refused(port, tmp_path, capsys, arguments
 def test_topics_of_the_robot_s_own_can_be_wished_for(port, tmp_path, monkeypatch, capsys):
     own = RunInfo(1, port, 1.0, 0.0, str(write_porter_system(tmp_path)), "",
                   (), "r1", 0, "porter")
-    monkeypatch.setattr("toolbox.record_verbs.find_run", lambda _port: own)
+    monkeypatch.setattr("rampart.cli.record.record_verbs.find_run", lambda _port: own)
     taken = tmp_path / "x.mcap"
     taken.touch()
     assert main(["record", str(taken), "--topics", "porter/*", "plan/route"]) == 2
@@ -411,7 +411,7 @@ def test_a_run_that_is_there_is_recorded_until_ctrl_c_or_the_terminal_is_closed(
     robot.send(10)  # nobody records yet
     with AnsweringLauncher(port, time.monotonic() - 100.0):
         verb = subprocess.Popen(
-            [*HEEDS_SIGNALS, sys.executable, "-m", "toolbox.main", "record", str(path),
+            [*HEEDS_SIGNALS, sys.executable, "-m", "rampart.cli.main", "record", str(path),
              "--port", str(port)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
         until(lambda: robot.send() or numbers(path), "nothing is written", 30)
         verb.send_signal(number)
@@ -435,7 +435,7 @@ def test_a_recording_that_fails_is_one_line(port, tmp_path, monkeypatch, capsys,
         raise error
 
     monkeypatch.setattr(Recorder, "run", fail)
-    monkeypatch.setattr("toolbox.record_verbs.stop_pipe", lambda: -1)
+    monkeypatch.setattr("rampart.cli.record.record_verbs.stop_pipe", lambda: -1)
     with AnsweringLauncher(port, time.monotonic()):
         assert main(["record", str(tmp_path / "x.mcap"), "--port", str(port)]) == 1
     assert capsys.readouterr().err == f"rampart: {error}\n"

@@ -22,23 +22,23 @@ from stub_actors import ROOT as HERE
 from stub_actors import free_base_port
 from websockets.asyncio.client import connect as open_socket
 
-from actors import messages as m
-from actors import topics
-from actors.operator.hmi_wishes import Wish
-from actors.recording.bag_reader import BagReader, key_of
-from actors.recording.bag_writer import BagWriter
-from actors.recording.message_form import MessageForm, form_of
-from actors.recording.recorder import Recorder
-from actors.runtime.envelope import ArrivalGuard, Header, encode
-from actors.runtime.topic import ROOT
-from actors.runtime.zenoh_bus import ZenohBus
-from actors.supervision import run_info
-from actors.supervision.process_title import RunProcess
-from toolbox import replaying
-from toolbox.main import main
-from toolbox.output import UsageError
-from toolbox.replaying import Replay
-from toolbox.session import connect
+from rampart.actors.bus.envelope import ArrivalGuard, Header, encode
+from rampart.actors.bus.topic import ROOT
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.operator.requests import Wish
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.recording.bag_reader import BagReader, key_of
+from rampart.actors.recording.bag_writer import BagWriter
+from rampart.actors.recording.message_form import MessageForm, form_of
+from rampart.actors.recording.recorder import Recorder
+from rampart.actors.run import run_info
+from rampart.actors.supervision.process_title import RunProcess
+from rampart.cli.main import main
+from rampart.cli.output import UsageError
+from rampart.cli.record import replaying
+from rampart.cli.record.replaying import Replay
+from rampart.cli.session import connect
 
 STRANGE = f"{ROOT}/no/such/topic"
 
@@ -243,7 +243,7 @@ def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(tmp_path, po
     folder = tmp_path / "folder"
     folder.mkdir()
     verb = subprocess.Popen(
-        [*HEEDS_SIGNALS, sys.executable, "-m", "toolbox.main", "replay", str(tmp_path / "run.mcap"),
+        [*HEEDS_SIGNALS, sys.executable, "-m", "rampart.cli.main", "replay", str(tmp_path / "run.mcap"),
          "--loop", "--port", str(port)], cwd=HERE, stdout=subprocess.PIPE, text=True,
         env={**os.environ, "TMPDIR": str(folder)})
     assert "playing" in verb.stdout.readline()

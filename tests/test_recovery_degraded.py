@@ -9,12 +9,12 @@ import pytest
 from recovery_world import Base, Boss, Node, Pilot, Supervisor
 from virtual_loop import System, run
 
-from actors import messages as m
-from actors import topics
-from actors.recovery.emergency_stop import EmergencyStop
-from actors.recovery.reduced_speed import ReducedSpeed
-from actors.recovery.respawn_braked import RespawnBraked
-from actors.runtime.actor import every
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
+from rampart.actors.osmosis.recovery.reduced_speed import ReducedSpeed
+from rampart.actors.osmosis.recovery.respawn_braked import RespawnBraked
+from rampart.actors.runtime.actor import every
 
 
 class BoundedPilot(Pilot):

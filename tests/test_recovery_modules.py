@@ -8,15 +8,15 @@ import pytest
 from recovery_world import Base, Boss, Node, Pilot, Supervisor, hang
 from virtual_loop import System, run
 
-from actors import messages as m
-from actors import topics
-from actors.messages import PilotMode
-from actors.recovery.controlled_stop import ControlledStop
-from actors.recovery.emergency_stop import EmergencyStop
-from actors.recovery.module import TRANSITIONS, IllegalTransitionError, RecoveryModule
-from actors.recovery.respawn import Respawn
-from actors.recovery.switch_teleoperation import SwitchTeleoperation
-from actors.runtime.wiring import Member, heard
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import PilotMode
+from rampart.actors.osmosis.recovery.controlled_stop import ControlledStop
+from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
+from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
+from rampart.actors.recovery.module import TRANSITIONS, IllegalTransitionError, RecoveryModule
+from rampart.actors.recovery.respawn import Respawn
+from rampart.actors.runtime.wiring import Member, heard
 
 P = m.RecoveryPhase
 

@@ -9,11 +9,18 @@ import re
 import msgspec
 import pytest
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Header
-from airport.formats import load_airport
-from sim.report import RunRecord, RunRecorder, clearance, clock, render, write_report
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.runtime.actor import Header
+from rampart.sim.osmosis.report import (
+    RunRecord,
+    RunRecorder,
+    clearance,
+    clock,
+    render,
+    write_report,
+)
 
 AIRPORT = load_airport("vallombre")
 MISSION = AIRPORT.mission("AB")

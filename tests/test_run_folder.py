@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.runtime import run_folder
+from rampart.actors.bus import run_folder
 
 
 @pytest.fixture

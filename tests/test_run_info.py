@@ -14,7 +14,7 @@ import msgspec
 import pytest
 from stub_actors import bases, free_base_port
 
-from actors.supervision import run_info
+from rampart.actors.run import run_info
 
 
 @contextmanager

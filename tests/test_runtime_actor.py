@@ -14,25 +14,25 @@ from contextlib import asynccontextmanager
 import msgspec
 import pytest
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Actor, Context, Header, every, on
-from actors.runtime.bus import Bus, BusError
-from actors.runtime.clock import Clock
-from actors.runtime.envelope import ArrivalGuard, encode
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from actors.runtime.wiring import load_class
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
-from actors.supervision.node_process import make_actor
-from actors.supervision.run_plan import (
+from rampart.actors.bus.bus import Bus, BusError
+from rampart.actors.bus.envelope import ArrivalGuard, encode
+from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.run.run_plan import (
     OBSERVER_CLASS,
     SUPERVISOR_CLASS,
     Layout,
     RunPlan,
     load_system,
 )
-from systems import SHIPPED
-from toolbox import systems
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.wiring import load_class
+from rampart.actors.supervision.node_process import make_actor
+from rampart.cli import systems
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.systems import SHIPPED
 
 
 class Talker(Actor):
@@ -311,17 +311,17 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
-    ("actors.operator.hmi:Hmi", "actors.operator.hmi:Hm",
-     "$.node[4].actor = 'actors.operator.hmi:Hm': no such actor class; known: Hmi"),
-    ("actors.operator.hmi:Hmi", "actors.operator.himi:Hmi",
+    ("rampart.actors.operator.hmi:Hmi", "rampart.actors.operator.hmi:Hm",
+     "$.node[4].actor = 'rampart.actors.operator.hmi:Hm': no such actor class; known: Hmi"),
+    ("rampart.actors.operator.hmi:Hmi", "actors.operator.himi:Hmi",
      "$.node[4].actor = 'actors.operator.himi:Hmi': No module named 'actors.operator.himi'"),
-    ("actors.detection.bounds:Bounds", "actors.stub.node:StubNode",
-     "$.detection[2].actor = 'actors.stub.node:StubNode': it does not publish detection/{name}, as "
+    ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.ftm.stub_node:StubNode",
+     "$.detection[2].actor = 'rampart.actors.ftm.stub_node:StubNode': it does not publish detection/{name}, as "
      "the modules of this table do"),
-    ("actors.detection.bounds:Bounds", "actors.stub.recovery:StubRecovery",
-     "$.detection[2].actor = 'actors.stub.recovery:StubRecovery': it does not publish detection/"),
-    ("actors.recovery.controlled_stop:ControlledStop", "actors.stub.detection:StubDetection",
-     "$.recovery[1].actor = 'actors.stub.detection:StubDetection': it does not publish recovery/"),
+    ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.recovery.stub:StubRecovery",
+     "$.detection[2].actor = 'rampart.actors.recovery.stub:StubRecovery': it does not publish detection/"),
+    ("rampart.actors.osmosis.recovery.controlled_stop:ControlledStop", "rampart.actors.detection.stub:StubDetection",
+     "$.recovery[1].actor = 'rampart.actors.detection.stub:StubDetection': it does not publish recovery/"),
 ])
 def test_a_class_that_is_not_there_or_of_another_table_is_named_with_its_place(
         tmp_path, old, new, message):

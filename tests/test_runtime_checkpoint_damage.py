@@ -23,9 +23,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stub_actors import ROOT
 
-from actors.runtime import checkpoint_file
-from actors.runtime.checkpoint import Keeper, StateFormat
-from actors.runtime.checkpoint_file import (
+from rampart.actors.runtime import checkpoint_file
+from rampart.actors.runtime.checkpoint import Keeper, StateFormat
+from rampart.actors.runtime.checkpoint_file import (
     APPLICATION,
     LARGEST_FILE_BYTES,
     LARGEST_STATE_BYTES,
@@ -33,7 +33,7 @@ from actors.runtime.checkpoint_file import (
     SUFFIXES,
     beside,
 )
-from actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 
 SAVED = 6
 NEW = 1000
@@ -316,7 +316,7 @@ def test_a_schema_that_would_take_minutes_to_load_is_left_after_some_steps(file)
 MEMORY = """
 import resource, sys
 from pathlib import Path
-from actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 store = SqliteCheckpoints(Path(sys.argv[1]), "run", 2, sync_period_s=0)
 problems = store.load().problems
@@ -432,7 +432,7 @@ def test_where_no_damaged_file_can_be_set_aside_the_node_goes_on_without(file):
 PERMISSIONS = """
 import os, sys
 from pathlib import Path
-from actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 if os.getuid() == 0:
     os.setuid(65534)
 file, mode = Path(sys.argv[1]), int(sys.argv[2], 8)

@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stub_actors import ROOT
 
-from actors.runtime.checkpoint import (
+from rampart.actors.runtime.checkpoint import (
     BUSY_TIMES,
     FAILED_LIVES,
     GENERATIONS,
@@ -40,8 +40,8 @@ from actors.runtime.checkpoint import (
     SupersededError,
     newest_sound,
 )
-from actors.runtime.checkpoint_file import APPLICATION, LARGEST_STATE_BYTES, STORE_FORMAT
-from actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.checkpoint_file import APPLICATION, LARGEST_STATE_BYTES, STORE_FORMAT
+from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 
 Open = Callable[[int], CheckpointStore]
 
@@ -407,8 +407,8 @@ def test_the_failures_of_former_lives_are_known_though_the_lock_keeps_one_from_c
 IN_A_PROCESS = """
 import os, resource, sys
 from pathlib import Path
-from actors.runtime.checkpoint import CheckpointError
-from actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.checkpoint import CheckpointError
+from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 file, what = Path(sys.argv[1]), sys.argv[2]
 store = SqliteCheckpoints(file, "run", 1, sync_period_s=0)
 if what == "full":  # python ignores SIGXFSZ: writing beyond the limit fails, as on a full disk

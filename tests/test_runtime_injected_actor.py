@@ -7,11 +7,11 @@ import math
 
 from virtual_loop import System, run
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Actor, Context, Header, every, on
-from actors.runtime.envelope import decode
-from actors.runtime.virtual_bus import VirtualBus
+from rampart.actors.bus.envelope import decode
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.sim.virtual.virtual_bus import VirtualBus
 
 
 class Talker(Actor):

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.messages import (
+from rampart.actors.osmosis.messages import (
     BaseStatus,
     Goal,
     Imu,
@@ -27,8 +27,8 @@ from actors.messages import (
     Route,
     Twist,
 )
-from actors.runtime.corruption import wrap
-from actors.runtime.injection import FaultGate, flaw
+from rampart.actors.runtime.corruption import wrap
+from rampart.actors.runtime.injection import FaultGate, flaw
 
 KEY = "rampart/localization/pose"
 POSE = Pose(1.0, 2.0, 0.5)

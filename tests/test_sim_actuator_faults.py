@@ -9,17 +9,17 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Context, Header
-from actors.runtime.clock import Clock
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from airport.model import Airport, StartPose
-from sim.actuator_faults import ActuatorFaults, FaultNews, Motor
-from sim.robot import WHEEL_NAMES, Drive, DriveLimits
-from sim.scene import WorldError
-from sim.simulator import Simulator
-from sim.world import World
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport, StartPose
+from rampart.actors.runtime.actor import Context, Header
+from rampart.actors.runtime.clock import Clock
+from rampart.sim.osmosis.actuator_faults import ActuatorFaults, FaultNews, Motor
+from rampart.sim.osmosis.robot import WHEEL_NAMES, Drive, DriveLimits
+from rampart.sim.osmosis.scene import WorldError
+from rampart.sim.osmosis.simulator import Simulator
+from rampart.sim.osmosis.world import World
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 
 STUCK = m.ActuatorFaultKind.STUCK_WHEEL
 WEAK = m.ActuatorFaultKind.WEAK_WHEEL

@@ -8,13 +8,13 @@ import msgspec
 import pytest
 from stub_actors import ROOT
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Header
-from actors.supervision.run_plan import RunPlan
-from airport.formats import load_airport
-from manager.specification import parse_specification
-from sim.console import Console
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.actor import Header
+from rampart.manager.spec.specification import parse_specification
+from rampart.sim.runs.console import Console
 
 PLAN = RunPlan("r", 7450, 1.0, 1, "", "", "", "", 0, ftm=True, hmi_port=0)
 MISSION = load_airport("vallombre").mission("AB")

@@ -11,14 +11,15 @@ import pytest
 from porter_actors import AXLE, LOAD
 from virtual_loop import shipped_system
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.bounds import bare
-from actors.runtime.envelope import Header, decode, encode
-from actors.runtime.injection import MODES, FaultGate, flaw
-from actors.runtime.topic import ROOT, Topic
-from actors.supervision.system_topics import published_keys
-from sim.faults import (
+from rampart.actors.bus.bounds import bare
+from rampart.actors.bus.envelope import Header, decode, encode
+from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.run.system_topics import published_keys
+from rampart.actors.runtime.injection import MODES, FaultGate, flaw
+from rampart.cli.look.topic_catalogue import resolve, uses
+from rampart.sim.faults.faults import (
     CATALOGUE,
     PAPER_FAULTS,
     SENSOR_FAULTS,
@@ -27,10 +28,9 @@ from sim.faults import (
     UnknownFaultError,
     find_fault,
 )
-from sim.sensor_faults import LEFT_OUT, SENSORS
-from sim.sensors import Gps
-from sim.topic_faults import DELAY_S, modes_of, systematic_faults, topic_fault
-from toolbox.topic_catalogue import resolve, uses
+from rampart.sim.faults.topic_faults import DELAY_S, modes_of, systematic_faults, topic_fault
+from rampart.sim.osmosis.sensor_faults import LEFT_OUT, SENSORS
+from rampart.sim.osmosis.sensors import Gps
 
 KEYS = published_keys(shipped_system())
 SYSTEMATIC = {fault.name: fault for fault in systematic_faults(KEYS)}

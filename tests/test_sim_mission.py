@@ -10,11 +10,11 @@ import math
 
 import pytest
 
-from airport.formats import load_airport, load_world
-from airport.photometry import intensity_from_illuminance, sensor_position
-from sim.judge import Judge, Sample
-from sim.sensors import LightSensor
-from sim.world import World
+from rampart.actors.osmosis.airport.formats import load_airport, load_world
+from rampart.actors.osmosis.airport.photometry import intensity_from_illuminance, sensor_position
+from rampart.sim.osmosis.judge import Judge, Sample
+from rampart.sim.osmosis.sensors import LightSensor
+from rampart.sim.osmosis.world import World
 
 AIRPORT = load_airport("vallombre")
 WAY = ["S0", "W1", "W2", "W3", "A1", "A4", "E1", "E2", "E3", "B1", "B3", "S1", "S0"]

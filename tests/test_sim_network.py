@@ -7,8 +7,8 @@ from collections import Counter
 
 import pytest
 
-from sim.network import NETWORKS, NetworkModel, SeededNetwork, find_network
-from sim.timing import Timing, draw, measured, share_below
+from rampart.sim.virtual.network import NETWORKS, NetworkModel, SeededNetwork, find_network
+from rampart.sim.virtual.timing import Timing, draw, measured, share_below
 
 EVEN = Timing((0.0, 10.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
 

@@ -7,9 +7,9 @@ import math
 import pytest
 import shapely
 
-from airport.model import Airport, StartPose
-from sim.robot import Drive, DriveLimits, twist_from_wheels, wheel_speeds
-from sim.world import World
+from rampart.actors.osmosis.airport.model import Airport, StartPose
+from rampart.sim.osmosis.robot import Drive, DriveLimits, twist_from_wheels, wheel_speeds
+from rampart.sim.osmosis.world import World
 
 FIELD = Airport(
     "Field", {"a": (0.0, 0.0), "b": (1.0, 0.0)}, (("a", "b"),), shapely.box(-90, -90, 90, 90),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from actors.messages import (
+from rampart.actors.osmosis.messages import (
     ControlPhase,
     ControlStatus,
     Goal,
@@ -11,7 +11,7 @@ from actors.messages import (
     Mode,
     Twist,
 )
-from sim.run_end import (
+from rampart.sim.runs.run_end import (
     ACCEPT_WITHIN_S,
     LOST_AFTER_S,
     SETTLE_S,

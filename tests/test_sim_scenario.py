@@ -8,11 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.messages import ActuatorFaultKind
-from sim.campaign.plan import fault_groups
-from sim.disturbance import UnknownFaultError
-from sim.injector import can_be_hit
-from sim.scenario import (
+from rampart.actors.osmosis.messages import ActuatorFaultKind
+from rampart.cli import systems
+from rampart.sim.campaign.plan import fault_groups
+from rampart.sim.faults.disturbance import UnknownFaultError
+from rampart.sim.faults.injector import can_be_hit
+from rampart.sim.faults.scenario import (
     OnActuators,
     OnProcess,
     OnTopics,
@@ -22,7 +23,6 @@ from sim.scenario import (
     action_of,
     parse_fault,
 )
-from toolbox import systems
 
 SYSTEM = systems.load(None)
 NODES = can_be_hit(SYSTEM)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import shapely
 
-from airport.model import Airport, Building, Light, ObstaclePreset, StartPose
-from airport.photometry import SENSOR_FORWARD_M, illuminance_lux
-from airport.world import WorldTruth
-from sim.sensors import LaserSpec, LightSensor, WheelOdometry, wrap
-from sim.world import World
+from rampart.actors.osmosis.airport.model import Airport, Building, Light, ObstaclePreset, StartPose
+from rampart.actors.osmosis.airport.photometry import SENSOR_FORWARD_M, illuminance_lux
+from rampart.actors.osmosis.airport.world import WorldTruth
+from rampart.sim.osmosis.sensors import LaserSpec, LightSensor, WheelOdometry, wrap
+from rampart.sim.osmosis.world import World
 
 
 def field(yaw_rad: float = 0.0, **changes) -> Airport:

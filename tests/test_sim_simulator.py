@@ -7,14 +7,14 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Context, Header
-from actors.runtime.clock import Clock
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from airport.formats import load_airport
-from sim.schedule import Schedule
-from sim.simulator import Simulator
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.runtime.actor import Context, Header
+from rampart.actors.runtime.clock import Clock
+from rampart.sim.osmosis.schedule import Schedule
+from rampart.sim.osmosis.simulator import Simulator
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 
 AIRPORT = load_airport("vallombre")
 

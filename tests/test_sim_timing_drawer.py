@@ -5,7 +5,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.timing import Stock, draw, drawer
+from rampart.sim.virtual.timing import Stock, draw, drawer
 
 
 @given(st.lists(st.floats(0, 1e4), min_size=2, max_size=40).map(sorted), st.integers())

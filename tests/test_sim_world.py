@@ -7,11 +7,17 @@ import math
 import pytest
 import shapely
 
-from airport.formats import load_airport, load_world
-from airport.model import Airport, Building, ObstaclePreset, StartPose, rectangle
-from sim.clearance import Clearance
-from sim.scene import NOTHING_M, SPARE_OBSTACLES, WorldError
-from sim.world import World
+from rampart.actors.osmosis.airport.formats import load_airport, load_world
+from rampart.actors.osmosis.airport.model import (
+    Airport,
+    Building,
+    ObstaclePreset,
+    StartPose,
+    rectangle,
+)
+from rampart.sim.osmosis.clearance import Clearance
+from rampart.sim.osmosis.scene import NOTHING_M, SPARE_OBSTACLES, WorldError
+from rampart.sim.osmosis.world import World
 
 # A road 40 m long and 4 m wide, eastward; the robot starts in its west.
 ROAD = shapely.box(-2, -2, 38, 2)

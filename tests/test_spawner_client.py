@@ -16,9 +16,9 @@ import msgspec
 import pytest
 from stub_actors import ROOT, free_base_port
 
-from actors.runtime import unix_peer
-from actors.supervision import spawner_client
-from actors.supervision.spawner import (
+from rampart.actors.bus import unix_peer
+from rampart.actors.supervision import spawner_client
+from rampart.actors.supervision.spawner import (
     MAX_DATAGRAM,
     NAMES,
     ForkRequest,
@@ -27,7 +27,7 @@ from actors.supervision.spawner import (
     Request,
     address,
 )
-from actors.supervision.spawner_client import (
+from rampart.actors.supervision.spawner_client import (
     SpawnerBusyError,
     SpawnerClient,
     SpawnerUnavailableError,
@@ -37,7 +37,7 @@ DM1 = ("DM1",)
 
 _CHILD = """
 import socket, sys, time
-from actors.supervision.process_title import set_title
+from rampart.actors.supervision.process_title import set_title
 port, launcher, name, incarnation, fd = sys.argv[1:]
 set_title(int(port), int(launcher), (name,), int(incarnation))
 socket.socket(fileno=int(fd)).send(b"{}")

@@ -14,12 +14,12 @@ import pytest
 from stub_actors import ROOT
 from virtual_loop import System, run
 
-from actors import topics
-from actors.messages import DetectionState
-from actors.runtime.wiring import load_class
-from actors.supervision.system_topics import system_topics
-from manager.gates import GateError, detection_gate
-from manager.schema import (
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import DetectionState
+from rampart.actors.run.system_topics import system_topics
+from rampart.actors.runtime.wiring import load_class
+from rampart.manager.model.gates import GateError, detection_gate
+from rampart.manager.spec.schema import (
     DetectionSpec,
     EventSpec,
     Layers,
@@ -31,8 +31,12 @@ from manager.schema import (
     Timing,
     Within,
 )
-from manager.specification import SpecificationError, parse_specification, read_document
-from manager.strategies import STRATEGIES
+from rampart.manager.spec.specification import (
+    SpecificationError,
+    parse_specification,
+    read_document,
+)
+from rampart.manager.strategies.registry import STRATEGIES
 
 DOCUMENT = (ROOT / "docs" / "specification.md").read_text(encoding="utf-8")
 EXAMPLE = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)[0]
@@ -87,7 +91,7 @@ def test_the_least_that_is_a_system_is_what_the_document_says():
     timeouts = "".join(f"{f.name} = 1.0\n" for f in msgspec.structs.fields(Timing)
                        if f.name.endswith("timeout_s"))
     text = f"""name = "x"\ntitle = "x"\n[timing]\n{timeouts}
-[[node]]\nname = "m"\nactor = "manager.actor:FtmManager"\nkind = "manager"
+[[node]]\nname = "m"\nactor = "rampart.manager.actor:FtmManager"\nkind = "manager"
 [[detection]]\nname = "D"\ntitle = "D"\nactor = "a.b:C"\nwithin_s = 0.1
 [[recovery]]\nname = "R"\ntitle = "R"\nactor = "a.b:C"\nkind = "forward"
 [[mechanism]]\nname = "M"\ndetect = "D"\nrecover = "R"\nevent = "e"
@@ -113,7 +117,7 @@ def test_the_worked_example_is_a_sound_system(tmp_path):
     file = tmp_path / "tank.toml"
     file.write_text(EXAMPLE, encoding="utf-8")
     done = subprocess.run(
-        [sys.executable, "-m", "toolbox.main", "table", "--system", str(file), "--json"], cwd=ROOT,
+        [sys.executable, "-m", "rampart.cli.main", "table", "--system", str(file), "--json"], cwd=ROOT,
         capture_output=True, text=True, check=True, timeout=30)
     assert [row["rm"] for row in json.loads(done.stdout)] == [
         ["R_SHUT"], ["R_RESTART"], ["R_SHUT", "R_RESTART"]]
@@ -122,8 +126,8 @@ def test_the_worked_example_is_a_sound_system(tmp_path):
 def test_the_modules_of_one_s_own_that_it_shows_work(tmp_path, monkeypatch):
     (tmp_path / "tank_actors.py").write_text(MODULES, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
-    text = EXAMPLE.replace("actors.stub.node:StubNode", "tank_actors:Gauge").replace(
-        "actors.stub.detection:StubDetection", "tank_actors:LevelTooHigh")
+    text = EXAMPLE.replace("rampart.actors.ftm.stub_node:StubNode", "tank_actors:Gauge").replace(
+        "rampart.actors.detection.stub:StubDetection", "tank_actors:LevelTooHigh")
     spec = parse_specification(text, "tank.toml")
     assert [topic.key for topic in system_topics(spec)][len(topics.ALL):] == ["tank/level"]
 

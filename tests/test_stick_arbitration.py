@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.messages import Joystick
-from actors.operator.stick_arbitration import TIMEOUT_S, StickArbiter
+from rampart.actors.osmosis.control.teleoperation.stick_arbitration import TIMEOUT_S, StickArbiter
+from rampart.actors.osmosis.messages import Joystick
 
 HELD = Joystick(0.5, 0.0, True)
 FREE = Joystick(0.0, 0.0, False)

@@ -12,7 +12,7 @@ import pytest
 from real_run import RealRun
 from stub_actors import ROOT
 
-from actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_title import find_processes
 
 pytestmark = [pytest.mark.processes, pytest.mark.skipif(
     os.getuid() != 0, reason="only root can become another user")]

@@ -19,20 +19,21 @@ from pathlib import Path
 import pytest
 from stub_actors import ROOT, launched, stub_plan, write_stub_system
 
-from actors import topics
-from actors.messages import Diagnostic, NodeTable, ProcessEvent, RespawnRequest
-from actors.runtime.actor import Actor, Context, Header, on
-from actors.runtime.clock import Clock
-from actors.runtime.run_folder import socket_path
-from actors.supervision import node_process, run_info
-from actors.supervision.kill_node import main as kill_node
-from actors.supervision.launcher import Launcher, LaunchError
-from actors.supervision.process_title import find_processes
-from actors.supervision.restart_policy import RestartPolicy
-from actors.supervision.run_info import find_runs
-from actors.supervision.run_plan import Layout, load_system
-from actors.supervision.spawner import address
-from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+from rampart.actors.bus.run_folder import socket_path
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import Diagnostic, NodeTable, ProcessEvent, RespawnRequest
+from rampart.actors.run import run_info
+from rampart.actors.run.run_info import find_runs
+from rampart.actors.run.run_plan import Layout, load_system
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision import node_process
+from rampart.actors.supervision.kill_node import main as kill_node
+from rampart.actors.supervision.launcher import Launcher, LaunchError
+from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.restart_policy import RestartPolicy
+from rampart.actors.supervision.spawner import address
+from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
 pytestmark = pytest.mark.processes
 

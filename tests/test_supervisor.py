@@ -14,29 +14,29 @@ import pytest
 from stub_actors import ROOT
 from virtual_loop import run, turns, until
 
-from actors import topics
-from actors.messages import (
+from rampart.actors.bus.envelope import decode, pack
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import (
     AdaptedSystem,
     Heartbeat,
     ManagerStatus,
     NodeState,
     RespawnRequest,
 )
-from actors.runtime.actor import Context
-from actors.runtime.clock import Clock
-from actors.runtime.envelope import decode, pack
-from actors.runtime.topic import Topic
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from actors.supervision.patience import Usage
-from actors.supervision.processes import Living, SpawnerUnavailableError
-from actors.supervision.run_plan import (
+from rampart.actors.run.run_plan import (
     SUPERVISOR,
     Layout,
     RunPlan,
     load_document,
     load_system,
 )
-from actors.supervision.supervisor import Supervisor
+from rampart.actors.runtime.actor import Context
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.patience import Usage
+from rampart.actors.supervision.processes import Living, SpawnerUnavailableError
+from rampart.actors.supervision.supervisor import Supervisor
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 
 PLAN = RunPlan("r", 20000, 1.0, 1, str(ROOT / "systems" / "paper.toml"), "", "", "", 0,
                ftm=True, hmi_port=0)

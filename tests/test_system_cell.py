@@ -14,10 +14,10 @@ import pytest
 from real_run import RealRun
 from stub_actors import ROOT
 
-from manager.gates import detection_gate
-from manager.schema import SpecificationError, Within
-from manager.specification import parse_specification
-from manager.strategies import decide
+from rampart.manager.model.gates import detection_gate
+from rampart.manager.spec.schema import SpecificationError, Within
+from rampart.manager.spec.specification import parse_specification
+from rampart.manager.strategies.registry import decide
 
 TEXT = (ROOT / "systems" / "cell.toml").read_text(encoding="utf-8")
 CELL = parse_specification(TEXT, "cell.toml")
@@ -129,7 +129,7 @@ def test_it_runs_its_dead_nodes_come_back_and_what_is_triggered_is_recovered_fro
         run.kill("arm_controller")
         run.wait_for("R_RESTART_MOTION, rule 1 for M_MOTION")
         run.wait_for("arm_controller respawned, incarnation 2")
-        first = subprocess.Popen([sys.executable, "-m", "toolbox.main", "trigger", "D_ENCODER_B",
+        first = subprocess.Popen([sys.executable, "-m", "rampart.cli.main", "trigger", "D_ENCODER_B",
                                   "--for", "4", "--port", str(run.port)], cwd=ROOT,
                                  stdout=subprocess.DEVNULL)
         try:
@@ -167,7 +167,7 @@ def test_bad_usage_is_one_line(arguments, words, tmp_path):
 def test_the_verbs_take_it_by_name():
     for verb in (["verify", "cell", "--json"], ["cut-sets", "cell", "--json"],
                  ["table", "--system", "cell", "--json"]):
-        done = subprocess.run([sys.executable, "-m", "toolbox.main", *verb], cwd=ROOT,
+        done = subprocess.run([sys.executable, "-m", "rampart.cli.main", *verb], cwd=ROOT,
                               capture_output=True, text=True, check=False, timeout=60)
         assert done.returncode == 0, done.stderr
         assert json.loads(done.stdout)
@@ -175,6 +175,6 @@ def test_the_verbs_take_it_by_name():
 
 def test_under_its_own_strategy_every_property_holds():
     done = subprocess.run(
-        [sys.executable, "-m", "toolbox.main", "verify", "cell", "--strict", "--strategy",
+        [sys.executable, "-m", "rampart.cli.main", "verify", "cell", "--strict", "--strategy",
          CELL.strategy], cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 0, done.stdout

@@ -10,8 +10,8 @@ import msgspec
 import pytest
 from stub_actors import ROOT
 
-from actors.messages import AdaptedSystem
-from actors.supervision.run_plan import Layout, RunPlan, adapted_system, load_system
+from rampart.actors.osmosis.messages import AdaptedSystem
+from rampart.actors.run.run_plan import Layout, RunPlan, adapted_system, load_system
 
 FILE = ROOT / "systems" / "paper.toml"
 PLAN = RunPlan("r", 20000, 1.0, 1, str(FILE), "", "", "", 0, ftm=True, hmi_port=0)

@@ -12,14 +12,19 @@ from types import SimpleNamespace
 
 import pytest
 
-import launch
-from actors import messages as m
-from actors import topics
-from actors.operator.joystick_device import AXIS, BUTTON, EVENT, INITIAL
-from actors.operator.teleoperation import Teleoperation
-from actors.runtime.actor import Actor, Context, Header, on
-from actors.runtime.clock import Clock
-from actors.runtime.virtual_bus import Hub, VirtualBus
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.teleoperation.joystick_device import (
+    AXIS,
+    BUTTON,
+    EVENT,
+    INITIAL,
+)
+from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.clock import Clock
+from rampart.cli import run as launch
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 
 RATE = 4.0
 SPEC = SimpleNamespace(robot=SimpleNamespace(top_speed_mps=1.0, top_turn_rate_radps=2.0))

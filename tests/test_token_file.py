@@ -11,7 +11,7 @@ import pytest
 from other_user import NOBODY, needs_root
 from stub_actors import ROOT
 
-from actors.runtime.token_file import MAX_BYTES, SecretError, read_secret
+from rampart.actors.web.token_file import MAX_BYTES, SecretError, read_secret
 
 TOKEN = "secret-of-the-hangar-7"
 

@@ -10,17 +10,17 @@ import msgspec
 import pytest
 from porter_actors import AXLE, LOAD, Axle, Load, write_porter_system
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.actor import Actor, Context, Header, every, on
-from actors.runtime.clock import Clock
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
-from actors.supervision.run_info import RunInfo
-from toolbox import systems
-from toolbox.following import draw
-from toolbox.main import main
-from toolbox.run_picture import RunPicture
-from toolbox.session import connect
+from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.run.run_info import RunInfo
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.clock import Clock
+from rampart.cli import systems
+from rampart.cli.following import draw
+from rampart.cli.main import main
+from rampart.cli.run_picture import RunPicture
+from rampart.cli.session import connect
 
 RATE = 5.0
 
@@ -111,7 +111,7 @@ async def run(monkeypatch, sockets):
     names = ("simulator", "DM1")
     info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), sockets, names,
                    "r1", 0, "test run", plan={"mission": "AB"})
-    monkeypatch.setattr("toolbox.session.find_run", lambda _port: info)
+    monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: info)
     async with AsyncExitStack() as stack:
         nodes = []
         for name, cls in (("simulator", Everything), ("DM1", Bystander)):
@@ -214,7 +214,7 @@ async def test_a_silent_topic_is_said_to_be_silent(run, capsys):
 @pytest.mark.parametrize("verb", ["echo", "hz"])
 async def test_echo_and_hz_end_with_the_run(run, capsys, monkeypatch, verb):
     looks = iter([False, False])
-    monkeypatch.setattr("toolbox.topic_verbs.is_over", lambda _run: next(looks, True))
+    monkeypatch.setattr("rampart.cli.look.topic_verbs.is_over", lambda _run: next(looks, True))
     code, out, err = await run.call(capsys, "topic", verb, "localization/pose")
     assert code == 0
     assert "localization/pose" in out
@@ -241,7 +241,7 @@ async def test_topics_of_the_robot_s_own_are_heard_measured_and_disturbed(
         run, capsys, monkeypatch, tmp_path):
     own = RunInfo(1, 7450, RATE, 0.0, str(write_porter_system(tmp_path)), "", (),
                   "r1", 0, "porter")
-    monkeypatch.setattr("toolbox.topic_catalogue.find_run", lambda _port: own)
+    monkeypatch.setattr("rampart.cli.look.topic_catalogue.find_run", lambda _port: own)
     code, out, _ = await run.call(capsys, "topic", "echo", "porter/axle/front", "-n", "1")
     assert (code, out.split()[1:]) == (0, ["simulator#1", "porter/axle/front", "[3.0]"])
     code, out, _ = await run.call(capsys, "topic", "echo", "porter/axle/*", "-n", "4")
@@ -259,7 +259,7 @@ async def test_topics_of_the_robot_s_own_are_heard_measured_and_disturbed(
 async def pictured(run, monkeypatch, system) -> RunPicture:
     """What `rampart top` and `rampart metrics` have of a run of some system."""
     of = msgspec.structs.replace(run.info, system_file=str(system))
-    monkeypatch.setattr("toolbox.session.find_run", lambda _port: of)
+    monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: of)
     picture = RunPicture()
     async with connect() as session:
         draw(session, picture)
@@ -355,7 +355,7 @@ async def test_a_permanent_fault_without_effect_is_ended_and_said_to_have_none(r
 
 async def test_a_fault_that_does_not_fit_its_messages_is_refused_by_the_node(
         run, capsys, monkeypatch):
-    monkeypatch.setattr("toolbox.inject_verbs.flaw", lambda *_: "")
+    monkeypatch.setattr("rampart.cli.operate.inject_verbs.flaw", lambda *_: "")
     code, _, err = await run.call(
         capsys, "inject", "--topic", "localization/pose", "--mode", "corrupt",
         "--noise", "x_m=-1", "--duration", "1")

@@ -11,17 +11,17 @@ import pytest
 from porter_actors import write_porter_system
 
 import systems as shipped
-from actors import messages as m
-from actors import topics
-from actors.supervision.run_info import RunInfo
-from sim.campaign.job import _document
-from sim.faults import find_fault
-from toolbox import systems
-from toolbox.inject_verbs import choose
-from toolbox.main import build_parser, main
-from toolbox.output import UsageError
-from toolbox.topic_catalogue import resolve
-from toolbox.topic_verbs import in_line, rate_of
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.run.run_info import RunInfo
+from rampart.cli import systems
+from rampart.cli.look.topic_catalogue import resolve
+from rampart.cli.look.topic_verbs import in_line, rate_of
+from rampart.cli.main import build_parser, main
+from rampart.cli.operate.inject_verbs import choose
+from rampart.cli.output import UsageError
+from rampart.sim.campaign.job import _document
+from rampart.sim.faults.faults import find_fault
 
 
 @pytest.fixture(autouse=True)
@@ -174,8 +174,8 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     (["topic", "echo", "localization/pose", "--duration", "0"], ["--duration 0"]),
 ])
 def test_nonsense_is_refused_in_one_line_that_names_it(capsys, monkeypatch, arguments, words):
-    monkeypatch.setattr("toolbox.session.find_run", lambda _port: pytest.fail("looked for a run"))
-    monkeypatch.setattr("actors.supervision.run_info.find_runs", list)
+    monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: pytest.fail("looked for a run"))
+    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)
     assert main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -190,7 +190,7 @@ def test_nonsense_is_refused_in_one_line_that_names_it(capsys, monkeypatch, argu
     ["obstacle", "add", "crate", "1", "2"], ["obstacle", "remove", "crate"],
 ])
 def test_without_a_run_each_verb_says_so_and_exits_2(capsys, monkeypatch, arguments):
-    monkeypatch.setattr("actors.supervision.run_info.find_runs", list)
+    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)
     assert main(arguments) == 2
     assert capsys.readouterr().err == (
         "rampart: no run found; start one with `python launch.py`\n")
@@ -316,8 +316,8 @@ def test_an_actor_that_cannot_be_loaded_is_one_line_and_needed_for_its_own_topic
     file = write_porter_system(tmp_path)
     file.write_text(file.read_text().replace("porter_actors:", "no_actors:"))
     run = RunInfo(1, 7450, 1.0, 0.0, str(file), "", (), "r1", 0, "test run")
-    monkeypatch.setattr("toolbox.topic_catalogue.find_run", lambda _port: run)
-    monkeypatch.setattr("actors.supervision.run_info.find_runs", list)
+    monkeypatch.setattr("rampart.cli.look.topic_catalogue.find_run", lambda _port: run)
+    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)
     for arguments in (["topic", "list", "--system", str(file)],
                       ["topic", "echo", "porter/load"], ["inject", "drop:porter/load"],
                       ["campaign", "--list", "--system", str(file)],

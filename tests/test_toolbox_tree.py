@@ -18,16 +18,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manager.diagram import Box, Diagram, Situation, clean, covers, draw
-from manager.layered import arrange_in_layers, crossings
-from manager.order import PartialOrder
-from manager.placing import _isotonic, place
-from systems import SHIPPED
-from toolbox import systems
-from toolbox.main import main
-from toolbox.tree_dot import quote, to_dot
-from toolbox.tree_svg import to_svg
-from toolbox.tree_text import to_text
+from rampart.cli import systems
+from rampart.cli.analyse.tree_dot import quote, to_dot
+from rampart.cli.analyse.tree_svg import to_svg
+from rampart.cli.analyse.tree_text import to_text
+from rampart.cli.main import main
+from rampart.manager.drawing.diagram import Box, Diagram, Situation, clean, covers, draw
+from rampart.manager.drawing.layered import arrange_in_layers, crossings
+from rampart.manager.drawing.placing import _isotonic, place
+from rampart.manager.model.order import PartialOrder
+from rampart.systems import SHIPPED
 
 SVG = "{http://www.w3.org/2000/svg}"
 

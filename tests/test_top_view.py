@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
-from actors import messages as m
-from actors import topics
-from actors.runtime.clock import Clock
-from actors.runtime.envelope import Header
-from actors.supervision.run_info import RunInfo
-from toolbox import top_screen
-from toolbox.run_picture import COUNTED, DECODED, RunPicture
-from toolbox.top_view import Frame, lines, picture_json
+from rampart.actors.bus.envelope import Header
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.run.run_info import RunInfo
+from rampart.actors.runtime.clock import Clock
+from rampart.cli.look import top_screen
+from rampart.cli.look.top_view import Frame, lines, picture_json
+from rampart.cli.run_picture import COUNTED, DECODED, RunPicture
 
 MISSION = m.MissionStatus(
     "id", "AB", m.MissionPhase.RUNNING, 1,

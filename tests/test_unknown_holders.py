@@ -10,15 +10,15 @@ import asyncio
 import msgspec
 from handler_fuzz import system
 
-from actors import messages as m
-from actors import topics
-from actors.control.safety_gate import Checks, GateLimits, SafetyGate
-from actors.holders import OTHERS, UNKNOWN, Holders
-from actors.messages import PilotMode
-from actors.runtime.actor import Context
-from actors.runtime.envelope import Header, encode
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from actors.runtime.virtual_loop import VirtualClock, VirtualLoop
+from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.ftm.holders import OTHERS, UNKNOWN, Holders
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate
+from rampart.actors.osmosis.messages import PilotMode
+from rampart.actors.runtime.actor import Context
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
 
 FORGED = 999_999
 

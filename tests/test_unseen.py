@@ -11,16 +11,16 @@ import sys
 import pytest
 from stub_actors import ROOT, Idler, free_base_port, launched, stub_plan, write_stub_system
 
-from actors.supervision.descriptors import needed_descriptors
-from actors.supervision.launcher import Launcher
-from actors.supervision.process_title import find_processes
-from actors.supervision.run_plan import load_system
-from actors.supervision.unseen import tell_of_callbacks, watch
-from airport.formats import load_airport, load_mission
-from sim.console import Console
-from sim.mission_run import MissionRun
-from sim.process_run import ProcessRun
-from sim.watched_run import WatchedRun
+from rampart.actors.osmosis.airport.formats import load_airport, load_mission
+from rampart.actors.run.run_plan import load_system
+from rampart.actors.supervision.descriptors import needed_descriptors
+from rampart.actors.supervision.launcher import Launcher
+from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.unseen import tell_of_callbacks, watch
+from rampart.sim.runs.console import Console
+from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.runs.process_run import ProcessRun
+from rampart.sim.runs.watched_run import WatchedRun
 
 
 class Stumbler(Idler):

@@ -20,11 +20,11 @@ from real_run import HEEDS_SIGNALS, RealRun
 from recording_samples import pose
 from stub_actors import ROOT, free_base_port
 
-import launch
-import sim.report
-from actors.recording.virtual import VirtualRecording
-from airport.formats import load_airport
-from sim.report import RunRecorder, try_report
+import rampart.sim.osmosis.report
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.recording.virtual import VirtualRecording
+from rampart.cli import run as launch
+from rampart.sim.osmosis.report import RunRecorder, try_report
 
 UNSAFE = 3
 
@@ -124,7 +124,7 @@ def test_no_file_gets_the_number_of_a_closed_stream():
 def test_the_toolbox_keeps_its_exit_code_too(tmp_path, arguments, redirected, code):
     script = f'{{ "$@"; echo $? >{tmp_path}/code; }} {redirected}'
     done = subprocess.run(
-        ["/bin/sh", "-c", script, "sh", sys.executable, "-m", "toolbox.main", *arguments],
+        ["/bin/sh", "-c", script, "sh", sys.executable, "-m", "rampart.cli.main", *arguments],
         cwd=ROOT, capture_output=True, text=True, check=False, timeout=100)
     assert (tmp_path / "code").read_text() == f"{code}\n", done.stderr
     assert "Traceback" not in done.stderr
@@ -176,7 +176,7 @@ def test_a_page_that_cannot_be_made_costs_neither_record_nor_verdict(
     def broken(_run):
         raise error
 
-    monkeypatch.setattr(sim.report, "render", broken)
+    monkeypatch.setattr(rampart.sim.osmosis.report, "render", broken)
     assert launch.main(unsafe(tmp_path)[2:]) == UNSAFE
     told = capsys.readouterr()
     result = result_of(told.out)

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors import topics
-from actors.runtime.clock import Clock
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from actors.runtime.virtual_loop import VirtualClock, VirtualLoop
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.clock import Clock
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
 
 
 def run(scenario):

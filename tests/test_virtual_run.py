@@ -16,11 +16,11 @@ from real_run import HEEDS_SIGNALS, RealRun
 from recording_samples import pose
 from stub_actors import ROOT
 
-import launch
-from actors.recording.bag_reader import BagReader, Summary
-from sim.campaign.job import Job, run_job, run_virtually
-from sim.scenario import PlannedFault, parse_fault
-from sim.virtual_run import LEAD_S
+from rampart.actors.recording.bag_reader import BagReader, Summary
+from rampart.cli import run as launch
+from rampart.sim.campaign.job import Job, run_job, run_virtually
+from rampart.sim.faults.scenario import PlannedFault, parse_fault
+from rampart.sim.virtual.virtual_run import LEAD_S
 
 SHORT = parse_fault("kill:mission_manager@6")
 """Loses the mission, so the run is over after ten simulated seconds."""

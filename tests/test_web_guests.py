@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.runtime.web_guests import (
+from rampart.actors.web.guests import (
     BYTES_AT_ONCE,
     BYTES_PER_S,
     PATIENCE_S,

@@ -9,7 +9,7 @@ import sys
 import pytest
 from stub_actors import ROOT
 
-from actors.runtime import working_folder
+from rampart.files import working_folder
 
 LOOK = ("from actors.runtime import working_folder, wiring\n"
         "working_folder.admit()\n"

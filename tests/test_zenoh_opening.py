@@ -14,9 +14,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from actors import topics
-from actors.runtime.run_folder import socket_path
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.bus.run_folder import socket_path
+from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.osmosis import topics
 
 FORK = multiprocessing.get_context("spawn")
 

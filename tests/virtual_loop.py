@@ -10,12 +10,12 @@ from collections.abc import Callable, Coroutine
 from functools import cache
 from typing import Any, TypeVar
 
-import systems
-from actors.runtime.actor import Actor, Context
-from actors.runtime.clock import Clock
-from actors.runtime.virtual_bus import Hub, VirtualBus
-from actors.runtime.virtual_loop import VirtualLoop
-from manager.specification import SystemSpec, parse_specification
+from rampart import systems
+from rampart.actors.runtime.actor import Actor, Context
+from rampart.actors.runtime.clock import Clock
+from rampart.manager.spec.specification import SystemSpec, parse_specification
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualLoop
 
 A = TypeVar("A", bound=Actor)
 T = TypeVar("T")

@@ -1,1 +1,1 @@
-"""Detection modules DM1 to DM7: pure monitors, and the thin actors that wire them to topics."""
+"""What every detection module is made of, and the modules that know no robot."""

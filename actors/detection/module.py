@@ -19,12 +19,12 @@ from __future__ import annotations
 import math
 from typing import Any, ClassVar, Protocol
 
-from actors import topics
-from actors.messages import DetectionReport, DetectionState
-from actors.runtime.actor import Actor, Context, every
-from actors.runtime.bounds import NAME_CHARS, clip
-from actors.runtime.parameters import amount
-from actors.runtime.topic import Topic
+from rampart.actors.bus.bounds import NAME_CHARS, clip
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import DetectionReport, DetectionState
+from rampart.actors.runtime.actor import Actor, Context, every
+from rampart.actors.runtime.parameters import amount
 
 TRANSITIONS = {
     DetectionState.IDLE: frozenset({DetectionState.ACTIVE}),

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from actors import messages as m
-from actors import topics
-from actors.detection.module import DetectionModule
-from actors.detection.watchdog_core import WatchdogCore
-from actors.runtime.actor import Context, Header, on
-from actors.runtime.parameters import amount
-from actors.runtime.topic import Topic
+from rampart.actors.bus.topic import Topic
+from rampart.actors.detection.module import DetectionModule
+from rampart.actors.detection.watchdog_core import WatchdogCore
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Context, Header, on
+from rampart.actors.runtime.parameters import amount
 
 
 class Watchdog(DetectionModule):

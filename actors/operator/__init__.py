@@ -1,1 +1,1 @@
-"""The operator's side: the HMI with its page, and teleoperation."""
+"""The operator's page: its node, its server, what it shows and what may be asked."""

@@ -14,38 +14,38 @@ from typing import Any
 
 import msgspec
 
-from actors import messages as m
-from actors import topics
-from actors.operator.camera_eye import CameraEye, renderer
-from actors.operator.hmi_bounds import MAX_NAME, clip
-from actors.operator.hmi_feed import Feed
-from actors.operator.hmi_map import PageMap, lights_shown, page_map
-from actors.operator.hmi_operating import OUTPUTS, SHOWN, Operating
-from actors.operator.hmi_orders import NoSenseError, Orders
-from actors.operator.hmi_processes import ProcessObserver
-from actors.operator.hmi_server import LOOPBACK, Handlers, PageServer, PortError, Visitor
-from actors.operator.hmi_state import HmiState
-from actors.operator.hmi_submission import (
-    REPEAT_S,
-    BusyError,
-    Submission,
-    first_request,
-    system_is_up,
-)
-from actors.operator.hmi_system import draw_system
-from actors.operator.hmi_wishes import (
+from rampart.actors.bus.envelope import UNREADABLE
+from rampart.actors.bus.topic import Topic
+from rampart.actors.operator.bounds import MAX_NAME, clip
+from rampart.actors.operator.camera_eye import CameraEye, renderer
+from rampart.actors.operator.feed import Feed
+from rampart.actors.operator.operating import OUTPUTS, SHOWN, Operating
+from rampart.actors.operator.processes import ProcessObserver
+from rampart.actors.operator.requests import (
     MissionWish,
     OrderWish,
     RefusedError,
     ResetWish,
     Wish,
 )
-from actors.runtime.actor import Actor, Context, Header, every, on
-from actors.runtime.envelope import UNREADABLE
-from actors.runtime.topic import Topic
-from actors.supervision.run_plan import RunPlan
-from airport.model import Airport, Mission
-from manager.specification import SystemSpec, check_document
+from rampart.actors.operator.server import LOOPBACK, Handlers, PageServer, PortError, Visitor
+from rampart.actors.operator.state import HmiState
+from rampart.actors.operator.system import draw_system
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport, Mission
+from rampart.actors.osmosis.page.map import PageMap, lights_shown, page_map
+from rampart.actors.osmosis.page.orders import NoSenseError, Orders
+from rampart.actors.osmosis.page.submission import (
+    REPEAT_S,
+    BusyError,
+    Submission,
+    first_request,
+    system_is_up,
+)
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.manager.spec.specification import SystemSpec, check_document
 
 __all__ = ["Hmi"]
 
@@ -58,7 +58,7 @@ class Hmi(Actor):
     "airport" (for the map and its missions), "hmi_port" (0 or None: no page; the parameter `port`
     has precedence), "hmi_host" and "hmi_token" (see `PageServer`), and those of
     `Operating`.
-    Parameters: `camera`, the module that renders the picture of the robot (`sim.camera`), if any.
+    Parameters: `camera`, the module that renders the picture of the robot (`rampart.sim.osmosis.camera`), if any.
     """
 
     outputs = (topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.RESET, *OUTPUTS)

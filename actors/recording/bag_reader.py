@@ -25,7 +25,7 @@ from mcap.records import (
     Schema,
 )
 
-from actors.recording.bag_records import (
+from rampart.actors.recording.bag_records import (
     COMPRESSIONS,
     HEAD,
     MAX_RECORD_BYTES,
@@ -36,9 +36,9 @@ from actors.recording.bag_records import (
     records_in,
     unpacked,
 )
-from actors.recording.bag_writer import END, KEY, RUN, BagError
-from actors.recording.run_documents import MAX_FILE_BYTES
-from files.reading import shown
+from rampart.actors.recording.bag_writer import END, KEY, RUN, BagError
+from rampart.actors.recording.run_documents import MAX_FILE_BYTES
+from rampart.files.reading import shown
 
 MAX_EXPANSION = 16 << 20, 64
 """What a file may be unpacked: so many bytes, and so many times its own size on top. Ours are a

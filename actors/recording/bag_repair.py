@@ -8,8 +8,8 @@ from pathlib import Path
 from mcap.records import Attachment, Message, Metadata
 from mcap.writer import CompressionType, Writer
 
-from actors.recording.bag_reader import BagReader
-from actors.recording.bag_writer import BagError, open_target
+from rampart.actors.recording.bag_reader import BagReader
+from rampart.actors.recording.bag_writer import BagError, open_target
 
 
 def repair(reader: BagReader, target: Path, *, overwrite: bool = False) -> int:

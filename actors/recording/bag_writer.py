@@ -21,13 +21,13 @@ from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
 
-from actors.recording import foxglove as fg
-from actors.recording.json_schema import plain_schema
-from actors.recording.message_form import MessageForm, Recorded, form_of
-from actors.recording.run_documents import Documents
-from actors.recording.sequence_gaps import SequenceGaps
-from actors.recording.views import CHANNELS, View, Views, encode
-from actors.runtime.topic import ROOT
+from rampart.actors.bus.topic import ROOT
+from rampart.actors.recording import foxglove as fg
+from rampart.actors.recording.json_schema import plain_schema
+from rampart.actors.recording.message_form import MessageForm, Recorded, form_of
+from rampart.actors.recording.run_documents import Documents
+from rampart.actors.recording.sequence_gaps import SequenceGaps
+from rampart.actors.recording.views import CHANNELS, View, Views, encode
 
 PROFILE = "rampart"
 RUN = "rampart.run"

@@ -13,9 +13,9 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from actors import topics
-from actors.runtime.envelope import UNREADABLE, Envelope, Header, decode, pack
-from actors.runtime.topic import ROOT, Topic
+from rampart.actors.bus.envelope import UNREADABLE, Envelope, Header, decode, pack
+from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.osmosis import topics
 
 B = TypeVar("B")
 

@@ -1,4 +1,4 @@
-"""The recorder as a process of its own: `python -m actors.recording.process ORDER`.
+"""The recorder as a process of its own: `python -m rampart.actors.recording.process ORDER`.
 
 ORDER is a JSON object (`Order`). It says "ready" on stdout when taps can find it, or "error: …" and
 ends; on stderr it says what came of it.
@@ -18,10 +18,10 @@ from pathlib import Path
 import msgspec
 import setproctitle
 
-from actors.recording.bag_writer import BagError
-from actors.recording.recorder import RUN_ENDED, Recorder
-from actors.runtime import streams
-from actors.runtime.plain_text import one_line
+from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.recorder import RUN_ENDED, Recorder
+from rampart.files import streams
+from rampart.files.plain_text import one_line
 
 _ROOT = Path(__file__).resolve().parents[2]
 _READY = "ready"
@@ -59,7 +59,7 @@ class RecorderProcess:
         environment["PYTHONPATH"] = os.pathsep.join(
             [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         self._process = subprocess.Popen(  # noqa: S603 our own interpreter and module
-            [sys.executable, "-P", "-m", "actors.recording.process",
+            [sys.executable, "-P", "-m", "rampart.actors.recording.process",
              msgspec.json.encode(self._order).decode()],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, env=environment)
         assert self._process.stdout is not None  # noqa: S101 for the type checker

@@ -22,14 +22,14 @@ from collections.abc import Callable, Iterable
 from operator import itemgetter
 from pathlib import Path
 
-from actors.recording.bag_writer import BagError, BagWriter, open_target
-from actors.recording.run_documents import Documents, collect, footprint_m, restore
-from actors.recording.views import Views
-from actors.runtime import tap
-from actors.runtime.unix_peer import is_same_user
-from actors.supervision.run_info import RunInfo, ask
-from airport.formats import load_airport
-from airport.model import Airport
+from rampart.actors.bus import tap
+from rampart.actors.bus.unix_peer import is_same_user
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.recording.bag_writer import BagError, BagWriter, open_target
+from rampart.actors.recording.run_documents import Documents, collect, footprint_m, restore
+from rampart.actors.recording.views import Views
+from rampart.actors.run.run_info import RunInfo, ask
 
 PERIOD_S = 0.05
 """Real seconds between two looks into the sockets."""

@@ -10,10 +10,10 @@ from typing import Any
 
 import msgspec
 
-from airport.foreign import IMAGE_SUFFIXES
-from airport.formats import load_airport
-from files import toml
-from files.reading import FileError, read_bytes
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.airport.graph_format import IMAGE_SUFFIXES
+from rampart.files import toml
+from rampart.files.reading import FileError, read_bytes
 
 FORMAT = "1"
 SYSTEM = "system.toml"
@@ -135,7 +135,7 @@ def _paths(plan: Mapping[str, Any]) -> list[tuple[str, Path]]:
                              if p.suffix.lower() in (*IMAGE_SUFFIXES, ".miss"))
             own = [p for p in beside if p.stem.startswith(source.stem)
                    and p.suffix.lower() in IMAGE_SUFFIXES]
-            if own:  # as `airport.foreign` chooses among several images
+            if own:  # as `rampart.actors.osmosis.airport.graph_format` chooses among several images
                 beside = [p for p in beside
                           if p in own or p.suffix.lower() not in IMAGE_SUFFIXES]
         paths += [(f"{AIRPORT}{path.name}", path) for path in beside]

@@ -7,9 +7,9 @@ from typing import Any
 
 import shapely
 
-from actors import messages as m
-from actors.recording import foxglove as fg
-from airport.model import Airport
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.recording import foxglove as fg
 
 MARGIN_M = 4.0
 """Strip of prohibited ground that is drawn round the airport."""

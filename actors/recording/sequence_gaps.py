@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from actors.runtime.envelope import Header
+from rampart.actors.bus.envelope import Header
 
 
 class SequenceGaps:

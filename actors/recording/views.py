@@ -14,16 +14,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from actors import messages as m
-from actors import topics
-from actors.recording import foxglove as fg
-from actors.recording import scene
-from actors.runtime.bounds import MANY, MOST
-from actors.runtime.envelope import Header
-from actors.runtime.limits import Remembered
-from actors.runtime.topic import Topic
-from airport.model import Airport
-from manager.words import decision_in_words
+from rampart.actors.bus.bounds import MANY, MOST
+from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.limits import Remembered
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.recording import foxglove as fg
+from rampart.actors.recording import scene
+from rampart.manager.model.words import decision_in_words
 
 View = tuple[str, fg.Record]
 """Channel and what is to be seen on it."""

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from actors.recording.bag_writer import BagError, BagWriter, open_target
-from actors.recording.recorder import views_of
-from actors.recording.run_documents import collect
+from rampart.actors.recording.bag_writer import BagError, BagWriter, open_target
+from rampart.actors.recording.recorder import views_of
+from rampart.actors.recording.run_documents import collect
 
 FLUSH_S = 10.0
 """Simulated seconds between two hand-overs of the file: some tenths of a real one."""

@@ -1,1 +1,1 @@
-"""Recovery modules RM1 to RM5: what the FTM Manager commands when a fault was detected."""
+"""What every recovery module is made of, and the modules that know no robot."""

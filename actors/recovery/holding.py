@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import math
 
-from actors.messages import RecoveryCommand, RecoveryPhase
-from actors.recovery.module import RecoveryModule
-from actors.runtime.actor import Context
+from rampart.actors.osmosis.messages import RecoveryCommand, RecoveryPhase
+from rampart.actors.recovery.module import RecoveryModule
+from rampart.actors.runtime.actor import Context
 
 _FAREWELLS = 5
 """How often the end of an order is said: one second long, for whoever is being respawned."""

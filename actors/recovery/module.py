@@ -19,13 +19,18 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from actors import topics
-from actors.messages import RecoveryCommand, RecoveryPhase, RecoveryReport, RecoveryState
-from actors.runtime.actor import Actor, Context, Header, every, on
-from actors.runtime.bounds import clip
-from actors.runtime.timer import Timer
-from actors.runtime.topic import Topic
-from manager.schema import SystemSpec
+from rampart.actors.bus.bounds import clip
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import (
+    RecoveryCommand,
+    RecoveryPhase,
+    RecoveryReport,
+    RecoveryState,
+)
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.timer import Timer
+from rampart.manager.spec.schema import SystemSpec
 
 _P = RecoveryPhase
 _ENDS = frozenset({_P.DONE, _P.DEGRADED, _P.FAILED})

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from actors import topics
-from actors.messages import Heartbeat, ProcessEvent, RecoveryCommand, RespawnRequest
-from actors.recovery.module import RecoveryModule
-from actors.recovery.respawn_core import RespawnCore
-from actors.runtime.actor import Context, Header, on
-from actors.runtime.topic import Topic
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import Heartbeat, ProcessEvent, RecoveryCommand, RespawnRequest
+from rampart.actors.recovery.module import RecoveryModule
+from rampart.actors.recovery.respawn_core import RespawnCore
+from rampart.actors.runtime.actor import Context, Header, on
 
 _REQUESTS_PER_LIFE = 1_000_000
 

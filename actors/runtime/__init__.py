@@ -1,1 +1,1 @@
-"""What every actor is made of: actor loop, bus, clock, mailbox, topics. Knows no robot."""
+"""What every actor is made of: loop, mailbox, timers, checkpoints, injected faults."""

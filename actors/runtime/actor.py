@@ -21,19 +21,19 @@ from typing import Any, ClassVar, TypeVar
 
 import msgspec
 
-from actors.runtime.bounds import MAX_PAYLOAD_BYTES, clip
-from actors.runtime.bus import Bus
-from actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
-from actors.runtime.clock import Clock
-from actors.runtime.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
-from actors.runtime.injection_desk import InjectionDesk
-from actors.runtime.limits import RateLimit, ReportLimit
-from actors.runtime.mailbox import Mailbox
-from actors.runtime.messages import Diagnostic, Heartbeat, Hello, Injection
-from actors.runtime.run_folder import Register
-from actors.runtime.timer import Timer
-from actors.runtime.topic import Qos, Topic
-from actors.runtime.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
+from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
+from rampart.actors.bus.bus import Bus
+from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
+from rampart.actors.bus.limits import RateLimit, ReportLimit
+from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection
+from rampart.actors.bus.run_folder import Register
+from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
+from rampart.actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.injection_desk import InjectionDesk
+from rampart.actors.runtime.mailbox import Mailbox
+from rampart.actors.runtime.timer import Timer
 
 __all__ = ["Actor", "Context", "Header", "every", "on"]
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from actors.runtime.checkpoint import GENERATIONS, Record
+from rampart.actors.runtime.checkpoint import GENERATIONS, Record
 
 STORE_FORMAT = 2
 """Version of the tables and checksums, in the file's `user_version`."""

@@ -36,8 +36,8 @@ import sqlite3
 import threading
 from pathlib import Path
 
-from actors.runtime import checkpoint_file as disk
-from actors.runtime.checkpoint import (
+from rampart.actors.runtime import checkpoint_file as disk
+from rampart.actors.runtime.checkpoint import (
     GENERATIONS,
     BusyError,
     CheckpointError,

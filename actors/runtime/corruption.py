@@ -18,8 +18,8 @@ from typing import Any
 
 import msgspec
 
-from actors.runtime.bounds import bare
-from actors.runtime.messages import Injection
+from rampart.actors.bus.bounds import bare
+from rampart.actors.bus.messages import Injection
 
 Change = Callable[[float], float]
 

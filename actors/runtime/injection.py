@@ -17,15 +17,15 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
-from actors.runtime.corruption import InjectionError, check_fields, corrupt
-from actors.runtime.messages import Injection
-from actors.runtime.topic import ROOT
-from actors.runtime.topics import (
+from rampart.actors.bus.messages import Injection
+from rampart.actors.bus.topic import ROOT
+from rampart.actors.bus.topics import (
     INJECT,
     INJECTION_REPORT,
     INJECTION_REQUEST,
     INJECTION_RESULT,
 )
+from rampart.actors.runtime.corruption import InjectionError, check_fields, corrupt
 
 MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp", "corrupt")
 

@@ -1,6 +1,6 @@
 """What an actor does about fault injections: takes orders, ends them in time, tells what became.
 
-`actors.runtime.injection` decides what happens to a message; here are the timers and the reports.
+`rampart.actors.runtime.injection` decides what happens to a message; here are the timers and the reports.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from actors.runtime.bounds import clip
-from actors.runtime.injection import FaultGate, News
-from actors.runtime.messages import Injection, InjectionReport
-from actors.runtime.timer import Timer
-from actors.runtime.topic import Topic
-from actors.runtime.topics import INJECTION_REPORT
+from rampart.actors.bus.bounds import clip
+from rampart.actors.bus.messages import Injection, InjectionReport
+from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topics import INJECTION_REPORT
+from rampart.actors.runtime.injection import FaultGate, News
+from rampart.actors.runtime.timer import Timer
 
 if TYPE_CHECKING:
-    from actors.runtime.actor import Actor
+    from rampart.actors.runtime.actor import Actor
 
 
 MAX_IN_FORCE = 64

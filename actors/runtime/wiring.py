@@ -13,9 +13,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from actors.runtime import working_folder
-from actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
-from actors.runtime.topic import Topic
+from rampart.actors.bus.topic import Topic
+from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
+from rampart.files import working_folder
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,12 +17,12 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 
-from actors.supervision.patience import Patience, usage
-from actors.supervision.process_title import RunProcess, find_processes
-from actors.supervision.restart_policy import RestartPolicy
-from actors.supervision.run_plan import SUPERVISOR, RunPlan
-from actors.supervision.spawner import NAMES
-from actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
+from rampart.actors.supervision.patience import Patience, usage
+from rampart.actors.supervision.process_title import RunProcess, find_processes
+from rampart.actors.supervision.restart_policy import RestartPolicy
+from rampart.actors.supervision.spawner import NAMES
+from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
 PERIOD_S = 0.25
 SUPERVISOR_PATIENCE_S = 1.5

@@ -8,8 +8,8 @@ import os
 import signal
 import sys
 
-from actors.runtime import streams
-from actors.supervision.process_title import RunProcess, find_processes
+from rampart.actors.supervision.process_title import RunProcess, find_processes
+from rampart.files import streams
 
 SIGNALS = {
     "KILL": signal.SIGKILL,

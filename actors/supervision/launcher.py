@@ -21,23 +21,23 @@ from pathlib import Path
 
 import msgspec
 
-from actors.messages import NodeTable
-from actors.runtime import run_folder
-from actors.runtime.tap import Tap
-from actors.runtime.unix_peer import is_same_user
-from actors.runtime.zenoh_bus import ZenohBus, endpoint
-from actors.supervision import run_info
-from actors.supervision.descriptors import needed_descriptors, raise_descriptor_limit
-from actors.supervision.guard import Guard
-from actors.supervision.lifeline import kill_leftovers
-from actors.supervision.run_plan import OBSERVER, RunPlan
-from actors.supervision.spawner import NAMES
-from actors.supervision.spawner_client import (
+from rampart.actors.bus import run_folder
+from rampart.actors.bus.tap import Tap
+from rampart.actors.bus.unix_peer import is_same_user
+from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.osmosis.messages import NodeTable
+from rampart.actors.run import run_info
+from rampart.actors.run.run_plan import OBSERVER, RunPlan
+from rampart.actors.supervision.descriptors import needed_descriptors, raise_descriptor_limit
+from rampart.actors.supervision.guard import Guard
+from rampart.actors.supervision.lifeline import kill_leftovers
+from rampart.actors.supervision.spawner import NAMES
+from rampart.actors.supervision.spawner_client import (
     START_PATIENCE_S,
     SpawnerClient,
     SpawnerUnavailableError,
 )
-from actors.supervision.unseen import tell_of_callbacks, watch
+from rampart.actors.supervision.unseen import tell_of_callbacks, watch
 
 LOAD_TIMEOUT_S = 60.0
 STARTUP_S = (1.0, 5.0)
@@ -114,7 +114,7 @@ class Launcher:
         environment["PYTHONPATH"] = os.pathsep.join(
             [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         spawner = subprocess.Popen(  # noqa: S603 our own interpreter and module
-            [sys.executable, "-P", "-m", "actors.supervision.spawner", name,
+            [sys.executable, "-P", "-m", "rampart.actors.supervision.spawner", name,
              str(self._lifeline[0])],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[self._lifeline[0]],
             env=environment, process_group=0)  # see `lifeline`

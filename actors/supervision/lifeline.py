@@ -20,8 +20,8 @@ import os
 import signal
 import threading
 
-from actors.runtime.run_folder import remove
-from actors.supervision.process_title import find_processes
+from rampart.actors.bus.run_folder import remove
+from rampart.actors.supervision.process_title import find_processes
 
 
 def exit_with_launcher(read_end: int, launcher: int, folder: str) -> None:

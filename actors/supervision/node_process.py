@@ -17,20 +17,20 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from actors.runtime.actor import Actor, Context
-from actors.runtime.bus import BusError
-from actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
-from actors.runtime.checkpoint_store import SqliteCheckpoints
-from actors.runtime.clock import Clock
-from actors.runtime.plain_text import one_line
-from actors.runtime.run_folder import register_of
-from actors.runtime.tap import Tap
-from actors.runtime.zenoh_bus import ZenohBus
-from actors.supervision.lifeline import exit_with_launcher
-from actors.supervision.process_title import set_title
-from actors.supervision.run_plan import Layout
-from actors.supervision.unseen import tell_of_callbacks
-from manager.schema import Kind
+from rampart.actors.bus.bus import BusError
+from rampart.actors.bus.run_folder import register_of
+from rampart.actors.bus.tap import Tap
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.run.run_plan import Layout
+from rampart.actors.runtime.actor import Actor, Context
+from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
+from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.lifeline import exit_with_launcher
+from rampart.actors.supervision.process_title import set_title
+from rampart.actors.supervision.unseen import tell_of_callbacks
+from rampart.files.plain_text import one_line
+from rampart.manager.spec.schema import Kind
 
 WORLD_NICE = -10
 """Niceness of the simulated world, where that is permitted."""

@@ -1,7 +1,7 @@
 """What the supervisor can do to processes, and how the kernel does it.
 
 The supervisor decides (who is dead, who is respawned when); this is the mechanism. `Processes` is
-what it asks for; `OsProcesses` is the machine. In virtual time `sim.virtual_processes` stands here.
+what it asks for; `OsProcesses` is the machine. In virtual time `rampart.sim.virtual.virtual_processes` stands here.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
-from actors.messages import AdaptedSystem
-from actors.supervision.patience import Usage, usage
-from actors.supervision.process_title import find_processes, is_stopped
-from actors.supervision.spawner_client import (
+from rampart.actors.osmosis.messages import AdaptedSystem
+from rampart.actors.supervision.patience import Usage, usage
+from rampart.actors.supervision.process_title import find_processes, is_stopped
+from rampart.actors.supervision.spawner_client import (
     SpawnerBusyError,
     SpawnerClient,
     SpawnerUnavailableError,

@@ -25,20 +25,20 @@ from typing import Any, NoReturn
 
 import msgspec
 
-from actors.messages import AdaptedSystem
-from actors.runtime import streams, working_folder
-from actors.runtime.run_folder import issue, issued, remove, socket_path
-from actors.runtime.unix_peer import is_same_user
-from actors.supervision.lifeline import kill_leftovers
-from actors.supervision.node_process import node_main, wedge
-from actors.supervision.process_title import set_title
-from actors.supervision.run_plan import (
+from rampart.actors.bus.run_folder import issue, issued, remove, socket_path
+from rampart.actors.bus.unix_peer import is_same_user
+from rampart.actors.osmosis.messages import AdaptedSystem
+from rampart.actors.run.run_plan import (
     Layout,
     RunPlan,
     adapted_system,
     load_shared,
     load_system,
 )
+from rampart.actors.supervision.lifeline import kill_leftovers
+from rampart.actors.supervision.node_process import node_main, wedge
+from rampart.actors.supervision.process_title import set_title
+from rampart.files import streams, working_folder
 
 NAMES = ("a", "b")
 MAX_DATAGRAM = 160_000
@@ -251,7 +251,7 @@ def _answer(connection: socket.socket, reply: Reply) -> bool:
 
 
 def main() -> int:
-    """Entry of a spawner that loads: `python -m actors.supervision.spawner NAME FD` < plan.
+    """Entry of a spawner that loads: `python -m rampart.actors.supervision.spawner NAME FD` < plan.
 
     NAME is `a` or `b`, FD the read end of the lifeline.
 

@@ -26,10 +26,10 @@ import time
 
 import msgspec
 
-from actors.messages import AdaptedSystem
-from actors.runtime.unix_peer import is_same_user, peer, receive_signed
-from actors.supervision.process_title import find_process
-from actors.supervision.spawner import (
+from rampart.actors.bus.unix_peer import is_same_user, peer, receive_signed
+from rampart.actors.osmosis.messages import AdaptedSystem
+from rampart.actors.supervision.process_title import find_process
+from rampart.actors.supervision.spawner import (
     MAX_DATAGRAM,
     NAMES,
     Adapt,

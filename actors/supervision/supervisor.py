@@ -27,8 +27,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from actors import topics
-from actors.messages import (
+from rampart.actors.bus.bounds import clip
+from rampart.actors.bus.limits import RateLimit
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import (
     AdaptedSystem,
     Diagnostic,
     Heartbeat,
@@ -41,13 +44,11 @@ from actors.messages import (
     ProcessEvent,
     RespawnRequest,
 )
-from actors.runtime.actor import Actor, Context, Header, every, on
-from actors.runtime.bounds import clip
-from actors.runtime.limits import RateLimit
-from actors.runtime.timer import Timer
-from actors.runtime.topic import Topic
-from actors.supervision.patience import AT_LEISURE, Patience
-from actors.supervision.processes import (
+from rampart.actors.run.run_plan import Layout, RunPlan, Unit, adapted_system
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.timer import Timer
+from rampart.actors.supervision.patience import AT_LEISURE, Patience
+from rampart.actors.supervision.processes import (
     Living,
     OsProcesses,
     Processes,
@@ -55,10 +56,9 @@ from actors.supervision.processes import (
     SpawnerBusyError,
     SpawnerUnavailableError,
 )
-from actors.supervision.restart_policy import RestartPolicy
-from actors.supervision.run_plan import Layout, RunPlan, Unit, adapted_system
-from manager.adaptation import changed_actors
-from manager.specification import Kind, SystemSpec
+from rampart.actors.supervision.restart_policy import RestartPolicy
+from rampart.manager.spec.adaptation import changed_actors
+from rampart.manager.spec.specification import Kind, SystemSpec
 
 STOP_GRACE_S = 0.5
 """Wall seconds between SIGTERM and SIGKILL at the end of a run."""

@@ -12,7 +12,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from sim.campaign.wording import MINUS, count, seconds
+from rampart.sim.campaign.wording import MINUS, count, seconds
 
 WIDTH = 520.0
 """Of the drawing, in its own units; text is 14 of them high."""

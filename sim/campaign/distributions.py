@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sim.campaign import charts
-from sim.campaign.grouping import KINDS, by_kind
-from sim.campaign.store import Run
-from sim.campaign.wording import count
-from sim.clearance import EXACT_BELOW_M
+from rampart.sim.campaign import charts
+from rampart.sim.campaign.grouping import KINDS, by_kind
+from rampart.sim.campaign.store import Run
+from rampart.sim.campaign.wording import count
+from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 
 
 def distributions(runs: Sequence[Run]) -> list[charts.Chart]:

@@ -9,9 +9,9 @@ from typing import Any
 
 import joblib
 
-from sim.campaign.defaults import BACKENDS
-from sim.campaign.job import Job, RunResult, run_job
-from sim.campaign.store import Store
+from rampart.sim.campaign.defaults import BACKENDS
+from rampart.sim.campaign.job import Job, RunResult, run_job
+from rampart.sim.campaign.store import Store
 
 CONNECT_TIMEOUT_S = 10.0
 """For reaching a cluster."""

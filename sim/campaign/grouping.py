@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import msgspec
 
-from sim.campaign.job import Job
-from sim.campaign.paper_tables import AS_THE_PAPER
-from sim.campaign.store import Run
-from sim.faults import PAPER_FAULTS, SENSOR_FAULTS
-from sim.scenario import ACTUATOR_FAULTS, OBSTACLE, PROCESS_FAULTS
+from rampart.sim.campaign.job import Job
+from rampart.sim.campaign.paper_tables import AS_THE_PAPER
+from rampart.sim.campaign.store import Run
+from rampart.sim.faults.faults import PAPER_FAULTS, SENSOR_FAULTS
+from rampart.sim.faults.scenario import ACTUATOR_FAULTS, OBSTACLE, PROCESS_FAULTS
 
 KINDS = {
     "none": "no fault", "paper": "paper's faults", "topic": "topics",

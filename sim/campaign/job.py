@@ -15,19 +15,19 @@ from typing import Any
 
 import msgspec
 
-import systems
-from actors.supervision.run_plan import RunPlan, load_shared, load_system, tailor
-from files import toml
-from files.reading import read_text
-from manager.adaptation import Action, Change, adapt
-from manager.specification import check_document, read_document
-from sim.campaign.defaults import PATIENCE_S
-from sim.injector import can_be_hit
-from sim.mission_run import MissionRun
-from sim.network import find_network
-from sim.report_record import RunRecord
-from sim.scenario import FaultOutcome, PlannedFault
-from sim.virtual_run import VirtualResult, VirtualRun
+from rampart import systems
+from rampart.actors.run.run_plan import RunPlan, load_shared, load_system, tailor
+from rampart.files import toml
+from rampart.files.reading import read_text
+from rampart.manager.spec.adaptation import Action, Change, adapt
+from rampart.manager.spec.specification import check_document, read_document
+from rampart.sim.campaign.defaults import PATIENCE_S
+from rampart.sim.faults.injector import can_be_hit
+from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
+from rampart.sim.osmosis.report_record import RunRecord
+from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.virtual.network import find_network
+from rampart.sim.virtual.virtual_run import VirtualResult, VirtualRun
 
 
 class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

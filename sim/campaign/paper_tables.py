@@ -22,12 +22,12 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 
-from manager.schema import SystemSpec
-from manager.strategies import decide
-from sim.campaign.job import Job
-from sim.campaign.statistics import NO_EFFECT, verdict, worst
-from sim.campaign.store import Run
-from sim.scenario import PlannedFault
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.strategies.registry import decide
+from rampart.sim.campaign.job import Job
+from rampart.sim.campaign.statistics import NO_EFFECT, verdict, worst
+from rampart.sim.campaign.store import Run
+from rampart.sim.faults.scenario import PlannedFault
 
 AS_THE_PAPER = {"RM2": {"latched": True}, "RM5": {"latched": True}}
 """What differs from the shipped system: the authors' code releases neither."""

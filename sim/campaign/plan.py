@@ -7,15 +7,15 @@ import random
 from collections.abc import Iterable, Sequence
 from itertools import product
 
-from actors.runtime.topic import ROOT
-from actors.supervision.system_topics import published_keys, system_topics
-from manager.schema import SystemSpec
-from sim.campaign.job import Job
-from sim.faults import PAPER_FAULTS, SENSOR_FAULTS
-from sim.injector import can_be_hit
-from sim.robot import WHEEL_NAMES
-from sim.scenario import OBSTACLE, PROCESS_FAULTS, PlannedFault
-from sim.topic_faults import systematic_faults
+from rampart.actors.bus.topic import ROOT
+from rampart.actors.run.system_topics import published_keys, system_topics
+from rampart.manager.spec.schema import SystemSpec
+from rampart.sim.campaign.job import Job
+from rampart.sim.faults.faults import PAPER_FAULTS, SENSOR_FAULTS
+from rampart.sim.faults.injector import can_be_hit
+from rampart.sim.faults.scenario import OBSTACLE, PROCESS_FAULTS, PlannedFault
+from rampart.sim.faults.topic_faults import systematic_faults
+from rampart.sim.osmosis.robot import WHEEL_NAMES
 
 EARLIEST_S, LATEST_S = 2.0, 120.0
 """Random faults are injected between these simulated times."""

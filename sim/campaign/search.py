@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from sim.campaign.job import Job, RunResult, run_job
-from sim.campaign.plan import EARLIEST_S
-from sim.scenario import OBSTACLE, PlannedFault
+from rampart.sim.campaign.job import Job, RunResult, run_job
+from rampart.sim.campaign.plan import EARLIEST_S
+from rampart.sim.faults.scenario import OBSTACLE, PlannedFault
 
 if TYPE_CHECKING:
     import optuna

@@ -9,8 +9,8 @@ from typing import Any
 
 import msgspec
 
-from sim.campaign.job import Job
-from sim.campaign.store import Run
+from rampart.sim.campaign.job import Job
+from rampart.sim.campaign.store import Run
 
 CONFIDENCE_Z = 1.959963984540054
 """Two-sided 95 %."""

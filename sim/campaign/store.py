@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from files.reading import shown
-from sim.campaign.job import Job, RunResult
+from rampart.files.reading import shown
+from rampart.sim.campaign.job import Job, RunResult
 
 FILE_NAME = "runs.sqlite"
 

@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from sim.campaign.grouping import KINDS, kind_of
-from sim.campaign.statistics import badness
-from sim.campaign.store import Run
-from sim.campaign.wording import metres
-from sim.report import points
-from sim.report_record import RunRecord
+from rampart.sim.campaign.grouping import KINDS, kind_of
+from rampart.sim.campaign.statistics import badness
+from rampart.sim.campaign.store import Run
+from rampart.sim.campaign.wording import metres
+from rampart.sim.osmosis.report import points
+from rampart.sim.osmosis.report_record import RunRecord
 
 _DECISIONS = 8
 _CLOSE_UP_M = 9.0

@@ -16,29 +16,29 @@ from PIL import Image
 from recording_samples import documents, pose
 from test_airport_formats import GRAPH, SCALE, TOML
 
-from actors.recording.bag_reader import BagReader, Summary
-from actors.recording.bag_repair import repair
-from actors.recording.bag_writer import BagError, BagWriter
-from actors.recording.message_form import MessageForm, header_of, renumbered, topic_of
-from actors.recording.run_documents import footprint_m, restore
-from airport.errors import AirportError
-from airport.formats import load_airport, load_mission
-from airport.mask import allowed_area
-from files import toml
-from files.reading import FileError
 from fuzz.samples import sample
 from fuzz.target import ROOT, target
-from manager.adaptation import Change, ChangeError, adapt, parse_value
-from manager.formula import formula_of
-from manager.gates import GateError, detection_gate, recovery_gate
-from manager.open_psa import OpenPsaError, read_open_psa, write_open_psa
-from manager.schema import SpecificationError
-from manager.specification import check_document, parse_specification, read_document
-from sim.campaign.job import Job, RunResult
-from sim.campaign.store import _NO_RUN, _run
-from sim.faults import UnknownFaultError
-from sim.scenario import ScenarioError, action_of, parse_fault
-from toolbox.bag_verbs import described
+from rampart.actors.osmosis.airport.errors import AirportError
+from rampart.actors.osmosis.airport.formats import load_airport, load_mission
+from rampart.actors.osmosis.airport.mask import allowed_area
+from rampart.actors.recording.bag_reader import BagReader, Summary
+from rampart.actors.recording.bag_repair import repair
+from rampart.actors.recording.bag_writer import BagError, BagWriter
+from rampart.actors.recording.message_form import MessageForm, header_of, renumbered, topic_of
+from rampart.actors.recording.run_documents import footprint_m, restore
+from rampart.cli.record.bag_verbs import described
+from rampart.files import toml
+from rampart.files.reading import FileError
+from rampart.manager.analysis.formula import formula_of
+from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa, write_open_psa
+from rampart.manager.model.gates import GateError, detection_gate, recovery_gate
+from rampart.manager.spec.adaptation import Change, ChangeError, adapt, parse_value
+from rampart.manager.spec.schema import SpecificationError
+from rampart.manager.spec.specification import check_document, parse_specification, read_document
+from rampart.sim.campaign.job import Job, RunResult
+from rampart.sim.campaign.store import _NO_RUN, _run
+from rampart.sim.faults.faults import UnknownFaultError
+from rampart.sim.faults.scenario import ScenarioError, action_of, parse_fault
 
 SYSTEMS = ROOT / "systems"
 _CELL = (SYSTEMS / "cell.toml").read_text("utf-8")
@@ -56,22 +56,22 @@ manager_timeout_s = 0.5
 detection_silence_timeout_s = 1
 [[node]]
 name = "manager"
-actor = "manager.actor:FtmManager"
+actor = "rampart.manager.actor:FtmManager"
 kind = "manager"
 [[node]]
 name = "lamp"
-actor = "actors.stub.node:StubNode"
+actor = "rampart.actors.ftm.stub_node:StubNode"
 kind = "control"
 respawn = "RM1"
 [[detection]]
 name = "DM1"
 title = "No light"
-actor = "actors.detection.watchdog:Watchdog"
+actor = "rampart.actors.detection.watchdog:Watchdog"
 parameters = { watch = ["lamp"], timeout_s = 0.5 }
 [[recovery]]
 name = "RM1"
 title = "New lamp"
-actor = "actors.recovery.respawn:Respawn"
+actor = "rampart.actors.recovery.respawn:Respawn"
 kind = "masking"
 claims = ["lamp"]
 [[mechanism]]

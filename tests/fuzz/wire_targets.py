@@ -6,24 +6,29 @@ from typing import Any
 
 import msgspec
 
-from actors import topics
-from actors.control.control_checkpoint import CONTROL_STATE
-from actors.control.graph_planner import ROUTE_STATE
-from actors.control.mission_checkpoint import MISSION_STATE
-from actors.operator.hmi_wishes import WishError, read_wish
-from actors.operator.joystick_device import EVENT, ForeignDeviceError, StickDecoder, StickMapping
-from actors.recording.message_form import form_of
-from actors.runtime.checkpoint import StateError
-from actors.runtime.envelope import UNREADABLE, ArrivalGuard, Header, encode
-from actors.runtime.tap import frame, parse_frame
-from actors.runtime.web_access import Access, page_url, shown_token
-from actors.supervision.process_title import parse_title
-from actors.supervision.process_usage import parse_stat
-from actors.supervision.run_info import RunInfo, read_info
-from actors.supervision.spawner import Adapt, ForkRequest, Ping, Reply, Request, SetOrigin
 from fuzz.samples import sample
 from fuzz.target import target
-from manager.actor import MANAGER_STATE
+from rampart.actors.bus.envelope import UNREADABLE, ArrivalGuard, Header, encode
+from rampart.actors.bus.tap import frame, parse_frame
+from rampart.actors.operator.requests import WishError, read_wish
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE
+from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE
+from rampart.actors.osmosis.control.planning.graph_planner import ROUTE_STATE
+from rampart.actors.osmosis.control.teleoperation.joystick_device import (
+    EVENT,
+    ForeignDeviceError,
+    StickDecoder,
+    StickMapping,
+)
+from rampart.actors.recording.message_form import form_of
+from rampart.actors.run.run_info import RunInfo, read_info
+from rampart.actors.runtime.checkpoint import StateError
+from rampart.actors.supervision.process_title import parse_title
+from rampart.actors.supervision.process_usage import parse_stat
+from rampart.actors.supervision.spawner import Adapt, ForkRequest, Ping, Reply, Request, SetOrigin
+from rampart.actors.web.access import Access, page_url, shown_token
+from rampart.manager.actor import MANAGER_STATE
 
 # -- the bus ---------------------------------------------------------------------------------------
 

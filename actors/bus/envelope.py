@@ -1,0 +1,215 @@
+"""The wire format: a msgpack array of header and body, and the guard that checks what arrives.
+
+`[source, incarnation, sequence, stamp, body]`. The guard refuses what does not decode, what an
+older incarnation of a node still sends after its successor was heard or started, what claims an
+incarnation that was never issued, what comes twice, and what is stamped ahead of now: it would stay
+fresh for ever, and shut out all that is true after it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection
+from typing import Any, Generic, TypeVar
+
+import msgspec
+
+from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, Count, Incarnation, Name, Seconds
+from rampart.actors.bus.run_folder import Register
+from rampart.actors.bus.topic import Qos, Topic
+
+B = TypeVar("B")
+
+UNREADABLE = (ValueError, RecursionError)
+"""What decoding the bytes of a stranger raises: msgspec's errors are ValueErrors, and so is that of
+a text which is no UTF-8; nesting without end is the other."""
+
+AHEAD_S = 0.1
+"""A stamp this far ahead of now (simulated seconds) is no jitter of a clock but wrong."""
+
+_REMEMBERED_COMMANDS = 64
+
+STRANGERS = 512
+"""Sources that are no nodes of the system, tools for the most part, of which something is
+remembered."""
+
+_KEYS = 256
+"""On which one source may publish; of those above the first is forgotten."""
+
+
+class Header(msgspec.Struct, frozen=True, gc=False):
+    """Who sent a message and when.
+
+    `incarnation` counts the lives of a node; `sequence` the messages of one life; `stamp` is the
+    simulated time at which the content was true (for a sensor: when it was measured).
+    """
+
+    source: Name
+    incarnation: Incarnation
+    sequence: Count
+    stamp: Seconds
+
+
+class Envelope(Header, Generic[B], frozen=True, array_like=True, gc=False):
+    """Header and body as they travel."""
+
+    body: B
+
+
+pack: Callable[[tuple[str, int, int, float, msgspec.Struct]], bytes] = (
+    msgspec.msgpack.Encoder().encode)
+"""Returns the payload for source, incarnation, sequence, stamp and body: `encode` in a hurry."""
+
+_decoders: dict[type[Any], Callable[[bytes], Envelope[Any]]] = {}
+
+
+def encode(header: Header, body: msgspec.Struct) -> bytes:
+    """Return the payload of one message."""
+    return pack((header.source, header.incarnation, header.sequence, header.stamp, body))
+
+
+def decode(topic: Topic[Any], payload: bytes) -> tuple[Header, Any]:
+    """Return header and body of a payload.
+
+    Raises:
+        ValueError, RecursionError: the payload is not a message of this topic's type, or longer
+            than any may be.
+    """
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise ValueError(too_long(payload))
+    envelope = (_decoders.get(topic.type) or _decoder(topic.type))(payload)
+    return envelope, envelope.body
+
+
+def too_long(payload: bytes) -> str:
+    """Return what is wrong with a payload that is too long to be decoded."""
+    return f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are right"
+
+
+def _decoder(kind: type[Any]) -> Callable[[bytes], Envelope[Any]]:
+    decoder = msgspec.msgpack.Decoder(Envelope[kind])  # type: ignore[valid-type]
+    _decoders[kind] = decoder.decode
+    return decoder.decode
+
+
+class _Life:
+    """What was heard from a node in its present life.
+
+    Attributes:
+        incarnation: which.
+        newest: newest sequence number by key, of the topics of which only the newest counts.
+        recent: of commands, by key, the last numbers.
+    """
+
+    __slots__ = ("incarnation", "newest", "recent")
+
+    def __init__(self, incarnation: int) -> None:
+        self.incarnation = incarnation
+        self.newest: dict[str, int] = {}
+        self.recent: dict[str, deque[int]] = {}
+
+
+class ArrivalGuard:
+    """Decides for each arriving payload whether the actor may see it.
+
+    What it has to remember is bounded: nodes of the system are never forgotten, and of all others
+    only the last `STRANGERS`. So no flood of names can bring a superseded node back.
+
+    Args:
+        now: returns simulated seconds.
+        members: names of the nodes of the system.
+        crowded: called for each stranger that is forgotten.
+        register: returns the incarnation of a node that was issued last; None if that is not known,
+            as of tools.
+    """
+
+    def __init__(self, now: Callable[[], float], members: Collection[str] = (),
+                 crowded: Callable[[], None] = lambda: None,
+                 register: Register = lambda _node: None) -> None:
+        self._now = now
+        self._members = frozenset(members)
+        self._crowded = crowded
+        self._register = register
+        self._lives: dict[str, _Life] = {}
+        self._strangers: deque[str] = deque()
+
+    def receiver(
+        self, topic: Topic[Any], take: Callable[[str, Envelope[Any]], None],
+        refuse: Callable[[str, str], None],
+    ) -> Callable[[str, bytes], None]:
+        """Return what is to be called with key and payload of each message of a topic.
+
+        Args:
+            topic: Which.
+            take: Called with the key and the message, unless it is a duplicate or was overtaken.
+            refuse: Called with the key and the reason, if it does not decode, is stamped ahead of
+                now, or comes from a superseded incarnation.
+        """
+        unpack, kind = _decoders.get(topic.type) or _decoder(topic.type), topic.type.__name__
+        lives, meet, is_command = self._lives, self._meet, topic.qos is Qos.COMMAND
+        now, object_to = self._now, self._object_to
+
+        def receive(key: str, payload: bytes) -> None:  # made of every message
+            if len(payload) > MAX_PAYLOAD_BYTES:
+                refuse(key, f"not a {kind}: {too_long(payload)}")
+                return
+            try:
+                message = unpack(payload)
+            except UNREADABLE as error:
+                refuse(key, f"not a {kind}: {error}")
+                return
+            if not message.stamp - now() <= AHEAD_S:  # nor is one that is no number
+                refuse(key, f"stamped {message.stamp - now():.2f} s ahead of now")
+                return
+            life = lives.get(message.source)
+            if life is None or life.incarnation != message.incarnation:
+                objection = object_to(life, message)
+                if objection:
+                    refuse(key, objection)
+                    return
+                life = meet(message.source, message.incarnation)
+            sequence = message.sequence
+            if is_command:
+                recent = life.recent.get(key)
+                if recent is None:
+                    _make_room(life.recent)
+                    recent = life.recent[key] = deque(maxlen=_REMEMBERED_COMMANDS)
+                if sequence in recent:
+                    return
+                recent.append(sequence)
+            else:
+                newest = life.newest
+                before = newest.get(key)
+                if before is None:
+                    _make_room(newest)
+                elif sequence <= before:
+                    return
+                newest[key] = sequence
+            take(key, message)
+
+        return receive
+
+    def _object_to(self, life: _Life | None, message: Header) -> str:
+        """Return why an incarnation is not that of a node's present process; "" if it may be."""
+        which = f"incarnation {message.incarnation} of {message.source}"
+        if life is not None and message.incarnation < life.incarnation:
+            return f"{which} was superseded by {life.incarnation}"
+        issued = self._register(message.source)
+        if issued is not None and message.incarnation != issued:
+            return f"{which}, of which {issued} was issued last"
+        return ""
+
+    def _meet(self, source: str, incarnation: int) -> _Life:
+        life = _Life(incarnation)
+        if source not in self._members and source not in self._lives:
+            self._strangers.append(source)
+            if len(self._strangers) > STRANGERS:
+                self._lives.pop(self._strangers.popleft(), None)
+                self._crowded()
+        self._lives[source] = life
+        return life
+
+
+def _make_room(by_key: dict[str, Any]) -> None:
+    if len(by_key) >= _KEYS:
+        del by_key[next(iter(by_key))]

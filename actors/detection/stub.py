@@ -1,0 +1,30 @@
+"""A detection module that detects what it is told."""
+
+from __future__ import annotations
+
+from rampart.actors.detection.module import DetectionModule
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Header, on
+
+
+class StubDetection(DetectionModule):
+    """Active while somebody says so on `stub/trigger` (`rampart trigger NAME`).
+
+    What it was told dies with it: in a new life it is idle from the start.
+    """
+
+    def on_start(self) -> None:
+        """In a new life, say at once that nobody has said anything yet."""
+        if not self.first_life:
+            self.know_idle()
+
+    @on(topics.STUB_TRIGGER)
+    def trigger(self, message: m.StubTrigger, _header: Header) -> None:
+        """Take the state that is asked for."""
+        if message.name != self.name:
+            return
+        if message.active:
+            self.activate(message.reason or "triggered by hand")
+        else:
+            self.know_idle()

@@ -1,0 +1,1 @@
+"""The contract of fault tolerance: what detection, recovery, manager and supervision say."""

@@ -1,0 +1,279 @@
+"""Faults that the operator injects from the page: ordered, watched, and told what came of them.
+
+Pure. A fault has a name of the catalogue that the launcher hands out, or is `MODE:TOPIC`. It acts
+where the topic is published; that node reports that it took hold, its first effect, and its end
+with the number of messages that it changed. None at all is *no effect*, and is said.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.injection import UNTOUCHED, flaw
+
+TAKE_HOLD_S = 3.0
+"""Simulated seconds within which a publisher reports, even one that is being respawned."""
+
+LATE_END_S = 2.0
+"""Simulated seconds that the report of the end may be late before its publisher counts as gone."""
+
+FIRST_EFFECT_S = 10.0
+"""Simulated seconds within which a permanent fault must change a message."""
+
+DELAY_S = 1.5
+"""Delay of `delay:TOPIC`: longer than any freshness timeout of the shipped system."""
+
+OWN_DURATION_S = 10.0
+STAMP_S = 0.5
+"""Error of `restamp:TOPIC`: ahead, and more than anybody accepts."""
+
+MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp")
+"""Modes that fit any topic; what to corrupt in a message is for the catalogue."""
+
+MAX_WAITING = 16
+MAX_PUBLISHERS = 100
+"""Of so many nodes reports on one injection are kept."""
+
+_KEPT = 20
+
+
+class FaultError(ValueError):
+    """A fault that cannot be injected; one line."""
+
+
+@dataclass(slots=True)
+class Ordered:
+    """One fault as ordered, and what is known of it."""
+
+    injection: str
+    fault: str
+    orders: tuple[m.Injection | m.ActuatorFault, ...]
+    begins_s: float
+    duration_s: float
+    affected: dict[str, dict[str, int]] = field(default_factory=dict)
+    finished: set[str] = field(default_factory=set)
+    reason: str = ""
+    sent: bool = False
+    ending: bool = False
+    outcome: str = ""
+    effective: bool | None = None
+
+    @property
+    def changed(self) -> int:
+        """How many messages (or ticks of the base) it has changed, as far as reported."""
+        return sum(n for nodes in self.affected.values() for n in nodes.values())
+
+    def state(self, now_s: float) -> str:
+        """Return in a few words how far it is."""
+        if self.outcome:
+            return self.outcome
+        if now_s < self.begins_s:
+            return f"begins at {self.begins_s:.0f} s"
+        if not self.affected:
+            return "asked for"
+        return f"in force, {self.changed} changed" if self.changed else "in force, no effect so far"
+
+
+class Injections:
+    """The faults that were ordered from the page.
+
+    Args:
+        prefix: of the ids; another one for each life of the HMI.
+        catalogue: faults that have a name.
+        places: keys of topics that can be disturbed.
+        overhead_s: granted for what takes real time, in simulated seconds.
+    """
+
+    def __init__(self, prefix: str, catalogue: Iterable[m.NamedFault],
+                 places: Iterable[str], overhead_s: float = 0.0) -> None:
+        self._prefix = prefix
+        self._overhead_s = overhead_s
+        self._catalogue: Mapping[str, m.NamedFault] = {f.name: f for f in catalogue}
+        self._places = tuple(places)
+        self._count = 0
+        self._ordered: list[Ordered] = []
+
+    def choice(self) -> dict[str, Any]:
+        """Return what can be injected, for the page."""
+        return {
+            "faults": [{"name": f.name, "title": f.title, "group": f.group,
+                        "duration_s": f.duration_s} for f in self._catalogue.values()],
+            "modes": list(MODES),
+            "topics": list(self._places),
+            "duration_s": OWN_DURATION_S,
+        }
+
+    def view(self, now_s: float) -> list[dict[str, Any]]:
+        """Return what was ordered, newest first, for the page."""
+        return [{"injection": o.injection, "fault": o.fault, "state": o.state(now_s),
+                 "ended": bool(o.outcome), "effective": o.effective}
+                for o in reversed(self._ordered)]
+
+    # -- the operator ---------------------------------------------------------------------------
+
+    def order(self, fault: str, delay_s: float, duration_s: float | None, now_s: float) -> Ordered:
+        """Take an order of the operator.
+
+        Args:
+            fault: name of the catalogue, or `MODE:TOPIC`.
+            delay_s: until it begins.
+            duration_s: how long it lasts, infinity for permanent, None for the fault's own.
+            now_s: now, simulated seconds.
+
+        Raises:
+            FaultError: there is none of this name, or too many wait.
+        """
+        if sum(not o.outcome for o in self._ordered) >= MAX_WAITING:
+            raise FaultError(f"{MAX_WAITING} faults are under way; wait for one to end")
+        self._count += 1
+        name = f"{self._prefix}.{self._count}"
+        orders, own_s = self._find(fault, name)
+        lasts_s = own_s if duration_s is None else duration_s
+        ordered = Ordered(name, fault, tuple(
+            msgspec.structs.replace(o, duration_s=lasts_s) for o in orders),
+            now_s + delay_s, lasts_s)
+        self._ordered.append(ordered)
+        ended = [o for o in self._ordered if o.outcome]
+        for old in ended[:max(0, len(self._ordered) - _KEPT)]:
+            self._ordered.remove(old)
+        return ordered
+
+    def end(self, injection: str, now_s: float) -> tuple[m.Injection | m.ActuatorFault, ...]:
+        """End a fault now: return the orders that do it.
+
+        Raises:
+            FaultError: there is no such fault under way.
+        """
+        for ordered in self._ordered:
+            if ordered.injection == injection and not ordered.outcome:
+                if not ordered.sent:
+                    ordered.outcome = "withdrawn before it took hold"
+                ordered.ending = True
+                ordered.duration_s = max(now_s - ordered.begins_s, 0.0)
+                ordered.orders = tuple(
+                    msgspec.structs.replace(o, duration_s=0.0) for o in ordered.orders)
+                return ordered.orders
+        raise FaultError(f"no fault {injection[:60]!r} is under way")
+
+    def _find(self, fault: str, injection: str
+              ) -> tuple[tuple[m.Injection | m.ActuatorFault, ...], float]:
+        named = self._catalogue.get(fault)
+        if named is not None:
+            orders: list[m.Injection | m.ActuatorFault] = [
+                *named.injections, *named.actuator_faults]
+            return tuple(msgspec.structs.replace(o, injection=f"{injection}.{i}")
+                         for i, o in enumerate(orders, start=1)), named.duration_s
+        mode, colon, key = fault.partition(":")
+        if not colon:
+            raise FaultError(f"no fault {fault[:60]!r}; choose one of the list, or MODE:TOPIC")
+        if mode not in MODES:
+            raise FaultError(f"mode {mode[:40]!r}: must be one of {', '.join(MODES)}")
+        if key not in self._places:
+            raise FaultError(f"topic {key[:60]!r}: this system has none of that key that can be "
+                             "disturbed")
+        order = m.Injection(f"{injection}.1", key, mode, OWN_DURATION_S,
+                            delay_s=DELAY_S if mode == "delay" else 0.0,
+                            stamp_s=STAMP_S if mode == "restamp" else 0.0)
+        if reason := flaw(order):
+            raise FaultError(reason)
+        return (order,), OWN_DURATION_S
+
+    # -- the run --------------------------------------------------------------------------------
+
+    def due(self, now_s: float) -> list[m.Injection | m.ActuatorFault]:
+        """Return the orders to send now, first or again: those that nobody has answered."""
+        begun = [o for o in self._ordered if not o.outcome and now_s >= o.begins_s]
+        for ordered in begun:
+            ordered.sent = True
+        return [order for o in begun for order in o.orders
+                if order.injection not in (o.finished if o.ending else o.affected)]
+
+    def hear(self, report: m.InjectionReport) -> str:
+        """Take a report; return what to tell, "" if there is nothing to say yet."""
+        for o in self._ordered:
+            if o.outcome or report.injection not in {x.injection for x in o.orders}:
+                continue
+            nodes = o.affected.setdefault(report.injection, {})
+            if len(nodes) >= MAX_PUBLISHERS and report.node not in nodes:
+                continue
+            nodes[report.node] = max(nodes.get(report.node, 0), report.affected)
+            o.reason = o.reason or report.reason
+            if report.finished:
+                o.finished.add(report.injection)
+            if len(o.finished) == len(o.orders):
+                return self._conclude(o)
+            if report.affected and o.effective is None:
+                o.effective = True
+                return f"fault {o.fault} takes effect"
+        return ""
+
+    def expire(self, now_s: float) -> list[str]:
+        """Return what to tell of faults from which no more reports are to be expected."""
+        told = []
+        now_s -= self._overhead_s
+        for o in self._ordered:
+            if o.outcome:
+                continue
+            missing = [x for x in o.orders if x.injection not in o.affected]
+            if missing and now_s > o.begins_s + TAKE_HOLD_S:
+                where = ", ".join(x.topic if isinstance(x, m.Injection) else "the base"
+                                  for x in missing)
+                o.reason = o.reason or f"nobody that publishes {where} answers"
+                told.append(self._conclude(o))
+            elif (math.isfinite(o.duration_s)
+                  and now_s > o.begins_s + o.duration_s + LATE_END_S):
+                o.reason = o.reason or "its publisher did not report the end, it was restarted"
+                told.append(self._conclude(o))
+            elif (math.isinf(o.duration_s) and o.effective is None
+                  and now_s > o.begins_s + FIRST_EFFECT_S):
+                o.effective = False
+                told.append(f"fault {o.fault} has had no effect for {FIRST_EFFECT_S:g} s; it stays")
+        return told
+
+    def _conclude(self, o: Ordered) -> str:
+        o.effective = o.changed > 0
+        unit = "messages changed"
+        if any(isinstance(x, m.ActuatorFault) for x in o.orders):
+            unit = "ticks of the base changed"
+        if o.effective:
+            o.outcome = f"over, {o.changed} {unit}" + (f"; {o.reason}" if o.reason else "")
+        else:
+            o.outcome = f"no effect: {o.reason or 'nothing was sent that it would have changed'}"
+        return f"fault {o.fault}: {o.outcome}"
+
+
+def places(all_topics: Iterable[Topic[Any]], nodes: Iterable[str], detections: Iterable[str],
+           recoveries: Iterable[str]) -> tuple[str, ...]:
+    """Return the keys of topics that can be disturbed, families spelt out.
+
+    Left out are the judge's (`world/`), those of the injections, and greetings and error reports.
+
+    Args:
+        all_topics: declared topics.
+        nodes: names of all nodes.
+        detections: names of detection modules.
+        recoveries: names of recovery modules.
+    """
+    members: Mapping[str, Iterable[str]] = {
+        topics.HEARTBEAT.key: [*nodes, *detections, *recoveries],
+        topics.DETECTION.key: detections,
+        topics.RECOVERY.key: recoveries,
+        topics.RECOVERY_COMMAND.key: recoveries,
+    }
+    found = []
+    for topic in all_topics:
+        if topic.key.startswith(("world/", "stub/")) or topic.key in UNTOUCHED:
+            continue
+        if topic.is_family:
+            found += [topic.key.replace("{name}", n) for n in members.get(topic.key, ())]
+        else:
+            found.append(topic.key)
+    return tuple(found)

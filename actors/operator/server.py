@@ -1,0 +1,305 @@
+"""The web side of the HMI: static files and a WebSocket, on loopback unless asked otherwise.
+
+It runs on the actor's own event loop and costs nothing while no page is open
+(`rampart.actors.web.server`, where connections are also let in and seen out).
+
+Who may do what is decided in `rampart.actors.web.access`, how much one may say in `hmi_limits`, and
+what may be said in `hmi_wishes`. The files are the same for everybody; everything else needs the
+token where there is one. Where there is none, only this process's user is let in at all.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from rampart.actors.operator.camera_eye import CameraError, CameraEye
+from rampart.actors.operator.feed import SEND_TIMEOUT_S, Feed, PageFeed
+from rampart.actors.operator.limits import MessageBudget, Verdict
+from rampart.actors.operator.requests import RefusedError, Wish, WishError, read_wish
+from rampart.actors.web.access import SUBPROTOCOL, Access, AccessError, is_loopback, shown_token
+from rampart.actors.web.server import WebServer, is_known, served
+
+LOOPBACK = "127.0.0.1"
+NO_TOKEN = 4401
+"""Close code of a WebSocket without the token; its page asks for it."""
+
+MAX_PAGES = 16
+MAX_MESSAGE_BYTES = 4096
+CLOSE_TIMEOUT_S = 1.0
+"""Real seconds for a goodbye to get into the socket."""
+
+_PAGE = Path(__file__).with_name("page")
+_FILES = {
+    "/": ("index.html", "text/html"),
+    "/style.css": ("style.css", "text/css"),
+    "/map.js": ("map.js", "text/javascript"),
+    "/tree.js": ("tree.js", "text/javascript"),
+    "/nodes.js": ("nodes.js", "text/javascript"),
+    "/log.js": ("log.js", "text/javascript"),
+    "/camera.js": ("camera.js", "text/javascript"),
+    "/dom.js": ("dom.js", "text/javascript"),
+    "/drive.js": ("drive.js", "text/javascript"),
+    "/faults.js": ("faults.js", "text/javascript"),
+    "/access.js": ("access.js", "text/javascript"),
+    "/operate.js": ("operate.js", "text/javascript"),
+    "/operate.css": ("operate.css", "text/css"),
+    "/app.js": ("app.js", "text/javascript"),
+}
+_CAMERA = "/camera.jpg"
+_REFUSAL = ("This page is for the user who runs the robot; you are another one of this machine. "
+            "With a token others get in too: launch.py --hmi-token-file FILE.")
+_HEADERS = {
+    "cache-control": "no-cache",
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; "
+        "require-trusted-types-for 'script'; trusted-types 'none'"),  # no text becomes HTML
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+}
+
+class PortError(OSError):
+    """The page's port cannot be bound."""
+
+
+@dataclass(frozen=True, slots=True)
+class Visitor:
+    """An open page: its number in this life of the HMI."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Handlers:
+    """Who deals with the pages.
+
+    Attributes:
+        came: returns what a new page is told first.
+        fulfil: acts on a page's wish and returns what to tell it; raises RefusedError.
+        left: hears of a page that was closed.
+    """
+
+    came: Callable[[Visitor], dict[str, Any]]
+    fulfil: Callable[[Wish, Visitor], str | dict[str, Any]]
+    left: Callable[[Visitor], None]
+
+
+class PageServer:
+    """Serves the operator's page.
+
+    Args:
+        port: TCP port; 0 lets the system choose one.
+        feed: what pages are shown.
+        handlers: who deals with the pages.
+        host: address to bind to.
+        token: what everybody has to show; "" for nothing, on loopback only.
+        camera: where pictures come from, or None.
+
+    Raises:
+        PortError: the address cannot be bound, or must not without a token.
+    """
+
+    def __init__(
+        self, port: int, feed: Feed, handlers: Handlers, host: str = LOOPBACK, token: str = "",
+        *, camera: CameraEye | None = None,
+    ) -> None:
+        self._feed = feed
+        self._camera = camera
+        self._handlers = handlers
+        self._visitors = 0
+        try:
+            Access(host, port, token)  # refused before anything is bound
+        except AccessError as error:
+            raise PortError(str(error)) from None
+        self._socket = _listen(host, port)
+        self.port: int = self._socket.getsockname()[1]
+        names = () if is_loopback(host) else (socket.gethostname(),)
+        self._access = Access(host, self.port, token, names)
+        self.pages = 0
+        self._server: WebServer | None = None
+
+    async def start(self) -> None:
+        """Begin to serve; to be awaited on the actor's loop."""
+        files = {path: (_PAGE / name).read_bytes() for path, (name, _) in _FILES.items()}
+
+        async def file(request: Request) -> Response:
+            path = request.url.path
+            return Response(files[path], media_type=_FILES[path][1], headers=_HEADERS)
+
+        app = Starlette(
+            routes=[*(Route(path, file) for path in _FILES), Route(_CAMERA, self._picture),
+                    WebSocketRoute("/ws", self._page)],
+            middleware=[Middleware(_Door, access=self._access)],
+        )
+        self._server = WebServer(
+            app, self._socket, refusal="" if self._access.token else _REFUSAL,
+            known=not self._access.token, ws_max_size=MAX_MESSAGE_BYTES)
+        await self._server.start()
+
+    def stop(self) -> None:
+        """Stop listening and say goodbye to the pages; harmless when not started."""
+        if self._server is None:
+            self._socket.close()
+        else:
+            self._server.stop()
+
+    async def _picture(self, request: Request) -> Response:
+        if request.headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
+            return PlainTextResponse("only for this page", 403)
+        try:
+            if self._camera is None:
+                raise CameraError("this system has no camera")
+            with served(request.scope):
+                return Response(await self._camera.picture(), media_type="image/jpeg",
+                                headers={"cache-control": "no-store"})
+        except CameraError as error:
+            return PlainTextResponse(str(error), 503)
+
+    async def _page(self, socket_: WebSocket) -> None:
+        offered = socket_.scope.get("subprotocols", ())
+        await socket_.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
+        if not _has_token(socket_, self._access):
+            await socket_.close(NO_TOKEN, "the token is missing or wrong")
+            return
+        if self.pages >= MAX_PAGES:
+            await socket_.close(1013, f"more than {MAX_PAGES} pages")
+            return
+        self.pages += 1
+        self._visitors += 1
+        visitor = Visitor(self._visitors)
+        try:
+            with served(socket_.scope), self._feed.page() as page:
+                await _send(socket_, self._handlers.came(visitor))
+                await _until_one_ends(self._talk(socket_, page, visitor),
+                                      self._push(socket_, page))
+        except (WebSocketDisconnect, RuntimeError, TimeoutError):
+            return  # the page has gone while it was being answered
+        finally:
+            self.pages -= 1
+            self._handlers.left(visitor)
+
+    async def _talk(self, socket_: WebSocket, page: PageFeed, visitor: Visitor) -> None:
+        loop = asyncio.get_running_loop()
+        budget = MessageBudget(loop.time())
+        while True:
+            message = await socket_.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            verdict = budget.spend(loop.time())
+            text = message.get("text") or message.get("bytes")
+            if verdict is Verdict.READ:
+                if not self._feed.heard(page, text):
+                    await _send(socket_, self._answer(text, visitor))
+            elif verdict is Verdict.TELL:
+                await _send(socket_, {"type": "error", "text": "too many messages from this page; "
+                                      "those beyond the limit are not read"})
+            elif verdict is Verdict.CLOSE:
+                await _close(socket_, 1008, "flooding: far too many messages")
+                return
+
+    async def _push(self, socket_: WebSocket, page: PageFeed) -> None:
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            try:
+                await self._feed.push(page, socket_.send_text)
+            except TimeoutError:
+                await _close(socket_, 1013, "this page does not keep up")
+
+    def _answer(self, text: str | bytes | None, visitor: Visitor) -> dict[str, Any]:
+        try:
+            told = self._handlers.fulfil(read_wish(text), visitor)
+        except (WishError, RefusedError) as error:
+            return {"type": "error", "text": str(error)}
+        return {"type": "done", "text": told} if isinstance(told, str) else told
+
+
+class _Door:
+    """Turns away whoever is not meant, before anything else is done."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app = app
+        self._access = access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        connection = HTTPConnection(scope)
+        hosts = connection.headers.getlist("host")
+        known = len(hosts) == 1 and self._access.own_host(hosts[0])
+        if scope["type"] == "websocket":
+            origin = connection.headers.get("origin")
+            if not (known and self._access.own_origin(origin)):
+                await send({"type": "websocket.close", "code": 1008})  # before it was accepted: 403
+                return
+        elif not known:
+            await PlainTextResponse("Invalid host header", 400)(scope, receive, send)
+            return
+        elif scope["path"] not in _FILES and not _has_token(connection, self._access):
+            await PlainTextResponse("The token is missing or wrong", 401)(scope, receive, send)
+            return
+        await self._app(scope, receive, send)
+
+
+def _has_token(connection: HTTPConnection, access: Access) -> bool:
+    permitted = access.permits(shown_token(
+        connection.headers.get("authorization"), connection.query_params.get("token"),
+        connection.scope.get("subprotocols", ())))
+    if permitted:
+        is_known(connection.scope)
+    return permitted
+
+
+async def _until_one_ends(*parts: Coroutine[Any, Any, None]) -> None:
+    """Run parts of a conversation side by side until one of them is over or raises."""
+    tasks = [asyncio.ensure_future(part) for part in parts]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _close(socket_: WebSocket, code: int, reason: str) -> None:
+    """Say goodbye; whoever takes nothing does not hear it."""
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(socket_.close(code, reason), CLOSE_TIMEOUT_S)
+
+
+async def _send(socket_: WebSocket, data: Any) -> None:
+    text = msgspec.json.encode(data).decode()
+    await asyncio.wait_for(socket_.send_text(text), SEND_TIMEOUT_S)
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    listener: socket.socket | None = None
+    try:
+        family, kind, number, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, kind, number)
+        # A respawned HMI takes its predecessor's port although old connections linger.
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen(16)
+        listener.setblocking(False)
+    except (OSError, OverflowError, UnicodeError) as error:
+        if listener is not None:
+            listener.close()
+        reason = getattr(error, "strerror", None) or str(error)
+        raise PortError(f"cannot serve the page on {host}:{port}: {reason}; "
+                        "choose another hmi_port") from None
+    return listener

@@ -1,0 +1,178 @@
+"""The fault tree with its barriers and the order of the recoveries, laid out for the page. Pure.
+
+The fault tree grows from left to right: its rows are then as high as a line of text and not as
+wide as one, so that it can be read on a telephone. What is lit is not said here: that changes, and
+is in the manager's status; the drawing changes only when the system is adapted.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from rampart.manager.drawing.diagram import Diagram, Situation, draw
+from rampart.manager.drawing.placing import place
+from rampart.manager.spec.schema import SystemSpec
+
+MAX_BOXES = 300
+"""A larger tree is not drawn: nobody could read it, and the layout would keep the node busy."""
+
+LETTERS = 23
+"""In a line of a box."""
+LINES = 3
+LINE = 14.0
+BOX_WIDTH = 156.0
+BARRIER = 78.0
+"""Length of the line before a box on which its barrier stands."""
+SYMBOL = 34.0
+"""Length of the gate behind a box."""
+STUB = 16.0
+"""Line before a box in a tree without barriers."""
+
+
+class Shape(msgspec.Struct, frozen=True):
+    """A box of a drawing; x and y are of its upper left corner, y grows downwards.
+
+    For an event: `gate` is its qualifier ("&", "≥2", "≥1"; "" for a basic event), `mechanism` the
+    barrier on it with its gates over detection and recovery modules, and `way` the names of the
+    events above it, up to and including the first with a barrier.
+    """
+
+    name: str
+    title: str
+    lines: tuple[str, ...]
+    x: float
+    y: float
+    width: float
+    height: float
+    gate: str = ""
+    mechanism: str = ""
+    detect: str = ""
+    recover: str = ""
+    detections: tuple[str, ...] = ()
+    recoveries: tuple[str, ...] = ()
+    way: tuple[str, ...] = ()
+
+
+class Line(msgspec.Struct, frozen=True):
+    """A line from an upper box to a lower one, through some points."""
+
+    upper: str
+    lower: str
+    points: tuple[tuple[float, float], ...]
+
+
+class Drawing(msgspec.Struct, frozen=True):
+    """Boxes and lines from (0, 0) to (width, height); `words` says the same to who cannot see."""
+
+    title: str
+    width: float
+    height: float
+    boxes: tuple[Shape, ...]
+    lines: tuple[Line, ...]
+    words: str = ""
+
+
+def draw_system(spec: SystemSpec) -> dict[str, Any]:
+    """Return the drawings of a system's fault tree and of its order of recoveries.
+
+    Either is None where the system has none, or one that is too large (see `note`).
+    """
+    order = spec.build_order()
+    tree = draw(spec, "fault-tree", order, spec.criteria, Situation())
+    ranks = draw(spec, "order", order, spec.criteria, Situation())
+    note = ""
+    if len(tree.boxes) > MAX_BOXES:
+        note = f"The fault tree has {len(tree.boxes)} events; up to {MAX_BOXES} are drawn."
+    return {
+        "title": spec.title or spec.name,
+        "strategy": spec.strategy,
+        "criteria": spec.criteria,
+        "note": note,
+        "tree": _fault_tree(spec, tree) if 0 < len(tree.boxes) <= MAX_BOXES else None,
+        "order": _order(ranks) if 0 < len(ranks.boxes) <= MAX_BOXES else None,
+    }
+
+
+def _fault_tree(spec: SystemSpec, diagram: Diagram) -> Drawing:
+    stem = BARRIER if spec.mechanisms else STUB
+    texts = {box.name: _wrap(box.title or box.name.replace("_", " ").capitalize())
+             for box in diagram.boxes}
+    tall = {name: LINE * max(2, len(lines)) + 12 for name, lines in texts.items()}
+    # The layout goes downwards; turned over, its x is our y.
+    placing = place({box.name: (tall[box.name], stem + BOX_WIDTH + (SYMBOL if box.gate else 0))
+                     for box in diagram.boxes}, diagram.edges, square=True)
+    mechanisms = {m.name: m for m in spec.mechanisms}
+    above: dict[str, list[str]] = {box.name: [] for box in diagram.boxes}
+    for upper, lower in diagram.edges:
+        above[lower].append(upper)
+    barriers = {box.name for box in diagram.boxes if box.mechanism}
+    boxes = []
+    for box in diagram.boxes:
+        at = placing.places[box.name]
+        mechanism = mechanisms.get(box.mechanism)
+        boxes.append(Shape(
+            box.name, box.title or box.name, texts[box.name], at.top + stem, at.left, BOX_WIDTH,
+            tall[box.name], _qualifier(box.gate, box.required), box.mechanism, box.detect,
+            box.recover, mechanism.detections if mechanism else (),
+            mechanism.recoveries if mechanism else (), _way(box.name, above, barriers)))
+    lines = tuple(Line(upper, lower, tuple((y, x) for x, y in points))
+                  for (upper, lower), points in zip(diagram.edges, placing.lines, strict=True))
+    return Drawing(diagram.title, placing.height, placing.width, tuple(boxes), lines,
+                   _in_words(diagram))
+
+
+def _order(diagram: Diagram) -> Drawing:
+    texts = {box.name: (box.name, *_wrap(box.subtitle)) for box in diagram.boxes}
+    tall = {name: LINE * len(lines) + 14 for name, lines in texts.items()}
+    placing = place({box.name: (BOX_WIDTH, tall[box.name]) for box in diagram.boxes},
+                    diagram.edges, square=False)
+    boxes = tuple(Shape(box.name, box.title or box.name, texts[box.name], at.left, at.top,
+                        BOX_WIDTH, tall[box.name])
+                  for box in diagram.boxes for at in (placing.places[box.name],))
+    lines = tuple(Line(upper, lower, points) for (upper, lower), points
+                  in zip(diagram.edges, placing.lines, strict=True))
+    return Drawing(diagram.title, placing.width, placing.height, boxes, lines,
+                   _in_words(diagram))
+
+
+def _qualifier(gate: str, required: int) -> str:
+    if not gate:
+        return ""
+    return "&" if gate == "and" else f"≥{required}"
+
+
+def _way(event: str, above: dict[str, list[str]], barriers: set[str]) -> tuple[str, ...]:
+    """Return the events that an event leads to until a barrier is met, that one included."""
+    way: dict[str, None] = {}
+    to_do = list(above[event])
+    while to_do:
+        upper = to_do.pop(0)
+        if upper not in way:
+            way[upper] = None
+            if upper not in barriers:
+                to_do += above[upper]
+    return tuple(way)
+
+
+def _wrap(text: str) -> tuple[str, ...]:
+    return tuple(textwrap.wrap(text, LETTERS, max_lines=LINES, placeholder="…"))
+
+
+def _in_words(diagram: Diagram) -> str:
+    below: dict[str, list[str]] = {}
+    names = {box.name: box.title or box.name for box in diagram.boxes}
+    for upper, lower in diagram.edges:
+        below.setdefault(upper, []).append(names[lower])
+    parts: list[str] = []
+    for box in diagram.boxes:
+        said: Sequence[str] = (
+            names[box.name] if box.title else box.name,
+            f"barrier {box.barrier_words}" if box.mechanism else "",
+            f"{box.gate_words} of {', '.join(below[box.name])}" if box.gate
+            else f"above {', '.join(below[box.name])}" if box.name in below else "")
+        parts.append(f"{'; '.join(filter(None, said))}.")
+    return " ".join(parts)

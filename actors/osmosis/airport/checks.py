@@ -1,0 +1,164 @@
+"""What must hold of an airport, checked once at load."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import shapely
+
+from rampart.actors.osmosis.airport.errors import Problem
+from rampart.actors.osmosis.airport.limits import MAX_GOALS_BY_EDGES, sides
+from rampart.actors.osmosis.airport.model import GOAL_MODES, GRAPH_REACH_M, Airport, Mission
+
+MIN_EDGE_CLEARANCE_M = 0.5
+"""An edge nearer than this to the prohibited area cannot be driven (half the robot's width)."""
+
+
+def problems(airport: Airport) -> Iterator[Problem]:
+    """Yield everything that is wrong, the fundamental first; later checks trust earlier ones."""
+    fundamental = list(_graph(airport))
+    yield from fundamental
+    if any(not found.tolerable for found in fundamental):
+        return
+    yield from _ground(airport)
+    yield from _lights(airport)
+    yield from _obstacles(airport)
+    yield from _search(sum(len(m.goals) for m in airport.missions.values()), "missions", airport)
+    for mission in airport.missions.values():
+        yield from mission_problems(mission, airport)
+
+
+def _graph(airport: Airport) -> Iterator[Problem]:
+    if not airport.nodes:
+        yield Problem("nodes", "empty", "a graph needs at least one node")
+    for name, at in airport.nodes.items():
+        if not all(math.isfinite(v) for v in at):
+            yield Problem(f"nodes.{name}", f"{at}", "coordinates must be finite numbers of metres")
+    for i, (a, b) in enumerate(airport.edges):
+        for name in (a, b):
+            if name not in airport.nodes:
+                yield Problem(f"edges[{i}]", repr(name), "unknown node; name one from nodes")
+        if a == b:
+            yield Problem(f"edges[{i}]", f"{a!r} to {b!r}", "an edge joins two different nodes")
+    pairs = Counter(frozenset(edge) for edge in airport.edges if edge[0] != edge[1])
+    for pair, times in pairs.items():
+        if times > 1:
+            yield Problem("edges", " to ".join(sorted(pair)), "edge given twice; once is enough",
+                          tolerable=True)
+
+
+def _search(goals: int, where: str, airport: Airport) -> Iterator[Problem]:
+    if goals * len(airport.edges) > MAX_GOALS_BY_EDGES:
+        yield Problem(where, f"{goals} goals on {len(airport.edges)} edges",
+                      f"their product must be at most {MAX_GOALS_BY_EDGES}")
+
+
+def _ground(airport: Airport) -> Iterator[Problem]:
+    if airport.allowed.is_empty:
+        yield Problem("surface", "empty", "the airport needs pavement to drive on")
+        return
+    start = airport.start
+    if not all(math.isfinite(v) for v in (start.x_m, start.y_m, start.yaw_rad)):
+        yield Problem("start", f"{start}", "the start pose must be finite")
+        return
+    if airport.prohibited_distance_m(start.x_m, start.y_m) <= 0:
+        yield Problem("start", f"({start.x_m:g}, {start.y_m:g})",
+                      "in the prohibited area; put it on the pavement", tolerable=True)
+    off_m = airport.nearest_on_graph(start.x_m, start.y_m).distance_m
+    if off_m > GRAPH_REACH_M:
+        yield Problem("start", f"({start.x_m:g}, {start.y_m:g})",
+                      f"{off_m:.1f} m from the graph; must be within {GRAPH_REACH_M:g} m")
+    off = _off_pavement(airport, list(airport.nodes.values()))
+    inside = [name for name, is_off in zip(airport.nodes, off, strict=True) if is_off]
+    for name in inside:
+        x_m, y_m = airport.nodes[name]
+        yield Problem(f"nodes.{name}", f"({x_m:g}, {y_m:g})",
+                      "in the prohibited area; put it on the pavement", tolerable=True)
+    yield from _edges(airport, set(inside))
+
+
+def _edges(airport: Airport, inside: set[str]) -> Iterator[Problem]:
+    """Yield edges that lead over grass or near it; those of nodes that are on it go without."""
+    edges = [(i, *edge) for i, edge in enumerate(airport.edges) if not inside & {*edge}]
+    lines = shapely.linestrings(
+        np.reshape([(airport.nodes[a], airport.nodes[b]) for _, a, b in edges], (-1, 2, 2)))
+    paved = shapely.covers(airport.allowed, lines)
+    rings = shapely.get_rings(shapely.get_parts(airport.allowed))
+    _, clear_m = shapely.STRtree(sides(rings)).query_nearest(
+        lines, all_matches=False, return_distance=True)
+    for (i, a, b), is_paved, distance_m in zip(edges, paved, clear_m, strict=True):
+        if not is_paved:
+            yield Problem(f"edges[{i}]", f"{a} to {b}", "passes through the prohibited area; "
+                          "lead it over pavement", tolerable=True)
+        elif distance_m < MIN_EDGE_CLEARANCE_M:
+            yield Problem(f"edges[{i}]", f"{a} to {b}", "nearer to the prohibited area than "
+                          f"{MIN_EDGE_CLEARANCE_M:g} m; the robot needs more room", tolerable=True)
+
+
+def _off_pavement(airport: Airport, points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Tell of each point whether it lies in the prohibited area or on its boundary."""
+    x_m, y_m = np.reshape(points, (-1, 2)).T
+    return [not paved for paved in shapely.contains_xy(airport.allowed, x_m, y_m).tolist()]
+
+
+def _lights(airport: Airport) -> Iterator[Problem]:
+    names = Counter(light.name for light in airport.lights)
+    for name, times in names.items():
+        if times > 1:
+            yield Problem("row", repr(name), "two lights of this name; names must be unique")
+    off = _off_pavement(airport, [(light.x_m, light.y_m) for light in airport.lights])
+    for light, is_off in zip(airport.lights, off, strict=True):
+        if not light.nominal_cd > 0:
+            yield Problem(f"row.{light.name}.nominal_cd", f"{light.nominal_cd:g}",
+                          "the nominal intensity must be positive")
+        if is_off:
+            yield Problem(f"row.{light.name}", f"({light.x_m:g}, {light.y_m:g})",
+                          "off the pavement; inset lights lie in it", tolerable=True)
+
+
+def _obstacles(airport: Airport) -> Iterator[Problem]:
+    names = Counter(preset.name for preset in airport.obstacles)
+    for name, times in names.items():
+        if times > 1:
+            yield Problem("obstacle", repr(name), "two obstacles of this name; must be unique")
+    for preset in airport.obstacles:
+        where = f"obstacle.{preset.name}"
+        if not 0.05 <= preset.radius_m <= 5.0:
+            yield Problem(f"{where}.radius_m", f"{preset.radius_m:g}", "must be in 0.05 to 5 m")
+        near_m = math.dist((preset.x_m, preset.y_m), (airport.start.x_m, airport.start.y_m))
+        if preset.appears_within_m is None and near_m < preset.radius_m + 0.5:
+            yield Problem(where, f"({preset.x_m:g}, {preset.y_m:g})",
+                          "stands on the start pose; move it at least 0.5 m clear")
+        for name in ("present_from_s", "appears_within_m", "gone_after_s"):
+            value = getattr(preset, name)
+            if value is not None and value < 0:
+                yield Problem(f"{where}.{name}", f"{value:g}", "must not be negative")
+
+
+def mission_problems(mission: Mission, airport: Airport) -> Iterator[Problem]:
+    """Yield what is wrong with one mission at an airport whose graph is sound."""
+    where = f"missions.{mission.name}"
+    if not mission.goals:
+        yield Problem(where, "empty", "a mission needs at least one goal")
+    yield from _search(len(mission.goals), where, airport)
+    off = _off_pavement(airport, [(goal.x_m, goal.y_m) for goal in mission.goals])
+    for i, goal in enumerate(mission.goals):
+        at = f"({goal.x_m:g}, {goal.y_m:g})"
+        spot = f"{where}.goals[{i}]"
+        if goal.mode not in GOAL_MODES:
+            yield Problem(f"{spot}.mode", repr(goal.mode), f"must be one of {GOAL_MODES}")
+        if not (math.isfinite(goal.x_m) and math.isfinite(goal.y_m)):
+            yield Problem(spot, at, "coordinates must be finite numbers of metres")
+            continue
+        nearest = airport.nearest_on_graph(goal.x_m, goal.y_m)
+        if nearest.distance_m > GRAPH_REACH_M:
+            yield Problem(spot, at, f"{nearest.distance_m:.1f} m from the graph; a mission point "
+                          f"must be within {GRAPH_REACH_M:g} m of it")
+        elif nearest.a not in airport.within_reach:
+            yield Problem(spot, at, "no way there from the start; connect the graph")
+        if off[i]:
+            yield Problem(spot, at, "in the prohibited area; put it on the pavement",
+                          tolerable=True)

@@ -1,0 +1,92 @@
+"""An airport as lines and rings to draw: for the operator's page and the inspection report.
+
+Everything stays in the `map` frame (metres, y north); whoever draws turns y over. The pavement
+and the prohibited area come as SVG path data, because only a path with holes can show a taxiway
+that runs round a patch of grass.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import shapely
+
+from rampart.actors.osmosis.airport.model import Airport
+
+FRAME_M = 4.0
+"""Strip of prohibited ground that is drawn round the airport."""
+
+_DECIMALS = 2
+
+
+class DrawnLight(msgspec.Struct, frozen=True):
+    """An inset light and the intensity it should have."""
+
+    name: str
+    row: str
+    x_m: float
+    y_m: float
+    nominal_cd: float
+
+
+class AirportDrawing(msgspec.Struct, frozen=True):
+    """What there is to draw of an airport.
+
+    Args:
+        name: of the airport.
+        bounds_m: (min x, min y, max x, max y) of the drawing.
+        prohibited: SVG path of the prohibited area within the bounds (fill rule evenodd).
+        surfaces: kind and SVG path of each piece of pavement; runways last, thus on top.
+        buildings: name and SVG path of each building.
+        nodes: graph node name to (x, y).
+        edges: (x1, y1, x2, y2) of each edge of the graph.
+        lights: all inset lights.
+        start: (x, y) where the robot stands at first.
+    """
+
+    name: str
+    bounds_m: tuple[float, float, float, float]
+    prohibited: str
+    surfaces: tuple[tuple[str, str], ...]
+    buildings: tuple[tuple[str, str], ...]
+    nodes: dict[str, tuple[float, float]]
+    edges: tuple[tuple[float, float, float, float], ...]
+    lights: tuple[DrawnLight, ...]
+    start: tuple[float, float]
+
+
+def draw(airport: Airport, tolerance_m: float = 0.02) -> AirportDrawing:
+    """Return the drawing of an airport; what is rounder than the tolerance has more points."""
+    x0, y0, x1, y1 = airport.bounds_m
+    return AirportDrawing(
+        name=airport.name,
+        bounds_m=(x0 - FRAME_M, y0 - FRAME_M, x1 + FRAME_M, y1 + FRAME_M),
+        prohibited=svg_path(airport.prohibited_polygon(FRAME_M), tolerance_m),
+        surfaces=tuple((s.kind, svg_path(s.polygon, tolerance_m)) for s in sorted(
+            airport.surfaces, key=lambda surface: surface.kind == "runway")),
+        buildings=tuple((b.name, svg_path(b.polygon, tolerance_m)) for b in airport.buildings),
+        nodes={name: (float(x), float(y)) for name, (x, y) in airport.nodes.items()},
+        edges=tuple((*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges),
+        lights=tuple(DrawnLight(light.name, light.row, light.x_m, light.y_m, light.nominal_cd)
+                     for light in airport.lights),
+        start=(airport.start.x_m, airport.start.y_m),
+    )
+
+
+def svg_path(shape: Any, tolerance_m: float = 0.02) -> str:
+    """Return SVG path data, in metres, of a shapely geometry made of polygons.
+
+    Parts without area (a union may leave lines) are not drawn.
+    """
+    rings: list[str] = []
+    for part in shapely.get_parts(shapely.simplify(shape, tolerance_m)):
+        if part.geom_type != "Polygon" or part.is_empty:
+            continue
+        rings += [_ring(ring) for ring in (part.exterior, *part.interiors)]
+    return "".join(rings)
+
+
+def _ring(ring: Any) -> str:
+    points = [f"{round(x, _DECIMALS):g} {round(y, _DECIMALS):g}" for x, y in ring.coords[:-1]]
+    return f"M{'L'.join(points)}Z"

@@ -1,0 +1,132 @@
+"""Loads airports and missions by name or file, in our own format or the paper authors'."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+from collections.abc import Iterator
+from pathlib import Path
+
+from rampart.actors.osmosis.airport import graph_format as foreign
+from rampart.actors.osmosis.airport import toml_format
+from rampart.actors.osmosis.airport.checks import mission_problems, problems
+from rampart.actors.osmosis.airport.errors import AirportError
+from rampart.actors.osmosis.airport.limits import MAX_WARNINGS
+from rampart.actors.osmosis.airport.mask import MaskScale
+from rampart.actors.osmosis.airport.model import Airport, Mission
+from rampart.actors.osmosis.airport.world import WorldTruth
+
+SHIPPED = Path(__file__).resolve().parents[3] / "systems" / "airports"
+"""Folder of the shipped airports."""
+
+DEFAULT_AIRPORT = "vallombre"
+
+
+def shipped_airports() -> tuple[str, ...]:
+    """Return the names of the shipped airports."""
+    return tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))
+
+
+def load_airport(name_or_path: str | Path, scale: MaskScale | None = None) -> Airport:
+    """Load and check an airport.
+
+    Args:
+        name_or_path: a shipped name, a `.toml` file, a `.graph` file with its image beside it,
+            or a folder that holds one `.toml` or one `.graph`.
+        scale: pixels to metres of an area image; default the authors'.
+
+    Returns:
+        The airport; for the authors' formats with `warnings` about what was tolerated.
+
+    Raises:
+        AirportError: one line that names file, field, value and what would be right.
+    """
+    return _load(name_or_path, scale)[0]
+
+
+def load_world(name_or_path: str | Path, scale: MaskScale | None = None) -> WorldTruth:
+    """Load the truth about an airport's lights, for the simulator only.
+
+    Raises:
+        AirportError: as `load_airport`.
+    """
+    return _load(name_or_path, scale)[1]
+
+
+def load_mission(name_or_path: str | Path, airport: Airport) -> Mission:
+    """Load a mission and check that it can be driven at `airport`.
+
+    Args:
+        name_or_path: a mission of the airport, or a `.miss` or `.toml` file.
+        airport: where it is to be driven.
+
+    Raises:
+        AirportError: as `load_airport`.
+    """
+    text = str(name_or_path)
+    if text in airport.missions:
+        return airport.missions[text]
+    path = Path(name_or_path)
+    if path.suffix == ".miss":
+        mission = foreign.read_mission(path)
+    elif path.suffix == ".toml":
+        mission = toml_format.read_mission(path)
+    else:
+        return airport.mission(text)
+    for problem in mission_problems(mission, airport):
+        raise AirportError(problem.line(str(path)))
+    return mission
+
+
+def _load(name_or_path: str | Path, scale: MaskScale | None) -> tuple[Airport, WorldTruth]:
+    with _readable(name_or_path):
+        path = _find(name_or_path)
+        if path.suffix == ".toml":
+            airport, truth = toml_format.read_airport(path)
+            own = True
+        else:
+            airport, truth = foreign.read_airport(path, scale), WorldTruth()
+            own = False
+    warnings = []
+    for problem in problems(airport):
+        if own or not problem.tolerable:
+            raise AirportError(problem.line(str(path)))
+        warnings.append(problem.line(path.name))
+    if len(warnings) > MAX_WARNINGS:
+        warnings[MAX_WARNINGS:] = [
+            f"{path.name}: and {len(warnings) - MAX_WARNINGS} more: mend these first"]
+    if not airport.lights:
+        warnings.append(f"{path.name}: lights: none: nothing will be measured")
+    return dataclasses.replace(airport, warnings=tuple(warnings), source=str(path)), truth
+
+
+@contextlib.contextmanager
+def _readable(name: str | Path) -> Iterator[None]:
+    """Have a name that is too long, or a folder that cannot be listed, refused like the rest."""
+    try:
+        yield
+    except OSError as error:
+        raise AirportError(f"{name}: cannot be read: {error.strerror}: give a file that exists"
+                           ) from None
+
+
+def _find(name_or_path: str | Path) -> Path:
+    text = str(name_or_path)
+    if text in shipped_airports():
+        return SHIPPED / f"{text}.toml"
+    path = Path(name_or_path)
+    if path.is_dir():
+        found = sorted([*path.glob("*.toml"), *path.glob("*.graph")])
+        if len(found) != 1:
+            listed = ", ".join(p.name for p in found) or "none"
+            raise AirportError(f"{path}: airport file: {listed}: need exactly one .toml or .graph")
+        return found[0]
+    if path.suffix in (".toml", ".graph"):
+        if not path.is_file():
+            raise AirportError(f"{path}: file: missing: give a file that exists")
+        return path
+    known = shipped_airports()
+    near = difflib.get_close_matches(text, known, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"shipped are: {', '.join(known)}"
+    raise AirportError(f"{text}: airport: no such name, folder, .toml or .graph: {hint}")

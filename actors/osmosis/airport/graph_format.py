@@ -1,0 +1,203 @@
+"""The formats of the paper's authors: graph as JSON, missions as lines, area as an image.
+
+    blagnac.graph      {"nodes": [{"id": "N1", "x": 24, "y": -62}], "edges": [["N1", "N2"]]}
+    MISSION_A.miss     x=20,y=-57,taxi=1      one goal a line; taxi=0 is light verification
+    blagnac_area.jpg   red pixels (R > 250) are prohibited; see `rampart.actors.osmosis.airport.mask`
+
+These files know no lights and no start pose: the robot starts at the graph's first node,
+looking along its first edge.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import shapely
+from shapely.geometry import MultiPoint, MultiPolygon
+
+from rampart.actors.osmosis.airport.errors import AirportError
+from rampart.actors.osmosis.airport.limits import (
+    MAX_COUNTS,
+    MAX_GOALS,
+    MAX_NAME,
+    MAX_NUMBER,
+    check_count,
+)
+from rampart.actors.osmosis.airport.mask import MaskScale, allowed_area
+from rampart.actors.osmosis.airport.model import Airport, Mission, MissionGoal, StartPose, Surface
+from rampart.files.reading import FileError, read_text, shown
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+MAX_TEXT_BYTES = 1 << 20
+"""Of a graph or a mission: 5,000 nodes and 10,000 edges take half of it."""
+
+_FIELD = re.compile(r"\s*(x|y|taxi)\s*=\s*(\S+)\s*")
+
+
+def read_airport(graph: Path, scale: MaskScale | None = None) -> Airport:
+    """Read a graph file with the area image and the missions that lie beside it.
+
+    Args:
+        graph: the `.graph` file.
+        scale: how pixels map to metres; default the authors'.
+
+    Raises:
+        AirportError: a file is missing or malformed.
+    """
+    nodes, edges = read_graph(graph)
+    image = _image_beside(graph)
+    allowed = _reached_by(nodes, allowed_area(image, scale or MaskScale()))
+    first, second = _first_edge(nodes, edges)
+    (x_m, y_m), (to_x, to_y) = nodes[first], nodes[second]
+    missions: dict[str, Mission] = {}
+    files = sorted(graph.parent.glob("*.miss"))
+    check_count(str(graph.parent), "*.miss", len(files), MAX_COUNTS["missions"])
+    for path in files:
+        mission = read_mission(path)
+        if mission.name in missions:
+            raise AirportError(f"{path}: mission name: {mission.name!r}: already used; rename it")
+        missions[mission.name] = mission
+    return Airport(
+        name=graph.stem,
+        nodes=nodes,
+        edges=edges,
+        allowed=allowed,
+        start=StartPose(x_m, y_m, math.atan2(to_y - y_m, to_x - x_m)),
+        surfaces=(Surface(graph.stem, "area", allowed),),
+        missions=missions,
+    )
+
+
+def _reached_by(nodes: dict[str, tuple[float, float]], area: Any) -> Any:
+    """Drop stray pavement that holds no node, such as marks at the image's rim."""
+    at = MultiPoint(list(nodes.values()))
+    parts = [part for part in shapely.get_parts(area) if part.intersects(at)]
+    return MultiPolygon(parts) if parts else area
+
+
+def read_graph(
+    path: Path,
+) -> tuple[dict[str, tuple[float, float]], tuple[tuple[str, str], ...]]:
+    """Read nodes and edges of a `.graph` file.
+
+    Raises:
+        AirportError: not JSON, or a node or edge of the wrong form.
+    """
+    try:
+        table = json.loads(_text(path))
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits; nesting
+        raise AirportError(f"{path}: not JSON: {error}: see the format's sample") from None
+    if not isinstance(table, dict) or not all(
+        isinstance(table.get(key), list) for key in ("nodes", "edges")
+    ):
+        raise AirportError(f"{path}: file: {shown(table)}: needs the lists nodes and edges")
+    for key in ("nodes", "edges"):
+        check_count(str(path), key, len(table[key]), MAX_COUNTS[key])
+    nodes: dict[str, tuple[float, float]] = {}
+    for i, entry in enumerate(table["nodes"]):
+        name, at = _node(entry, f"{path}: nodes[{i}]")
+        if name in nodes:
+            raise AirportError(f"{path}: nodes[{i}].id: {name!r}: given twice; must be unique")
+        nodes[name] = at
+    edges = []
+    for i, entry in enumerate(table["edges"]):
+        if not (isinstance(entry, list) and len(entry) == 2
+                and all(isinstance(end, str) for end in entry)):  # fmt: skip
+            raise AirportError(f'{path}: edges[{i}]: {shown(entry)}: must be ["N1", "N2"]')
+        for end in entry:
+            if end not in nodes:
+                raise AirportError(f"{path}: edges[{i}]: {end!r}: unknown node; name one of nodes")
+        edges.append((entry[0], entry[1]))
+    if not nodes:
+        raise AirportError(f"{path}: nodes: empty: a graph needs at least one node")
+    return nodes, tuple(edges)
+
+
+def read_mission(path: Path) -> Mission:
+    """Read a mission file; `MISSION_A.miss` gives mission "A".
+
+    Raises:
+        AirportError: a line of the wrong form, or no goal at all.
+    """
+    goals = []
+    for number, line in enumerate(_text(path).splitlines(), start=1):
+        if line.strip():
+            goals.append(_goal(line, f"{path}: line {number}"))
+            check_count(str(path), "goals", len(goals), MAX_GOALS)
+    if not goals:
+        raise AirportError(f"{path}: goals: empty: give lines such as x=20,y=-57,taxi=1")
+    return Mission(path.stem.removeprefix("MISSION_"), tuple(goals))
+
+
+def _goal(line: str, where: str) -> MissionGoal:
+    found = [_FIELD.fullmatch(part) for part in line.split(",")]
+    fields = {match.group(1): match.group(2) for match in found if match}
+    if len(found) != 3 or fields.keys() != {"x", "y", "taxi"}:
+        raise AirportError(f"{where}: {shown(line.strip())}: must be like x=20,y=-57,taxi=1")
+    if fields["taxi"] not in ("0", "1"):
+        raise AirportError(f"{where}: taxi={fields['taxi'][:20]}: 1 is taxi, 0 light verification")
+    x_m, y_m = (_number(fields[axis], f"{where}: {axis}") for axis in ("x", "y"))
+    return MissionGoal(x_m, y_m, "taxi" if fields["taxi"] == "1" else "light verification")
+
+
+def _node(entry: Any, where: str) -> tuple[str, tuple[float, float]]:
+    if not (isinstance(entry, dict) and isinstance(entry.get("id"), str)):
+        raise AirportError(f'{where}: {shown(entry)}: must be {{"id": "N1", "x": 0, "y": 0}}')
+    name = entry["id"]
+    if not name.isprintable() or len(name) > MAX_NAME:
+        raise AirportError(f"{where}.id: {shown(name)}: must be a name of at most {MAX_NAME} "
+                           "printable characters")
+    return name, (
+        _number(entry.get("x"), f"{where}.x"),
+        _number(entry.get("y"), f"{where}.y"),
+    )
+
+
+def _number(value: Any, where: str) -> float:
+    try:
+        if isinstance(value, bool):
+            raise TypeError
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise AirportError(f"{where}: {shown(value)}: must be a finite number of metres")
+    if abs(number) > MAX_NUMBER:
+        raise AirportError(f"{where}: {shown(value)}: must be within {MAX_NUMBER:,.0f} m of 0")
+    return number
+
+
+def _first_edge(
+    nodes: dict[str, tuple[float, float]], edges: tuple[tuple[str, str], ...]
+) -> tuple[str, str]:
+    first = next(iter(nodes))
+    for a, b in edges:
+        if first in (a, b):
+            return first, b if a == first else a
+    return first, first
+
+
+def _image_beside(graph: Path) -> Path:
+    images = sorted(p for p in graph.parent.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+    own = [p for p in images if p.stem.startswith(graph.stem)] or images
+    if len(own) != 1:
+        listed = ", ".join(p.name for p in own) or "none"
+        raise AirportError(
+            f"{graph}: area image: {listed}: need exactly one, {graph.stem}_area.jpg or .png"
+        )
+    return own[0]
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_text(path, MAX_TEXT_BYTES)
+    except OSError as error:
+        raise AirportError(
+            f"{path}: cannot be read: {error.strerror}: give a readable file"
+        ) from None
+    except FileError as error:
+        raise AirportError(f"{path}: file: {error}: give a text like the format's sample") from None

@@ -1,0 +1,90 @@
+"""Bridging a stale pose where it is used, by odometry, for a bounded distance.
+
+While localization is dead, frozen or late, its reader still hears the wheels. The last pose plus
+the way that odometry measured since *the pose's stamp* is where the robot is now: wheels and a
+straight way are good to a few millimetres per metre, a turn of a skid-steer robot to a tenth of a
+radian (docs/localization.md). That holds for some metres and not for ever, so beyond the bound
+there is no pose, and its reader has to stop.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections import deque
+from operator import itemgetter
+
+from rampart.actors.osmosis.control.plausible import is_possible, is_sane
+
+Pose2 = tuple[float, float, float]
+"""x m, y m, yaw rad."""
+
+AFTER_S = 0.15
+"""Three periods of the pose: an older one is stale."""
+
+_ODOMETRY_FRESH_S = 0.2
+_KEPT = 125
+"""Readings of odometry, 2.5 s: a pose may be stamped that much earlier."""
+
+_stamp_of = itemgetter(0)
+
+
+class DeadReckoning:
+    """Keeps the newest pose and the odometry since. Times are simulated seconds.
+
+    Args:
+        bridge_m: longest way from the last pose, m.
+        after_s: age of a pose from which on it is bridged, s.
+    """
+
+    def __init__(self, bridge_m: float, after_s: float = AFTER_S) -> None:
+        if not 0 < bridge_m < math.inf:
+            raise ValueError(f"bridge_m = {bridge_m!r}: must be metres, above 0")
+        self.bridge_m = bridge_m
+        self.after_s = after_s
+        self._pose: Pose2 | None = None
+        self._stamp_s = -math.inf
+        self._way: deque[tuple[float, Pose2, float]] = deque(maxlen=_KEPT)
+        self._start: tuple[float, Pose2, float] | None = None
+
+    def pose(self, stamp_s: float, pose: Pose2, now_s: float) -> None:
+        """Take a pose in `map`; one not newer, of the future, or no number changes nothing."""
+        if stamp_s > self._stamp_s and is_possible(stamp_s, now_s) and is_sane(*pose):
+            self._pose, self._stamp_s, self._start = pose, stamp_s, None
+
+    def odometry(self, stamp_s: float, pose: Pose2, now_s: float) -> None:
+        """Take a pose in `odom`."""
+        way = self._way
+        if not is_possible(stamp_s, now_s) or not is_sane(*pose):
+            return
+        if not way:
+            way.append((stamp_s, pose, 0.0))
+        elif stamp_s > way[-1][0]:
+            _, (x_m, y_m, _), made_m = way[-1]
+            way.append((stamp_s, pose, made_m + math.hypot(pose[0] - x_m, pose[1] - y_m)))
+
+    def estimate(self, now_s: float) -> Pose2 | None:
+        """Return the pose in `map`, bridged if need be; None if it is not known any more."""
+        if self._pose is None or now_s - self._stamp_s <= self.after_s:
+            return self._pose
+        way = self._way
+        if not way or now_s - way[-1][0] > _ODOMETRY_FRESH_S:
+            return None
+        start = self._start or self._find_start()
+        if start is None:
+            return None
+        self._start = start
+        _, (x0_m, y0_m, yaw0), made0_m = start
+        _, (x_m, y_m, yaw), made_m = way[-1]
+        if made_m - made0_m > self.bridge_m:
+            return None
+        turn = self._pose[2] - yaw0
+        cos, sin = math.cos(turn), math.sin(turn)
+        dx, dy = x_m - x0_m, y_m - y0_m
+        return (self._pose[0] + dx * cos - dy * sin, self._pose[1] + dx * sin + dy * cos,
+                math.remainder(yaw + turn, math.tau))
+
+    def _find_start(self) -> tuple[float, Pose2, float] | None:
+        """Return the odometry at the pose's stamp; None if it is older than what is kept."""
+        after = bisect_right(self._way, self._stamp_s + 1e-6, key=_stamp_of)
+        return self._way[after - 1] if after else None

@@ -1,0 +1,252 @@
+"""Light inspection: the intensity of each light of a row, measured in passing.
+
+The illuminance under the sensor is linear in the intensities of the lights near it,
+E = sum(I_j * g(d_j)), with g the photometric model of `rampart.actors.osmosis.airport.photometry`. Samples are matched
+to poses by their stamps, the intensity is the least-squares fit over the samples near a light,
+and what is left of a pose error along the way is fitted too, as a shift. So neither noise nor a
+late pose makes a good light look dim.
+
+A light is judged once, when the sensor has passed it with samples before, over and behind it.
+With samples missing it is not judged: no result rather than a false accusation. Below half its
+nominal intensity a light is unserviceable (ICAO Annex 14, 10.4).
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from operator import attrgetter
+
+import numpy as np
+
+from rampart.actors.osmosis.airport.photometry import SENSOR_HEIGHT_M, sensor_position
+from rampart.actors.osmosis.control.polyline import Array, Point
+
+DIM_BELOW = 0.5
+"""Ratio of measured to nominal intensity below which a light is dim (ICAO Annex 14, 10.4)."""
+
+OUT_BELOW = 0.05
+"""Ratio below which it is out."""
+
+
+@dataclass(frozen=True, slots=True)
+class RowLight:
+    """A light to be measured: name, place in `map`, and the intensity it should have."""
+
+    name: str
+    x_m: float
+    y_m: float
+    nominal_cd: float
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """Result for one light: `ratio` is measured by nominal intensity, `verdict` follows."""
+
+    light: str
+    intensity_cd: float
+    ratio: float
+    verdict: str
+
+
+@dataclass(frozen=True, slots=True)
+class InspectionLimits:
+    """What a measurement needs.
+
+    Args:
+        fit_radius_m: samples within this horizontal distance of a light enter its fit.
+        span_m: samples at least this far before and behind the light are needed.
+        aside_m: the sensor passes at most this far beside the light.
+        largest_gap_m: neighbouring samples of a fit are at most this far apart.
+        least_samples: fewer make no fit.
+        passed_m: a light is passed when the sensor is this far from it again.
+        neighbour_m: lights nearer to each other than this are fitted together.
+        shift_m: largest shift along the way that is tried, for a pose error.
+        pose_gap_s: a sample between two poses farther apart than this is not used.
+        keep_s: samples older than this are forgotten: a robot that waited is no longer sure.
+    """
+
+    fit_radius_m: float = 0.8
+    span_m: float = 0.3
+    aside_m: float = 0.35
+    largest_gap_m: float = 0.15
+    least_samples: int = 8
+    passed_m: float = 0.9
+    neighbour_m: float = 4.0
+    shift_m: float = 0.15
+    pose_gap_s: float = 0.3
+    keep_s: float = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Pose:
+    stamp_s: float
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+
+_stamp_s = attrgetter("stamp_s")
+
+
+def verdict(ratio: float) -> str:
+    """Return "ok", "dim" or "out" for a ratio of measured to nominal intensity."""
+    if ratio < OUT_BELOW:
+        return "out"
+    return "dim" if ratio < DIM_BELOW else "ok"
+
+
+class LightInspection:
+    """Collects poses and samples; gives each light one measurement once it is passed.
+
+    Args:
+        lights: the lights that may be met.
+        limits: what a measurement needs.
+        judged: names of lights that have their measurement already.
+    """
+
+    def __init__(
+        self,
+        lights: Iterable[RowLight],
+        limits: InspectionLimits | None = None,
+        judged: Iterable[str] = (),
+    ) -> None:
+        self._lights = tuple(lights)
+        self._limits = limits or InspectionLimits()
+        self._places = np.array([(li.x_m, li.y_m) for li in self._lights]).reshape(-1, 2)
+        self._x_m, self._y_m = np.ascontiguousarray(self._places.T)
+        self.judged: set[str] = set(judged)
+        self._poses: deque[_Pose] = deque(maxlen=60)
+        self._waiting: deque[tuple[float, float]] = deque(maxlen=60)
+        self._samples: dict[int, list[tuple[float, float, float, float]]] = {}
+
+    def pose(self, stamp_s: float, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Take a pose of `base_link` in `map` and when it was true; older ones are ignored."""
+        if not self._poses or stamp_s > self._poses[-1].stamp_s:
+            self._poses.append(_Pose(stamp_s, x_m, y_m, yaw_rad))
+
+    def sample(self, stamp_s: float, illuminance_lux: float) -> None:
+        """Take a reading of the light sensor and when it was measured."""
+        if math.isfinite(illuminance_lux):
+            self._waiting.append((stamp_s, illuminance_lux))
+
+    def take(self, *, ended: bool = False) -> list[Measurement]:
+        """Return the measurements of lights passed since the last call.
+
+        Args:
+            ended: the row is at its end: also judge lights that the sensor is past, but not yet
+                by the full distance.
+        """
+        self._place_samples()
+        found = []
+        here = self._sensor_now()
+        if here is None:
+            return []
+        for index in list(self._samples):
+            light = self._lights[index]
+            distance_m = math.dist(here, (light.x_m, light.y_m))
+            if distance_m < self._limits.passed_m and not ended:
+                continue
+            samples = self._samples.pop(index)
+            intensity_cd = self._fit(index, samples)
+            if intensity_cd is None or light.name in self.judged:
+                continue
+            ratio = intensity_cd / light.nominal_cd
+            self.judged.add(light.name)
+            found.append(Measurement(light.name, intensity_cd, ratio, verdict(ratio)))
+        return found
+
+    def _sensor_now(self) -> Point | None:
+        if not self._poses:
+            return None
+        last = self._poses[-1]
+        return sensor_position(last.x_m, last.y_m, last.yaw_rad)
+
+    def _place_samples(self) -> None:
+        """Give each sample whose time is between two poses its place, and to the lights near."""
+        while self._waiting and self._poses and self._waiting[0][0] <= self._poses[-1].stamp_s:
+            stamp_s, lux = self._waiting.popleft()
+            place = self._sensor_at(stamp_s)
+            if place is None or not self._lights:
+                continue
+            near = np.hypot(self._x_m - place[0], self._y_m - place[1]) <= (
+                self._limits.fit_radius_m)
+            for index in near.nonzero()[0] if np.count_nonzero(near) else ():
+                samples = self._samples.setdefault(int(index), [])
+                if samples and stamp_s - samples[0][0] > self._limits.keep_s:
+                    samples.clear()
+                samples.append((stamp_s, *place, lux))
+
+    def _sensor_at(self, stamp_s: float) -> Point | None:
+        after = bisect.bisect_left(self._poses, stamp_s, key=_stamp_s)
+        if after >= len(self._poses):
+            return None
+        b = self._poses[after]
+        if b.stamp_s == stamp_s:
+            return sensor_position(b.x_m, b.y_m, b.yaw_rad)
+        if after == 0:
+            return None
+        a = self._poses[after - 1]
+        span_s = b.stamp_s - a.stamp_s
+        if span_s > self._limits.pose_gap_s:
+            return None
+        share = (stamp_s - a.stamp_s) / span_s
+        turn = math.remainder(b.yaw_rad - a.yaw_rad, math.tau)
+        return sensor_position(
+            a.x_m + share * (b.x_m - a.x_m),
+            a.y_m + share * (b.y_m - a.y_m),
+            a.yaw_rad + share * turn,
+        )
+
+    def _fit(self, index: int, samples: list[tuple[float, float, float, float]]) -> float | None:
+        """Return the intensity in candela by least squares, or None if samples are missing."""
+        limits = self._limits
+        if len(samples) < limits.least_samples:
+            return None
+        table = np.array(samples)
+        places, lux = table[:, 1:3], table[:, 3]
+        along = self._way(places)
+        relative = places - self._places[index]
+        ahead = relative @ along
+        aside = np.abs(relative @ np.array((-along[1], along[0])))
+        order = np.argsort(ahead)
+        near = np.abs(ahead) < limits.span_m
+        gaps = np.diff(ahead[order])
+        if ahead.min() > -limits.span_m or ahead.max() < limits.span_m:
+            return None
+        if not near.any() or float(aside[near].min()) > limits.aside_m:
+            return None
+        if float(gaps.max()) > limits.largest_gap_m:
+            return None
+        others = np.hypot(*(self._places - self._places[index]).T) <= limits.neighbour_m
+        others[index] = False
+        columns = np.concatenate(((index,), np.flatnonzero(others)))
+        best = (math.inf, 0.0)
+        for shift_m in np.linspace(-limits.shift_m, limits.shift_m, 31):
+            moved = places + shift_m * along
+            offsets = moved[:, None, :] - self._places[None, columns, :]
+            kernel = _per_candela(np.hypot(offsets[:, :, 0], offsets[:, :, 1]))
+            # Neighbours farther off than the fit's radius hardly show: damping keeps them sane.
+            normal = kernel.T @ kernel + np.diag([0.0] + [1e-4] * (len(columns) - 1))
+            solution = np.linalg.solve(normal, kernel.T @ lux)
+            misfit = float(np.sum((kernel @ solution - lux) ** 2))
+            if misfit < best[0]:
+                best = (misfit, float(solution[0]))
+        return max(best[1], 0.0)
+
+    @staticmethod
+    def _way(places: Array) -> Array:
+        """Unit vector of the direction in which the samples lie."""
+        centred = places - places.mean(axis=0)
+        _, _, axes = np.linalg.svd(centred, full_matrices=False)
+        along: Array = axes[0]
+        return along if (places[-1] - places[0]) @ along >= 0 else -along
+
+
+def _per_candela(distance_m: Array) -> Array:
+    """Illuminance per candela, as `rampart.actors.osmosis.airport.photometry.illuminance_per_candela`, on arrays."""
+    square = distance_m**2 + SENSOR_HEIGHT_M**2
+    return np.asarray(SENSOR_HEIGHT_M / (square * np.sqrt(square)))

@@ -1,0 +1,269 @@
+"""Light verification: follow the row of lights straight on, wait in front of obstacles.
+
+Unlike in taxi mode the robot does not leave the row: a light is measured only if the sensor passes
+over it. In front of an obstacle it stops, and goes on when the way has been free for a moment
+(paper, section III). That is a wait for ever in front of one that stays, so it may be told to pass
+after a while: it drives round as in taxi mode, if the pavement has room, and comes back to the row
+behind. The lights that it thereby misses remain unmeasured.
+
+A light that was missed for another reason can be had by going back (`rampart.actors.osmosis.control.following.light_ledger`
+decides that): the robot turns round, drives back as far as it is told, and turns round again. It
+never drives in reverse, because the laser looks ahead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rampart.actors.osmosis.control.following.escape import EscapeLimits
+from rampart.actors.osmosis.control.following.path_follower import (
+    STANDSTILL,
+    Motion,
+    MotionLimits,
+    PathFollower,
+    Ramp,
+    braking_speed,
+    find_place,
+)
+from rampart.actors.osmosis.control.polyline import (
+    Array,
+    Hull,
+    Point,
+    Polyline,
+    Projection,
+    to_map,
+    wrap_angle,
+)
+
+_SAME_PLACE_M = 0.3
+_TURNS_RADPS = 0.3
+_BEHIND_RAD = 2.8
+
+
+@dataclass(frozen=True, slots=True)
+class RowLimits:
+    """How a row is followed.
+
+    Args:
+        speed_mps: speed along the row.
+        lookahead_m: distance of the point steered at.
+        stop_distance_m: free distance kept to an obstacle ahead of the hull; larger than what
+            the Safety Pilot keeps, so that the stop is the controller's own.
+        lane_margin_m: width added to the hull on each side when looking for obstacles.
+        clear_s: how long the way has to be free before going on.
+        overrun_m: the goal is reached within this distance of abeam.
+        goal_reach_m: farthest lateral distance at which the goal still counts as reached.
+        pass_after_s: how long the robot waits before it drives round an obstacle; infinite for
+            never, as in the paper.
+        edge_m: distance of the robot's centre to the prohibited area that driving round leaves.
+        give_up_s: how long it may be at a standstill while it drives round, before it waits again.
+    """
+
+    speed_mps: float = 0.8
+    lookahead_m: float = 1.0
+    stop_distance_m: float = 1.0
+    lane_margin_m: float = 0.2
+    clear_s: float = 1.0
+    overrun_m: float = 0.05
+    goal_reach_m: float = 1.1
+    pass_after_s: float = math.inf
+    edge_m: float = 1.15
+    give_up_s: float = 4.0
+
+
+class LightRow:
+    """Follows one row.
+
+    State: progress, how long it has waited, how long the way has been free, and the follower of
+    taxi mode while it drives round an obstacle.
+
+    Args:
+        waypoints: the row in `map`, at least one point; usually start and goal.
+        hull: footprint of the robot.
+        motion: acceleration and turn limits.
+        limits: how the row is followed.
+        edge_m: distance from a point in `map` to the prohibited area, for driving round obstacles;
+            without it there is no room to.
+        near_s_m: arc length at which the robot was last known to be, for one that resumes.
+    """
+
+    def __init__(
+        self,
+        waypoints: tuple[Point, ...],
+        hull: Hull | None = None,
+        motion: MotionLimits | None = None,
+        limits: RowLimits | None = None,
+        edge_m: Callable[[float, float], float] | None = None,
+        *,
+        near_s_m: float | None = None,
+    ) -> None:
+        self.line = self._line = Polyline(waypoints)
+        self._hull = hull or Hull()
+        self._motion = motion or MotionLimits()
+        self._limits = limits or RowLimits()
+        self._ramp = Ramp(self._motion)
+        self._s_m: float | None = None
+        self._free_for_s = math.inf
+        self._arrived = False
+        self._edge_m = edge_m
+        self._waited_s = 0.0
+        self._stood_s = 0.0
+        self._passing: PathFollower | None = None
+        self._resumed_at_m = near_s_m
+        self._back: LightRow | None = None
+
+    @property
+    def progress_m(self) -> float | None:
+        """Arc length at which the robot is; None before the first step."""
+        return self._s_m
+
+    @property
+    def is_off_course(self) -> bool:
+        """Whether it drives round an obstacle, or back."""
+        return self._passing is not None or self._back is not None
+
+    @property
+    def back_to(self) -> Point | None:
+        """Where in `map` it is driving back to; None while it is not."""
+        return self._back.line.end if self._back is not None else None
+
+    def go_back(self, to_s_m: float) -> None:
+        """Turn round, drive back to an arc length, turn round and go on from there.
+
+        Given up if something stands in the way for `give_up_s`.
+        """
+        if self._s_m is None:
+            return
+        self._arrived = False
+        self._passing = None
+        self._stood_s = 0.0
+        self._back = LightRow(self._line.part(self._s_m, to_s_m), self._hull, self._motion,
+                              replace(self._limits, pass_after_s=math.inf))
+        self._back._ramp = self._ramp  # it is the same robot
+
+    def go_on(self) -> None:
+        """Go back no further."""
+        self._back = None
+
+    @property
+    def is_passing(self) -> bool:
+        """Whether it drives round an obstacle."""
+        return self._passing is not None
+
+    def adopt(self, back_to: Point | None, *, passing: bool) -> None:
+        """Go back, drive round, or neither, as another follower of the same row does."""
+        if self._s_m is None:
+            return
+        if back_to is None:
+            self._back = None
+        elif self.back_to is None or math.dist(self.back_to, back_to) > _SAME_PLACE_M:
+            self.go_back(self._line.project(*back_to).s_m)
+        if passing and self._passing is None and self._back is None:
+            self._begin_to_pass(self._s_m)
+        elif not passing:
+            self._passing = None
+
+    def step(self, x_m: float, y_m: float, yaw_rad: float, points: Array, dt_s: float) -> Motion:
+        """Return the command for now; arguments as for `PathFollower.step`."""
+        line, limits = self._line, self._limits
+        if self._s_m is None:
+            foot = find_place(line, x_m, y_m, self._resumed_at_m)
+        else:
+            foot = line.project(x_m, y_m, self._s_m)
+        self._s_m = foot.s_m
+        to_go_m = line.length_m - foot.s_m
+        if self._back is not None:
+            back = self._back.step(x_m, y_m, yaw_rad, points, dt_s)
+            self._stood_s = self._stood_s + dt_s if back.waiting else 0.0
+            if not back.arrived and self._stood_s < limits.give_up_s:
+                return Motion(back.linear_mps, back.angular_radps, False, back.waiting,
+                              foot.segment, to_go_m)
+            self._back = None
+        if to_go_m <= limits.overrun_m and abs(foot.n_m) <= limits.goal_reach_m:
+            self._arrived = True
+        if self._arrived:
+            self._ramp.last = STANDSTILL
+            return Motion(0.0, 0.0, True, False, len(line.points) - 1, 0.0)
+        if self._passing is not None:
+            return self._pass(self._passing, (x_m, y_m, yaw_rad), foot, points, dt_s)
+
+        braking = self._motion.deceleration_mps2
+        cruise = min(limits.speed_mps, self._motion.max_linear_mps)
+        free_m = self._free(x_m, y_m, yaw_rad, points, foot.s_m)
+        allowed = braking_speed(free_m - limits.stop_distance_m, braking)
+        self._free_for_s = self._free_for_s + dt_s if allowed >= cruise else 0.0
+        if self._free_for_s < limits.clear_s:
+            allowed = min(allowed, self._ramp.last[0])  # an echo that comes and goes is there
+        waiting = allowed == 0.0
+        bearing = self._bearing(x_m, y_m, yaw_rad, foot.s_m)
+        if abs(bearing) > _BEHIND_RAD:  # either way round is as short: do not waver between them
+            turning = self._ramp.last[1]
+            bearing = math.copysign(bearing, turning if abs(turning) > _TURNS_RADPS else 1.0)
+        speed = 0.0
+        if abs(bearing) < self._motion.turn_in_place_rad:
+            approach = max(braking_speed(to_go_m, braking), 0.15)
+            speed = min(cruise * math.cos(bearing) ** 2, approach, allowed)
+        turn = 0.0 if waiting else self._motion.heading_gain_per_s * bearing
+        linear, angular = self._ramp.towards(speed, turn, dt_s)
+        stands = waiting and linear == 0.0
+        self._waited_s = self._waited_s + dt_s if stands else 0.0
+        if self._waited_s >= limits.pass_after_s:
+            self._waited_s = 0.0
+            self._begin_to_pass(foot.s_m)
+        return Motion(linear, angular, False, stands, foot.segment, to_go_m)
+
+    def _begin_to_pass(self, s_m: float) -> None:
+        """Take the follower of taxi mode, if the pavement is wide enough along the next metres."""
+        if self._edge_m is None:
+            return
+        usual = EscapeLimits()
+        ahead_m = range(math.ceil(usual.range_m + usual.depth_m) + 2)
+        room_m = min(self._edge_m(*self._line.point_at(min(s_m + far_m, self._line.length_m)))
+                     for far_m in ahead_m) - self._limits.edge_m
+        if room_m > self._hull.half_width_m:
+            self._stood_s = 0.0
+            self._passing = PathFollower(
+                self._line.points, self._hull, self._motion,
+                escape=replace(usual, max_deviation_m=min(usual.max_deviation_m, room_m)))
+
+    def _pass(
+        self, follower: PathFollower, pose: tuple[float, float, float], foot: Projection,
+        points: Array, dt_s: float,
+    ) -> Motion:
+        """Drive round, and hand back when on the row again with nothing in the way."""
+        motion = follower.step(*pose, points, dt_s)
+        self._ramp.last = (motion.linear_mps, motion.angular_radps)
+        self._arrived = motion.arrived
+        self._stood_s = self._stood_s + dt_s if motion.waiting else 0.0
+        heading_off = wrap_angle(self._line.heading_at(foot.s_m) - pose[2])
+        back = (follower.aside_m == 0.0 and abs(foot.n_m) < 0.1 and abs(heading_off) < 0.2
+                and self._free(*pose, points, foot.s_m) > self._limits.stop_distance_m + 0.5)
+        if back or self._stood_s >= self._limits.give_up_s:
+            self._passing = None
+            self._free_for_s = math.inf if back else 0.0
+        return motion
+
+    def _bearing(self, x_m: float, y_m: float, yaw_rad: float, s_m: float) -> float:
+        x_to, y_to = self._line.point_at(s_m + self._limits.lookahead_m)
+        return wrap_angle(math.atan2(y_to - y_m, x_to - x_m) - yaw_rad)
+
+    def _free(
+        self, x_m: float, y_m: float, yaw_rad: float, points: Array, s_m: float
+    ) -> float:
+        """Free distance ahead of the hull in the lane along the row; infinite if all is free."""
+        if len(points) == 0:
+            return math.inf
+        reach_m = 2.0 * self._limits.stop_distance_m + 4.0
+        echoes = self._line.coordinates(
+            to_map(points, x_m, y_m, yaw_rad), s_m - 1.0, s_m + reach_m
+        )
+        half_m = self._hull.half_width_m + self._limits.lane_margin_m
+        lane = (np.abs(echoes[:, 1]) < half_m) & (echoes[:, 0] > s_m)
+        ahead = echoes[lane, 0]
+        if not len(ahead):
+            return math.inf
+        return float(ahead.min()) - s_m - self._hull.half_length_m

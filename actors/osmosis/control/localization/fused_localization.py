@@ -1,0 +1,88 @@
+"""Localization by fusion: odometry, IMU, GPS and the absolute pose, any one of which may fail.
+
+In the place of `rampart.actors.osmosis.control.localization.localization`, the paper's, if a system's spec says so. It keeps
+nothing that a restart would lose: a new life starts from the first absolute pose and fix.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
+from rampart.actors.osmosis.control.localization.position_source import FilterLimits
+from rampart.actors.osmosis.messages import GpsFix, Imu, LocalizationStatus, Odometry, Pose
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.parameters import amount
+
+_PERIOD_S = 0.05
+
+
+class FusedLocalization(Actor):
+    """Publishes the fused pose with the stamp of its newest accepted reading.
+
+    It publishes none while it does not know one, so that a reader, and DM6, sees it grow old.
+
+    Parameters:
+        bridge_m: how far the robot may go on dead reckoning alone, m.
+    """
+
+    outputs = (topics.POSE, topics.LOCALIZATION_STATUS)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        limits = FilterLimits()
+        self._filter = PoseFilter(replace(
+            limits, bridge_m=amount(self.parameters, "bridge_m", limits.bridge_m)))
+        self._told_s = -math.inf
+
+    @on(topics.IMU)
+    def imu(self, message: Imu, header: Header) -> None:
+        """Take a reading of the gyro."""
+        self._filter.imu(header.stamp, message.yaw_rad, message.yaw_rate_radps,
+                         (message.accel_x_mps2, message.accel_y_mps2), self.clock.now())
+
+    @on(topics.ODOMETRY)
+    def odometry(self, message: Odometry, header: Header) -> None:
+        """Take a reading of the wheels."""
+        pose = message.pose
+        self._filter.odometry(header.stamp, (pose.x_m, pose.y_m, pose.yaw_rad),
+                              message.twist.linear_mps, self.clock.now())
+
+    @on(topics.ABSOLUTE_POSE)
+    def absolute_pose(self, message: Pose, header: Header) -> None:
+        """Take an absolute pose."""
+        self._filter.absolute_pose(header.stamp, message.x_m, message.y_m, message.yaw_rad,
+                                   self.clock.now())
+        self._tell_first()
+
+    @on(topics.GPS)
+    def gps(self, message: GpsFix, header: Header) -> None:
+        """Take a fix."""
+        self._filter.gps(header.stamp, (message.x_m, message.y_m),
+                         (message.velocity_x_mps, message.velocity_y_mps),
+                         message.accuracy_m, self.clock.now())
+        self._tell_first()
+
+    @every(_PERIOD_S)
+    def tell(self) -> None:
+        """Publish the pose, if there is a newer one."""
+        estimate = self._filter.estimate()
+        if estimate is not None and estimate.stamp_s > self._told_s:
+            self._told_s = estimate.stamp_s
+            self.publish(topics.POSE, Pose(estimate.x_m, estimate.y_m, estimate.yaw_rad),
+                         stamp=estimate.stamp_s)
+
+    @every(0.2)
+    def repeat(self) -> None:
+        """Say what the pose rests on."""
+        status = self._filter.status(self.clock.now())
+        self.publish(topics.LOCALIZATION_STATUS, LocalizationStatus(
+            status.in_use, status.excluded, status.position_sd_m, status.heading_sd_rad,
+            status.bridged_m))
+
+    def _tell_first(self) -> None:
+        """Publish the first pose at once, so that a respawn costs no extra period."""
+        if self._told_s == -math.inf:
+            self.tell()

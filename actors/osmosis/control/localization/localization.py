@@ -1,0 +1,38 @@
+"""Localization: the robot's pose for all who need it, stamped with when it was measured.
+
+The paper's localization is the simulator's absolute pose (section V). The stamp is that of the
+measurement, not of its passing on: a pose that arrives late must look old to DM6.
+"""
+
+from __future__ import annotations
+
+import math
+
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.plausible import is_possible
+from rampart.actors.osmosis.messages import Pose
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+
+
+def is_newer(pose: Pose, stamp_s: float, last_stamp_s: float, now_s: float) -> bool:
+    """Whether a measurement is usable and later than the last one passed on."""
+    return stamp_s > last_stamp_s and is_possible(stamp_s, now_s) and all(
+        math.isfinite(value) for value in (pose.x_m, pose.y_m, pose.yaw_rad)
+    )
+
+
+class Localization(Actor):
+    """Passes the absolute pose on; keeps nothing that a restart would lose."""
+
+    outputs = (topics.POSE,)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self._last_stamp_s = -math.inf
+
+    @on(topics.ABSOLUTE_POSE)
+    def absolute_pose(self, pose: Pose, header: Header) -> None:
+        """Pass a measurement on with its own stamp."""
+        if is_newer(pose, header.stamp, self._last_stamp_s, self.clock.now()):
+            self._last_stamp_s = header.stamp
+            self.publish(topics.POSE, pose, stamp=header.stamp)

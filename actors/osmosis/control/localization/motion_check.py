@@ -1,0 +1,189 @@
+"""Whether odometry and IMU can be believed, each by what it says twice.
+
+Both devices report an integral and its rate: odometry a pose and a twist, the IMU a heading and a
+turning rate. The two come from the same wheels and the same gyro, so what they say about the way
+since the last message must be the same, up to rounding: a parity check with no model of the robot
+in it (analytical redundancy; Isermann, "Fault-Diagnosis Systems", 2006, chapter 10). What passes
+as one step may add up over many, so the difference is also summed up, and forgotten slowly.
+
+Besides, a MEMS device never repeats itself to the last bit; one that does is stuck, though its
+stamps be fresh. Wheels that stand do repeat themselves, so odometry has no such check.
+
+A device that has failed is believed again when it has been without a flaw for a while.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from rampart.actors.osmosis.control.localization.planar_ekf import wrap
+from rampart.actors.osmosis.control.plausible import is_possible, is_sane
+
+BACK_AFTER_S = 1.0
+"""How long a device must have been without a flaw to be believed again."""
+
+LONGEST_STEP_S = 0.2
+"""After a longer gap a message says nothing about the way meanwhile, right or wrong."""
+
+_FLAT_READINGS = 3
+"""The same reading so many times in a row is a stuck device."""
+
+
+@dataclass(frozen=True, slots=True)
+class ParityLimits:
+    """How much integral and rate may differ.
+
+    Args:
+        step: in one step, m or rad.
+        sum: of all, with forgetting, m or rad.
+        forget_s: time constant of the forgetting. A rate error r adds up to r * forget_s.
+        fastest: rate beyond which a step is impossible, m/s or rad/s.
+    """
+
+    step: float
+    sum: float
+    forget_s: float
+    fastest: float
+
+
+ODOMETRY_PARITY = ParityLimits(step=0.02, sum=0.05, forget_s=1.0, fastest=3.6)
+"""Measured without a fault: 1e-6 m a step, 0.6 mm where a message was lost at 1.5 m/s2. A tenth of
+a metre per second too much reaches the sum's limit in 0.7 s. The drive can do 3 m/s."""
+
+IMU_PARITY = ParityLimits(step=0.02, sum=0.02, forget_s=2.0, fastest=3.6)
+"""Measured without a fault: below 1e-15 rad a step, 0.4 mrad where a message was lost at 4 rad/s2.
+Two hundredths of a radian per second reach the sum's limit in 1.4 s."""
+
+
+class Trust:
+    """Whether a source is believed, and since when it has been without a flaw.
+
+    Attributes:
+        reason: why it is not believed; "" if it is.
+    """
+
+    __slots__ = ("_clean_since_s", "reason")
+
+    def __init__(self) -> None:
+        self.reason = ""
+        self._clean_since_s = -math.inf
+
+    def flaw(self, reason: str, stamp_s: float) -> None:
+        """Note a flaw: it is not believed from now on; the first reason stays."""
+        self.reason = self.reason or reason
+        self._clean_since_s = stamp_s
+
+    def clean(self, stamp_s: float) -> None:
+        """Note a message without a flaw."""
+        if self.reason and stamp_s - self._clean_since_s >= BACK_AFTER_S:
+            self.reason = ""
+
+
+class OdometryCheck:
+    """Takes odometry messages and gives the way made since the last one.
+
+    Attributes:
+        trust: whether it is believed.
+        stamp_s: of the newest message.
+        speed_mps: of the newest message.
+    """
+
+    def __init__(self) -> None:
+        self.trust = Trust()
+        self.stamp_s = -math.inf
+        self.speed_mps = 0.0
+        self._pose = (0.0, 0.0, 0.0)
+        self._sum = (0.0, 0.0)
+
+    def take(self, stamp_s: float, pose: tuple[float, float, float], linear_mps: float
+             ) -> tuple[float, float, float] | None:
+        """Take a message; return (duration s, way forward m, turn rad) since the last one.
+
+        Args:
+            stamp_s: when it was measured.
+            pose: x m, y m, yaw rad in `odom`.
+            linear_mps: speed.
+
+        Returns:
+            None for the first message, one after a gap, an old one, one that is no number, and
+            one with a flaw; `trust` may deny more.
+        """
+        if not stamp_s > self.stamp_s or not is_sane(*pose, linear_mps):
+            return None
+        then_s, was = self.stamp_s, self._pose
+        self.stamp_s, self._pose, self.speed_mps = stamp_s, pose, linear_mps
+        x_m, y_m, yaw_rad = pose
+        dt_s = stamp_s - then_s
+        if dt_s > LONGEST_STEP_S:
+            return None
+        limits = ODOMETRY_PARITY
+        turn = wrap(yaw_rad - was[2])
+        middle = was[2] + turn / 2
+        cos, sin = math.cos(middle), math.sin(middle)
+        dx, dy = x_m - was[0], y_m - was[1]
+        forward_m = dx * cos + dy * sin
+        off_x, off_y = dx - linear_mps * dt_s * cos, dy - linear_mps * dt_s * sin
+        if abs(linear_mps) > limits.fastest or math.hypot(off_x, off_y) > limits.step + dt_s**2:
+            self._sum = (0.0, 0.0)
+            self.trust.flaw("pose and twist contradict each other", stamp_s)
+            return None
+        keep = max(0.0, 1.0 - dt_s / limits.forget_s)
+        self._sum = sum_x, sum_y = self._sum[0] * keep + off_x, self._sum[1] * keep + off_y
+        if sum_x * sum_x + sum_y * sum_y > limits.sum**2:
+            self.trust.flaw("pose and twist drift apart", stamp_s)
+        else:
+            self.trust.clean(stamp_s)
+        return dt_s, forward_m, turn
+
+
+class ImuCheck:
+    """Takes IMU messages and gives the heading at any time near the newest one.
+
+    Attributes:
+        trust: whether it is believed.
+        stamp_s: of the newest message.
+        yaw_rad: heading of the newest message.
+        rate_radps: turning rate of the newest message.
+    """
+
+    def __init__(self) -> None:
+        self.trust = Trust()
+        self.stamp_s = -math.inf
+        self.yaw_rad = 0.0
+        self.rate_radps = 0.0
+        self._acceleration = (0.0, 0.0)
+        self._sum = 0.0
+        self._flat = 0
+
+    def take(self, stamp_s: float, yaw_rad: float, rate_radps: float,
+             acceleration: tuple[float, float], now_s: float) -> None:
+        """Take a message; the acceleration is along x and y, m/s2."""
+        if not stamp_s > self.stamp_s or not is_possible(stamp_s, now_s) \
+                or not is_sane(yaw_rad, rate_radps, *acceleration):
+            return
+        then_s, then_yaw = self.stamp_s, self.yaw_rad
+        same = (rate_radps == self.rate_radps and yaw_rad == then_yaw
+                and acceleration == self._acceleration)
+        self._flat = self._flat + 1 if same else 0
+        self.stamp_s, self.yaw_rad, self.rate_radps = stamp_s, yaw_rad, rate_radps
+        self._acceleration = acceleration
+        dt_s = stamp_s - then_s
+        if dt_s > LONGEST_STEP_S:
+            return
+        limits = IMU_PARITY
+        off = wrap(yaw_rad - then_yaw - rate_radps * dt_s)
+        self._sum = self._sum * max(0.0, 1.0 - dt_s / limits.forget_s) + off
+        if abs(rate_radps) > limits.fastest or not -limits.step < off < limits.step:
+            self._sum = 0.0
+            self.trust.flaw("heading and turning rate contradict each other", stamp_s)
+        elif abs(self._sum) > limits.sum:
+            self.trust.flaw("heading and turning rate drift apart", stamp_s)
+        elif self._flat >= _FLAT_READINGS:
+            self.trust.flaw("repeats the same reading", stamp_s)
+        elif self.trust.reason:
+            self.trust.clean(stamp_s)
+
+    def heading_at(self, stamp_s: float) -> float:
+        """Return the heading at a time near the newest message, rad, not wrapped."""
+        return self.yaw_rad + self.rate_radps * (stamp_s - self.stamp_s)

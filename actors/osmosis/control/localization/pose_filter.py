@@ -1,0 +1,455 @@
+"""Where the robot is, from four sources of which any one may fail.
+
+A Kalman filter alone does not isolate faults. It trusts a precise source that lies slowly, follows
+it, and then rejects the honest one. So three witnesses of the position are held against each other,
+absolute pose, GPS and dead reckoning (wheels and gyro), and two that agree outvote the third:
+
+* *Both positions agree*: they are right, whatever dead reckoning says. If neither fits the filter,
+  the prediction was wrong: the filter starts anew from them, and wheels or gyro are excluded.
+* *They contradict each other*: the one that has moved otherwise than the wheels in the last seconds
+  is excluded. If neither has done so clearly, both are excluded once they are far apart.
+* *One fails the gate alone* (normalised innovation squared): it is not taken in, and if it goes on
+  it is excluded.
+* *The only one left* is excluded when it moves otherwise than the wheels: one against one.
+
+What the wheels and the gyro say is checked before it is used (`motion_check`). An excluded source
+is believed again when it has fitted for a second without a flaw.
+
+While fewer than two witnesses agree the filter dead-reckons, and counts the way. Beyond `bridge_m`
+it gives no estimate: not knowing is better than being wrong with confidence.
+
+Times are simulated seconds, positions and headings are those of `base_link` in `map`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck, Trust
+from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf, wrap
+from rampart.actors.osmosis.control.localization.position_source import FilterLimits, PositionSource
+from rampart.actors.osmosis.control.plausible import AHEAD_S, is_sane
+
+ABSOLUTE_POSE, GPS, ODOMETRY, IMU = "absolute pose", "GPS", "odometry", "IMU"
+
+_MAX_AGE_S = 0.3
+"""A reading that arrives later is not used: the robot has moved on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A pose in `map` and when it was true."""
+
+    stamp_s: float
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class FilterStatus:
+    """What the estimate rests on; standard deviations are infinite before there is one."""
+
+    in_use: tuple[str, ...]
+    excluded: tuple[tuple[str, str], ...]
+    position_sd_m: float
+    heading_sd_rad: float
+    bridged_m: float
+
+
+class PoseFilter:
+    """Fuses the sources. Hand it each reading as it comes; ask for `estimate` when one is due.
+
+    Args:
+        limits: noise, gates and bounds.
+
+    Attributes:
+        imu: takes an IMU reading: stamp s, yaw rad, rate rad/s, acceleration along x and y m/s2
+            as a pair, and what time it is.
+    """
+
+    def __init__(self, limits: FilterLimits | None = None) -> None:
+        self.limits = limits or FilterLimits()
+        self._ekf: PlanarEkf | None = None
+        self._wheels = OdometryCheck()
+        self._gyro = ImuCheck()
+        self.imu = self._gyro.take  # at 50 Hz a call of its own would show
+        self._pose = PositionSource(ABSOLUTE_POSE, fresh_s=0.2, patience=4)
+        self._gps = PositionSource(GPS, fresh_s=0.35, patience=3)
+        self._time_s = -math.inf
+        self._speed_mps = 0.0
+        self._track = (0.0, 0.0)
+        self._apart = (0.0, 0.0)
+        self._together = 0
+        self._gyro_used: float | None = None
+        self._gyro_off = 0.0
+        self._first_s: float | None = None
+        self._bridged_m = 0.0
+
+    # -- results --------------------------------------------------------------------------------
+
+    def estimate(self) -> Estimate | None:
+        """Return the pose as of the newest accepted reading, or None while it is not known."""
+        ekf = self._ekf
+        if ekf is None or self._lost(ekf):
+            return None
+        return Estimate(self._time_s, ekf.x_m, ekf.y_m, ekf.yaw_rad)
+
+    def status(self, now_s: float) -> FilterStatus:
+        """Return which sources are in use, which not and why, and how sure the estimate is."""
+        found = {
+            **{source.name: _state(source.trust, source.stamp_s, source.fresh_s, now_s)
+               for source in (self._pose, self._gps)},
+            ODOMETRY: _state(self._wheels.trust, self._wheels.stamp_s, _WHEELS_FRESH_S, now_s),
+            IMU: _state(self._gyro.trust, self._gyro.stamp_s, _GYRO_FRESH_S, now_s),
+        }
+        ekf = self._ekf
+        return FilterStatus(
+            tuple(name for name, reason in found.items() if not reason),
+            tuple((name, reason) for name, reason in found.items() if reason),
+            ekf.position_sd_m if ekf else math.inf, ekf.heading_sd_rad if ekf else math.inf,
+            self._bridged_m)
+
+    def _lost(self, ekf: PlanarEkf) -> bool:
+        blind = not self._wheels_usable(self._time_s) and not (
+            self._pose.usable(self._time_s) or self._gps.usable(self._time_s))
+        return (blind or self._bridged_m > self.limits.bridge_m
+                or ekf.position_sd_m > self.limits.largest_sd_m)
+
+    # -- wheels and gyro ------------------------------------------------------------------------
+
+    def odometry(self, stamp_s: float, pose: tuple[float, float, float], linear_mps: float,
+                 now_s: float) -> None:
+        """Take an odometry reading: pose (x m, y m, yaw rad) in `odom`, speed in `base_link`."""
+        if not _timely(stamp_s, now_s):
+            return
+        wheels = self._wheels
+        step = wheels.take(stamp_s, pose, linear_mps)
+        if step is None or self._ekf is None:
+            return
+        dt_s, forward_m, turn_rad = step
+        if wheels.trust.reason:
+            if abs(forward_m / dt_s - self._speed_mps) > _OTHER_SPEED_MPS:
+                wheels.trust.flaw(wheels.trust.reason, stamp_s)
+            return
+        self._speed_mps = linear_mps
+        rest_s = stamp_s - self._time_s
+        if rest_s <= 0:
+            return
+        if rest_s > dt_s + _WHEELS_FRESH_S:  # what was in between nobody has seen
+            self._ekf.doubt_position(_TOP_SPEED_MPS * (rest_s - dt_s))
+            self._bridged_m += _TOP_SPEED_MPS * (rest_s - dt_s)
+        # After a while without wheels the filter may be part of the way along this step.
+        share = rest_s / dt_s if rest_s < dt_s else 1.0
+        self._move(self._ekf, stamp_s, forward_m * share, turn_rad * share)
+
+    def _wheels_usable(self, now_s: float) -> bool:
+        return not self._wheels.trust.reason and now_s - self._wheels.stamp_s <= _WHEELS_FRESH_S
+
+    def _gyro_usable(self, now_s: float) -> bool:
+        return not self._gyro.trust.reason and now_s - self._gyro.stamp_s <= _GYRO_FRESH_S
+
+    def _move(self, ekf: PlanarEkf, stamp_s: float, forward_m: float, turn_rad: float | None
+              ) -> None:
+        """Predict up to a time; `turn_rad` by the wheels, None without them."""
+        limits = self.limits
+        dt_s = stamp_s - self._time_s
+        wheels = turn_rad is not None
+        if self._gyro_usable(stamp_s):
+            heading = self._gyro.heading_at(stamp_s)
+            before = self._gyro_used
+            turn = turn_rad or 0.0 if before is None else wrap(heading - before)
+            self._gyro_used = heading
+            turn_variance = _GYRO_RAD2_PER_S * dt_s
+        else:
+            self._gyro_used = None
+            turn = turn_rad or 0.0
+            turn_variance = ((_WHEEL_TURN_SHARE * turn) ** 2 + _WHEEL_RAD2_PER_S * dt_s if wheels
+                             else (_UNKNOWN_TURN_RADPS * dt_s) ** 2)
+        variance = limits.way_m2_per_m * abs(forward_m) + limits.way_m2_per_rad * abs(turn)
+        if not wheels:
+            variance += (_UNKNOWN_SPEED_MPS * dt_s) ** 2
+        dx, dy = ekf.predict(forward_m, turn, variance, turn_variance)
+        self._track = (self._track[0] + dx, self._track[1] + dy)
+        self._time_s = stamp_s
+        witnesses = (self._pose.usable(stamp_s) + self._gps.usable(stamp_s)
+                     + (wheels or self._wheels_usable(stamp_s)))
+        if witnesses >= 2:
+            self._bridged_m = 0.0
+        else:
+            self._bridged_m += max(abs(forward_m), _CREEP_MPS * dt_s)
+
+    def _catch_up(self, ekf: PlanarEkf, stamp_s: float) -> None:
+        """Without wheels, go on with the last known speed up to a reading."""
+        dt_s = stamp_s - self._time_s
+        if dt_s > 0 and not self._wheels_usable(stamp_s):
+            self._move(ekf, stamp_s, self._speed_mps * dt_s, None)
+
+    # -- positions ------------------------------------------------------------------------------
+
+    def absolute_pose(self, stamp_s: float, x_m: float, y_m: float, yaw_rad: float,
+                      now_s: float) -> None:
+        """Take an absolute pose."""
+        source = self._pose
+        if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s \
+                or not is_sane(x_m, y_m, yaw_rad):
+            return
+        then_s, was = source.stamp_s, source.reading
+        source.stamp_s, source.reading = stamp_s, (x_m, y_m, yaw_rad)
+        ekf = self._ekf
+        if ekf is None:
+            self._try_to_start(now_s)
+            return
+        limits = self.limits
+        self._catch_up(ekf, stamp_s)
+        x_m, y_m = self._bring_up(ekf, source, stamp_s - then_s)
+        yaw_rad += self._gyro.rate_radps * (self._time_s - stamp_s) if self._gyro_usable(
+            stamp_s) else 0.0
+        self._weigh_gyro(ekf, stamp_s)
+        variance, heading_variance = limits.absolute_sd_m**2, limits.absolute_sd_rad**2
+        fits = (ekf.position_nis(x_m, y_m, variance) <= limits.gate
+                and ekf.heading_nis(yaw_rad, heading_variance) <= limits.gate)
+        if self._judge(ekf, source, self._gps, fits):
+            ekf.update_position(x_m, y_m, variance)
+            ekf.update_heading(yaw_rad, heading_variance)
+            dt_s = stamp_s - then_s
+            if dt_s <= _MAX_AGE_S and not self._wheels_usable(stamp_s) \
+                    and not self._gps.usable(stamp_s):
+                made = source.reading[0] - was[0], source.reading[1] - was[1]
+                self._speed_mps = (made[0] * math.cos(ekf.yaw_rad)
+                                   + made[1] * math.sin(ekf.yaw_rad)) / dt_s
+
+    def gps(self, stamp_s: float, position: tuple[float, float], velocity: tuple[float, float],
+            accuracy_m: float, now_s: float) -> None:
+        """Take a GPS fix, m, with its velocity over ground, m/s, both in `map`."""
+        source = self._gps
+        x_m, y_m = position
+        if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s or not accuracy_m >= 0 \
+                or not is_sane(x_m, y_m, accuracy_m) or not math.hypot(*velocity) <= _FASTEST_MPS:
+            return
+        then_s = source.stamp_s
+        same = (x_m, y_m, 0.0) == source.reading and velocity == source.velocity
+        source.repeats = source.repeats + 1 if same else 0
+        source.stamp_s, source.reading, source.velocity = stamp_s, (x_m, y_m, 0.0), velocity
+        ekf = self._ekf
+        if ekf is None:
+            self._try_to_start(now_s)
+            return
+        limits = self.limits
+        self._catch_up(ekf, stamp_s)
+        x_m, y_m = self._bring_up(ekf, source, stamp_s - then_s)
+        if source.repeats >= _GPS_REPEATS:
+            source.trust.flaw("repeats the same fix", stamp_s)
+        self._compare(ekf, stamp_s)
+        variance = max(accuracy_m, limits.gps_sd_m) ** 2
+        fits = source.repeats < _GPS_REPEATS and (
+            ekf.position_nis(x_m, y_m, variance) <= limits.gate)
+        if self._judge(ekf, source, self._pose, fits):
+            ekf.update_position(x_m, y_m, variance)
+            self._take_velocity(ekf, velocity, stamp_s)
+
+    def _take_velocity(self, ekf: PlanarEkf, velocity: tuple[float, float], stamp_s: float
+                       ) -> None:
+        """Take the speed if the wheels are out, and the course if the absolute pose is."""
+        along = velocity[0] * math.cos(ekf.yaw_rad) + velocity[1] * math.sin(ekf.yaw_rad)
+        if not self._wheels_usable(stamp_s):
+            self._speed_mps = along
+        turning = abs(self._gyro.rate_radps) > _STRAIGHT_RADPS or not self._gyro_usable(stamp_s)
+        if abs(along) < _COURSE_FROM_MPS or turning or self._pose.usable(stamp_s):
+            return
+        sign = math.copysign(1.0, along)
+        course = math.atan2(sign * velocity[1], sign * velocity[0])
+        variance = (_GPS_VELOCITY_SD_MPS / along) ** 2 + _SIDESLIP_RAD**2
+        if ekf.heading_nis(course, variance) <= self.limits.gate:
+            ekf.update_heading(course, variance)
+
+    def _bring_up(self, ekf: PlanarEkf, source: PositionSource, dt_s: float) -> tuple[float, float]:
+        """Move a reading on to the filter's time, note its offset from the track, return it."""
+        on_m = self._speed_mps * (self._time_s - source.stamp_s)
+        x_m = source.reading[0] + on_m * math.cos(ekf.yaw_rad)
+        y_m = source.reading[1] + on_m * math.sin(ekf.yaw_rad)
+        # While it is not clear who is wrong, and later of who is, nothing is taken for usual.
+        sure = self._pose.trust.reason or self._gps.trust.reason
+        doubted = source.trust.reason if sure else (
+            math.hypot(*self._apart) > self.limits.apart_m)
+        source.see((x_m - self._track[0], y_m - self._track[1]), dt_s,
+                   math.inf if doubted else self.limits.witness_s)
+        return x_m, y_m
+
+    # -- who is wrong ---------------------------------------------------------------------------
+
+    def _compare(self, ekf: PlanarEkf, stamp_s: float) -> None:
+        """Hold the absolute pose and GPS against each other, and both against the wheels."""
+        pose, gps, limits = self._pose, self._gps, self.limits
+        if not pose.fresh(stamp_s):
+            self._apart, self._together = (0.0, 0.0), 0
+            return
+        together = math.dist(pose.offset, gps.offset) <= limits.apart_m and not gps.repeats
+        self._together = self._together + 1 if together else 0
+        apart = self._apart
+        apart = self._apart = (
+            apart[0] + _APART_GAIN * (pose.offset[0] - gps.offset[0] - apart[0]),
+            apart[1] + _APART_GAIN * (pose.offset[1] - gps.offset[1] - apart[1]))
+        apart_m = math.hypot(*apart)
+        by_pose, by_gps = pose.deviation_m, gps.deviation_m
+        excluded = pose.trust.reason or gps.trust.reason
+        if apart_m <= limits.apart_m:
+            if min(by_pose, by_gps) > _WHEELS_ASTRAY_M and not (
+                    excluded or self._wheels.trust.reason):
+                self._wheels.trust.flaw("drifts against both positions", stamp_s)
+                pose.start_over()
+                gps.start_over()
+            return
+        if excluded:
+            return
+        clear = self._wheels_usable(stamp_s)
+        if clear and by_pose > _CLEARLY * by_gps:
+            self._exclude(ekf, pose, apart_m, stamp_s)
+        elif clear and by_gps > _CLEARLY * by_pose:
+            self._exclude(ekf, gps, apart_m, stamp_s)
+        elif apart_m > limits.contradiction_m:
+            for source, other in ((pose, gps), (gps, pose)):
+                source.trust.flaw(f"contradicts {other.name} by {apart_m:.1f} m", stamp_s)
+
+    def _exclude(self, ekf: PlanarEkf, source: PositionSource, apart_m: float, stamp_s: float
+                 ) -> None:
+        source.trust.flaw(f"moves otherwise than the others, {apart_m:.1f} m", stamp_s)
+        # It has been taken in until now; what was farther off than this failed the gate.
+        doubt_m = min(apart_m, self.limits.contradiction_m / 2)
+        ekf.doubt_position(doubt_m)
+        ekf.doubt_heading(doubt_m / 10)
+
+    def _judge(self, ekf: PlanarEkf, source: PositionSource, other: PositionSource, fits: bool
+               ) -> bool:
+        """Note whether a reading fits; return whether to take it in."""
+        stamp_s, trust = source.stamp_s, source.trust
+        apart_m = math.hypot(*self._apart)
+        if source.deviation_m > _WHEELS_ASTRAY_M and not trust.reason \
+                and not other.usable(stamp_s) \
+                and self._wheels_usable(stamp_s) and self._gyro_usable(stamp_s):
+            # One against one. Who is wrong is not known; dead reckoning is wrong more slowly.
+            self._exclude(ekf, source, source.deviation_m, stamp_s)
+        if fits:
+            source.fails = 0
+            if trust.reason:
+                if apart_m > self.limits.apart_m if other.fresh(stamp_s) else (
+                        source.deviation_m > _WHEELS_ASTRAY_M):
+                    trust.flaw(trust.reason, stamp_s)
+                else:
+                    trust.clean(stamp_s)
+                    if not trust.reason:
+                        source.start_over()
+            return not trust.reason
+        source.fails += 1
+        if trust.reason:
+            trust.flaw(trust.reason, stamp_s)
+        if other.fails and other.fresh(stamp_s) and self._together >= _MORE_THAN_CHANCE:
+            self._believe_both(ekf, stamp_s)
+        elif source.fails >= source.patience and not trust.reason:
+            trust.flaw("does not fit the motion", stamp_s)
+        return False
+
+    def _believe_both(self, ekf: PlanarEkf, stamp_s: float) -> None:
+        """Neither position fits the filter, and they agree: it was the prediction that failed."""
+        pose, gps = self._pose, self._gps
+        if abs(wrap(pose.reading[2] - ekf.yaw_rad)) > _GYRO_ASTRAY_RAD:
+            self._gyro.trust.flaw("its turns do not fit the positions", stamp_s)
+            self._gyro_used = None
+        else:
+            self._wheels.trust.flaw("does not fit the positions", stamp_s)
+        x_m, y_m = (o + t for o, t in zip(pose.offset, self._track, strict=True))
+        ekf.doubt_position(1.0)
+        ekf.doubt_heading(1.0)
+        ekf.update_position(x_m, y_m, self.limits.absolute_sd_m**2)
+        ekf.update_heading(pose.reading[2], self.limits.absolute_sd_rad**2)
+        self._apart = (0.0, 0.0)
+        for source in (pose, gps):
+            source.trust, source.fails = Trust(), 0
+            source.start_over()
+
+    def _weigh_gyro(self, ekf: PlanarEkf, stamp_s: float) -> None:
+        """Keep an excluded gyro excluded while it turns otherwise than the robot."""
+        trust = self._gyro.trust
+        if trust.reason:
+            off = wrap(self._gyro.yaw_rad - ekf.yaw_rad)
+            if abs(wrap(off - self._gyro_off)) > _GYRO_ASTRAY_RAD:
+                self._gyro_off = off
+                trust.flaw(trust.reason, stamp_s)
+
+    # -- start ----------------------------------------------------------------------------------
+
+    def _try_to_start(self, now_s: float) -> None:
+        """Start from both positions if they agree, or from the only one after a short wait."""
+        pose, gps, limits = self._pose, self._gps, self.limits
+        first_s = self._first_s = now_s if self._first_s is None else self._first_s
+        by_pose, by_gps = pose.fresh(now_s), gps.fresh(now_s)
+        if not (by_pose or by_gps):  # what came is late already, on a machine that is busy
+            return
+        x_m, y_m, yaw_rad = pose.reading
+        heading_sd_rad: float | None = limits.absolute_sd_rad
+        if by_pose and by_gps:
+            dt_s = pose.stamp_s - gps.stamp_s
+            there = [at + v * dt_s for at, v in zip(gps.reading, gps.velocity, strict=False)]
+            if math.dist(there, (x_m, y_m)) > _START_APART_M:
+                return
+        elif now_s - first_s < _START_ALONE_S:
+            return
+        elif by_gps:
+            x_m, y_m, _ = gps.reading
+            yaw_rad, heading_sd_rad = self._heading_without_pose(now_s)
+        if heading_sd_rad is None:
+            return
+        self._time_s = pose.stamp_s if by_pose else gps.stamp_s
+        sd_m = limits.absolute_sd_m if by_pose else limits.gps_sd_m
+        self._ekf = PlanarEkf(x_m, y_m, yaw_rad, sd_m, heading_sd_rad)
+        self._speed_mps = gps.velocity[0] * math.cos(yaw_rad) + gps.velocity[1] * math.sin(yaw_rad)
+        for source in (pose, gps):
+            source.usual = None
+            source.offset = source.reading[:2]
+
+    def _heading_without_pose(self, now_s: float) -> tuple[float, float | None]:
+        """Return the heading and its standard deviation, None if it is not known.
+
+        The IMU's, which was aligned before the mission, or else the course over ground of a
+        robot that moves forward.
+        """
+        if self._gyro_usable(now_s):
+            return wrap(self._gyro.yaw_rad), _IMU_HEADING_SD_RAD
+        vx, vy = self._gps.velocity
+        speed_mps = math.hypot(vx, vy)
+        if speed_mps > _COURSE_FROM_MPS and self._wheels.speed_mps > 0:
+            return math.atan2(vy, vx), _GPS_VELOCITY_SD_MPS / speed_mps + _SIDESLIP_RAD
+        return 0.0, None
+
+
+_WHEELS_FRESH_S, _GYRO_FRESH_S = 0.15, 0.1
+_OTHER_SPEED_MPS = 0.3
+_GYRO_RAD2_PER_S = 1e-6
+_WHEEL_TURN_SHARE, _WHEEL_RAD2_PER_S = 0.15, 1e-5
+_UNKNOWN_TURN_RADPS, _UNKNOWN_SPEED_MPS = 1.0, 0.3
+_CREEP_MPS = 0.05
+_TOP_SPEED_MPS = 1.0
+_FASTEST_MPS = 100.0
+_GPS_REPEATS = 2
+_GPS_VELOCITY_SD_MPS, _SIDESLIP_RAD = 0.03, 0.03
+_COURSE_FROM_MPS, _STRAIGHT_RADPS = 0.4, 0.1
+_APART_GAIN = 0.3
+_MORE_THAN_CHANCE = 3
+_CLEARLY = 2.0
+_WHEELS_ASTRAY_M, _GYRO_ASTRAY_RAD = 0.25, 0.1
+_START_APART_M, _START_ALONE_S = 0.3, 0.15
+_IMU_HEADING_SD_RAD = 0.05
+
+
+def _timely(stamp_s: float, now_s: float) -> bool:
+    return -AHEAD_S <= now_s - stamp_s <= _MAX_AGE_S
+
+
+def _state(trust: Trust, stamp_s: float, fresh_s: float, now_s: float) -> str:
+    """Return why a source is not in use, or ""."""
+    if trust.reason:
+        return trust.reason
+    if stamp_s == -math.inf:
+        return "never heard"
+    return "silent or late" if now_s - stamp_s > fresh_s else ""

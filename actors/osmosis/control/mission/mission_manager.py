@@ -1,0 +1,166 @@
+"""Mission Manager: takes a mission and gives its goals one by one."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from rampart.actors.bus.bounds import clip
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.control.mission import mission_state
+from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE, catch_up
+from rampart.actors.osmosis.control.mission.mission_state import MissionState
+from rampart.actors.osmosis.messages import (
+    ControlStatus,
+    Goal,
+    LightMeasurement,
+    ManagerStatus,
+    MissionOrder,
+    MissionRequest,
+    Route,
+)
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.parameters import names
+
+UNCERTAIN_S = 1.0
+"""A Mission Manager that comes back waits so long for word of the step that others are at. They
+repeat it five times a second, and at once for a newcomer."""
+
+_SAME_POINT_M = 0.1
+"""A route that ends so near to a goal leads to it."""
+
+
+class MissionManager(Actor):
+    """Wires `mission_state` to its topics; see there for the machine.
+
+    Parameters:
+        held_by: names of the recovery modules that hold the robot while they are activated; the
+            mission is paused then, for that reason. None by default, as in the paper.
+
+    Who holds the robot is heard from the FTM Manager's status, ten times a second, so a respawned
+    Mission Manager finds out as well.
+    """
+
+    outputs = (topics.GOAL, topics.MISSION_STATUS, topics.MISSION_ORDER_ANSWER)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.state = MissionState()
+        self._held_by = names(self.parameters, "held_by")
+        self._uncertain_until_s = -math.inf
+        airport: Airport | None = context.shared.get("airport")
+        self._lights = frozenset(light.name for light in airport.lights) if airport else None
+
+    @on(topics.MISSION_REQUEST)
+    def request(self, message: MissionRequest, _header: Header) -> None:
+        """Take a mission, unless it was taken before."""
+        self._become(mission_state.accept(self.state, message, self.clock.now()))
+
+    @on(topics.MISSION_ORDER)
+    def order(self, message: MissionOrder, _header: Header) -> None:
+        """Obey an order or refuse it, and say so."""
+        state, answer = mission_state.obey(self.state, message, self.clock.now())
+        self._become(state)
+        self.publish(topics.MISSION_ORDER_ANSWER, answer)
+
+    @on(topics.MANAGER_STATUS)
+    def manager(self, message: ManagerStatus, _header: Header) -> None:
+        """Pause while a recovery holds the robot, and go on when it is released."""
+        if self._held_by:
+            self._become(mission_state.hold(self.state, hold_reason(message, self._held_by)))
+
+    @on(topics.CONTROL_STATUS)
+    def progress(self, message: ControlStatus, _header: Header) -> None:
+        """Step on when the current goal is reached."""
+        self._compare(message.mission_id, message.step)
+        if self._lights is not None and not self._lights.issuperset(message.unmeasured):
+            message = msgspec.structs.replace(message, unmeasured=tuple(
+                name for name in message.unmeasured if name in self._lights))
+        self._become(mission_state.progress(self.state, message, self.clock.now()))
+
+    @on(topics.ROUTE)
+    def route(self, message: Route, _header: Header) -> None:
+        """Give up when there is no way."""
+        self._compare(message.mission_id, message.step, message.waypoints[-1:])
+        self._become(mission_state.routed(self.state, message))
+
+    @on(topics.LIGHT_MEASURED)
+    def light(self, message: LightMeasurement, _header: Header) -> None:
+        """Keep a light's measurement, if it is one of the airport's."""
+        if self._lights is not None and message.light not in self._lights:
+            self.report_diagnostic("light", "no light of this airport", message.light)
+            return
+        self._become(mission_state.measured(self.state, message))
+
+    def on_start(self) -> None:
+        """Say at once how things stand.
+
+        A state from a checkpoint may be an older one. So status and goal are held back until
+        planner or control have said which step they are at, or have had the time to.
+        """
+        state = self.kept(MISSION_STATE)
+        if state is not None:
+            self.state = state
+            if state.phase in mission_state.ACTIVE:
+                self._uncertain_until_s = self.clock.now() + UNCERTAIN_S
+        self.repeat_status()
+        self.repeat_goal()
+
+    @every(0.2)
+    def repeat_goal(self) -> None:
+        """Repeat the goal for whoever joined late."""
+        if self.clock.now() >= self._uncertain_until_s:
+            self.publish(topics.GOAL, mission_state.goal_order(self.state))
+
+    @every(1.0)
+    def remember(self) -> None:
+        """Keep the state, if that failed when it was new."""
+        self.keep(MISSION_STATE, self.state)
+
+    def _compare(
+        self, mission_id: str, step: int, end: tuple[tuple[float, float], ...] = ()
+    ) -> None:
+        """End the uncertainty after a respawn: planner or control know the step as well.
+
+        A later step than the checkpoint's is believed only with a way to that step's goal: if the
+        former life died because it gave a wrong goal, the others were told a wrong step.
+        """
+        if self.clock.now() < self._uncertain_until_s and mission_id == self.state.mission_id:
+            if step > self.state.step and not _leads_to(end, self.state.goals[step:step + 1]):
+                return
+            self._uncertain_until_s = -math.inf
+            self._become(catch_up(self.state, step, self.clock.now()))
+            self.repeat_status()
+            self.repeat_goal()
+
+    @every(0.5)
+    def repeat_status(self) -> None:
+        """Repeat the status for whoever joined late."""
+        if self.clock.now() >= self._uncertain_until_s:
+            self.publish(topics.MISSION_STATUS, mission_state.status(self.state))
+
+    def _become(self, state: MissionState) -> None:
+        if state is self.state:
+            return
+        before, self.state = self.state, state
+        self.remember()  # before anybody acts on it
+        self.repeat_status()
+        order = mission_state.goal_order(state)
+        if order != mission_state.goal_order(before):
+            self.repeat_goal()
+
+
+def _leads_to(end: tuple[tuple[float, float], ...], goals: tuple[Goal, ...]) -> bool:
+    return any(math.dist(point, (goal.x_m, goal.y_m)) < _SAME_POINT_M
+               for point, goal in zip(end, goals, strict=False))
+
+
+def hold_reason(status: ManagerStatus, holding: tuple[str, ...]) -> str:
+    """Return which of the recoveries that can hold the robot do, and for what; "" if none does."""
+    held_by = [name for name in holding if name in status.activated]
+    if not held_by:
+        return ""
+    causes = [f"{view.name}: {view.reason}" for view in status.detections if view.active]
+    return clip(f"held by {' and '.join(held_by)}" + (f": {'; '.join(causes)}" if causes else ""))

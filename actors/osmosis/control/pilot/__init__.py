@@ -1,0 +1,1 @@
+"""The Safety Pilot: the last gate before the wheels."""

@@ -1,0 +1,358 @@
+"""Core of the Safety Pilot: the last gate between anybody's command and the wheels.
+
+Whatever reaches the base was decided here, from what is known now: the recovery modules' orders,
+the manager's sign of life, the operator's stick, the last good command, the last scan. The gate
+never trusts its inputs to be there: each has an age, and what is too old counts against motion.
+
+The strictest engaged order wins: stop > teleoperation > auto. A fresh joystick pre-empts auto.
+In auto there may be two computers of the command, Osmosis Control and its standby; which of them
+drives, and what they drive when they disagree, is `rampart.actors.osmosis.control.pilot.command_pair`.
+In the paper's unprotected baseline (`Checks` all off) only three things are left: the last
+command is kept and repeated, obstacles stop the robot, the joystick pre-empts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import msgspec
+
+from rampart.actors.bus.limits import Remembered
+from rampart.actors.ftm.holders import Holders
+from rampart.actors.osmosis.control.pilot.command_pair import CommandPair, PairLimits
+from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
+from rampart.actors.osmosis.control.plausible import AHEAD_S
+from rampart.actors.osmosis.control.polyline import NO_POINTS, Array
+from rampart.actors.osmosis.messages import PilotMode
+
+STRICTNESS = (PilotMode.AUTO, PilotMode.TELEOPERATION, PilotMode.STOP)
+"""Modes from the most permissive to the strictest; declared here, once."""
+
+_STANDING_MPS = 1e-3
+"""What a computer of the command may round to."""
+
+_SOURCES = 64
+"""Of commands, of which the newest one's place in the sequence is remembered."""
+
+_SLOWED = 0.999
+"""Below this share of the command the reason says that obstacles slow the robot."""
+
+
+@dataclass(frozen=True, slots=True)
+class Checks:
+    """Which checks are in force; the system spec's layers switch them.
+
+    Args:
+        bounds: refuse commands beyond the limits or not finite.
+        freshness: refuse and drop stale commands.
+        sequence: refuse commands older than one already taken.
+        scan: stop without a fresh scan.
+        manager: stop without the manager's sign of life.
+    """
+
+    bounds: bool = True
+    freshness: bool = True
+    sequence: bool = True
+    scan: bool = True
+    manager: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class GateLimits:
+    """Bounds and ages.
+
+    Args:
+        max_linear_mps: largest speed, either direction.
+        max_angular_radps: largest turn rate, either direction.
+        reverse_mps: largest speed backwards, where no laser looks; only the joystick drives there.
+        command_timeout_s: age at which a command is stale.
+        scan_timeout_s: age at which a scan is.
+        joystick_timeout_s: silence after which the stick counts as released.
+        manager_timeout_s: silence after which the manager counts as dead.
+        settling_s: a gate that has just started (perhaps again) knows no orders yet; it lets
+            nothing pass before each recovery module has had time to repeat its own.
+        room: distances of the obstacle stop.
+        pair: who drives when there is a standby.
+    """
+
+    max_linear_mps: float = 1.0
+    max_angular_radps: float = 2.0
+    reverse_mps: float = 0.25
+    command_timeout_s: float = 0.5
+    scan_timeout_s: float = 0.5
+    joystick_timeout_s: float = 0.3
+    manager_timeout_s: float = 0.5
+    settling_s: float = 0.45
+    room: StoppingRoom = field(default_factory=StoppingRoom)
+    pair: PairLimits = field(default_factory=PairLimits)
+
+
+class Stamped(msgspec.Struct, frozen=True, gc=False):
+    """A velocity command with where it comes from: the header of its message."""
+
+    linear_mps: float
+    angular_radps: float
+    source: str
+    incarnation: int
+    sequence: int
+    stamp_s: float
+
+
+class GateOutput(msgspec.Struct, frozen=True, gc=False):
+    """What goes to the base. `stopped`: the gate, not the command, keeps the robot standing."""
+
+    linear_mps: float
+    angular_radps: float
+    mode: PilotMode
+    stopped: bool
+    reason: str
+
+
+class _Order(NamedTuple):
+    """What a recovery module has ordered; `top_speed_mps` 0 for no bound."""
+
+    mode: PilotMode
+    reason: str
+    top_speed_mps: float
+
+
+@dataclass(slots=True)
+class _Line:
+    """State of one command source: auto, its standby, or joystick."""
+
+    twist: tuple[float, float] | None = None
+    stamp_s: float = -math.inf
+    heard_s: float = -math.inf
+    newest: dict[str, tuple[int, int]] = field(
+        default_factory=lambda: Remembered(_SOURCES))
+    fault: str = ""
+
+
+class SafetyGate:
+    """Collects inputs, answers `output(now)`. All times in simulated seconds.
+
+    Args:
+        limits: bounds and ages.
+        checks: which of them are in force.
+        started_s: now.
+        recoveries: names of the modules that may give orders; others are obeyed, and named.
+    """
+
+    def __init__(self, limits: GateLimits, checks: Checks, started_s: float,
+                 recoveries: Collection[str] | None = None) -> None:
+        self._limits = limits
+        self._checks = checks
+        self._started_s = started_s
+        self._orders: Holders[_Order] = Holders(
+            recoveries, _Order(PilotMode.STOP, "too many unknown modules order something", 0.0))
+        self._auto = _Line()
+        self._standby = _Line()
+        self._pair = CommandPair(limits.pair)
+        self._stick = _Line()
+        self._manager_heard_s = -math.inf
+        self._points: Array = NO_POINTS
+        self._scan_s = -math.inf
+        self._scan_fault = ""
+        self.refused = 0
+
+    def order(self, recovery: str, engaged: bool, mode: PilotMode, reason: str,
+              top_speed_mps: float = 0.0) -> None:
+        """Take note of a recovery module's order; it is in force until that module ends it.
+
+        `top_speed_mps` bounds the speed meanwhile, whoever drives; 0 or nonsense does not.
+        """
+        if engaged:
+            self._orders.hold(recovery, _Order(
+                mode, reason, top_speed_mps if top_speed_mps > 0 else 0.0))
+        else:
+            self._orders.let_go(recovery)
+
+    def reset(self, name: str) -> bool:
+        """End the order of one that is no recovery module; return whether there was one."""
+        return self._orders.reset(name)
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Who gives orders and is no recovery module of the system."""
+        return self._orders.unknown
+
+    def manager_alive(self, stamp_s: float) -> None:
+        """Take note of the manager's sign of life, given at `stamp_s`."""
+        self._manager_heard_s = max(self._manager_heard_s, stamp_s)
+
+    def scan(self, points: Array, stamp_s: float, fault: str = "") -> None:
+        """Take a scan: echoes in `base_link`, shape (n, 2), and when it was measured.
+
+        One that must not be believed (`fault` says why) is as good as none.
+        """
+        self._scan_fault = fault
+        self._points = points
+        self._scan_s = stamp_s
+
+    def command(self, command: Stamped, now: float) -> str:
+        """Offer Osmosis Control's command; return why it was refused, or ""."""
+        refused = self._take(self._auto, command, now)
+        if self._standby.twist is not None:
+            self._pair.active(*self._offer(self._auto, now), command.incarnation, now)
+        return refused
+
+    def standby(self, command: Stamped, now: float) -> str:
+        """Offer the command of Osmosis Control's standby; return why it was refused, or ""."""
+        refused = self._take(self._standby, command, now)
+        self._pair.standby(*self._offer(self._standby, now), command.incarnation, now)
+        return refused
+
+    def standby_drives(self, now: float) -> bool:
+        """Whether the standby's command is the one to execute now, or has a say in it."""
+        stick = now - self._stick.heard_s <= self._limits.joystick_timeout_s
+        return not stick and bool(self._wanted(stick, now)[1])
+
+    def _offer(self, line: _Line, now: float) -> tuple[tuple[float, float] | None, float]:
+        """Return what a line has to offer to the pair, and from when it is."""
+        return None if self._unusable(line, now) else line.twist, line.stamp_s
+
+    def joystick(self, command: Stamped, now: float) -> str:
+        """Offer Teleoperation's command; return why it was refused, or ""."""
+        return self._take(self._stick, command, now)
+
+    def _take(self, line: _Line, command: Stamped, now: float) -> str:
+        position = (command.incarnation, command.sequence)
+        if self._checks.sequence:
+            newest = line.newest.get(command.source)
+            if newest is not None and position <= newest:
+                # The newer one that was taken before stays valid.
+                self.refused += 1
+                return (f"command {command.source}:{position[0]}/{position[1]} is out of sequence,"
+                        f" newest is {newest[0]}/{newest[1]}")
+            line.newest[command.source] = position
+        line.fault = self._fault(command, now) or self._reverse_fault(line, command)
+        if line.fault:
+            self.refused += 1
+            if self._checks.bounds:
+                line.twist = (0.0, 0.0)
+            return line.fault
+        line.twist = (command.linear_mps, command.angular_radps)
+        line.stamp_s = command.stamp_s
+        line.heard_s = now
+        return ""
+
+    def _fault(self, command: Stamped, now: float) -> str:
+        linear, angular = command.linear_mps, command.angular_radps
+        limits = self._limits
+        if not (math.isfinite(linear) and math.isfinite(angular)):
+            # Also in the baseline: no base can execute it, the last command goes on instead.
+            return f"command ({linear}, {angular}) is not finite"
+        if self._checks.bounds:
+            slack = 1.0 + 1e-6
+            if abs(linear) > limits.max_linear_mps * slack:
+                return f"command of {linear:.2f} m/s is beyond {limits.max_linear_mps:.2f} m/s"
+            if abs(angular) > limits.max_angular_radps * slack:
+                return (f"command of {angular:.2f} rad/s is beyond"
+                        f" {limits.max_angular_radps:.2f} rad/s")
+        if self._checks.freshness:
+            age_s = now - command.stamp_s
+            if not age_s <= limits.command_timeout_s:
+                return f"command is {age_s:.2f} s old, limit {limits.command_timeout_s:.2f} s"
+            if age_s < -AHEAD_S:
+                return f"command is stamped {-age_s:.2f} s ahead of now"
+        return ""
+
+    def _reverse_fault(self, line: _Line, command: Stamped) -> str:
+        if self._checks.bounds and line is not self._stick and command.linear_mps < -_STANDING_MPS:
+            return f"command of {command.linear_mps:.2f} m/s is backwards, where no laser looks"
+        return ""
+
+    @property
+    def mode(self) -> PilotMode:
+        """The strictest engaged order's mode, auto without any."""
+        if not self._orders:
+            return PilotMode.AUTO
+        return max((order.mode for order in self._orders.values()), key=STRICTNESS.index)
+
+    def output(self, now: float) -> GateOutput:
+        """Return what the base is to do now."""
+        mode = self.mode
+        reason = self._forbidden(mode, now)
+        if reason:
+            return GateOutput(0.0, 0.0, mode, True, reason)
+        stick = now - self._stick.heard_s <= self._limits.joystick_timeout_s
+        if mode is PilotMode.TELEOPERATION and not stick:
+            return GateOutput(0.0, 0.0, mode, True, self._why(mode) or "waiting for the joystick")
+        wanted, passing = self._wanted(stick, now)
+        if wanted is None:
+            return GateOutput(0.0, 0.0, mode, True, passing or "no command yet")
+        wanted, passing = self._bounded(wanted, passing)
+        linear, angular = limited(*wanted, self._points, self._limits.room)
+        reason = passing
+        if stick and mode is PilotMode.AUTO:
+            reason = ", ".join(filter(None, ("the joystick pre-empts", passing)))
+        stopped = (linear, angular) == (0.0, 0.0) != wanted
+        if abs(linear) < abs(wanted[0]) * _SLOWED or stopped:
+            reason = "obstacle: stopped" if linear == 0.0 else "obstacle: slowed down"
+        return GateOutput(linear, angular, mode, stopped, reason)
+
+    def forbidden(self, now: float) -> str:
+        """Return why nobody may drive now, not even by the joystick, or ""."""
+        return self._forbidden(self.mode, now)
+
+    @property
+    def top_speed_mps(self) -> float:
+        """The lowest speed that an order in force allows at most; 0 if none bounds it."""
+        return min((order.top_speed_mps for order in self._orders.values() if order.top_speed_mps),
+                   default=0.0)
+
+    def _bounded(self, wanted: tuple[float, float], passing: str
+                 ) -> tuple[tuple[float, float], str]:
+        """Return a command no faster than orders and eyes allow; the turn rate is kept."""
+        top_mps, reverse_mps = self.top_speed_mps, self._limits.reverse_mps
+        if self._checks.scan and wanted[0] < -reverse_mps:
+            wanted, passing = (-reverse_mps, wanted[1]), passing or "slowly: no laser looks back"
+        if not top_mps or abs(wanted[0]) <= top_mps:
+            return wanted, passing
+        return (math.copysign(top_mps, wanted[0]), wanted[1]), passing or "speed bounded by order"
+
+    def _wanted(self, stick: bool, now: float) -> tuple[tuple[float, float] | None, str]:
+        """Return the command to execute and what is special about it, or None and why not."""
+        line = self._stick if stick else self._auto
+        unusable = self._unusable(line, now)
+        if stick or self._standby.twist is None:
+            return (None, unusable) if unusable else (line.twist, "")
+        other = self._standby
+        return self._pair.choice(
+            (None, unusable) if unusable else (line.twist, ""),
+            None if self._unusable(other, now) else other.twist, now)
+
+    def _forbidden(self, mode: PilotMode, now: float) -> str:
+        """Why nobody's command may pass, or ""."""
+        limits = self._limits
+        if mode is PilotMode.STOP:
+            return self._why(mode) or "ordered to stop"
+        if self._checks.manager:
+            silence_s = now - self._manager_heard_s
+            if silence_s > limits.manager_timeout_s:
+                return "the manager is silent"
+            if now - self._started_s < limits.settling_s:
+                return "just started, orders may not have arrived yet"
+        if self._checks.scan and self._scan_fault:
+            return self._scan_fault
+        if self._checks.scan and not -AHEAD_S <= now - self._scan_s <= limits.scan_timeout_s:
+            return "no fresh laser scan"  # nor is one with a stamp from the future, or none
+        return ""
+
+    def _unusable(self, line: _Line, now: float) -> str:
+        """Why a line's last command may not be executed, or ""."""
+        if line.fault and self._checks.bounds:
+            return line.fault
+        if self._checks.freshness and line.twist is not None:
+            age_s = now - line.stamp_s
+            if age_s > self._limits.command_timeout_s:
+                return "no fresh command"
+        return ""
+
+    def _why(self, mode: PilotMode) -> str:
+        """The reasons of the orders for a mode."""
+        named = sorted(self._orders.items())
+        return "; ".join(f"{name}: {order.reason}" for name, order in named if order.mode is mode)

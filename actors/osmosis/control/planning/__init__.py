@@ -1,0 +1,1 @@
+"""The Graph Planner: ways through the airport, round what is closed."""

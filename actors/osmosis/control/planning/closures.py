@@ -1,0 +1,108 @@
+"""Closures: stretches of the airport's graph that are blocked for a while, and the graph without.
+
+An edge that passes a blocked place is not closed from end to end. Only the stretch within
+`gap_m` of the place is cut out, so that the robot, which stands in front of the place on that very
+edge, still stands on the graph, and a goal behind it can still be reached from the other side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from rampart.actors.osmosis.control.planning.route_search import Edge
+from rampart.actors.osmosis.control.polyline import Point
+
+MOST_PLACES = 32
+"""That are closed at a time; with one more, the one closed first is tried again."""
+
+_LEAST_STUB_M = 0.05
+"""A shorter rest of an edge is none."""
+
+
+@dataclass(slots=True)
+class Closures:
+    """The places that are blocked, each until it is tried again.
+
+    Args:
+        gap_m: how far round a place the graph is closed.
+        lasts_s: how long a place stays closed.
+    """
+
+    gap_m: float = 1.0
+    lasts_s: float = 60.0
+    _until_s: dict[Point, float] = field(default_factory=dict)
+
+    def close(self, place: Point, now_s: float) -> None:
+        """Close the graph round a place in `map`; one near it that was closed before is renewed."""
+        for known in self._until_s:
+            if math.dist(known, place) <= self.gap_m:
+                self._until_s[known] = now_s + self.lasts_s
+                return
+        if len(self._until_s) >= MOST_PLACES:
+            del self._until_s[next(iter(self._until_s))]
+        self._until_s[place] = now_s + self.lasts_s
+
+    def reopen(self) -> None:
+        """Open everything: with it there is no way at all."""
+        self._until_s.clear()
+
+    def closed(self, now_s: float) -> tuple[Point, ...]:
+        """Return the places that are closed now."""
+        for place in [p for p, until_s in self._until_s.items() if until_s <= now_s]:
+            del self._until_s[place]
+        return tuple(self._until_s)
+
+
+def without(
+    nodes: Mapping[str, Point], edges: Iterable[Edge], places: Iterable[Point], gap_m: float
+) -> tuple[dict[str, Point], list[Edge]]:
+    """Return the graph without what lies within `gap_m` of the places.
+
+    The rests of an edge that is cut end in nodes of their own, named after the edge. No name of an
+    airport has the character `|`, and if one had, the node would only be counted on.
+    """
+    left, kept = dict(nodes), list(edges)
+    for place in places:
+        cut: list[Edge] = []
+        for a, b in kept:
+            span = _within(place, left[a], left[b], gap_m)
+            if span is None:
+                cut.append((a, b))
+                continue
+            length_m = math.dist(left[a], left[b])
+            for end, share in ((a, span[0]), (b, span[1])):
+                rest_m = share * length_m if end == a else (1.0 - share) * length_m
+                if rest_m > _LEAST_STUB_M:
+                    name = _fresh(f"{a}|{b}", left)
+                    left[name] = _between(left[a], left[b], share)
+                    cut.append((end, name))
+        kept = cut
+    return left, kept
+
+
+def _within(place: Point, a: Point, b: Point, gap_m: float) -> tuple[float, float] | None:
+    """Return the shares of the way from a to b between which it is within `gap_m` of a place."""
+    (dx, dy), (px, py) = (b[0] - a[0], b[1] - a[1]), (place[0] - a[0], place[1] - a[1])
+    square = dx * dx + dy * dy
+    if square == 0.0:
+        return (0.0, 1.0) if math.hypot(px, py) <= gap_m else None
+    middle = (px * dx + py * dy) / square
+    aside_square = max(px * px + py * py - middle * middle * square, 0.0)
+    if aside_square > gap_m * gap_m:
+        return None
+    half = math.sqrt((gap_m * gap_m - aside_square) / square)
+    first, last = max(middle - half, 0.0), min(middle + half, 1.0)
+    return (first, last) if first < last else None
+
+
+def _between(a: Point, b: Point, share: float) -> Point:
+    return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])
+
+
+def _fresh(stem: str, taken: Mapping[str, Point]) -> str:
+    number = 1
+    while f"{stem}#{number}" in taken:
+        number += 1
+    return f"{stem}#{number}"

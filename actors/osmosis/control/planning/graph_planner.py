@@ -1,0 +1,182 @@
+"""Graph Planner: the way to the current goal over the airport's graph."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from rampart.actors.bus.bounds import clip
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.control.planning.closures import Closures, without
+from rampart.actors.osmosis.control.planning.route_search import PlannedRoute, plan_route
+from rampart.actors.osmosis.control.plausible import is_sane
+from rampart.actors.osmosis.messages import Blockage, ControlStatus, GoalOrder, Mode, Pose, Route
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.checkpoint import StateFormat
+from rampart.actors.runtime.parameters import amount
+
+
+class RouteKept(msgspec.Struct, frozen=True):
+    """State of the Graph Planner: the goal, and the route that was found for it."""
+
+    order: GoalOrder
+    route: Route
+
+
+def _objection(kept: RouteKept) -> str:
+    if not all(math.isfinite(v) for waypoint in kept.route.waypoints for v in waypoint):
+        return "a waypoint is not finite"
+    order, route = kept.order, kept.route
+    same = (order.mission_id, order.step, order.active) == (
+        route.mission_id, route.step, route.active)
+    return "" if same else f"route of step {route.step}, goal of step {order.step}"
+
+
+ROUTE_STATE = StateFormat(RouteKept, version=1, objection=_objection)
+
+
+class GraphPlanner(Actor):
+    """Plans once per goal, from the latest pose, and repeats the route.
+
+    While the goal stays the same the route does, so nothing changes under the driving robot. A
+    respawned planner has its route from the checkpoint, and repeats it when it hears the goal that
+    it is for; without one it plans again, from where the robot is then.
+
+    If Osmosis Control reports that it does not get past something, the planner may plan round it:
+    the stretch of the graph near that place is closed for a while. Where there is no other way
+    the route stays, and the robot waits.
+
+    Parameters:
+        replan_after_s: how long the robot must have been blocked, s; never if 0, as in the paper.
+        avoid_for_s: how long the stretch stays closed, s (60).
+        avoid_gap_m: how far round the place the graph is closed, m (1).
+    """
+
+    outputs = (topics.ROUTE,)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self._airport: Airport = context.shared["airport"]
+        self._pose: Pose | None = None
+        self._order: GoalOrder | None = None
+        self._route: Route | None = None
+        self._replan_after_s = amount(self.parameters, "replan_after_s", 0.0)
+        self._closures = Closures(amount(self.parameters, "avoid_gap_m", 1.0),
+                                  amount(self.parameters, "avoid_for_s", 60.0))
+        self._try_again_s = -math.inf
+        self._blocked: Blockage | None = None
+        self._kept: RouteKept | None = None
+
+    def on_start(self) -> None:
+        """Remember the route; it is told when its goal is heard, for it may be an older one."""
+        self._kept = self.kept(ROUTE_STATE)
+
+    @on(topics.POSE)
+    def pose(self, message: Pose, _header: Header) -> None:
+        """Keep the latest pose, if it is one; plan if a goal was waiting for it."""
+        if not is_sane(message.x_m, message.y_m, message.yaw_rad):
+            return
+        self._pose = message
+        if self._route is None:
+            self._plan()
+
+    @on(topics.GOAL)
+    def goal(self, message: GoalOrder, _header: Header) -> None:
+        """Plan if the goal is another one."""
+        if message == self._order:
+            return
+        before, self._order = self._order, message
+        if self._blocked is not None and before is not None and message.plan > before.plan \
+                and (message.mission_id, message.step) == (before.mission_id, before.step):
+            # Another plan is wanted, and what stands in front of the robot is known.
+            self._closures.close((self._blocked.x_m, self._blocked.y_m), self.clock.now())
+        self._route = self._blocked = None
+        self._try_again_s = -math.inf
+        if self._kept is not None and self._kept.order == message:
+            self._route = self._kept.route
+            self._tell()
+        else:
+            self._plan()
+        self._kept = None
+
+    @on(topics.CONTROL_STATUS)
+    def control(self, message: ControlStatus, _header: Header) -> None:
+        """Plan round what has blocked the robot for long enough."""
+        route, now_s = self._route, self.clock.now()
+        self._blocked = None
+        if route is None or not route.active or (
+                (message.mission_id, message.step) != (route.mission_id, route.step)):
+            return
+        for blockage in message.blocked:
+            if not math.isfinite(blockage.x_m + blockage.y_m):
+                continue
+            self._blocked = blockage
+            if 0 < self._replan_after_s <= now_s - blockage.since_s and now_s >= self._try_again_s:
+                self._try_again_s = now_s + self._replan_after_s
+                self._plan_round(blockage, now_s)
+
+    @every(0.2)
+    def repeat(self) -> None:
+        """Repeat the route for whoever joined late."""
+        self._tell()
+
+    def _tell(self) -> None:
+        """Publish the route; what others follow is kept before."""
+        if self._order is not None and self._route is not None:
+            self.keep(ROUTE_STATE, RouteKept(self._order, self._route))
+            self.publish(topics.ROUTE, self._route)
+
+    def _plan(self) -> None:
+        order, pose = self._order, self._pose
+        if order is None:
+            return
+        if not order.active:
+            self._route = Route(order.mission_id, order.step, order.goal.mode, False, (), "",
+                                order.plan)
+        elif pose is None:
+            return
+        else:
+            plan = self._search(order, pose)
+            if not plan.waypoints and self._closures.closed(self.clock.now()):
+                self._closures.reopen()
+                plan = self._search(order, pose)
+            if plan.reason:
+                self.report_diagnostic("route search", plan.reason, order.mission_id)
+            self._route = _route(order, plan, plan.reason)
+        self._tell()
+
+    def _plan_round(self, blockage: Blockage, now_s: float) -> None:
+        order, pose, place = self._order, self._pose, (blockage.x_m, blockage.y_m)
+        if order is None or pose is None:
+            return
+        self._closures.close(place, now_s)
+        plan = self._search(order, pose)
+        where = f"({place[0]:.1f}, {place[1]:.1f})"
+        if not plan.waypoints:
+            self._closures.reopen()
+            self.report_diagnostic("route search", f"no way round {where}: {plan.reason}",
+                                   order.mission_id)
+            return
+        self._route = _route(order, plan, f"way round {where}, which is blocked")
+        self._tell()
+
+    def _search(self, order: GoalOrder, pose: Pose) -> PlannedRoute:
+        nodes, edges = self._airport.nodes, self._airport.edges
+        closed = self._closures.closed(self.clock.now())
+        if closed:
+            open_nodes, open_edges = without(nodes, edges, closed, self._closures.gap_m)
+            nodes, edges = open_nodes, tuple(open_edges)
+        return plan_route(
+            nodes,
+            edges,
+            (pose.x_m, pose.y_m),
+            (order.goal.x_m, order.goal.y_m),
+            straight=order.goal.mode is Mode.LIGHT_VERIFICATION,
+        )
+
+
+def _route(order: GoalOrder, plan: PlannedRoute, reason: str) -> Route:
+    return Route(order.mission_id, order.step, order.goal.mode, True, plan.waypoints,
+                 clip(reason), order.plan)

@@ -1,0 +1,26 @@
+"""Which stamps and readings are possible at all: what is not must do no harm, now or later.
+
+A stamp from the future would shut out all honest ones after it and stay fresh for ever. A number
+beyond all measure would overflow in a square, or stay in a sum for good.
+"""
+
+from __future__ import annotations
+
+import math
+
+from rampart.actors.bus.envelope import AHEAD_S
+
+__all__ = ["AHEAD_S", "is_possible", "is_sane"]
+
+ABSURD = 1e7
+"""No coordinate in m, no angle in rad and no rate of this robot is as large."""
+
+
+def is_possible(stamp_s: float, now_s: float) -> bool:
+    """Whether something may have been true at `stamp_s`: a number, and not ahead of now."""
+    return math.isfinite(stamp_s) and stamp_s <= now_s + AHEAD_S
+
+
+def is_sane(*values: float) -> bool:
+    """Whether all are numbers, and none is absurd."""
+    return sum(map(abs, values)) < ABSURD

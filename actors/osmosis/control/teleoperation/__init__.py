@@ -1,0 +1,1 @@
+"""Driving by hand: joysticks, gamepads, and whose stick counts."""

@@ -1,0 +1,234 @@
+"""A joystick that is plugged into this machine, as the kernel's joystick interface tells of it.
+
+`/dev/input/jsN` is a stream of 8-byte records, `struct js_event` of <linux/joystick.h> as described
+in the kernel's Documentation/input/joydev/joystick-api.rst: milliseconds, value, type, number. When
+the device is opened, and when its queue has overflowed, the kernel first tells the state of every
+button and axis in records marked as initial.
+
+A button that is already down when the device is opened is not a press: the dead man counts only
+from a press that was seen. So neither a stuck button nor a gamepad that is plugged in again in the
+wrong moment moves the robot.
+
+Anything that speaks the same records will do: a FIFO or a pseudo-terminal is a virtual joystick.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import re
+import stat
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from rampart.actors.osmosis.messages import Joystick
+
+AUTO = "auto"
+"""Stands for the first joystick there is."""
+
+EVENT = struct.Struct("=IhBB")
+"""`struct js_event`: time in ms, value, type, number of the button or axis."""
+
+BUTTON = 0x01
+AXIS = 0x02
+INITIAL = 0x80
+"""Mark of a record that tells a state and not a change."""
+
+FULL_SCALE = 32767
+_DEVICES = Path("/dev/input")
+_READ_BYTES = 64 * EVENT.size
+_NUMBER = re.compile(r"js(\d+)$")
+
+
+class ForeignDeviceError(Exception):
+    """What comes from the device are no records of a joystick; one line."""
+
+
+@dataclass(frozen=True, slots=True)
+class StickMapping:
+    """Which axes and which button of a device mean what; the defaults suit common gamepads.
+
+    Attributes:
+        forward_axis: number of the axis for forward and back.
+        left_axis: number of the axis for turning left and right.
+        forward_sign: -1 if the axis grows as the stick is pulled back, as the kernel has it.
+        left_sign: -1 if the axis grows to the right, as the kernel has it.
+        dead_man_button: number of the button to be held while driving (4: the left shoulder).
+        dead_zone: share of the way from the middle that counts as the middle; what is left is
+            stretched, so that the speed begins at zero.
+    """
+
+    forward_axis: int = 1
+    left_axis: int = 0
+    forward_sign: int = -1
+    left_sign: int = -1
+    dead_man_button: int = 4
+    dead_zone: float = 0.1
+
+
+def mapping_of(parameters: Mapping[str, Any]) -> StickMapping:
+    """Return the mapping that a node's parameters ask for; those for something else are left.
+
+    Raises:
+        ValueError: a value makes no sense; it says which, and what would be right.
+    """
+    given = {f.name: parameters[f.name] for f in fields(StickMapping) if f.name in parameters}
+    for name, value in given.items():
+        if name == "dead_zone":
+            right = "a number from 0 to below 1"
+            sound = isinstance(value, (int, float)) and 0 <= value < 1
+        elif name.endswith("_sign"):
+            right, sound = "1 or -1", value in (1, -1)
+        else:
+            right, sound = "a whole number from 0 to 255", value in range(256)
+        if not sound or isinstance(value, bool):
+            raise ValueError(f"{name} = {value!r}: must be {right}")
+    mapping = StickMapping(**given)
+    if mapping.forward_axis == mapping.left_axis:
+        raise ValueError(f"left_axis = {mapping.left_axis}: is the forward axis already")
+    return mapping
+
+
+class StickDecoder:
+    """Records in, position of the stick out. Pure.
+
+    Args:
+        mapping: what means what.
+    """
+
+    def __init__(self, mapping: StickMapping) -> None:
+        self._mapping = mapping
+        self._rest = b""
+        self._axes = {mapping.forward_axis: 0, mapping.left_axis: 0}
+        self._pressed = False
+
+    def feed(self, data: bytes) -> None:
+        """Take what was read; a record that is not complete waits for its rest.
+
+        Raises:
+            ForeignDeviceError: a record is neither about a button nor about an axis.
+        """
+        data = self._rest + data
+        whole = len(data) - len(data) % EVENT.size
+        self._rest = data[whole:]
+        for _time_ms, value, kind, number in EVENT.iter_unpack(data[:whole]):
+            if kind & ~INITIAL == BUTTON:
+                self._button(number, value, initial=bool(kind & INITIAL))
+            elif kind & ~INITIAL == AXIS:
+                if number in self._axes:
+                    self._axes[number] = value
+            else:
+                raise ForeignDeviceError(
+                    f"event type 0x{kind:02x} is none of a joystick's (0x01 button, 0x02 axis)")
+
+    @property
+    def stick(self) -> Joystick:
+        """Where the stick is now."""
+        mapping = self._mapping
+        return Joystick(
+            self._position(mapping.forward_axis, mapping.forward_sign),
+            self._position(mapping.left_axis, mapping.left_sign), self._pressed)
+
+    def _button(self, number: int, value: int, *, initial: bool) -> None:
+        if number == self._mapping.dead_man_button:
+            self._pressed = bool(value) and (self._pressed or not initial)
+
+    def _position(self, axis: int, sign: int) -> float:
+        share = min(abs(self._axes[axis]) / FULL_SCALE, 1.0)
+        zone = self._mapping.dead_zone
+        if share <= zone:
+            return 0.0
+        return math.copysign((share - zone) / (1.0 - zone), sign * self._axes[axis])
+
+
+def device_path(name: str, directory: Path = _DEVICES) -> str:
+    """Return the path of a device; for `AUTO` the first one there is, "" if there is none."""
+    if name != AUTO:
+        return name
+    found = [(int(match[1]), entry) for entry in directory.glob("js*")
+             if (match := _NUMBER.match(entry.name))]
+    return str(min(found)[1]) if found else ""
+
+
+class JoystickDevice:
+    """Reads a device on the event loop, without ever waiting for it.
+
+    Args:
+        name: path of the device, or `AUTO`.
+        mapping: what means what.
+        moved: called when something was read; `stick` is the new position.
+        gone: called with the reason when an open device has vanished or proved to be none.
+    """
+
+    def __init__(self, name: str, mapping: StickMapping, moved: Callable[[], None],
+                 gone: Callable[[str], None]) -> None:
+        self.path = name
+        self._name = name
+        self._mapping = mapping
+        self._decoder = StickDecoder(mapping)
+        self._moved = moved
+        self._gone = gone
+        self._file: int | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a device to read from."""
+        return self._file is not None
+
+    @property
+    def stick(self) -> Joystick:
+        """Where the stick is; in the middle and let go while there is no device."""
+        return self._decoder.stick
+
+    def open(self) -> str:
+        """Open the device if it is there; return why it is not, or ""."""
+        self.path = device_path(self._name)
+        if not self.path:
+            return f"there is no joystick in {_DEVICES}"
+        try:
+            mode = Path(self.path).stat().st_mode
+            if not (stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)):
+                return "is neither a device nor a FIFO"
+            file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+        except (OSError, ValueError) as error:
+            return getattr(error, "strerror", None) or str(error)
+        try:
+            asyncio.get_running_loop().add_reader(file, self._readable)
+        except OSError as error:  # a device that cannot be waited for, such as /dev/zero
+            os.close(file)
+            return f"is no joystick: {error.strerror}"
+        self._decoder = StickDecoder(self._mapping)
+        self._file = file
+        return ""
+
+    def close(self) -> None:
+        """Let the device go, and the stick with it. Closing twice is harmless."""
+        file, self._file = self._file, None
+        self._decoder = StickDecoder(self._mapping)
+        if file is not None:
+            asyncio.get_running_loop().remove_reader(file)
+            os.close(file)
+
+    def _readable(self) -> None:
+        if self._file is None:
+            return
+        try:
+            data = os.read(self._file, _READ_BYTES)
+            self._decoder.feed(data)
+        except BlockingIOError:
+            return
+        except (OSError, ForeignDeviceError) as error:
+            self._lost(getattr(error, "strerror", None) or str(error))
+            return
+        if data:
+            self._moved()
+        else:
+            self._lost("ended")
+
+    def _lost(self, why: str) -> None:
+        self.close()
+        self._gone(why)

@@ -1,0 +1,99 @@
+"""Who has the stick when several want to drive. Pure.
+
+A joystick on this machine, the operator's page and a terminal may all offer positions. The rules:
+
+- Nobody has the stick: whoever holds the dead man gets it.
+- Who has it keeps it until letting go, or not being heard for `timeout_s`.
+- Who holds the dead man meanwhile is not followed and is told so, once. So is who was lost while
+  holding it and comes back. Both have to let go before they can get the stick: a robot must not
+  leap because *somebody else* let go, nor because a connection has recovered.
+- A position counts from its stamp: what is old when it arrives holds nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from rampart.actors.osmosis.messages import Joystick
+
+TIMEOUT_S = 0.3
+"""Simulated seconds without a position after which a source counts as lost; the Safety Pilot's."""
+
+_REMEMBERED = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Ruling:
+    """What follows from an offer, or from the passing of time.
+
+    Attributes:
+        stick: position to follow now, or None.
+        released: whether the one who had the stick has just let go or was lost: stop.
+        told: why a source is not followed, or no longer; "" if there is nothing to say.
+        whom: the source that `told` is about.
+    """
+
+    stick: Joystick | None = None
+    released: bool = False
+    told: str = ""
+    whom: str = ""
+
+
+class StickArbiter:
+    """Follows one source at a time.
+
+    Args:
+        timeout_s: see `TIMEOUT_S`.
+    """
+
+    def __init__(self, timeout_s: float = TIMEOUT_S) -> None:
+        self.holder = ""
+        self._timeout_s = timeout_s
+        self._heard_s = -math.inf
+        self._barred: dict[str, bool] = {}
+        """Sources that have to let go first, and whether they know; the newest are remembered."""
+
+    def offer(self, source: str, stick: Joystick, stamp_s: float, now_s: float) -> Ruling:
+        """Take a position from a source.
+
+        Args:
+            source: who offers it.
+            stick: the position; one that is not finite counts as let go.
+            stamp_s: when it was measured.
+            now_s: now, on the same clock.
+        """
+        lost = self.expire(now_s)
+        sound = stick.dead_man and math.isfinite(stick.forward) and math.isfinite(stick.left)
+        if not sound:
+            self._barred.pop(source, None)
+            if source != self.holder:
+                return lost
+            self.holder = ""
+            return Ruling(released=True)
+        if not now_s - stamp_s <= self._timeout_s:  # so is a stamp that is no number
+            return Ruling(None, lost.released, "its position came too late", source)
+        if not self.holder and source not in self._barred:
+            self.holder = source
+        if source == self.holder:
+            self._heard_s = min(stamp_s, now_s)
+            return Ruling(stick, False, lost.told, lost.whom)
+        if self._barred.get(source):
+            return lost
+        self._bar(source, told=True)
+        why = f"{self.holder} has the stick" if self.holder else "it has to let go first"
+        return Ruling(None, lost.released, f"not followed: {why}", source)
+
+    def expire(self, now_s: float) -> Ruling:
+        """Take the stick from a source that has not been heard for too long."""
+        if not self.holder or now_s - self._heard_s <= self._timeout_s:
+            return Ruling()
+        source, self.holder = self.holder, ""
+        self._bar(source, told=False)
+        return Ruling(None, True, f"not heard for {self._timeout_s:g} s: counts as let go", source)
+
+    def _bar(self, source: str, *, told: bool) -> None:
+        self._barred.pop(source, None)
+        self._barred[source] = told
+        if len(self._barred) > _REMEMBERED:
+            del self._barred[next(iter(self._barred))]

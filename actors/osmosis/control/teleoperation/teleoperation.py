@@ -1,0 +1,153 @@
+"""Teleoperation: the operator's stick as a velocity command.
+
+Silent while the dead-man button is released, so the Safety Pilot's joystick mode ends with it. The
+stick may be a device on this machine or anybody who publishes `topics.JOYSTICK`; who is followed
+if there are several is decided in `stick_arbitration`.
+"""
+
+from __future__ import annotations
+
+import math
+
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.teleoperation.joystick_device import JoystickDevice, mapping_of
+from rampart.actors.osmosis.control.teleoperation.stick_arbitration import (
+    TIMEOUT_S,
+    Ruling,
+    StickArbiter,
+)
+from rampart.actors.osmosis.messages import Joystick, Twist
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.timer import Timer
+
+_LOOK_S = 0.05
+"""Period in which a held stick is repeated and a silent one noticed (simulated seconds)."""
+
+_REPLUG_S = 0.5
+"""Period in which a device that is not there is looked for."""
+
+
+def stick_twist(stick: Joystick, max_linear_mps: float, max_angular_radps: float) -> Twist | None:
+    """Return the velocity for a stick position, None while the dead man is released.
+
+    Args:
+        stick: positions in [-1, 1]; beyond, they are cut; not finite counts as released.
+        max_linear_mps: speed at full stick.
+        max_angular_radps: turn rate at full stick.
+    """
+    if not (stick.dead_man and math.isfinite(stick.forward) and math.isfinite(stick.left)):
+        return None
+    forward = min(max(stick.forward, -1.0), 1.0)
+    left = min(max(stick.left, -1.0), 1.0)
+    return Twist(forward * max_linear_mps, left * max_angular_radps)
+
+
+class Teleoperation(Actor):
+    """Turns each stick position into a command at once.
+
+    A device tells changes only, so while its dead man is held its position is repeated; messages
+    are repeated by whoever sends them. A device that vanishes has let go, and is looked for again.
+
+    Parameters: `linear_mps`, `angular_radps`: velocities at full stick; the robot's if left out.
+    `device`: path of a joystick or "auto" for the first one; "" for none. `forward_axis`,
+    `left_axis`, `forward_sign`, `left_sign`, `dead_man_button`, `dead_zone`: see
+    `joystick_device.StickMapping`.
+
+    Shared objects: "joystick" (device that has precedence over the parameter, or ""; None: devices
+    are not to be opened).
+    """
+
+    outputs = (topics.TELEOP_COMMAND,)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        robot = context.shared["system"].robot
+        self._linear_mps = float(context.parameters.get("linear_mps", robot.top_speed_mps))
+        self._angular_radps = float(
+            context.parameters.get("angular_radps", robot.top_turn_rate_radps))
+        self._arbiter = StickArbiter(TIMEOUT_S)
+        self._look: Timer | None = None
+        self._device: JoystickDevice | None = None
+        self._missing = ""
+
+    def on_start(self) -> None:
+        """Open the joystick, if there is to be one."""
+        asked = self.context.shared.get("joystick", "")
+        name = asked or self.parameters.get("device", "")
+        if not name or asked is None:
+            return
+        try:
+            mapping = mapping_of(self.parameters)
+        except ValueError as error:
+            self.report_diagnostic("joystick", f"not used: {error}", str(name))
+            return
+        self._device = JoystickDevice(str(name), mapping, self._moved, self._gone)
+        self._plug()
+
+    def on_stop(self) -> None:
+        """Let the joystick go."""
+        if self._device is not None:
+            self._device.close()
+
+    @on(topics.JOYSTICK)
+    def joystick(self, message: Joystick, header: Header) -> None:
+        """Offer a position; if it is followed, its velocity goes out at once."""
+        self._offer(header.source, message, header.stamp)
+
+    def _offer(self, source: str, stick: Joystick, stamp_s: float) -> None:
+        self._obey(self._arbiter.offer(source, stick, stamp_s, self.clock.now()), stamp_s)
+        self._attend()
+
+    def _attend(self) -> None:
+        """Look again soon while somebody has the stick, or holds a device in vain."""
+        held = self._device is not None and self._device.stick.dead_man
+        if (held or self._arbiter.holder) and self._look is None:
+            self._look = self.call_later(_LOOK_S, self._again)
+
+    def _obey(self, ruling: Ruling, stamp_s: float) -> None:
+        """Publish the stick's velocity; on release one last zero, so the stop does not wait."""
+        twist = ruling.stick and stick_twist(ruling.stick, self._linear_mps, self._angular_radps)
+        if twist is not None:
+            self.publish(topics.TELEOP_COMMAND, twist, stamp=stamp_s)
+        elif ruling.released:
+            self.publish(topics.TELEOP_COMMAND, Twist(0.0, 0.0))
+        if ruling.told:
+            self.report_diagnostic("joystick", ruling.told, ruling.whom)
+
+    def _again(self) -> None:
+        """Repeat a device that is held, and notice who has fallen silent."""
+        self._look = None
+        device = self._device
+        if device is not None and device.stick.dead_man:
+            self._moved()
+        else:
+            now_s = self.clock.now()
+            self._obey(self._arbiter.expire(now_s), now_s)
+        self._attend()
+
+    # -- the device -----------------------------------------------------------------------------
+
+    def _plug(self) -> None:
+        device = self._device
+        if device is None:
+            return
+        missing = device.open()
+        if missing and missing != self._missing:
+            self.report_diagnostic("joystick", f"waiting for it: {missing}", device.path)
+        self._missing = missing
+        if missing:
+            self.call_later(_REPLUG_S, self._plug)
+
+    def _moved(self) -> None:
+        device = self._device
+        if device is not None:
+            self._offer(device.path, device.stick, self.clock.now())
+
+    def _gone(self, why: str) -> None:
+        device = self._device
+        if device is None:
+            return
+        self._offer(device.path, device.stick, self.clock.now())  # closed, it has let go
+        self.report_diagnostic("joystick", f"vanished: {why}", device.path)
+        self._missing = why
+        self.call_later(_REPLUG_S, self._plug)

@@ -1,0 +1,138 @@
+"""DM8: error in localization estimation (paper, figure 5: an event that it leaves bare).
+
+Freshness and a heartbeat show a localization that is silent or dead. This module shows one that
+lies: it holds the pose against GPS, wheels and IMU, which it hears for itself. The pose is wrong
+if GPS and the wheels agree with each other and not with it; a receiver that is wrong alone does
+not make it active. It names the life of the node that published the pose, so that this one is
+respawned, and no later one.
+"""
+
+from __future__ import annotations
+
+import math
+
+from rampart.actors.detection.module import DetectionModule
+from rampart.actors.detection.plausible import is_sane
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.detection.area.geofence import Fix
+from rampart.actors.osmosis.detection.area.position_vote import PositionVote
+from rampart.actors.runtime.actor import Context, Header, on
+
+_POSE = "localization"
+_TURNED_RAD = 0.3
+_TURNED_FIXES = 3
+
+
+class EstimationMonitor:
+    """Active while the pose is outvoted, in its position or, while it drives, in its heading.
+
+    The heading is held against the IMU's and against the course over ground.
+
+    Args:
+        known: whether idle may be claimed before anything was compared.
+        wait_until_s: until when the first comparison may take; then there is nothing to compare,
+            which is for DM6 and for the fence to notice.
+    """
+
+    def __init__(self, *, known: bool, wait_until_s: float) -> None:
+        self.vote = PositionVote(_POSE)
+        self.nodes: tuple[str, ...] = ()
+        self.reason = ""
+        self._known = known
+        self._wait_until_s = wait_until_s
+        self._yaw_rad = 0.0
+        self._turned = 0
+
+    @property
+    def active(self) -> bool:
+        """Whether the pose is wrong."""
+        return bool(self.reason)
+
+    @property
+    def known(self) -> bool:
+        """Whether anything was compared, or could not be."""
+        return self._known or self.vote.compared
+
+    @property
+    def due_s(self) -> float:
+        """When it stops waiting for something to compare."""
+        return math.inf if self.known else self._wait_until_s
+
+    def expire(self, now_s: float) -> None:
+        """Give up waiting."""
+        self._known = self._known or now_s >= self._wait_until_s
+
+    def pose(self, pose: m.Pose, stamp_s: float, now_s: float, suspect: str) -> None:
+        """Take the pose under test; `suspect` is the life of the node that says it."""
+        vote = self.vote
+        if not is_sane(pose.yaw_rad) or not vote.see_position(
+                stamp_s, (pose.x_m, pose.y_m), now_s):
+            return
+        if not self.active:
+            self.nodes = (suspect,)
+        self._yaw_rad = pose.yaw_rad
+
+    def gps(self, fix: Fix, stamp_s: float, now_s: float) -> None:
+        """Take a fix."""
+        if self.vote.see_gps(fix, stamp_s, now_s):
+            self._hold_heading(fix, now_s)
+            self._judge()
+
+    def _hold_heading(self, fix: Fix, now_s: float) -> None:
+        vote = self.vote
+        if vote.track.straight and vote.wheels_fresh(now_s) and vote.position.fresh(now_s):
+            course = math.atan2(fix.velocity_y_mps, fix.velocity_x_mps)
+            off = min(abs(math.remainder(self._yaw_rad - heading, math.tau))
+                      for heading in (course, vote.track.heading_rad))
+            self._turned = self._turned + 1 if off > _TURNED_RAD else 0
+
+    def _judge(self) -> None:
+        vote = self.vote
+        if vote.outlier == _POSE:
+            self.reason = self.reason or (
+                f"the pose is {vote.apart_m:.1f} m from GPS, which moves as the wheels do")
+        elif self._turned >= _TURNED_FIXES:
+            self.reason = self.reason or "the pose is turned against the IMU and the course"
+        elif not self._turned:
+            self.reason = ""
+
+
+class EstimationError(DetectionModule):
+    """DM8. It has no parameters."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.monitor = EstimationMonitor(
+            known=self.first_life, wait_until_s=self.clock.now() + self.grace_s(1.0))
+
+    def on_start(self) -> None:
+        """Start waiting for something to compare."""
+        self.follow(self.monitor)
+
+    @on(topics.IMU)
+    def imu(self, message: m.Imu, header: Header) -> None:
+        """Hear the heading."""
+        self.monitor.vote.track.imu(
+            header.stamp, message.yaw_rad, message.yaw_rate_radps, self.clock.now())
+
+    @on(topics.ODOMETRY)
+    def odometry(self, message: m.Odometry, header: Header) -> None:
+        """Hear the way that the wheels made."""
+        self.monitor.vote.track.odometry(
+            header.stamp, message.pose.yaw_rad, message.twist.linear_mps, self.clock.now())
+
+    @on(topics.GPS)
+    def gps(self, message: m.GpsFix, header: Header) -> None:
+        """Hear a fix, and compare."""
+        self.monitor.gps(
+            Fix(message.x_m, message.y_m, message.velocity_x_mps, message.velocity_y_mps,
+                message.accuracy_m), header.stamp, self.clock.now())
+        self.follow(self.monitor)
+
+    @on(topics.POSE)
+    def pose(self, message: m.Pose, header: Header) -> None:
+        """Hear the pose under test."""
+        self.monitor.pose(message, header.stamp, self.clock.now(),
+                          f"{header.source}#{header.incarnation}")
+        self.follow(self.monitor)

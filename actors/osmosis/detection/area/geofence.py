@@ -1,0 +1,139 @@
+"""Whether the robot can still stop before the prohibited area: geometry of DM1.
+
+The robot is taken for a disc about its centre that holds its footprint at any heading, grown by
+the error of the positioning device. If it is driven on with its present velocity until a
+recovery takes effect, and then brakes, the disc sweeps a capsule. The robot is safe while that
+capsule stays clear of the prohibited area:
+
+    length = v * reaction + v^2 / (2 * braking)      radius = half diagonal + accuracy
+
+So the margin ahead grows with speed, and beside the robot it does not: a robot that skirts an
+obstacle along the edge of its lane is not taken for one that is about to leave it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import msgspec
+
+from rampart.actors.detection.plausible import is_sane
+
+ProhibitedDistance = Callable[[float, float], float]
+"""Signed distance (m) from a point in `map` to the prohibited area, negative inside it."""
+
+_LEAST_STEP_M = 0.02
+"""Resolution at which a grazing capsule is examined."""
+
+_ROUNDING_M = 1e-6
+"""Far more than the rounding errors of distances."""
+
+_FASTEST_MPS = 100.0
+"""Nothing that drives on an airport is faster: a receiver that says so says nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class FenceLimits:
+    """What the capsule is made of.
+
+    Args:
+        half_diagonal_m: radius of the disc about `base_link` that holds the footprint.
+        reaction_s: from the error to the brakes taking hold, s.
+        braking_mps2: deceleration that is certain.
+        hysteresis_m: how much farther away the area must be before the robot counts as safe again.
+    """
+
+    half_diagonal_m: float
+    reaction_s: float
+    braking_mps2: float
+    hysteresis_m: float = 0.1
+
+
+class Fix(msgspec.Struct, frozen=True, gc=False):
+    """Position and velocity over ground in `map`, with the bound of the position's error."""
+
+    x_m: float
+    y_m: float
+    velocity_x_mps: float
+    velocity_y_mps: float
+    accuracy_m: float
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether all of it are numbers, and ones that can be."""
+        return self.accuracy_m >= 0 \
+            and is_sane(self.x_m, self.y_m, self.accuracy_m) \
+            and math.hypot(self.velocity_x_mps, self.velocity_y_mps) <= _FASTEST_MPS
+
+
+class DistanceBound:
+    """What one look at the distance says about places near it, without another look.
+
+    A distance changes by no more than the way made. An exact one costs as much as all the rest of
+    a fix, and the robot is far from the prohibited area nearly always.
+
+    Args:
+        exact: the distance.
+    """
+
+    def __init__(self, exact: ProhibitedDistance) -> None:
+        self._exact = exact
+        self._at_m = (0.0, 0.0)
+        self._distance_m = -math.inf
+
+    def exceeds(self, x_m: float, y_m: float, needed_m: float) -> bool:
+        """Whether the distance from a place is greater than needed; as the exact one would say."""
+        bound_m = self._distance_m - math.dist(self._at_m, (x_m, y_m))
+        if bound_m > needed_m + _ROUNDING_M:
+            return True
+        self._at_m, self._distance_m = (x_m, y_m), self._exact(x_m, y_m)
+        return self._distance_m > needed_m
+
+
+def stopping_distance_m(speed_mps: float, limits: FenceLimits) -> float:
+    """Return how far the robot goes on: reaction and braking distance, m."""
+    return speed_mps * limits.reaction_s + speed_mps**2 / (2 * limits.braking_mps2)
+
+
+def reach_m(fix: Fix, limits: FenceLimits, extra_m: float = 0.0) -> float:
+    """Return how far from the position the capsule ends, m: beyond, all is well for certain."""
+    speed_mps = math.hypot(fix.velocity_x_mps, fix.velocity_y_mps)
+    return (limits.half_diagonal_m + fix.accuracy_m + extra_m
+            + stopping_distance_m(speed_mps, limits))
+
+
+def intrusion(fix: Fix, distance_m: ProhibitedDistance, limits: FenceLimits,
+              extra_m: float = 0.0) -> str:
+    """Return why the robot will not stop in time, or "" if it will.
+
+    Args:
+        fix: a usable fix.
+        distance_m: the prohibited area.
+        limits: size, reaction and brakes.
+        extra_m: added to the radius of the capsule.
+    """
+    radius_m = limits.half_diagonal_m + fix.accuracy_m + extra_m
+    here_m = distance_m(fix.x_m, fix.y_m)
+    if here_m < 0:
+        return "the robot is inside the prohibited area"
+    if here_m <= radius_m:
+        return (f"the robot is {here_m:.2f} m from the prohibited area, "
+                f"{radius_m:.2f} m is the least")
+    speed_mps = math.hypot(fix.velocity_x_mps, fix.velocity_y_mps)
+    length_m = stopping_distance_m(speed_mps, limits)
+    if here_m - length_m > radius_m:  # wherever it goes: most fixes end here
+        return ""
+    # Sphere tracing: a distance changes by no more than the way made, so from a point that is
+    # d away one may go on by d - radius without looking.
+    along_m, gap_m = 0.0, here_m - radius_m
+    while along_m < length_m:
+        along_m = min(length_m, along_m + max(gap_m, _LEAST_STEP_M))
+        share = along_m / speed_mps
+        gap_m = distance_m(fix.x_m + fix.velocity_x_mps * share,
+                           fix.y_m + fix.velocity_y_mps * share) - radius_m
+        if gap_m <= 0:
+            return (f"at {speed_mps:.2f} m/s the robot would touch the prohibited area in "
+                    f"{along_m:.2f} m, it needs {length_m:.2f} m to stop")
+    return ""

@@ -1,0 +1,155 @@
+"""DM1 for the full system: the prohibited area, by a position on which two out of three agree.
+
+The paper's DM1 (`prohibited_area`) hears the GPS receiver alone: a receiver that is wrong by two
+metres stops a robot that is well, and one that is stuck blinds it. This one votes between GPS, the
+absolute pose and its own dead reckoning, and is still independent of the localization node, which
+it does not hear. While fewer than two agree it goes on by dead reckoning, with a bound of the error
+that grows with the way. Beyond a bounded time or way it knows nothing, and is active.
+"""
+
+from __future__ import annotations
+
+import math
+
+from rampart.actors.detection.module import DetectionModule
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
+from rampart.actors.osmosis.detection.area.geofence import FenceLimits, Fix
+from rampart.actors.osmosis.detection.area.position_vote import GPS, PositionVote
+from rampart.actors.osmosis.detection.area.prohibited_area import GPS_PERIOD_S, half_diagonal_m
+from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.runtime.actor import Context, Header, on
+from rampart.actors.runtime.parameters import amount
+from rampart.manager.spec.budget import time_to_intrusion_s
+from rampart.manager.spec.schema import Robot, SystemSpec
+
+_ABSOLUTE = "absolute pose"
+_ERROR_PER_M = 0.06
+"""Error of dead reckoning, m per m driven: above the worst measured over 5 m."""
+
+
+class VotedPosition:
+    """The voted position over time; `look` gives it as a fix for the fence.
+
+    Args:
+        accuracy_m: bound of the error of a voted position, m.
+        blind_s: how long it may go on by dead reckoning, s.
+        blind_m: how far, m.
+    """
+
+    def __init__(self, accuracy_m: float, blind_s: float, blind_m: float) -> None:
+        self.vote = PositionVote(_ABSOLUTE)
+        self._accuracy_m = accuracy_m
+        self._blind_s, self._blind_m = blind_s, blind_m
+        self._anchor: tuple[float, float] | None = None
+        self._trusted_s = -math.inf
+        self._since_m = 0.0
+        self._fix: Fix | None = None
+        self.by_gps = False
+
+    def odometry(self, stamp_s: float, yaw_rad: float, linear_mps: float, now_s: float) -> None:
+        """Take the way that the wheels made."""
+        self._since_m += self.vote.track.odometry(stamp_s, yaw_rad, linear_mps, now_s)
+
+    def gps(self, fix: Fix, stamp_s: float, now_s: float) -> None:
+        """Take a GPS fix."""
+        if self.vote.see_gps(fix, stamp_s, now_s):
+            self._fix = fix
+
+    def look(self, now_s: float) -> tuple[Fix, float] | None:
+        """Return where the robot is, as far as is known, and when that was; None if it is not."""
+        vote = self.vote
+        two = vote.agreeing(now_s)
+        self.by_gps = GPS in two
+        if two:
+            witness = vote.gps if self.by_gps else vote.position
+            self._anchor, self._since_m = witness.offset, 0.0
+            self._trusted_s = witness.stamp_s
+            if self.by_gps and self._fix is not None:
+                return self._fix, witness.stamp_s
+        if self._anchor is None or not vote.wheels_fresh(now_s) \
+                or now_s - self._trusted_s > self._blind_s or self._since_m > self._blind_m:
+            return None
+        track = vote.track
+        heading = track.heading_rad
+        return Fix(self._anchor[0] + track.place[0], self._anchor[1] + track.place[1],
+                   track.speed_mps * math.cos(heading), track.speed_mps * math.sin(heading),
+                   self._accuracy_m + _ERROR_PER_M * self._since_m), track.stamp_s
+
+
+class VotedArea(DetectionModule):
+    """Active while the robot would not stop before the prohibited area, or its place is unknown.
+
+    Parameters:
+        margin_m: as for `ProhibitedArea`.
+        unknown_s: how long the place may be unknown, s.
+        hold_s: how long it must have been safe again before the module is idle, s.
+        blind_s: how long it goes on by dead reckoning while fewer than two witnesses agree, s.
+        blind_m: how far it does so, m.
+    """
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        system: SystemSpec = context.shared["system"]
+        airport: Airport = context.shared["airport"]
+        robot = system.robot
+        timeout_s = amount(self.parameters, "unknown_s", 5 * GPS_PERIOD_S)
+        self._looked_s = -math.inf
+        self._where = VotedPosition(robot.gps_accuracy_m,
+                                    amount(self.parameters, "blind_s", 10.0),
+                                    amount(self.parameters, "blind_m", 5.0))
+        self.monitor = FenceMonitor(
+            airport.prohibited_distance_m,
+            FenceLimits(half_diagonal_m(robot), self._reaction_s(system, robot),
+                        robot.braking_mps2),
+            FreshnessMonitor("position that two sources agree on", timeout_s, 2 * GPS_PERIOD_S,
+                             self.clock.now(), self.grace_s(timeout_s), known=self.first_life),
+            amount(self.parameters, "hold_s", 0.5))
+
+    def _reaction_s(self, system: SystemSpec, robot: Robot) -> float:
+        needed_s = GPS_PERIOD_S + system.timing.arbitration_s + system.timing.actuation_s
+        if "margin_m" not in self.parameters:
+            return needed_s
+        return max(needed_s, time_to_intrusion_s(robot, amount(self.parameters, "margin_m", 0.0)))
+
+    def on_start(self) -> None:
+        """Start waiting for the first position."""
+        self.follow(self.monitor)
+
+    @on(topics.IMU)
+    def imu(self, message: m.Imu, header: Header) -> None:
+        """Hear the heading."""
+        self._where.vote.track.imu(
+            header.stamp, message.yaw_rad, message.yaw_rate_radps, self.clock.now())
+
+    @on(topics.ABSOLUTE_POSE)
+    def absolute_pose(self, message: m.Pose, header: Header) -> None:
+        """Hear the absolute pose."""
+        self._where.vote.see_position(
+            header.stamp, (message.x_m, message.y_m), self.clock.now())
+
+    @on(topics.GPS)
+    def gps(self, message: m.GpsFix, header: Header) -> None:
+        """Hear a fix, and look where the robot is and where it is going."""
+        fix = Fix(message.x_m, message.y_m, message.velocity_x_mps, message.velocity_y_mps,
+                  message.accuracy_m)
+        self._where.gps(fix, header.stamp, self.clock.now())
+        self._look()
+
+    @on(topics.ODOMETRY)
+    def odometry(self, message: m.Odometry, header: Header) -> None:
+        """Hear the way that the wheels made; look, if GPS gives no occasion."""
+        now_s = self.clock.now()
+        self._where.odometry(header.stamp, message.pose.yaw_rad, message.twist.linear_mps, now_s)
+        waited_s = now_s - self._looked_s
+        if waited_s >= (1.5 if self._where.by_gps else 0.99) * GPS_PERIOD_S:
+            self._look()
+
+    def _look(self) -> None:
+        now_s = self._looked_s = self.clock.now()
+        found = self._where.look(now_s)
+        if found is not None:
+            self.monitor.fix(*found, now_s)
+        self.follow(self.monitor)

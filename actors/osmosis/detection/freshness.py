@@ -1,0 +1,82 @@
+"""DM2 and DM6: command not updated, localization not updated (paper, table I)."""
+
+from __future__ import annotations
+
+from rampart.actors.detection.module import DetectionModule
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.runtime.actor import Context, Header, on
+from rampart.actors.runtime.parameters import amount, names
+
+
+class Freshness(DetectionModule):
+    """Active while a topic is stale. A subclass per topic, so that each hears only its own.
+
+    Class attributes:
+        subject: what is stale, for the reason.
+        default_timeout_s: timeout if no parameter says.
+
+    Parameters:
+        timeout_s: greatest admissible age of the content, s.
+        hold_s: how long it must be fresh again before the module is idle, s.
+        suspects: names of nodes to be respawned when it is active, as a rule the one that
+            publishes the topic; none by default, as in the paper.
+
+    The first sample of a starting system may take the spec's `startup_grace_s`. A respawned
+    module joins a running system: for it the timeout itself is the grace.
+    """
+
+    subject = ""
+    default_timeout_s = 1.0
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        if not self.subject:
+            raise ValueError(f"{self.name}: actor Freshness hears no topic; name a subclass, "
+                             "CommandFreshness or LocalizationFreshness")
+        timeout_s = amount(self.parameters, "timeout_s", self.default_timeout_s)
+        self.monitor = FreshnessMonitor(
+            self.subject, timeout_s, amount(self.parameters, "hold_s", 0.2), self.clock.now(),
+            self.grace_s(timeout_s), known=self.first_life)
+        self._suspects = names(self.parameters, "suspects")
+        self.monitor.nodes = self._suspects
+
+    def on_start(self) -> None:
+        """Start waiting for the first sample."""
+        self.follow(self.monitor)
+
+    def sample(self, header: Header) -> None:
+        """Take note of a sample."""
+        monitor = self.monitor
+        monitor.heard(header.stamp, self.clock.now())
+        if self._suspects and not monitor.active:
+            # The life that was last heard is accused: a later one has done nothing yet.
+            monitor.nodes = tuple(
+                f"{name}#{header.incarnation}" if name == header.source else name
+                for name in self._suspects)
+        self.follow(monitor)
+
+
+class CommandFreshness(Freshness):
+    """DM2: Osmosis Control's command is not updated (0.64 s in the authors' code)."""
+
+    subject = "command"
+    default_timeout_s = 0.64
+
+    @on(topics.COMMAND)
+    def command(self, _message: m.Twist, header: Header) -> None:
+        """Hear a command."""
+        self.sample(header)
+
+
+class LocalizationFreshness(Freshness):
+    """DM6: the pose is not updated (1 s in the authors' code)."""
+
+    subject = "localization"
+    default_timeout_s = 1.0
+
+    @on(topics.POSE)
+    def pose(self, _message: m.Pose, header: Header) -> None:
+        """Hear a pose."""
+        self.sample(header)

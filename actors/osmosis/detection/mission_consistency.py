@@ -1,0 +1,70 @@
+"""DM11: the mission does not advance, or somebody in the control chain has got stuck.
+
+A node may be alive and beat, and its timer repeat a message that is no longer true. Watchdogs do
+not see that. This module hears what the three control nodes hand on and names the one that
+contradicts the others, so that it can be respawned.
+"""
+
+from __future__ import annotations
+
+from rampart.actors.detection.module import DetectionModule
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.detection.consistency_monitor import (
+    ConsistencyLimits,
+    ConsistencyMonitor,
+)
+from rampart.actors.runtime.actor import Context, Header, on
+from rampart.actors.runtime.parameters import amount
+
+
+class MissionConsistency(DetectionModule):
+    """Active while a control node contradicts the others, or its words are not updated.
+
+    Parameters:
+        patience_s: how long a contradiction may last, s.
+        silence_s: greatest age of what a node says about the mission, s.
+    """
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        limits = ConsistencyLimits()
+        self.monitor = ConsistencyMonitor(
+            ConsistencyLimits(amount(self.parameters, "patience_s", limits.patience_s),
+                              amount(self.parameters, "silence_s", limits.silence_s)),
+            self.clock.now(), known=self.first_life)
+
+    def on_start(self) -> None:
+        """Start listening."""
+        self.follow(self.monitor)
+
+    @on(topics.MISSION_STATUS)
+    def mission(self, message: m.MissionStatus, header: Header) -> None:
+        """Hear how the mission stands."""
+        self._hear(message, header)
+
+    @on(topics.GOAL)
+    def goal(self, message: m.GoalOrder, header: Header) -> None:
+        """Hear the current goal."""
+        self._hear(message, header)
+
+    @on(topics.ROUTE)
+    def route(self, message: m.Route, header: Header) -> None:
+        """Hear the route."""
+        self._hear(message, header)
+
+    @on(topics.CONTROL_STATUS)
+    def control(self, message: m.ControlStatus, header: Header) -> None:
+        """Hear how far the robot is."""
+        self._hear(message, header)
+
+    @on(topics.POSE)
+    def pose(self, message: m.Pose, _header: Header) -> None:
+        """Hear where the robot is."""
+        self.monitor.pose(message.x_m, message.y_m, self.clock.now())
+        self.follow(self.monitor)
+
+    def _hear(self, message: m.Message, header: Header) -> None:
+        self.monitor.heard(message, header.source, header.incarnation, header.stamp,
+                           self.clock.now())
+        self.follow(self.monitor)

@@ -1,0 +1,676 @@
+"""The messages of the controller, one struct each: SI units, REP-103 axes, REP-105 frames.
+
+Header data (source, incarnation, sequence, stamp) is not in these structs: the bus puts it
+round them (see `rampart.actors.bus.envelope`). Angles are in (-pi, pi], x forward, y left, yaw
+counter-clockwise. A field named `*_f32` is a little-endian float32 array as bytes.
+
+Every field but a measurement or a command is bounded, by the types of `rampart.actors.bus.bounds`: a
+payload beyond the bounds never reaches an actor. Those that are plain `float` may be anything, NaN
+and infinity included: to judge them is the business of whoever reads them.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import msgspec
+
+from rampart.actors.bus.bounds import (
+    MANY,
+    MOST,
+    Count,
+    Document,
+    Duration,
+    Explained,
+    Floats32,
+    Incarnation,
+    Lasting,
+    Name,
+    Names,
+    Pid,
+    Seconds,
+    Text,
+    Texts,
+)
+from rampart.actors.bus.messages import (  # noqa: F401
+    Diagnostic,
+    Heartbeat,
+    Hello,
+    Injection,
+    InjectionReport,
+    Message,
+)
+
+# ---- robot: what a Summit XL driver publishes and takes --------------------------------------
+
+
+class Pose(Message, frozen=True):
+    """Planar pose of `base_link`."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+
+class Twist(Message, frozen=True):
+    """Planar velocity of `base_link` in its own axes."""
+
+    linear_mps: float
+    angular_radps: float
+
+
+class Odometry(Message, frozen=True):
+    """Wheel odometry: pose in `odom` (starts at the origin), velocity in `base_link`."""
+
+    pose: Pose
+    twist: Twist
+
+
+class Imu(Message, frozen=True):
+    """Inertial measurement in `base_link`; `yaw_rad` is the integrated heading."""
+
+    yaw_rad: float
+    yaw_rate_radps: float
+    accel_x_mps2: float
+    accel_y_mps2: float
+
+
+class GpsFix(Message, frozen=True):
+    """RTK-GPS position in `map` (local east-north), with velocity over ground in `map`."""
+
+    x_m: float
+    y_m: float
+    velocity_x_mps: float
+    velocity_y_mps: float
+    accuracy_m: float
+
+
+class LaserScan(Message, frozen=True):
+    """One sweep of the 2D laser in `base_link`; a range of `range_max_m` means no echo.
+
+    `reference_m` is the range to the target in the laser's housing, measured once a sweep, by which
+    it can be checked (`rampart.actors.osmosis.control.pilot.laser_check`); exactly -1 for a device without one.
+    """
+
+    angle_min_rad: float
+    angle_increment_rad: float
+    range_max_m: float
+    ranges_f32: Floats32
+    reference_m: float = -1.0
+
+
+class LightSample(Message, frozen=True):
+    """Illuminance at the light sensor, which looks down at the ground ahead of the robot."""
+
+    illuminance_lux: float
+
+
+class BaseCommand(Message, frozen=True):
+    """Velocity for the base. The base stops by itself when these cease (dead man)."""
+
+    linear_mps: float
+    angular_radps: float
+
+
+class BrakeCommand(Message, frozen=True):
+    """Low-level brake. Engaged, it blocks the wheels whatever the velocity command says.
+
+    Several may hold it; it is released when the last of them has let go.
+    """
+
+    engaged: bool
+    reason: Text
+
+
+class BaseStatus(Message, frozen=True):
+    """State of the Summit XL layer. Wheels: front left, front right, rear left, rear right."""
+
+    brake_engaged: bool
+    dead_man_tripped: bool
+    command_age_s: float
+    wheel_speeds_radps: tuple[float, float, float, float]
+
+
+# ---- mission and control ---------------------------------------------------------------------
+
+
+class Mode(StrEnum):
+    """How a goal is reached (paper, section III)."""
+
+    TAXI = "taxi"
+    LIGHT_VERIFICATION = "light verification"
+
+
+class Goal(Message, frozen=True):
+    """One point of a mission, in `map`, and the mode in which to reach it."""
+
+    x_m: float
+    y_m: float
+    mode: Mode
+
+
+Goals = Annotated[tuple[Goal, ...], msgspec.Meta(max_length=MANY)]
+
+
+class MissionRequest(Message, frozen=True):
+    """A mission for the Mission Manager. The same `mission_id` twice is one mission."""
+
+    mission_id: Name
+    name: Name
+    goals: Goals
+
+
+class MissionPhase(StrEnum):
+    """State of a mission."""
+
+    IDLE = "idle"
+    RUNNING = "running"
+    PAUSED = "paused"
+    RETURNING = "returning home"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+class LightVerdict(StrEnum):
+    """Judgement on a light: below half its nominal intensity it is dim (ICAO Annex 14, 10.4)."""
+
+    OK = "ok"
+    DIM = "dim"
+    OUT = "out"
+
+
+class LightMeasurement(Message, frozen=True):
+    """One light measured in passing."""
+
+    light: Name
+    intensity_cd: float
+    ratio: float
+    verdict: LightVerdict
+
+
+_Lights = Annotated[tuple[LightMeasurement, ...], msgspec.Meta(max_length=MOST)]
+_LightNames = Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST)]
+
+
+class MissionAction(StrEnum):
+    """What can be asked of a mission under way."""
+
+    PAUSE = "pause"
+    RESUME = "resume"
+    REPLAN = "replan"
+    SKIP = "skip"
+    CANCEL = "cancel"
+    HOME = "home"
+
+
+class MissionOrder(Message, frozen=True):
+    """Asks the Mission Manager for something; the same `order` twice is one order.
+
+    `by` is who asks, `reason` why: both are kept with what comes of it.
+    """
+
+    order: Name
+    action: MissionAction
+    reason: Text
+    by: Name
+
+
+class MissionOrderAnswer(Message, frozen=True):
+    """Whether an order was obeyed, and why not; `plan` is the number of the plan it led to."""
+
+    order: Name
+    accepted: bool
+    reason: Text
+    plan: Count = 0
+
+
+_StepTimes = Annotated[tuple[Seconds, ...], msgspec.Meta(max_length=MANY)]
+_Steps = Annotated[tuple[Count, ...], msgspec.Meta(max_length=MANY)]
+_Actions = Annotated[tuple[MissionAction, ...], msgspec.Meta(max_length=16)]
+
+
+class MissionStatus(Message, frozen=True):
+    """Where the mission is. `step` is the index of the current goal; lights measured so far.
+
+    `skipped` holds the indices of goals that were left out on request, `unmeasured` names the
+    lights that the robot passed without being able to measure them. `orders` are those that would
+    be obeyed now.
+    """
+
+    mission_id: Name
+    name: Name
+    phase: MissionPhase
+    step: Count
+    goals: Goals
+    step_times_s: _StepTimes
+    lights: _Lights
+    reason: Text
+    skipped: _Steps = ()
+    unmeasured: _LightNames = ()
+    orders: _Actions = ()
+
+
+class GoalOrder(Message, frozen=True):
+    """The Mission Manager's current goal for the Graph Planner; `active` False means none.
+
+    On the way home `step` is the number of goals. `plan` grows with each wish for another plan.
+    """
+
+    mission_id: Name
+    step: Count
+    goal: Goal
+    active: bool
+    plan: Count = 0
+
+
+_Waypoints = Annotated[tuple[tuple[float, float], ...], msgspec.Meta(max_length=MOST)]
+
+
+class Route(Message, frozen=True):
+    """Way to a goal: waypoints in `map`, first is the start; empty with a `reason` if none.
+
+    `plan` is that of the goal it was made for. Of a way round something blocked the reason says so.
+    """
+
+    mission_id: Name
+    step: Count
+    mode: Mode
+    active: bool
+    waypoints: _Waypoints
+    reason: Text
+    plan: Count = 0
+
+
+class ControlPhase(StrEnum):
+    """What Osmosis Control is doing with its route."""
+
+    IDLE = "idle"
+    FOLLOWING = "following"
+    WAITING = "waiting"
+    ARRIVED = "arrived"
+    REFUSED = "refused"
+
+
+class Blockage(Message, frozen=True):
+    """Something on the route that the robot does not get past: where in `map`, and since when."""
+
+    x_m: float
+    y_m: float
+    since_s: Seconds
+
+
+_Blockages = Annotated[tuple[Blockage, ...], msgspec.Meta(max_length=MANY)]
+
+
+class ControlStatus(Message, frozen=True):
+    """Progress along the route of (mission, step).
+
+    `blocked` holds at most one blockage, the one in front of the robot now. `reason` says why a
+    route was refused. `unmeasured` names, on arrival, lights that were passed unmeasured.
+
+    What a standby has to do as well: `back_to` holds the point in `map` to which the robot goes
+    back, if it does, `passing` says that it leaves the row to drive round something, `aside_m` how
+    far to the left of the route it means to be, and `turn_added_radps` what its yaw loop has
+    learnt.
+    """
+
+    mission_id: Name
+    step: Count
+    phase: ControlPhase
+    waypoint: Count
+    distance_to_go_m: float
+    blocked: _Blockages = ()
+    reason: Text = ""
+    unmeasured: _LightNames = ()
+    back_to: _Waypoints = ()
+    passing: bool = False
+    aside_m: float = 0.0
+    turn_added_radps: float = 0.0
+
+
+class LocalizationStatus(Message, frozen=True):
+    """What the pose rests on: sources in use, and those that are not, each with the reason.
+
+    Standard deviations are infinite before there is a pose. `bridged_m` is the way made since two
+    independent sources last agreed on the position.
+    """
+
+    in_use: Names
+    excluded: Explained
+    position_sd_m: float
+    heading_sd_rad: float
+    bridged_m: float
+
+
+class Joystick(Message, frozen=True):
+    """Stick positions in [-1, 1] and the dead-man button."""
+
+    forward: float
+    left: float
+    dead_man: bool
+
+
+# ---- safety pilot, detection, recovery, manager ----------------------------------------------
+
+
+class PilotMode(StrEnum):
+    """Whose commands the Safety Pilot passes on."""
+
+    AUTO = "auto"
+    STOP = "stop"
+    TELEOPERATION = "teleoperation"
+
+
+class PilotOrder(Message, frozen=True):
+    """A recovery module's order to the Safety Pilot, in force while `engaged`.
+
+    `top_speed_mps` bounds the speed of what passes; 0 leaves the bound of the robot.
+    """
+
+    engaged: bool
+    mode: PilotMode
+    reason: Text
+    top_speed_mps: float = 0.0
+
+
+class PilotStatus(Message, frozen=True):
+    """What the Safety Pilot does and why: `reason` is empty while commands pass unchanged.
+
+    `top_speed_mps` is the lowest bound that was ordered, 0 for none. `forbids` says why nobody may
+    drive now, not even by the joystick; "" if somebody may.
+    """
+
+    mode: PilotMode
+    stopped: bool
+    reason: Text
+    refused_commands: Count
+    top_speed_mps: float = 0.0
+    forbids: Text = ""
+
+
+class Holds(Message, frozen=True):
+    """Who holds the brake, or an order to the pilot, and is no recovery module of the system.
+
+    `what` is held; `holders` are obeyed until they let go, or an operator does for them.
+    """
+
+    what: Name
+    holders: Names
+
+
+class DetectionState(StrEnum):
+    """State of a detection module (paper, figure 4)."""
+
+    IDLE = "idle"
+    ACTIVE = "active"
+
+
+class DetectionReport(Message, frozen=True):
+    """State of one detection module; `nodes` names the failed nodes where that is the subject."""
+
+    state: DetectionState
+    reason: Text
+    nodes: Names
+    since_s: Seconds
+
+
+class RecoveryState(StrEnum):
+    """State of a recovery module (paper, figure 4)."""
+
+    IDLE = "idle"
+    ACTIVATED = "activated"
+
+
+class RecoveryPhase(StrEnum):
+    """How far an activated recovery is: only `ACTING` must not be cut off."""
+
+    IDLE = "idle"
+    ACTING = "acting"
+    DONE = "done"
+    DEGRADED = "degraded"
+    FAILED = "failed"
+
+
+class RecoveryCommand(Message, frozen=True):
+    """The manager's wish for one recovery module, repeated until it is reported fulfilled."""
+
+    activate: bool
+    decision: Count
+    nodes: Names
+    reason: Text
+
+
+class RecoveryReport(Message, frozen=True):
+    """State of one recovery module, for the decision it last obeyed."""
+
+    state: RecoveryState
+    phase: RecoveryPhase
+    decision: Count
+    reason: Text
+
+
+class DecisionRecord(Message, frozen=True):
+    """A decision with its certificate: rule is the block 1 to 4 of safety-first, 0 for no fault."""
+
+    decision: Count
+    strategy: Name
+    active: Names
+    rule: Count
+    recoveries: Names
+    path: Texts
+    rejected: Explained
+    detected_s: Seconds
+
+
+class AdaptationRequest(Message, frozen=True):
+    """Asks the manager to change a mechanism while running (`rampart.manager.spec.adaptation.Change`).
+
+    `values` is a JSON object. The answer carries the same `request`.
+    """
+
+    request: Name
+    action: Name
+    name: Name
+    values: Document
+    by: Name
+
+
+class AdaptationAnswer(Message, frozen=True):
+    """Whether a change was made, and why not; `version` counts the changes made in this run."""
+
+    request: Name
+    accepted: bool
+    reason: Text
+    version: Count
+
+
+class AdaptedSystem(Message, frozen=True):
+    """The system as it was changed; `document` is its whole spec as a JSON object."""
+
+    version: Count
+    change: Text
+    by: Name
+    document: Document
+
+
+class StubTrigger(Message, frozen=True):
+    """Makes the stand-in for detection module `name` active or idle."""
+
+    name: Name
+    active: bool
+    reason: Text
+
+
+class ShadowRecord(Message, frozen=True):
+    """A decision that the strategy in shadow would have taken instead of decision `decision`."""
+
+    decision: Count
+    strategy: Name
+    active: Names
+    rule: Count
+    recoveries: Names
+    taken: Names
+
+
+class DetectionView(Message, frozen=True):
+    """What the manager believes about a detection module (it holds a flapping one active)."""
+
+    name: Name
+    active: bool
+    reason: Text
+    nodes: Names
+
+
+_Views = Annotated[tuple[DetectionView, ...], msgspec.Meta(max_length=MANY)]
+
+
+class ManagerStatus(Message, frozen=True):
+    """The manager's view, and by its regularity the proof that it lives."""
+
+    active: Names
+    silent: Names
+    activated: Names
+    latched: Names
+    strategy: Name
+    decision: Count
+    detections: _Views = ()
+
+
+class Reset(Message, frozen=True):
+    """Operator's word to release a latched recovery, e.g. the emergency stop."""
+
+    recovery: Name
+    by: Name
+
+
+# ---- runtime and supervision -----------------------------------------------------------------
+
+
+class NodeState(StrEnum):
+    """State of a node's process as the supervisor sees it."""
+
+    STARTING = "starting"
+    RUNNING = "running"
+    CRASHED = "crashed"
+    STOPPED = "stopped"
+    WEDGED = "wedged"
+    GIVEN_UP = "given up"
+
+
+class NodeInfo(Message, frozen=True):
+    """One row of the supervisor's table."""
+
+    name: Name
+    kind: Name
+    pid: Pid
+    state: NodeState
+    incarnation: Incarnation
+    restarts: Count
+
+
+_Rows = Annotated[tuple[NodeInfo, ...], msgspec.Meta(max_length=MANY)]
+
+
+class NodeTable(Message, frozen=True):
+    """All nodes of the system."""
+
+    nodes: _Rows
+
+
+class RespawnRequest(Message, frozen=True):
+    """A wish of a recovery module or the manager: kill a process, if it lives, and restart it."""
+
+    request: Count
+    node: Name
+    failed_incarnation: Incarnation
+    by: Name
+
+
+class ProcessEvent(Message, frozen=True):
+    """Something happened to a process: crashed, stopped, wedged, respawned, refused, given up."""
+
+    node: Name
+    event: Name
+    pid: Pid
+    incarnation: Incarnation
+    by: Name
+    detail: Text
+
+
+# ---- world: for the judge and the tests, never for the controller ----------------------------
+
+
+class GroundTruth(Message, frozen=True):
+    """What really happens. Counters are cumulative, so a lost sample loses nothing."""
+
+    pose: Pose
+    twist: Twist
+    collisions: Count
+    prohibited_s: Duration
+    obstacle_clearance_m: float
+    prohibited_clearance_m: float
+    real_time_factor: float
+
+
+class ObstacleCommand(Message, frozen=True):
+    """Makes a named obstacle of the airport appear at (x, y) in `map`, or go away."""
+
+    name: Name
+    present: bool
+    x_m: float
+    y_m: float
+    radius_m: float
+
+
+_Obstacles = Annotated[tuple[ObstacleCommand, ...], msgspec.Meta(max_length=MANY)]
+
+
+class ActuatorFaultKind(StrEnum):
+    """What can fail about the base's actuators."""
+
+    STUCK_WHEEL = "stuck wheel"
+    WEAK_WHEEL = "weak wheel"
+    BRAKE_FAILURE = "brake failure"
+
+
+class ActuatorFault(Message, frozen=True):
+    """Puts a fault of the base's actuators in force; 0 simulated seconds end it.
+
+    `wheel`: front left, front right, rear left or rear right; a brake failure ignores it.
+    `strength` from 0 to 1: what is left of a weak wheel's torque and speed, or of the braking
+    torque with a brake failure, whose wheels do not lock; 1 loses nothing. A stuck wheel ignores
+    it. `InjectionReport.affected` counts the 10 ms ticks in which the fault changed something.
+    """
+
+    injection: Name
+    kind: ActuatorFaultKind
+    wheel: Name
+    strength: float
+    duration_s: Lasting
+
+
+_ActuatorFaults = Annotated[tuple[ActuatorFault, ...], msgspec.Meta(max_length=64)]
+_Injections = Annotated[tuple[Injection, ...], msgspec.Meta(max_length=64)]
+
+
+class NamedFault(Message, frozen=True):
+    """A fault that can be ordered by its name: what the launcher offers to the operator's page.
+
+    `duration_s` is how long it lasts unless told otherwise, simulated seconds. The ids of the
+    orders are filled in when it is ordered.
+    """
+
+    name: Name
+    title: Text
+    group: Name
+    duration_s: Lasting
+    injections: _Injections = ()
+    actuator_faults: _ActuatorFaults = ()
+
+
+class ObstacleList(Message, frozen=True):
+    """The obstacles that are there now, for the map on the operator's page."""
+
+    obstacles: _Obstacles

@@ -1,0 +1,79 @@
+"""The airport as the page draws it: at once, and no more of it than a page can hold. Pure.
+
+It is sent to each page that opens, once. A map with more in it than a person can see is drawn with
+less detail, then without what there is most of, and how much is missing is counted and shown.
+"""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import msgspec
+
+from rampart.actors.operator.bounds import MAX_NAME, clip
+from rampart.actors.operator.state import MAX_LIGHTS
+from rampart.actors.osmosis.airport.drawing import AirportDrawing, DrawnLight, draw
+from rampart.actors.osmosis.airport.model import Airport, Light
+
+MAX_PATHS_BYTES = 100_000
+"""Of the prohibited area, the pavement and the buildings together."""
+
+MAX_GRAPH = 1500
+"""Nodes, and edges."""
+
+MAX_BUILDINGS = 300
+_TOLERANCES_M = (0.02, 0.1, 0.5, 2.0)
+
+
+class PageMap(msgspec.Struct, frozen=True):
+    """A map as it is sent.
+
+    Attributes:
+        encoded: an `AirportDrawing` as JSON.
+        left_out: what is missing, and how many of it.
+    """
+
+    encoded: msgspec.Raw
+    left_out: dict[str, int]
+
+
+def page_map(airport: Airport) -> PageMap:
+    """Return the map of an airport."""
+    for tolerance_m in _TOLERANCES_M:
+        drawn = draw(airport, tolerance_m)
+        if (size := _paths_bytes(drawn)) <= MAX_PATHS_BYTES:
+            break
+    fits = size <= MAX_PATHS_BYTES
+    shown = msgspec.structs.replace(
+        drawn, name=clip(drawn.name, MAX_NAME),
+        prohibited=drawn.prohibited if fits else "", surfaces=drawn.surfaces if fits else (),
+        buildings=tuple((clip(name, MAX_NAME), path)
+                        for name, path in drawn.buildings[:MAX_BUILDINGS]) if fits else (),
+        nodes={clip(name, MAX_NAME): at for name, at in islice(drawn.nodes.items(), MAX_GRAPH)},
+        edges=drawn.edges[:MAX_GRAPH],
+        lights=tuple(islice(filter(_is_plain, drawn.lights), MAX_LIGHTS)))
+    missing = {
+        "prohibited areas": int(shown.prohibited != drawn.prohibited),
+        "pieces of pavement": len(drawn.surfaces) - len(shown.surfaces),
+        "buildings": len(drawn.buildings) - len(shown.buildings),
+        "nodes of the graph": len(drawn.nodes) - len(shown.nodes),
+        "edges of the graph": len(drawn.edges) - len(shown.edges),
+        "lights": len(drawn.lights) - len(shown.lights)}
+    return PageMap(msgspec.Raw(msgspec.json.encode(shown)),
+                   {what: count for what, count in missing.items() if count})
+
+
+def lights_shown(airport: Airport) -> frozenset[str]:
+    """Return the names of the lights that are on the map of an airport."""
+    return frozenset(light.name for light in islice(filter(_is_plain, airport.lights), MAX_LIGHTS))
+
+
+def _is_plain(light: Light | DrawnLight) -> bool:
+    """Tell whether the page can show a light's name as it is: by that the light is known."""
+    return light.name == clip(light.name, MAX_NAME) and light.row == clip(light.row, MAX_NAME)
+
+
+def _paths_bytes(drawn: AirportDrawing) -> int:
+    return len(drawn.prohibited) + sum(
+        len(path) for _, path in (*drawn.surfaces, *drawn.buildings))
+

@@ -1,0 +1,13 @@
+"""RM5: switch to teleoperation (paper, table II)."""
+
+from __future__ import annotations
+
+from rampart.actors.osmosis.messages import PilotMode
+from rampart.actors.osmosis.recovery.controlled_stop import PilotRecovery
+
+
+class SwitchTeleoperation(PilotRecovery):
+    """The Safety Pilot executes the joystick only. A stop, being stricter, fulfils this too."""
+
+    mode = PilotMode.TELEOPERATION
+    confirming = (PilotMode.TELEOPERATION, PilotMode.STOP)

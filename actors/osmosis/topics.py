@@ -1,0 +1,112 @@
+"""Every key of the system, declared once. `topics.md` is written from this file."""
+
+from __future__ import annotations
+
+from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.bus.topics import (  # noqa: F401
+    DIAGNOSTIC,
+    HEARTBEAT,
+    HELLO,
+    INJECT,
+    INJECTION_REPORT,
+    INJECTION_REQUEST,
+    INJECTION_RESULT,
+)
+from rampart.actors.osmosis import messages as m
+
+# Summit XL layer: a real robot's driver stands behind these keys just as well.
+ABSOLUTE_POSE = Topic("summit_xl/absolute_pose", m.Pose, Qos.SENSOR, 20, "map",
+                      "Absolute localization that the simulator offers, as in the paper.")
+ODOMETRY = Topic("summit_xl/odom", m.Odometry, Qos.SENSOR, 50, "odom", "Wheel odometry.")
+IMU = Topic("summit_xl/imu", m.Imu, Qos.SENSOR, 50, "base_link", "Inertial measurement unit.")
+GPS = Topic("summit_xl/gps", m.GpsFix, Qos.SENSOR, 10, "map", "RTK-GPS receiver.")
+SCAN = Topic("summit_xl/scan", m.LaserScan, Qos.SENSOR, 20, "base_link", "2D laser scanner.")
+UPPER_SCAN = Topic("summit_xl/upper_scan", m.LaserScan, Qos.SENSOR, 20, "base_link",
+                   "A second laser scanner above the first, where the robot has one.")
+LIGHT = Topic("summit_xl/light", m.LightSample, Qos.SENSOR, 20, "base_link", "Light sensor.")
+BASE_STATUS = Topic("summit_xl/status", m.BaseStatus, Qos.STATE, 10, "base_link",
+                    "Brake, dead man and wheel speeds.")
+BASE_COMMAND = Topic("summit_xl/command", m.BaseCommand, Qos.SENSOR, 20, "base_link",
+                     "Velocity command; when it ceases the base brakes.")
+BRAKE = Topic("summit_xl/brake", m.BrakeCommand, Qos.COMMAND, 5, "base_link",
+              "Low-level brake, repeated while in force. Each source lets go of its own hold only: "
+              "the base brakes as long as anybody holds it.")
+
+# Control chain.
+MISSION_REQUEST = Topic("mission/request", m.MissionRequest, Qos.COMMAND, 0, "map",
+                        "A mission from the operator.")
+MISSION_ORDER = Topic("mission/order", m.MissionOrder, Qos.COMMAND, 0, "",
+                      "Pause, resume, replan, skip, cancel or return home.")
+MISSION_ORDER_ANSWER = Topic("mission/order_answer", m.MissionOrderAnswer, Qos.COMMAND, 0, "",
+                             "Whether an order was obeyed, and why not.")
+MISSION_STATUS = Topic("mission/status", m.MissionStatus, Qos.STATE, 2, "map",
+                       "Progress and results of the mission.")
+GOAL = Topic("mission/goal", m.GoalOrder, Qos.STATE, 5, "map", "The current goal.")
+ROUTE = Topic("plan/route", m.Route, Qos.STATE, 5, "map", "The way to the current goal.")
+COMMAND = Topic("control/command", m.Twist, Qos.SENSOR, 20, "base_link",
+                "Velocity that Osmosis Control computes.")
+STANDBY_COMMAND = Topic("control/standby_command", m.Twist, Qos.SENSOR, 20, "base_link",
+                        "The same, computed by a hot standby in a process of its own.")
+CONTROL_STATUS = Topic("control/status", m.ControlStatus, Qos.STATE, 5, "",
+                       "Progress along the route.")
+LIGHT_MEASURED = Topic("inspection/light", m.LightMeasurement, Qos.COMMAND, 0, "",
+                       "A light was measured in passing.")
+POSE = Topic("localization/pose", m.Pose, Qos.SENSOR, 20, "map", "The robot's pose.")
+LOCALIZATION_STATUS = Topic("localization/status", m.LocalizationStatus, Qos.STATE, 5, "map",
+                            "What the pose rests on, and how sure it is.")
+JOYSTICK = Topic("teleoperation/joystick", m.Joystick, Qos.SENSOR, 20, "",
+                 "The operator's stick, wherever it is.")
+TELEOP_COMMAND = Topic("teleoperation/command", m.Twist, Qos.SENSOR, 20, "base_link",
+                       "Velocity from the stick; silent while the dead man is released.")
+
+# Safety pilot, fault tolerance.
+PILOT_ORDER = Topic("pilot/order/{name}", m.PilotOrder, Qos.STATE, 5, "",
+                    "Order of the recovery module {name} to the Safety Pilot.")
+PILOT_STATUS = Topic("pilot/status", m.PilotStatus, Qos.STATE, 5, "",
+                     "What the Safety Pilot does, and why.")
+HOLDS = Topic("holds/{name}", m.Holds, Qos.STATE, 5, "",
+              "Who makes {name} stand and is no recovery module of the system; silent while "
+              "nobody does. `rampart reset` lets go in its place.")
+DETECTION = Topic("detection/{name}", m.DetectionReport, Qos.STATE, 5, "",
+                  "State of detection module {name}.")
+RECOVERY_COMMAND = Topic("recovery/{name}/command", m.RecoveryCommand, Qos.STATE, 5, "",
+                         "The manager's wish for recovery module {name}.")
+RECOVERY = Topic("recovery/{name}/state", m.RecoveryReport, Qos.STATE, 5, "",
+                 "State of recovery module {name}.")
+DECISION = Topic("manager/decision", m.DecisionRecord, Qos.COMMAND, 0, "",
+                 "Each decision of the FTM Manager with its certificate.")
+SHADOW = Topic("manager/shadow", m.ShadowRecord, Qos.COMMAND, 0, "",
+               "What the strategy in shadow would have decided, where it differs.")
+ADAPT = Topic("manager/adapt", m.AdaptationRequest, Qos.COMMAND, 0, "",
+              "Change a module, a mechanism or the strategy while running.")
+ADAPTATION = Topic("manager/adaptation", m.AdaptationAnswer, Qos.COMMAND, 0, "",
+                   "Whether a change was made, and why not.")
+ADAPTED_SYSTEM = Topic("manager/system", m.AdaptedSystem, Qos.STATE, 1, "",
+                       "The changed system, whole; silent while nothing was changed.")
+MANAGER_STATUS = Topic("manager/status", m.ManagerStatus, Qos.STATE, 10, "",
+                       "The FTM Manager's view; its silence stops the robot.")
+RESET = Topic("manager/reset", m.Reset, Qos.COMMAND, 0, "", "Release a latched recovery.")
+
+# Runtime and supervision.
+NODES = Topic("supervisor/nodes", m.NodeTable, Qos.STATE, 2, "", "The supervisor's node table.")
+RESPAWN = Topic("supervisor/respawn", m.RespawnRequest, Qos.COMMAND, 0, "",
+                "Ask for a node to be respawned.")
+ERROR_REPORT = Topic("supervisor/error", m.Diagnostic, Qos.COMMAND, 0, "",
+                     "Diagnostics of all nodes, passed on: who shows them needs one link only.")
+PROCESS_EVENT = Topic("supervisor/event", m.ProcessEvent, Qos.COMMAND, 0, "",
+                      "What happened to processes.")
+
+# Stand-ins for modules that are not written yet.
+STUB_TRIGGER = Topic("stub/trigger", m.StubTrigger, Qos.COMMAND, 0, "",
+                     "Make the stand-in of a detection module active or idle.")
+
+# World: ground truth is for the judge, never for the controller.
+TRUTH = Topic("world/truth", m.GroundTruth, Qos.STATE, 20, "map", "Ground truth.")
+OBSTACLE = Topic("world/obstacle", m.ObstacleCommand, Qos.COMMAND, 0, "map",
+                 "Put an obstacle into the world or take it away.")
+ACTUATOR_FAULT = Topic("world/actuator_fault", m.ActuatorFault, Qos.COMMAND, 0, "",
+                       "Put a fault of the base's actuators in force or end it.")
+OBSTACLES = Topic("world/obstacles", m.ObstacleList, Qos.STATE, 1, "map",
+                  "Obstacles present, for maps shown to people.")
+
+ALL: tuple[Topic, ...] = tuple(v for v in globals().values() if isinstance(v, Topic))  # type: ignore[type-arg]

@@ -1,0 +1,118 @@
+"""How a tool finds the runs on this machine: it asks the launchers.
+
+A launcher answers on an abstract unix socket, `rampart.PORT.launcher`, with one JSON object.
+The kernel lists such sockets in /proc/net/unix; nothing lies on a disk that could be stale.
+"""
+
+from __future__ import annotations
+
+import re
+import socket
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.envelope import UNREADABLE
+from rampart.actors.bus.unix_peer import is_same_user
+from rampart.actors.bus.zenoh_bus import endpoint
+
+REPLAY = "replay"
+"""Name of the one socket in the folder of a replay: it plays all nodes."""
+
+_NAME = re.compile(r"@rampart\.(\d+)\.launcher$")
+_TIMEOUT_S = 1.0
+
+
+class RunInfo(msgspec.Struct, frozen=True):
+    """One run: where it is, what it runs, and when its simulated time began.
+
+    `folder` holds the sockets of its nodes, `nodes`; `origin_s` is a reading of the machine's
+    monotonic clock. `page` is where the operator's page is, without its token. `plan` is
+    what a recording keeps of the run's plan. `replay_of` names the file of a replay.
+    """
+
+    pid: int
+    base_port: int
+    rate: float
+    origin_s: float
+    system_file: str
+    folder: str
+    nodes: tuple[str, ...]
+    run_id: str
+    hmi_port: int
+    title: str
+    page: str = ""
+    plan: dict[str, Any] = {}
+    replay_of: str = ""
+
+    @property
+    def endpoints(self) -> list[str]:
+        """Where a tool that hears everything connects to."""
+        names = (REPLAY,) if self.replay_of else self.nodes
+        return [endpoint(self.folder, name) for name in names]
+
+
+class NoRunError(Exception):
+    """There is no run, or several and none was chosen; the text is one line for the user."""
+
+
+def address(port: int) -> str:
+    """Return the abstract socket address of the launcher of the run on a base port."""
+    return f"\0rampart.{port}.launcher"
+
+
+def find_runs() -> list[RunInfo]:
+    """Return all runs of this machine whose launcher answers."""
+    try:
+        table = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return []
+    ports = {int(m[1]) for line in table.splitlines() if (m := _NAME.search(line))}
+    return [info for port in sorted(ports) if (info := ask(port)) is not None]
+
+
+def find_run(port: int | None = None) -> RunInfo:
+    """Return the one run there is, or the one on a base port.
+
+    A replay counts only where there is no run: whoever says nothing means the robot.
+
+    Raises:
+        NoRunError: there is none, or there are several and no port was given.
+    """
+    runs = find_runs()
+    if port is not None:
+        for run in runs:
+            if run.base_port == port:
+                return run
+        known = ", ".join(str(r.base_port) for r in runs) or "none"
+        raise NoRunError(f"--port {port}: no run there; runs found: {known}")
+    if not runs:
+        raise NoRunError("no run found; start one with `python launch.py`")
+    runs = [run for run in runs if not run.replay_of] or runs
+    if len(runs) > 1:
+        listed = ", ".join(f"{r.base_port} ({r.title})" for r in runs)
+        raise NoRunError(f"several runs, choose one with --port: {listed}")
+    return runs[0]
+
+
+def ask(port: int) -> RunInfo | None:
+    """Return what the launcher of the run on a base port tells; None if there is none."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.settimeout(_TIMEOUT_S)
+        try:
+            connection.connect(address(port))
+            if not is_same_user(connection):
+                return None
+            return read_info(connection.recv(65536))
+        except (OSError, *UNREADABLE):
+            return None
+
+
+def read_info(data: bytes) -> RunInfo:
+    """Return what a launcher told.
+
+    Raises:
+        ValueError, RecursionError: it is no such thing.
+    """
+    return msgspec.json.decode(data, type=RunInfo)

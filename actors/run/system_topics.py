@@ -1,0 +1,112 @@
+"""All topics of a system: those of `actors/osmosis/topics.py`, and what its actors declare besides."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import topics
+from rampart.actors.run.run_plan import DEFAULT_PORT, OBSERVER, Layout, RunPlan
+from rampart.actors.runtime.wiring import heard, load_class, published, topics_of
+from rampart.manager.spec.specification import SystemSpec
+
+_ANY_RUN = RunPlan("", DEFAULT_PORT, rate=1.0, seed=0, system_file="", strategy="", airport="",
+                   mission="", obstacles=0, ftm=True, hmi_port=0)
+"""Which keys a system publishes follows from its spec; nothing in the plan of a run matters."""
+
+_SHIPPED = ("actors.", "manager.", "sim.")
+"""Where the actors that ship are; that their topics are common is a test's business."""
+
+
+def system_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return every topic of a system once: the common ones first, then the robot's own.
+
+    The own ones are in the order of the spec. A key of `actors/osmosis/topics.py` keeps its contract.
+
+    Raises:
+        ValueError: the spec names an actor class that does not exist, or one of them declares a
+            topic that makes no sense.
+    """
+    return (*topics.ALL, *_beyond_the_common(_actors(spec)))
+
+
+def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return the topics that a system has beyond the common ones.
+
+    Only actors that do not ship are loaded, for those that do declare common topics only: a tool
+    that looks at a run need not wait for controller and simulator to be imported.
+
+    Raises:
+        ValueError: as `system_topics`, of the actors that do not ship.
+    """
+    return _beyond_the_common(
+        path for path in _actors(spec) if not path.startswith(_SHIPPED))
+
+
+def published_keys(spec: SystemSpec) -> tuple[str, ...]:
+    """Return the keys that the nodes of a system and its supervisor publish, families spelt out.
+
+    Raises:
+        ValueError: the spec names an actor class that does not exist.
+    """
+    members = [m for m in Layout(_ANY_RUN, spec).members.values() if m.name != OBSERVER]
+    wanted: dict[str, dict[str, None]] = {}
+    for member in members:
+        for key, names in heard(member).items():
+            wanted.setdefault(key, {}).update(dict.fromkeys(names or ()))
+    found: dict[str, None] = {}
+    for member in members:
+        for key, names in published(member).items():
+            # A node that may publish any member of a family publishes those that somebody hears.
+            chosen = wanted.get(key, {}) if names is None else names
+            spelt = [key.replace("{name}", n) for n in chosen] if "{name}" in key else [key]
+            found.update(dict.fromkeys(spelt))
+    return tuple(sorted(found))
+
+
+def find_topic(key: str, known: Iterable[Topic[Any]]) -> Topic[Any] | None:
+    """Return the topic of a key below the root, one member's if it is a family, or None."""
+    for topic in known:
+        if not topic.is_family:
+            if key == topic.key:
+                return topic
+            continue
+        head, tail = topic.key.split("{name}")
+        member = key[len(head):len(key) - len(tail)]
+        if key == f"{head}{member}{tail}" and member and not set("/*{}") & set(member):
+            return topic
+    return None
+
+
+def _actors(spec: SystemSpec) -> Iterator[str]:
+    """Yield the paths of all actor classes of a system."""
+    for part in (spec.nodes, spec.detections, spec.recoveries):
+        for one in part:
+            yield one.actor
+
+
+def _beyond_the_common(paths: Iterable[str]) -> tuple[Topic[Any], ...]:
+    """Return what actors declare that is not in `actors/osmosis/topics.py`, each key once."""
+    common = {topic.key for topic in topics.ALL}
+    found: dict[str, Topic[Any]] = {}
+    for path in dict.fromkeys(paths):
+        inputs, outputs = topics_of(load_class(path))
+        for topic in (*inputs, *outputs):
+            if topic.key in common or topic.key in found:
+                continue
+            if reason := _flaw(topic):
+                raise ValueError(f"actor = {path!r}: topic {topic.key!r}: {reason}")
+            found[topic.key] = topic
+    return tuple(found.values())
+
+
+def _flaw(topic: Topic[Any]) -> str:
+    """Return what is wrong with a topic, or an empty text."""
+    if topic.key.count("{name}") > 1:
+        return "one {name} at most is right"
+    if not (isinstance(topic.type, type) and issubclass(topic.type, msgspec.Struct)):
+        return f"type = {topic.type!r}: must be derived from rampart.actors.osmosis.messages.Message"
+    return ""

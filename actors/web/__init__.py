@@ -1,0 +1,1 @@
+"""HTTP and WebSocket serving that strangers cannot bring down: access, limits, tokens."""

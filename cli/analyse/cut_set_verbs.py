@@ -1,0 +1,200 @@
+"""`rampart cut-sets`: which events together make the top occur, and what stands in their way."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+from pathlib import Path
+from typing import Any
+
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.cli import systems
+from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say
+from rampart.cli.session import connect
+from rampart.files.reading import FileError, read_bytes
+from rampart.manager.analysis.barriers import Outlook, guard, outlook
+from rampart.manager.analysis.cut_sets import CutSets, TooLargeError
+from rampart.manager.analysis.formula import Formula, FormulaError, formula_of
+from rampart.manager.analysis.open_psa import MAX_BYTES, OpenPsaError, read_open_psa, write_open_psa
+from rampart.manager.model.order import UnknownElementError
+from rampart.manager.spec.schema import SystemSpec
+
+_LIMIT = 100
+_WAIT_S = 1.0
+
+
+def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+    """Add the verb to the parser."""
+    parser = verbs.add_parser(
+        "cut-sets", parents=[common], formatter_class=formatter,
+        help="minimal cut sets of a fault tree, and the barriers on them",
+        description="Find the minimal sets of events that make the top event of a fault tree\n"
+                    "occur. For a system spec also the mechanisms that are barriers on each, and\n"
+                    "what single event is left before the top. Sets are counted without listing\n"
+                    "them, so millions are no problem. docs/fault-trees.md says how.",
+        epilog="examples:\n"
+               "  rampart cut-sets                              the shipped system\n"
+               "  rampart cut-sets cell\n"
+               "  rampart cut-sets plant.xml --count --json     an Open-PSA file\n"
+               "  rampart cut-sets plant.xml --top g12 --max-order 2\n"
+               "  rampart cut-sets --active FTM2                what is left if DM2 is active\n"
+               "  rampart cut-sets --live                       what is left in the run, now\n"
+               "  rampart cut-sets --export osmosis.xml         for other tools")
+    systems.add_arguments(parser, what=", or Open-PSA .xml", dest="file")
+    parser.add_argument("--count", action="store_true", help="only count")
+    parser.add_argument("--top", metavar="GATE", default="", help="top gate of an Open-PSA file")
+    parser.add_argument("--max-order", type=int, metavar="K", help="no sets with more events")
+    parser.add_argument("--limit", type=int, default=_LIMIT, metavar="N",
+                        help=f"list no more than N sets (default {_LIMIT})")
+    parser.add_argument("--active", nargs="+", default=[], metavar="FTM",
+                        help="what is left before the top if these mechanisms are active")
+    parser.add_argument("--live", action="store_true",
+                        help="what is left before the top in the running system, now")
+    parser.add_argument("--export", metavar="FILE", help="write the fault tree as Open-PSA")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Do what the options ask for."""
+    for name in ("limit", "max_order"):
+        if (getattr(options, name) or 0) < 0:
+            raise UsageError(f"--{name.replace('_', '-')} {getattr(options, name)}: must be 0 or "
+                             "more")
+    if options.live:
+        return asyncio.run(_live(options))
+    spec, formula = _load(options)
+    if options.active or options.export:
+        if spec is None:
+            raise UsageError(f"{options.file}: --active and --export need a system spec")
+        if options.export:
+            return _export(spec, options.export)
+        return _show_outlook(spec, options.active, as_json=options.json)
+    try:
+        found = CutSets(formula, progress=_progress)
+    except TooLargeError as error:
+        raise NoEffectError(f"{options.file}: {error}") from None
+    finally:
+        _progress("")
+    if options.count:
+        if options.json:
+            print_json({"top": formula.top, "minimal_cut_sets": found.count})
+        else:
+            say(f"{formula.top}: {found.count} minimal cut sets")
+        return 0
+    return _list(spec, formula, found, options)
+
+
+def _load(options: argparse.Namespace) -> tuple[SystemSpec | None, Formula]:
+    if options.file and options.file.lower().endswith(".xml"):
+        try:
+            text = read_bytes(Path(options.file), MAX_BYTES)
+            return None, read_open_psa(text, options.file, options.top)
+        except OSError as error:
+            raise UsageError(f"{options.file}: {error.strerror}") from None
+        except FileError as error:
+            raise UsageError(f"{options.file}: {error}") from None
+        except OpenPsaError as error:
+            raise UsageError(str(error)) from None
+    spec = systems.load(options.file)
+    try:
+        formula = formula_of(spec.build_fault_tree())
+        if options.top:
+            formula = Formula(formula.gates, frozenset(formula.basic), {}, options.top)
+    except FormulaError as error:
+        raise UsageError(f"{options.file or spec.name}: {error}") from None
+    return spec, formula
+
+
+def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: argparse.Namespace
+          ) -> int:
+    try:
+        sets = list(found.sets(options.limit, options.max_order))
+    except TooLargeError as error:
+        raise NoEffectError(f"{options.file}: {error}") from None
+    guarded = guard(spec, sets) if spec is not None and not options.top else ()
+    if options.json:
+        print_json({
+            "top": formula.top, "minimal_cut_sets": found.count, "by_size": found.sizes,
+            "coherent": formula.is_monotone,
+            "sets": [{"events": g.events, "barriers": g.barriers} for g in guarded]
+            if guarded else [{"events": events} for events in sets]})
+        return 0
+    say(f"{formula.top}: {found.count} minimal cut sets"
+        + ("" if formula.is_monotone else " (not coherent: sets of which exactly these occur)"))
+    for size, count in enumerate(found.sizes):
+        if count:
+            say(f"  {count} of {size} event{'s' if size != 1 else ''}")
+    say()
+    if guarded:
+        print_table(("barriers", "events", "mechanisms, nearest to the top first"),
+                    [(len(g.barriers), " ".join(g.events), " ".join(g.barriers)) for g in guarded])
+        bare = [g for g in guarded if len(g.barriers) < 2]
+        if bare:
+            say()
+            say("fewer than two barriers:")
+            for g in bare:
+                behind = f"only {g.barriers[0]}" if g.barriers else "none"
+                say(f"  {' and '.join(g.events)}: {behind}")
+    else:
+        for events in sets:
+            say("  " + (" ".join(events) or "(the empty set: the top occurs by itself)"))
+    if len(sets) < found.count:
+        say()
+        say(f"{len(sets)} shown; --limit N shows more")
+    return 0
+
+
+def _export(spec: SystemSpec, file: str) -> int:
+    try:
+        Path(file).write_text(write_open_psa(spec), encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"--export {file}: {error.strerror}") from None
+    say(f"{spec.name}: {len(spec.events)} events written to {file}")
+    return 0
+
+
+def _show_outlook(spec: SystemSpec, active: list[str], *, as_json: bool) -> int:
+    try:
+        spec.build_mechanisms().sort(active)
+    except UnknownElementError as error:
+        raise UsageError(str(error)) from None
+    view = outlook(spec, active)
+    if as_json:
+        print_json(view)
+    else:
+        _say_outlook(spec, view)
+    return 0
+
+
+def _say_outlook(spec: SystemSpec, view: Outlook) -> None:
+    top = spec.build_fault_tree().top
+    if not view.occurred:
+        say("no mechanism is active: nothing has occurred")
+    for name, barriers in view.left.items():
+        event = next(m.event for m in spec.mechanisms if m.name == name)
+        say(f"{event} has occurred ({name} is active); left before {top}: "
+            f"{', '.join(barriers) or 'nothing'}")
+    say()
+    say(f"single events that would now lead to {top}, and the idle barriers left on the way:")
+    print_table(("barriers", "event", "mechanisms, nearest to the top first"),
+                [(len(g.barriers), " ".join(g.events), " ".join(g.barriers))
+                 for g in view.next_events])
+
+
+async def _live(options: argparse.Namespace) -> int:
+    async with connect(options.port) as session:
+        spec = systems.load(session.run.system_file)
+        heard = await session.latest((topics.MANAGER_STATUS,), session.real_s(_WAIT_S))
+    status: m.ManagerStatus | None = heard.get(topics.MANAGER_STATUS.key)
+    if status is None:
+        raise NoEffectError("the FTM Manager does not answer; try again when it is back")
+    known = {mechanism.name for mechanism in spec.mechanisms}
+    return _show_outlook(spec, [n for n in status.active if n in known], as_json=options.json)
+
+
+def _progress(text: str) -> None:
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{text[:100]}", end="", file=sys.stderr, flush=True)

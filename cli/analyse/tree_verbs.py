@@ -1,0 +1,113 @@
+"""`rampart tree`: draw a system's fault tree, FTMTree and order of the recoveries."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rampart.cli import systems
+from rampart.cli.analyse.tree_dot import to_dot
+from rampart.cli.analyse.tree_svg import to_svg
+from rampart.cli.analyse.tree_text import to_text
+from rampart.cli.output import UsageError, say, unknown
+from rampart.manager.drawing.diagram import WHATS, Diagram, Situation, clean, draw
+from rampart.manager.model.order import CycleError, UnknownElementError
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.strategies.registry import UnknownStrategyError, decide
+
+
+def to_json(diagrams: Sequence[Diagram]) -> str:
+    """Return diagrams as a list of JSON objects."""
+    return msgspec.json.format(msgspec.json.encode(diagrams), indent=2).decode() + "\n"
+
+
+FORMATS: dict[str, Callable[[Sequence[Diagram]], str]] = {
+    "text": to_text, "svg": to_svg, "dot": to_dot, "json": to_json,
+}
+_ENDINGS = {".svg": "svg", ".dot": "dot", ".gv": "dot", ".json": "json", ".txt": "text"}
+
+
+def add(verbs: Any, formatter: Any) -> None:
+    """Add the verb to the parser."""
+    parser = verbs.add_parser(
+        "tree", formatter_class=formatter, help="draw fault tree, FTMTree and order of recoveries",
+        description="Draw the fault tree with the mechanisms as barriers (‖), the FTMTree that\n"
+                    "follows from it, and the order of the recoveries, the safer above.",
+        epilog="examples:\n  rampart tree\n  rampart tree my_system.toml\n"
+               "  rampart tree --what ftm-tree --active FTM3 FTM4\n"
+               "  rampart tree --what fault-tree --output fault_tree.svg\n"
+               "  rampart tree --what order --format dot | dot -Tpdf > order.pdf")
+    systems.add_arguments(parser)
+    parser.add_argument("--what", choices=(*WHATS, "all"), default="all", help="default all")
+    parser.add_argument("--format", choices=tuple(FORMATS),
+                        help="default by the ending of --output, else text")
+    parser.add_argument("--json", action="store_const", dest="format", const="json",
+                        help="the same as --format json")
+    parser.add_argument("--output", metavar="FILE", help="write there instead of to stdout")
+    parser.add_argument("--order", metavar="NAME", action="append",
+                        help="order of recoveries; several: the next decides what the one before "
+                             "leaves open; default the spec's")
+    parser.add_argument("--active", metavar="FTM", nargs="+", default=[],
+                        help="active mechanisms; they are lit, and the decision is marked")
+    parser.add_argument("--strategy", metavar="NAME", help="that decides; default the spec's")
+    parser.set_defaults(run=show_tree)
+
+
+def show_tree(options: argparse.Namespace) -> int:
+    """Print or write the diagrams."""
+    ending = Path(options.output).suffix.lower() if options.output else ""
+    if ending and not options.format and ending not in _ENDINGS:
+        raise UsageError(f"--output {options.output}: unknown ending; one of "
+                         f"{', '.join(_ENDINGS)} is right, or say --format")
+    form = options.format or _ENDINGS.get(ending, "text")
+    spec = systems.load(options.system)
+    diagrams = _draw(spec, WHATS if options.what == "all" else (options.what,), options)
+    text = FORMATS[form](diagrams)
+    if options.output is None:
+        _print(text)
+        return 0
+    try:
+        Path(options.output).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"--output {options.output}: {error.strerror}") from None
+    for diagram in diagrams:
+        say(f"{options.output}: {diagram.what}, {len(diagram.boxes)} boxes, "
+            f"{len(diagram.edges)} lines")
+    return 0
+
+
+def _draw(spec: SystemSpec, whats: Sequence[str], options: argparse.Namespace
+          ) -> tuple[Diagram, ...]:
+    criteria = tuple(options.order or spec.criteria)
+    for name in criteria:
+        if name not in spec.orders:
+            raise unknown("order", name, map(clean, spec.orders))
+    strategy = options.strategy or spec.strategy
+    try:
+        order = spec.build_order(*criteria)
+        situation = Situation()
+        if options.active or options.strategy:
+            decision = decide(options.active, spec.build_mechanisms(), spec.build_ftm_tree(),
+                              order, strategy)
+            situation = Situation(frozenset(decision.active), decision.recoveries, decision.rule,
+                                  strategy)
+    except CycleError as error:
+        raise UsageError(f"--order {' '.join(criteria)}: together they have a {error}") from None
+    except (UnknownElementError, UnknownStrategyError) as error:
+        raise UsageError(str(error)) from None
+    return tuple(draw(spec, what, order, criteria, situation) for what in whats)
+
+
+def _print(text: str) -> None:
+    try:
+        text.encode(sys.stdout.encoding or "utf-8")
+    except UnicodeEncodeError:
+        raise UsageError(f"stdout takes {sys.stdout.encoding} only and a tree has other "
+                         "characters; write it with --output FILE") from None
+    sys.stdout.write(text)
+    sys.stdout.flush()

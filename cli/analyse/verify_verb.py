@@ -1,0 +1,106 @@
+"""`rampart verify`: is the arbitration of a system safe, in every case?"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from typing import Any
+
+from rampart.cli import systems
+from rampart.cli.output import UsageError, print_json, print_table, say
+from rampart.manager.analysis.verification import MEANING, Report, TooLargeError, verify
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.strategies.registry import UnknownStrategyError
+
+
+def add(verbs: Any, formatter: Any) -> None:
+    """Add the verb to the parser."""
+    parser = verbs.add_parser(
+        "verify", formatter_class=formatter, help="check every property of the arbitration",
+        description="Check the arbitration of a system exhaustively: what each strategy decides\n"
+                    "for every set of active mechanisms, and every state of the arbiter that\n"
+                    "carries it out, from when it has heard every module. A property holds, or\n"
+                    "the shortest counterexamples are shown. docs/verification.md explains the\n"
+                    "properties, and what is not looked at.",
+        epilog="examples:\n  rampart verify\n"
+               "  rampart verify my_system.toml --strategy safety-first\n"
+               "  rampart verify cell --json\n"
+               "  rampart verify --strict && python launch.py     only if all holds\n\n"
+               "exit code: 0 verified, whatever was found; with --strict 1 if a property of the\n"
+               "system's strategy (or of one given by --strategy) fails; 2 bad usage or bad spec")
+    systems.add_arguments(parser)
+    parser.add_argument("--strategy", action="append", default=[], metavar="NAME",
+                        help="only this strategy; repeat for several (default: all)")
+    parser.add_argument("--together", type=int, default=2, metavar="K",
+                        help="explore K recoveries at a time (default 2, which suffices; the "
+                             "number of recoveries of the system explores all, in minutes)")
+    parser.add_argument("--strict", action="store_true", help="exit 1 if a property fails")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Verify, and show what was found."""
+    spec = systems.load(options.system)
+    if options.together < 1:
+        raise UsageError(f"--together {options.together}: a number from 1 up is right")
+    start = time.monotonic()
+    try:
+        report = verify(spec, options.strategy, options.together, _progress)
+    except (TooLargeError, UnknownStrategyError) as error:
+        raise UsageError(str(error)) from None
+    finally:
+        _progress("")
+    if options.json:
+        print_json({
+            "system": report.system, "strategy": report.strategy,
+            "active_sets": report.active_sets, "states": report.states,
+            "permissiveness": report.permissiveness,
+            "stuck_behind_last_resort": report.stuck_behind_last_resort,
+            "properties": report.properties})
+    else:
+        _show(spec, report, time.monotonic() - start)
+    wanted = set(options.strategy or [spec.strategy]) | {""}
+    failed = any(not p.holds and p.strategy in wanted for p in report.properties)
+    return 1 if options.strict and failed else 0
+
+
+def _progress(text: str) -> None:
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{text[:100]}", end="", file=sys.stderr, flush=True)
+
+
+def _show(spec: SystemSpec, report: Report, seconds: float) -> None:
+    strategies = list(report.permissiveness)
+    say(f"{spec.title} ({report.system}): {report.active_sets} active sets, "
+        f"{report.states} states of the arbiter, in {seconds:.1f} s\n")
+    found = {(p.name, p.strategy): p for p in report.properties}
+    rows = []
+    for name, meaning in MEANING.items():
+        cells = []
+        for strategy in strategies:
+            checked = found.get((name, strategy)) or found.get((name, ""))
+            cells.append("" if checked is None else
+                         "holds" if checked.holds else f"FAILS in {checked.count}")
+        rows.append((name, *cells, meaning))
+    print_table(("property", *strategies, ""), rows)
+    for words, counts in (
+            ("in which the robot must stop until somebody resets it", report.permissiveness),
+            ("in which a repair that is needed never runs while the last resort keeps the robot "
+             "stopped;\nit cannot be reset until somebody repairs by hand, and repairs-run exempts "
+             "them", report.stuck_behind_last_resort)):
+        say()
+        say(f"active sets {words}:")
+        for strategy, count in counts.items():
+            say(f"  {strategy:<16} {count:>5} of {report.active_sets}")
+    say()
+    say("not explored: the start of a manager, until it has heard every module or its grace has "
+        "passed")
+    for checked in report.properties:
+        for trace in checked.counterexamples[:1]:
+            say()
+            say(f"{checked.name} fails{f' under {checked.strategy}' if checked.strategy else ''},"
+                f" in {checked.count} of {checked.cases} cases; the shortest:")
+            for number, step in enumerate(trace, 1):
+                say(f"  {number}. {step}")

@@ -1,0 +1,103 @@
+"""A tool's stay in a run: to its end, into the next one, until the user has had enough."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import AsyncGenerator, Iterator
+from typing import Any
+
+from rampart.actors.bus.topic import Topic
+from rampart.actors.run.run_info import RunInfo, find_runs
+from rampart.actors.supervision.process_title import process_state
+from rampart.cli import systems
+from rampart.cli.output import UsageError, warn
+from rampart.cli.run_picture import COUNTED, DECODED, RunPicture
+from rampart.cli.session import Session, connect
+
+LOOK_S = 0.25
+"""Real seconds between two looks whether a run has ended or begun."""
+
+
+def is_over(run: RunInfo) -> bool:
+    """Whether the launcher of a run has ended; its nodes do not outlive it."""
+    return process_state(run.pid) in {"X", "Z"}
+
+
+async def wait_for_run(port: int | None, stop: asyncio.Event) -> bool:
+    """Wait until there is a run to join; return False if `stop` came first."""
+    while not stop.is_set():
+        runs = await asyncio.to_thread(find_runs)
+        if any(port in {None, run.base_port} for run in runs):
+            return True
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), LOOK_S)
+    return False
+
+
+async def sessions(
+    port: int | None, stop: asyncio.Event, *, follow: bool, option: str = "--port"
+) -> AsyncGenerator[Session, None]:
+    """Yield a session of the run and, if `follow`, of each that comes after it.
+
+    Whoever iterates ends the loop's body when `is_over` or `stop`.
+
+    Args:
+        port: base port of the run; None if there is only one.
+        stop: the user has had enough.
+        follow: wait for a run if there is none, and for the next.
+        option: by which the verb is told the base port.
+
+    Raises:
+        UsageError: there is no run and `follow` is not set, or it must be chosen.
+    """
+    while not follow or await wait_for_run(port, stop):
+        try:
+            async with connect(port) as session:
+                yield session
+        except UsageError as error:
+            if not follow or len(find_runs()) > 1:
+                raise UsageError(str(error).replace("--port", option)) from None
+        if not follow:
+            return
+
+
+@contextlib.contextmanager
+def stopped_by_signals(stop: asyncio.Event) -> Iterator[None]:
+    """Have SIGINT, SIGTERM and SIGHUP set an event."""
+    loop = asyncio.get_running_loop()
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as it is under nohup
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
+        loop.add_signal_handler(number, stop.set)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            loop.remove_signal_handler(number)
+
+
+def draw(session: Session, picture: RunPicture) -> None:
+    """Have everything that a session hears drawn into a picture, a robot's own topics too."""
+    clock = session.clock
+
+    def read(topic: Topic[Any]) -> None:
+        session.listen(topic, topic.pattern, lambda _key, header, body: picture.heard(
+            topic, header, body, clock.now()))
+
+    def count(topic: Topic[Any]) -> None:
+        session.overhear(topic, lambda _key, _load: picture.count(topic))
+
+    for topic in DECODED:
+        read(topic)
+    for topic in COUNTED:
+        count(topic)
+    try:
+        own = systems.own_topics_of(systems.load(session.run.system_file))
+    except UsageError as error:  # of a run from elsewhere, say: the common topics are enough
+        warn(f"{error}; topics of its own are not counted")
+        return
+    for topic in own:
+        count(topic)

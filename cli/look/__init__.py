@@ -1,0 +1,1 @@
+"""Commands that look at a run: top, topic, metrics, live viewers."""

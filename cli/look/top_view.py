@@ -1,0 +1,281 @@
+"""What `rampart top` shows: a picture of the run in, lines for the terminal out. Pure.
+
+Every line fits the width, all lines the height, whatever they are. Nothing is told by colour alone:
+colours only repeat what words say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from rich.cells import cell_len, set_cell_size
+from rich.text import Text
+
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.cli.run_picture import RunPicture
+from rampart.cli.state_words import manager_in_words, mission_in_words, pilot_in_words
+from rampart.files.plain_text import printable
+from rampart.manager.model.words import decision_in_words
+
+_LABEL = 10
+_PROCESS_WIDTH = 57
+_RATES_WIDTH = 28
+_LEAST_PROCESSES = 6
+_BAR = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """All that one screen is made of.
+
+    Attributes:
+        title: what runs.
+        port: base port of the run.
+        rate: simulated seconds per second.
+        time_s: simulated time.
+        picture: what was heard.
+        usage: per process name: `cpu` percent of a core, `mb` resident, `age_s` real seconds.
+        guards: rows of processes that are in no table of the supervisor, as dicts.
+        skip: so many processes are scrolled away.
+        by_cpu: whether the busiest process comes first.
+    """
+
+    title: str
+    port: int
+    rate: float
+    time_s: float
+    picture: RunPicture
+    usage: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    guards: Sequence[Mapping[str, Any]] = ()
+    skip: int = 0
+    by_cpu: bool = False
+
+
+def lines(frame: Frame, width: int, height: int) -> list[Text]:
+    """Return the screen, at most `height` lines of at most `width` cells."""
+    head = [_title(frame, width), *_state(frame, width)]
+    foot = Text("q quit, c sort by CPU, arrows scroll", style="dim")
+    room = height - len(head) - 2  # a heading, and the last line
+    told = min(3, max(0, room - _LEAST_PROCESSES))
+    head += _decisions(frame, told)
+    body = _tables(frame, width, max(0, height - len(head) - 1))
+    screen = [*[*head, *body][:max(0, height - 1)], foot]
+    return [_fit(line, width) for line in screen[-max(height, 0):]] if height > 0 else []
+
+
+def picture_json(frame: Frame) -> dict[str, Any]:
+    """Return the same as data."""
+    picture = frame.picture
+    return {
+        "title": frame.title, "port": frame.port, "rate": frame.rate,
+        "time_s": round(frame.time_s, 3),
+        "mission": picture.latest(topics.MISSION_STATUS),
+        "pose": picture.latest(topics.POSE),
+        "control": picture.latest(topics.CONTROL_STATUS),
+        "pilot": picture.latest(topics.PILOT_STATUS),
+        "manager": picture.latest(topics.MANAGER_STATUS),
+        "safety": _safety(picture.latest(topics.TRUTH)) or None,
+        "detections": dict(sorted(picture.detections.items())),
+        "recoveries": dict(sorted(picture.recoveries.items())),
+        "decisions": [
+            {"time_s": stamp_s, "decision": record.decision, "words": _words(record)}
+            for stamp_s, record in picture.decisions],
+        "processes": [
+            {**row, **frame.usage.get(row["name"], {})} for row in _rows(frame)],
+        "rates_hz": picture.rates(),
+    }
+
+
+def _fit(line: Text, width: int) -> Text:
+    """Return a line cut to the width, with an ellipsis where something is missing."""
+    line.no_wrap = True
+    line.truncate(width, overflow="ellipsis")
+    return line
+
+
+# -- the state, one line each -------------------------------------------------------------------
+
+
+def _title(frame: Frame, width: int) -> Text:
+    left = f" rampart top  {printable(frame.title)}"
+    right = f"port {frame.port}  {frame.time_s:.1f} s x{frame.rate:g} "
+    gap = max(2, width - cell_len(left) - cell_len(right))
+    return Text(left + " " * gap + right, style="reverse")
+
+
+def _state(frame: Frame, width: int) -> list[Text]:
+    picture, now_s = frame.picture, frame.time_s
+    mission = picture.latest(topics.MISSION_STATUS)
+    manager = picture.latest(topics.MANAGER_STATUS)
+    safety = _safety(picture.latest(topics.TRUTH))
+    rows: list[tuple[str, str, str, Any]] = [
+        ("mission", _mission(mission, width), "", topics.MISSION_STATUS),
+        ("robot", _robot(picture), "", topics.POSE),
+        ("pilot", *_pilot(picture.latest(topics.PILOT_STATUS)), topics.PILOT_STATUS),
+        ("safety", safety or "not known: nobody tells the ground truth",
+         "bold red" if "UNSAFE" in safety else "", topics.TRUTH),
+        ("manager", *_manager(manager), topics.MANAGER_STATUS),
+        ("detection", *_detections(picture), None),
+    ]
+    shown = []
+    for label, text, style, topic in rows:
+        line = Text(f"{label:<{_LABEL}}", style="bold")
+        silent_s = picture.silence_s(topic, now_s) if topic else 0.0
+        if silent_s:
+            line.append(f"SILENT for {silent_s:.0f} s; last: ", style="bold yellow")
+        shown.append(line.append(printable(text), style=style))
+    return shown
+
+
+def _mission(status: m.MissionStatus | None, width: int) -> str:
+    words = mission_in_words(status)
+    if status is None or not status.goals or width < 100:
+        return words
+    steps = len(status.goals)
+    done = round(_BAR * min(status.step, steps) / steps)
+    return f"[{'#' * done}{'.' * (_BAR - done)}] {words}"
+
+
+def _robot(picture: RunPicture) -> str:
+    pose: m.Pose | None = picture.latest(topics.POSE)
+    if pose is None:
+        return "no pose"
+    text = f"x {pose.x_m:.2f} m  y {pose.y_m:.2f} m  heading {math.degrees(pose.yaw_rad):.0f} deg"
+    control: m.ControlStatus | None = picture.latest(topics.CONTROL_STATUS)
+    if control is not None:
+        text += f"  {control.phase.value}, {control.distance_to_go_m:.1f} m to go"
+    return text
+
+
+def _pilot(status: m.PilotStatus | None) -> tuple[str, str]:
+    return pilot_in_words(status), "yellow" if status and status.stopped else ""
+
+
+def _safety(truth: m.GroundTruth | None) -> str:
+    """Return what the ground truth says, as the judge judges it; "" if nobody tells it."""
+    if truth is None:
+        return ""
+    harm = [text for text, there in (
+        (f"{truth.collisions} collisions", truth.collisions > 0),
+        (f"{truth.prohibited_s:.1f} s in the prohibited area", truth.prohibited_s > 0)) if there]
+    near = (f"nearest obstacle {truth.obstacle_clearance_m:.2f} m, "
+            f"prohibited area {truth.prohibited_clearance_m:.2f} m")
+    return f"UNSAFE: {', '.join(harm)}; {near}" if harm else f"safe so far; {near}"
+
+
+def _manager(status: m.ManagerStatus | None) -> tuple[str, str]:
+    busy = status is not None and (status.active or status.activated)
+    return manager_in_words(status), "yellow" if busy else ""
+
+
+def _detections(picture: RunPicture) -> tuple[str, str]:
+    found = sorted(picture.detections.items())
+    manager: m.ManagerStatus | None = picture.latest(topics.MANAGER_STATUS)
+    silent = manager.silent if manager else ()
+    active = [f"{name} silent" for name in silent]
+    active += [f"{name} {report.reason}" for name, report in found
+               if report.state is m.DetectionState.ACTIVE and name not in silent]
+    if active:
+        modules = len({*silent, *picture.detections})
+        return f"{len(active)} of {modules}: {'; '.join(active)}", "yellow"
+    return (f"none of {len(found)} modules detects anything" if found else "no module heard", "")
+
+
+def _words(record: m.DecisionRecord) -> str:
+    return decision_in_words(record.active, record.rule, record.recoveries, record.strategy)
+
+
+def _decisions(frame: Frame, count: int) -> list[Text]:
+    newest = list(frame.picture.decisions)[::-1][:count]
+    return [Text(f"{'decisions' if not i else '':<{_LABEL}}", style="bold").append(
+        printable(f"{stamp_s:.1f} s  {record.decision}: {_words(record)}"), style="not bold")
+        for i, (stamp_s, record) in enumerate(newest)]
+
+
+# -- the tables ---------------------------------------------------------------------------------
+
+
+def _rows(frame: Frame) -> list[dict[str, Any]]:
+    """Return a row for each process: those in trouble first, then as asked for."""
+    table: m.NodeTable | None = frame.picture.latest(topics.NODES)
+    rows = [{"name": n.name, "kind": n.kind, "pid": n.pid, "state": n.state.value,
+             "incarnation": n.incarnation, "restarts": n.restarts}
+            for n in (table.nodes if table else ())]
+    rows += [dict(guard) for guard in frame.guards]
+
+    def place(row: Mapping[str, Any]) -> tuple[bool, float]:
+        busy = frame.usage.get(row["name"], {}).get("cpu", 0.0) if frame.by_cpu else 0.0
+        return row["state"] == m.NodeState.RUNNING.value, -busy
+
+    return sorted(rows, key=place)
+
+
+def _tables(frame: Frame, width: int, height: int) -> list[Text]:
+    """Return processes and, where there is room beside them, topics with their rates."""
+    if height < 2:
+        return []
+    beside = width >= _PROCESS_WIDTH + 20
+    left = _processes(frame, _PROCESS_WIDTH if beside else width, height)
+    if not beside:
+        return left
+    right = _rates(frame, width - _PROCESS_WIDTH, height)
+    blank = Text(" " * _PROCESS_WIDTH)
+    return [Text.assemble(left[i] if i < len(left) else blank.copy(),
+                          right[i] if i < len(right) else "")
+            for i in range(max(len(left), len(right)))]
+
+
+def _processes(frame: Frame, width: int, height: int) -> list[Text]:
+    rows = _rows(frame)
+    head = f"{'process':<18} {'state':<8} {'life':>4} {'again':>5} {'age':>6} {'cpu':>4} {'MB':>5}"
+    shown = [Text(set_cell_size(head, width), style="bold underline")]
+    room = height - 1
+    skip = max(0, min(frame.skip, len(rows) - room))
+    for row in rows[skip:skip + room]:
+        used = frame.usage.get(row["name"])
+        figures = (f"{_age(used['age_s']):>6} {used['cpu']:>3.0f}% {used['mb']:>5.0f}"
+                   if used else f"{'-':>6} {'-':>4} {'-':>5}")
+        name = set_cell_size(printable(row["name"]), 18)
+        text = (f"{name} {row['state']:<8} {row['incarnation']:>4} {row['restarts']:>5} "
+                f"{figures}")
+        trouble = row["state"] != m.NodeState.RUNNING.value
+        shown.append(Text(set_cell_size(text, width), style="bold red" if trouble else ""))
+    if not rows:
+        shown.append(Text(set_cell_size("the supervisor has not told yet", width)))
+    hidden = len(rows) - skip - room
+    if hidden > 0 and room > 0:
+        shown[-1] = Text(set_cell_size(f"... {hidden + 1} more below", width), style="dim")
+    return shown
+
+
+def _rates(frame: Frame, width: int, height: int) -> list[Text]:
+    rates = [(key, hz) for key, hz in frame.picture.rates().items() if hz > 0]
+    columns = max(1, width // _RATES_WIDTH)
+    column = width // columns
+    shown = [Text(set_cell_size("  topic" + "Hz".rjust(column - 7), width), style="bold underline")]
+    room = height - 1
+    per_column = min(room, math.ceil(len(rates) / columns)) if rates else 0
+    for i in range(per_column):
+        line = ""
+        for key, hz in rates[i::per_column][:columns]:
+            line += f"  {set_cell_size(_short(key, column - 8), column - 8)}{hz:>6.1f}"
+        shown.append(Text(line))
+    return shown
+
+
+def _short(key: str, width: int) -> str:
+    """Return a key that fits: its end says more than its beginning."""
+    key = key.replace("{name}", "*")
+    return key if len(key) <= width else "~" + key[-max(0, width - 1):]
+
+
+def _age(seconds: float) -> str:
+    minutes, second = divmod(int(seconds), 60)
+    hours, minute = divmod(minutes, 60)
+    if hours >= 100:
+        return f"{hours // 24}d"
+    return f"{hours}h{minute:02}m" if hours else f"{minute}:{second:02}"

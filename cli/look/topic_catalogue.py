@@ -1,0 +1,226 @@
+"""Everything there is to know about the topics: what they carry, who publishes, who reads."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from enum import Enum
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES
+from rampart.actors.bus.topic import ROOT, Qos, Topic
+from rampart.actors.osmosis import topics
+from rampart.actors.run.run_info import NoRunError, find_run
+from rampart.actors.run.run_plan import (
+    OBSERVER,
+    OBSERVER_CLASS,
+    SUPERVISOR,
+    SUPERVISOR_CLASS,
+    load_class,
+)
+from rampart.actors.run.system_topics import find_topic
+from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
+from rampart.actors.runtime.wiring import topics_of
+from rampart.cli import systems
+from rampart.cli.output import UsageError, unknown
+from rampart.manager.spec.specification import SystemSpec
+
+MAILBOX = {
+    Qos.SENSOR: "latest wins",
+    Qos.STATE: "latest wins",
+    Qos.COMMAND: "queued, bounded",
+}
+"""How a topic's messages wait at their reader (see `rampart.actors.runtime.mailbox`)."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class TopicUse:
+    """A topic with the nodes that publish and read it."""
+
+    topic: Topic[Any]
+    publishers: tuple[str, ...]
+    readers: tuple[str, ...]
+
+
+def uses(spec: SystemSpec) -> list[TopicUse]:
+    """Return all topics with their publishers and readers in a system.
+
+    Raises:
+        UsageError: the spec names an actor class that does not exist, or one of them declares a
+            topic that makes no sense.
+    """
+    members = [(SUPERVISOR, SUPERVISOR_CLASS), (OBSERVER, OBSERVER_CLASS),
+               *((node.name, node.actor) for node in spec.actors())]
+    wired: list[tuple[str, tuple[Topic[Any], ...], tuple[Topic[Any], ...]]] = []
+    for name, path in members:
+        inputs, outputs = topics_of(_class(name, path))
+        wired.append((name, inputs, outputs))
+    return [TopicUse(topic, _publishers(topic, wired), _readers(topic, wired))
+            for topic in systems.topics_of(spec)]
+
+
+def resolve(key: str, known: Sequence[Topic[Any]] = topics.ALL) -> tuple[Topic[Any], str]:
+    """Return topic and full key expression for a key as a user types it.
+
+    A family may be given as `detection/DM1`, `detection/{name}` or `detection/*`; the leading
+    `rampart/` may be left out.
+
+    Args:
+        key: as typed.
+        known: all topics of the system.
+
+    Raises:
+        UsageError: no topic has this key.
+    """
+    found = _match(key, known)
+    if found is None:
+        raise unknown("topic", key, (topic.key for topic in known))
+    return found
+
+
+def topics_for(key: str, port: int | None) -> tuple[Topic[Any], ...]:
+    """Return the topics among which to look for a key: where it is none that ships, the run's.
+
+    So a run of which the actors cannot be loaded here is no obstacle to what is known without.
+
+    Args:
+        key: as typed.
+        port: base port of the run, if there are several; without a run only what ships is known.
+
+    Raises:
+        UsageError: the system of the run, or one of its actors, cannot be loaded.
+    """
+    if _match(key, topics.ALL) is not None:
+        return topics.ALL
+    try:
+        run = find_run(port)
+    except NoRunError:
+        return topics.ALL
+    return systems.topics_of(systems.load(run.system_file))
+
+
+def _match(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str] | None:
+    short = key.removeprefix("/").removeprefix(f"{ROOT}/")
+    topic = find_topic(short, known)
+    if topic is not None:
+        return topic, f"{ROOT}/{short}"
+    return next(((topic, topic.pattern) for topic in known if topic.is_family
+                 and short in (topic.key, topic.key.replace("{name}", "*"))), None)
+
+
+def fields(kind: type[msgspec.Struct]) -> list[tuple[str, str]]:
+    """Return name and type of each field of a message, as text."""
+    return [(f.name, _type_name(f.type)) for f in msgspec.structs.fields(kind)]
+
+
+def markdown(spec: SystemSpec) -> str:
+    """Return `topics.md`: the contract of every key, for people."""
+    lines = [
+        "# Topics",
+        "",
+        "The contract of every Zenoh key. Written from `actors/osmosis/topics.py` and the actor classes "
+        f"of `systems/{spec.name}.toml` by `rampart topic list --markdown`; a test keeps it true.",
+        "",
+        f"All keys are below `{ROOT}/`. A payload is a msgpack array `[source, incarnation, "
+        "sequence, stamp, body]`: which node, which life of it, how many-th message of that life, "
+        "the simulated time in seconds at which the content was true, and the message. Units are "
+        "SI and stand in the field names; frames follow REP-105, axes REP-103. Rates are in "
+        "simulated time; 0 means on event. Bounds stand in braces: `{0..9}` of a number, `{<=9}` "
+        "of the characters of a text, the bytes of an array or the elements of a sequence. What is "
+        f"beyond them, or longer than {MAX_PAYLOAD_BYTES} bytes, is refused by every reader. A "
+        "`float` without bounds may be anything, NaN and infinity included.",
+        "",
+        "- **sensor**: the newest sample counts; at the reader the latest wins.",
+        "- **state**: like sensor, and repeated at its rate even without change.",
+        "- **command**: each message counts; queued at the reader, bounded, an overflow is "
+        "reported.",
+        "",
+        "| key | message | QoS | mailbox | rate | frame | publishers | readers |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    table = uses(spec)
+    for use in table:
+        t = use.topic
+        cells = (
+            f"`{t.key}`", f"[{t.type.__name__}](#{t.type.__name__.lower()})", t.qos.value,
+            MAILBOX[t.qos], _rate(t), f"`{t.frame}`" if t.frame else "",
+            ", ".join(use.publishers), ", ".join(use.readers))
+        lines.append(f"| {' | '.join(cells)} |")
+    lines += ["", "## What each key is for", ""]
+    lines += [f"- `{use.topic.key}`: {use.topic.doc}" for use in table]
+    lines += ["", "## Messages", ""]
+    for kind in _messages(use.topic for use in table):
+        lines += [f"### {kind.__name__}", "", _summary(kind), ""]
+        lines += [f"- `{name}`: {type_name}" for name, type_name in fields(kind)]
+        lines.append("")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _publishers(topic: Topic[Any], wired: list[Any]) -> tuple[str, ...]:
+    if topic in BASE_OUTPUTS:
+        return ("every node",)
+    found = tuple(name for name, _, outputs in wired if topic in outputs)
+    return found or ("tools",)
+
+
+def _readers(topic: Topic[Any], wired: list[Any]) -> tuple[str, ...]:
+    if topic in BASE_INPUTS:
+        return ("every node",)
+    return tuple(name for name, inputs, _ in wired if topic in inputs)
+
+
+def _class(name: str, path: str) -> type[Actor]:
+    try:
+        return load_class(path)
+    except ValueError as error:
+        raise UsageError(f"node {name}: {error}") from None
+
+
+def _rate(topic: Topic[Any]) -> str:
+    return f"{topic.rate_hz:g} Hz" if topic.rate_hz else "on event"
+
+
+def _messages(used: Iterable[Topic[Any]]) -> list[type[msgspec.Struct]]:
+    """Return the message types of topics and those nested in them, each once."""
+    found: dict[type[msgspec.Struct], None] = {}
+
+    def visit(kind: Any) -> None:
+        if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+            if kind not in found:
+                found[kind] = None
+                for f in msgspec.structs.fields(kind):
+                    visit(f.type)
+            return
+        for part in getattr(kind, "__args__", ()):
+            visit(part)
+
+    for topic in used:
+        visit(topic.type)
+    return list(found)
+
+
+def _limits(meta: msgspec.Meta) -> str:
+    """Return the bounds of a field: least and greatest value, or how long it may be."""
+    if meta.max_length is not None:
+        return f"{{<={meta.max_length}}}"
+    least, most = ("" if bound is None else str(bound) if isinstance(bound, int) else f"{bound:g}"
+                   for bound in (meta.ge, meta.le))
+    return f"{{{least}..{most}}}"
+
+
+def _summary(kind: type[Any]) -> str:
+    return " ".join((kind.__doc__ or "").split())
+
+
+def _type_name(kind: Any) -> str:
+    if hasattr(kind, "__metadata__"):
+        return _type_name(kind.__origin__) + "".join(map(_limits, kind.__metadata__))
+    arguments = getattr(kind, "__args__", ())
+    if not arguments:
+        if isinstance(kind, type) and issubclass(kind, Enum):
+            return " | ".join(f'"{member.value}"' for member in kind)
+        return str(getattr(kind, "__name__", kind))
+    inner = ", ".join("..." if a is Ellipsis else _type_name(a) for a in arguments)
+    return f"{getattr(kind, '__origin__', kind).__name__}[{inner}]"

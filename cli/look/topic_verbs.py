@@ -1,0 +1,289 @@
+"""`rampart topic`: what travels on the keys."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import itertools
+import math
+import statistics
+from collections import deque
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.bounds import MANY
+from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.limits import Remembered
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import topics
+from rampart.cli import systems
+from rampart.cli.following import LOOK_S, is_over
+from rampart.cli.look.topic_catalogue import MAILBOX, fields, markdown, resolve, topics_for, uses
+from rampart.cli.output import (
+    NoEffectError,
+    UsageError,
+    print_json,
+    print_table,
+    say,
+    say_text,
+    unknown,
+    warn,
+)
+from rampart.cli.session import Session, connect
+from rampart.files import streams
+
+_WINDOW = 500
+_SHOWN_BYTES = 24
+_HZ_REPORT_S = 1.0
+
+
+def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+    """Add the verbs to the parser."""
+    topic = verbs.add_parser(
+        "topic", formatter_class=formatter, help="what travels on the keys",
+        description="List, print and measure topics. A key is given as in `rampart topic list`;\n"
+                    "a family as detection/DM1 for one member or 'detection/*' for all.",
+        epilog="examples:\n  rampart topic list\n  rampart topic echo localization/pose -n 3\n"
+               "  rampart topic hz control/command\n  rampart topic info plan/route")
+    subverbs = topic.add_subparsers(dest="subverb", required=True, metavar="VERB")
+
+    parser = subverbs.add_parser(
+        "list", formatter_class=formatter, help="all topics (needs no run)",
+        description="List all topics with message, QoS and nominal rate.",
+        epilog="examples:\n  rampart topic list\n  rampart topic list --markdown > topics.md")
+    systems.add_arguments(parser)
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--json", action="store_true", help="print JSON")
+    how.add_argument("--markdown", action="store_true", help="print topics.md")
+    parser.set_defaults(run=topic_list)
+
+    parser = subverbs.add_parser(
+        "info", formatter_class=formatter, help="the contract of one topic (needs no run)",
+        description="Show type, fields, QoS, publishers and readers of a topic.",
+        epilog="examples:\n  rampart topic info control/command\n"
+               "  rampart topic info detection/DM1")
+    parser.add_argument("key", metavar="KEY")
+    parser.add_argument("--system", metavar="FILE", help="system spec; default the shipped one")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=topic_info)
+
+    parser = subverbs.add_parser(
+        "echo", parents=[common], formatter_class=formatter, help="print messages as they come",
+        description="Print one line per message: stamp (simulated seconds), source#incarnation,\n"
+                    "key, message. A payload that is no message is shown with the reason.",
+        epilog="examples:\n  rampart topic echo localization/pose\n"
+               "  rampart topic echo 'detection/*' --duration 5\n"
+               "  rampart topic echo plan/route -n 1 --json")
+    parser.add_argument("key", metavar="KEY")
+    parser.add_argument("-n", "--count", type=int, metavar="N", help="end after N messages")
+    parser.add_argument("--duration", type=float, metavar="S", help="end after S real seconds")
+    parser.add_argument("--json", action="store_true", help="one JSON object per line")
+    parser.set_defaults(run=lambda options: asyncio.run(topic_echo(options)))
+
+    parser = subverbs.add_parser(
+        "hz", parents=[common], formatter_class=formatter, help="measure the rate of a topic",
+        description="Measure how often messages arrive, in simulated time like the nominal rate,\n"
+                    "each second over a window of the last 500, until interrupted or the run ends.",
+        epilog="examples:\n  rampart topic hz control/command\n"
+               "  rampart topic hz 'heartbeat/*' --duration 3 --json")
+    parser.add_argument("key", metavar="KEY")
+    parser.add_argument("--duration", type=float, metavar="S",
+                        help="end after S real seconds (with --json 3 if not given)")
+    parser.add_argument("--json", action="store_true", help="print JSON at the end")
+    parser.set_defaults(run=lambda options: asyncio.run(topic_hz(options)))
+
+
+def topic_list(options: argparse.Namespace) -> int:
+    """Print all topics."""
+    spec = systems.load(options.system)
+    if options.markdown:
+        say_text(markdown(spec).rstrip("\n"))
+        return 0
+    table = uses(spec)
+    if options.json:
+        print_json([_describe(use.topic, use.publishers, use.readers) for use in table])
+    else:
+        print_table(("key", "message", "qos", "rate", "frame"),
+                    [(u.topic.key, u.topic.type.__name__, u.topic.qos.value,
+                      f"{u.topic.rate_hz:g} Hz" if u.topic.rate_hz else "on event", u.topic.frame)
+                     for u in table])
+    return 0
+
+
+def topic_info(options: argparse.Namespace) -> int:
+    """Print the contract of one topic."""
+    spec = systems.load(options.system)
+    topic, _ = resolve(options.key, systems.topics_of(spec))
+    use = next(u for u in uses(spec) if u.topic is topic)
+    if options.json:
+        print_json({**_describe(topic, use.publishers, use.readers),
+                    "fields": [{"name": n, "type": t} for n, t in fields(topic.type)]})
+        return 0
+    say(f"key         {topic.key}")
+    say(f"message     {topic.type.__name__}: {' '.join((topic.type.__doc__ or '').split())}")
+    for name, type_name in fields(topic.type):
+        say(f"              {name}: {type_name}")
+    say(f"about       {topic.doc}")
+    say(f"qos         {topic.qos.value}, at the reader: {MAILBOX[topic.qos]}")
+    say(f"rate        {f'{topic.rate_hz:g} Hz' if topic.rate_hz else 'on event'}")
+    say(f"frame       {topic.frame or 'none'}")
+    say(f"publishers  {', '.join(use.publishers) or 'none'}")
+    say(f"readers     {', '.join(use.readers) or 'none'}")
+    return 0
+
+
+async def topic_echo(options: argparse.Namespace) -> int:
+    """Print messages as they come."""
+    topic, key = resolve(options.key, topics_for(options.key, options.port))
+    _positive("--count", options.count)
+    _positive("--duration", options.duration)
+    done = asyncio.Event()
+    seen = 0
+
+    def count() -> bool:
+        nonlocal seen
+        seen += 1
+        if options.count is not None and seen >= options.count:
+            done.set()
+        return options.count is None or seen <= options.count
+
+    def heard(short: str, header: Header, body: Any) -> None:
+        if not count():
+            return
+        if options.json:
+            print_json({"key": short, "stamp": header.stamp, "source": header.source,
+                        "incarnation": header.incarnation, "sequence": header.sequence,
+                        "message": body}, indent=False)
+        else:
+            say(f"{header.stamp:.3f} {header.source}#{header.incarnation} {short} {in_line(body)}")
+
+    def garbage(short: str, payload: bytes, reason: str) -> None:
+        if not count():
+            return
+        if options.json:
+            print_json({"key": short, "garbage": payload[:256].hex(), "bytes": len(payload),
+                        "reason": reason}, indent=False)
+        else:
+            say(f"garbage {short} {len(payload)} bytes, not a {topic.type.__name__}: {reason}; "
+                f"{payload[:_SHOWN_BYTES]!r}")
+
+    async with connect(options.port) as session:
+        _check_member(session, topic, key)
+        session.listen(topic, key, heard, garbage)
+        loop = asyncio.get_running_loop()
+        end = math.inf if options.duration is None else loop.time() + options.duration
+        while not (done.is_set() or is_over(session.run) or streams.lost()) and (
+                left := end - loop.time()) > 0:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(done.wait(), min(LOOK_S, left))
+        _tell_end(session)
+    if not seen:
+        raise _nothing_came(options.key, options.duration)
+    return 0
+
+
+async def topic_hz(options: argparse.Namespace) -> int:
+    """Measure rates."""
+    topic, key = resolve(options.key, topics_for(options.key, options.port))
+    _positive("--duration", options.duration)
+    arrivals: Remembered[str, deque[float]] = Remembered(MANY)
+    duration_s = options.duration
+    if options.json and duration_s is None:
+        duration_s = 3.0
+    async with connect(options.port) as session:
+        _check_member(session, topic, key)
+
+        def heard(short: str, _header: Header, _body: Any) -> None:
+            times = arrivals.get(short)
+            if times is None:
+                times = arrivals[short] = deque(maxlen=_WINDOW)
+            times.append(session.clock.now())
+
+        session.listen(topic, key, heard)
+        loop = asyncio.get_running_loop()
+        end = math.inf if duration_s is None else loop.time() + duration_s
+        while (left := end - loop.time()) > 0 and not (is_over(session.run) or streams.lost()):
+            await asyncio.sleep(min(_HZ_REPORT_S, left))
+            if not options.json:
+                for short in sorted(arrivals):
+                    _print_rate(short, rate_of(list(arrivals[short])))
+                if not arrivals:
+                    say(f"nothing on {options.key} yet")
+        _tell_end(session)
+    if options.json:
+        print_json([{"key": short, "nominal_hz": topic.rate_hz, **rate_of(list(times))}
+                    for short, times in sorted(arrivals.items())])
+    if not arrivals:
+        raise _nothing_came(options.key, duration_s)
+    return 0
+
+
+def rate_of(times_s: list[float]) -> dict[str, Any]:
+    """Return rate and spread of arrival times, as `ros2 topic hz` gives them (pure)."""
+    gaps = [b - a for a, b in itertools.pairwise(times_s)]
+    if not gaps:
+        return {"rate_hz": None, "min_s": None, "max_s": None, "std_dev_s": None,
+                "window": len(times_s)}
+    mean = statistics.fmean(gaps)
+    return {
+        "rate_hz": 1 / mean if mean > 0 else None, "min_s": min(gaps), "max_s": max(gaps),
+        "std_dev_s": statistics.pstdev(gaps), "window": len(times_s),
+    }
+
+
+def in_line(body: Any) -> str:
+    """Return a message as one line of JSON, with long bytes only counted."""
+    plain = msgspec.to_builtins(body, builtin_types=(bytes,))
+
+    def shorten(value: Any) -> Any:
+        if isinstance(value, bytes):
+            return f"<{len(value)} bytes>"
+        if isinstance(value, dict):
+            return {k: shorten(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [shorten(v) for v in value]
+        return value
+
+    return msgspec.json.encode(shorten(plain)).decode()
+
+
+def _print_rate(key: str, rate: dict[str, Any]) -> None:
+    if rate["rate_hz"] is None:
+        say(f"{key}: one message so far")
+        return
+    say(f"{key}: average rate: {rate['rate_hz']:.3f} min: {rate['min_s']:.3f}s "
+        f"max: {rate['max_s']:.3f}s std dev: {rate['std_dev_s']:.5f}s window: {rate['window']}")
+
+
+def _tell_end(session: Session) -> None:
+    if is_over(session.run):
+        warn(f"the run has ended: {session.run.title} (port {session.run.base_port})")
+
+
+def _nothing_came(key: str, duration_s: float | None) -> NoEffectError:
+    when = "before the run ended" if duration_s is None else f"within {duration_s:g} s"
+    return NoEffectError(f"nothing came on {key} {when}")
+
+
+def _check_member(session: Session, topic: Topic[Any], key: str) -> None:
+    if not topic.is_family or key == topic.pattern or topic not in topics.ALL:
+        return  # the members of a robot's own families need not be nodes
+    head, tail = topic.at("\0").split("\0")
+    member = key[len(head):len(key) - len(tail)]
+    if member not in session.run.nodes:
+        raise unknown("node", member, session.run.nodes)
+
+
+def _positive(option: str, value: float | None) -> None:
+    if value is not None and not value > 0:
+        raise UsageError(f"{option} {value:g}: must be above 0")
+
+
+def _describe(
+    topic: Topic[Any], publishers: tuple[str, ...], readers: tuple[str, ...]
+) -> dict[str, Any]:
+    return {"key": topic.key, "message": topic.type.__name__, "qos": topic.qos.value,
+            "rate_hz": topic.rate_hz, "frame": topic.frame, "mailbox": MAILBOX[topic.qos],
+            "publishers": publishers, "readers": readers, "doc": topic.doc}

@@ -1,0 +1,105 @@
+"""`rampart`: the toolbox's command line.
+
+Exit codes: 0 it worked; 1 it was asked for and had no effect, or nothing answered; 2 bad usage,
+unknown name, no run found, or the answer could not be written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from rampart.cli.analyse import campaign_verb, cut_set_verbs, decide_verbs, tree_verbs, verify_verb
+from rampart.cli.look import live_verb, metrics_verb, top_verb, topic_verbs
+from rampart.cli.operate import (
+    adapt_verb,
+    inject_verbs,
+    joystick_verb,
+    mission_verb,
+    node_verbs,
+    operator_verbs,
+)
+from rampart.cli.output import NoEffectError, UsageError, warn
+from rampart.cli.record import bag_verbs, record_verbs
+from rampart.files import streams, working_folder
+
+_EPILOG = """examples:
+  rampart status                                 the run at a glance
+  rampart top                                    the run in the terminal, live
+  rampart node list                              processes, states, restarts
+  rampart topic echo localization/pose           see messages go by
+  rampart inject command-not-updated             break something
+  rampart reset RM1                              release the emergency stop
+  rampart mission pause                          give the mission an order
+  rampart joystick                               drive from the keyboard
+  rampart adapt set strategy guarded-repair      change mechanisms while it runs
+  rampart live foxglove                          see it in another viewer
+  rampart record run.mcap                        keep all that is said; `rampart replay` it
+  rampart table                                  what the manager would decide
+  rampart tree                                   see fault tree, FTMTree and orders
+  rampart campaign --paper                       break it a hundred times, and count
+  rampart verify                                 prove it, or show where it fails
+`rampart VERB --help` shows more."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser with all verbs; each sets `run`, a function of the options."""
+    formatter = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        prog="rampart", formatter_class=formatter, epilog=_EPILOG,
+        description="Look at a running system, disturb it, and ask the arbiter.")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--port", type=int, metavar="N",
+                        help="base port of the run, if there are several on this machine")
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    node_verbs.add(verbs, formatter, common)
+    top_verb.add(verbs, formatter, common)
+    topic_verbs.add(verbs, formatter, common)
+    inject_verbs.add(verbs, formatter, common)
+    operator_verbs.add(verbs, formatter, common)
+    mission_verb.add(verbs, formatter, common)
+    joystick_verb.add(verbs, formatter, common)
+    live_verb.add(verbs, formatter, common)
+    metrics_verb.add(verbs, formatter)
+    adapt_verb.add(verbs, formatter, common)
+    record_verbs.add(verbs, formatter, common)
+    bag_verbs.add(verbs, formatter)
+    campaign_verb.add(verbs, formatter)
+    cut_set_verbs.add(verbs, formatter, common)
+    decide_verbs.add(verbs, formatter)
+    tree_verbs.add(verbs, formatter)
+    verify_verb.add(verbs, formatter)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit code."""
+    streams.secure()
+    code = _run(arguments)
+    if code == 0 and (why := streams.lost_result()):
+        warn(f"stdout: {why}")
+        return 2
+    return code
+
+
+def _run(arguments: Sequence[str] | None) -> int:
+    options = build_parser().parse_args(arguments)
+    working_folder.admit()  # for actors of one's own, as in the processes of a run
+    try:
+        return int(options.run(options))
+    except UsageError as error:
+        warn(str(error))
+        return 2
+    except NoEffectError as error:
+        warn(str(error))
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    except OSError as error:  # of a disk; what the user named wrongly was refused above
+        warn(" ".join(str(error).split()))
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Commands that act on a run: inject, adapt, reset, mission, joystick."""

@@ -1,0 +1,248 @@
+"""`rampart inject`: choose a fault of the catalogue, or describe one, and have it injected."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.bounds import bare
+from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.osmosis import topics
+from rampart.actors.run.system_topics import published_keys
+from rampart.actors.runtime.corruption import InjectionError, field_type, is_array
+from rampart.actors.runtime.injection import MODES, flaw
+from rampart.cli import systems
+from rampart.cli.look.topic_catalogue import resolve, topics_for
+from rampart.cli.operate.injecting import run_fault
+from rampart.cli.output import UsageError, print_json, print_table, say
+from rampart.manager.spec.specification import SystemSpec
+from rampart.sim.faults.faults import (
+    PAPER_FAULTS,
+    SENSOR_FAULTS,
+    Disturbance,
+    Fault,
+    UnknownFaultError,
+    find_fault,
+)
+from rampart.sim.faults.topic_faults import modes_of, systematic_faults
+
+_DEFAULT_DURATION_S = 5.0
+
+_EPILOG = """examples:
+  rampart inject --list                           what there is
+  rampart inject command-out-of-bounds --duration 3
+  rampart inject prohibited-area --at-once
+  rampart inject laser-stuck --duration inf       permanent: until the node's process ends
+  rampart inject gps-dropout --on 1 --off 4 --duration 30
+                                                  intermittent: 1 s without GPS, 4 s with
+  rampart inject drop:localization/pose           any mode on any topic ...
+  rampart inject corrupt:plan/route --seed 7      ... here one of its numbers: odd seeds, one each
+  rampart inject drop:control/command --share 0.3 three messages in ten are lost
+your own:
+  rampart inject --topic localization/pose --mode delay --delay 0.8
+  rampart inject --topic summit_xl/scan --mode restamp --stamp=-0.2
+                                                  stamped 0.2 s before the truth
+  rampart inject --topic localization/pose --mode corrupt --ramp x_m=0.25
+  rampart inject --topic control/command --mode corrupt --set angular_radps=2.5
+  rampart inject --topic summit_xl/scan --mode corrupt --add ranges_f32=0.4 \\
+                 --noise ranges_f32=0.2
+Fields are those of `rampart topic info TOPIC`; one inside another is written pose.x_m."""
+
+
+def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+    """Add the verb to the parser."""
+    parser = verbs.add_parser(
+        "inject", parents=[common], formatter_class=formatter, help="inject a fault",
+        description="Inject a fault of the catalogue, or disturb any topic, for a while. It\n"
+                    "acts in the node that publishes the topic. The verb waits for its end and\n"
+                    "says how many messages were affected; if none was, it says so and exits 1.\n"
+                    "For a permanent fault it waits until the first message was affected.\n"
+                    "Ctrl-C ends the fault at once. Durations are simulated seconds.",
+        epilog=_EPILOG)
+    parser.add_argument("fault", nargs="?", metavar="FAULT",
+                        help="a name from --list, or MODE:TOPIC")
+    parser.add_argument("--list", action="store_true", help="list the catalogue (needs no run)")
+    parser.add_argument("--system", metavar="FILE",
+                        help="for --list: system spec; default the shipped one")
+    parser.add_argument("--duration", type=float, metavar="S",
+                        help="simulated seconds, inf for permanent; default the fault's own, "
+                             f"else {_DEFAULT_DURATION_S:g}")
+    parser.add_argument("--at-once", action="store_true",
+                        help="return as soon as the fault is in force; do not wait for its end")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    when = parser.add_argument_group("which messages")
+    when.add_argument("--share", type=float, metavar="P",
+                      help="probability that a message is affected, up to 1 (default)")
+    when.add_argument("--on", type=float, metavar="S", help="intermittent: in force for S ...")
+    when.add_argument("--off", type=float, metavar="S", help="... and away for S, repeating")
+    when.add_argument("--seed", type=int, metavar="N",
+                      help="of share, noise and what restamp:TOPIC and corrupt:TOPIC draw; "
+                           "default 0")
+    own = parser.add_argument_group("a fault of your own, instead of FAULT")
+    own.add_argument("--topic", metavar="KEY", help="e.g. control/command or detection/DM2")
+    own.add_argument("--mode", metavar="MODE", help=", ".join(MODES))
+    own.add_argument("--delay", type=float, metavar="S", help="for delay: simulated seconds")
+    own.add_argument("--stamp", type=float, metavar="S",
+                     help="for restamp: added to each stamp, simulated seconds; above 0 is ahead")
+    own.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE",
+                     help="for corrupt: overwrite a field; may be repeated, as all below")
+    own.add_argument("--add", action="append", default=[], metavar="FIELD=BIAS",
+                     help="for corrupt: add BIAS to a number, or to each of an array")
+    own.add_argument("--ramp", action="append", default=[], metavar="FIELD=RATE",
+                     help="for corrupt: add RATE per simulated second")
+    own.add_argument("--noise", action="append", default=[], metavar="FIELD=SIGMA",
+                     help="for corrupt: add Gaussian noise of this standard deviation")
+    own.add_argument("--keep-ends", action="append", default=[], metavar="FIELD",
+                     help="for corrupt: keep only first and last element of a list")
+    parser.set_defaults(run=inject)
+
+
+def inject(options: argparse.Namespace) -> int:
+    """List the catalogue, or inject a fault."""
+    if options.list:
+        _print_catalogue(systems.load(options.system), as_json=options.json)
+        return 0
+    if options.system is not None:
+        raise UsageError(f"--system {options.system}: goes with --list; a fault is injected into "
+                         "the run that there is")
+    fault = choose(options)
+    if options.duration is not None and not options.duration > 0:
+        raise UsageError(f"--duration {options.duration:g}: must be seconds above 0, or inf")
+    return asyncio.run(run_fault(
+        fault, options.duration, options.port, at_once=options.at_once, as_json=options.json))
+
+
+def choose(options: argparse.Namespace) -> Fault:
+    """Return the fault that the options describe.
+
+    Raises:
+        UsageError: neither or both of FAULT and --topic, or something in them is wrong.
+    """
+    if (options.fault is None) == (options.topic is None):
+        raise UsageError("give either a FAULT of the catalogue (rampart inject --list) or --topic")
+    if options.share is not None and not 0 < options.share <= 1:
+        raise UsageError(f"--share {options.share:g}: must be above 0, and at most 1")
+    if (options.on is None) != (options.off is None):
+        raise UsageError("--on S and --off S go together")
+    for name in ("on", "off"):
+        value = getattr(options, name)
+        if value is not None and not 0 < value < float("inf"):
+            raise UsageError(f"--{name} {value:g}: must be seconds above 0")
+    fault = _own_fault(options) if options.fault is None else _known_fault(options)
+    return fault.varied(share=options.share, on_s=options.on, off_s=options.off)
+
+
+def _known_fault(options: argparse.Namespace) -> Fault:
+    for name in ("mode", "delay", "stamp", "set", "add", "ramp", "noise", "keep_ends"):
+        if getattr(options, name):
+            raise UsageError(f"--{name.replace('_', '-')} goes with --topic, not with a "
+                             "FAULT of the catalogue")
+    try:
+        _, colon, key = options.fault.partition(":")
+        known = topics_for(key, options.port) if colon else topics.ALL
+        return find_fault(options.fault, options.seed or 0, known)
+    except UnknownFaultError as error:
+        raise UsageError(str(error)) from None
+
+
+def _own_fault(options: argparse.Namespace) -> Fault:
+    topic, key = resolve(options.topic, topics_for(options.topic, options.port))
+    if "*" in key:
+        raise UsageError(f"--topic {options.topic}: name one member of the family, "
+                         f"e.g. {topic.key.replace('{name}', 'DM1')}")
+    if options.mode not in MODES:
+        raise UsageError(f"--mode {options.mode}: must be one of {', '.join(MODES)}")
+    changes = (options.set, options.add, options.ramp, options.noise, options.keep_ends)
+    if any(changes) != (options.mode == "corrupt"):
+        raise UsageError("--mode corrupt goes with --set, --add, --ramp, --noise or --keep-ends, "
+                         "and no other mode does")
+    if (options.delay is not None) != (options.mode == "delay"):
+        raise UsageError("--mode delay goes with --delay S, and no other mode does")
+    if options.delay is not None and not 0 < options.delay < float("inf"):
+        raise UsageError(f"--delay {options.delay:g}: must be seconds above 0")
+    if (options.stamp is not None) != (options.mode == "restamp"):
+        raise UsageError("--mode restamp goes with --stamp S, and no other mode does")
+    disturbance = Disturbance(
+        key.removeprefix(f"{ROOT}/"), options.mode, options.delay or 0.0,
+        set_fields=dict(_setting(text, topic) for text in options.set),
+        add_fields=dict(_amount("--add", text, topic) for text in options.add),
+        ramp_fields=dict(_amount("--ramp", text, topic) for text in options.ramp),
+        noise_fields=dict(_amount("--noise", text, topic) for text in options.noise),
+        keep_ends=tuple(options.keep_ends),
+        seed=options.seed or 0, stamp_s=options.stamp or 0.0)
+    reason = flaw(disturbance.order("", _DEFAULT_DURATION_S), topic.type)
+    if reason:
+        raise UsageError(f"--topic {options.topic}: {reason}")
+    return Fault(f"{options.mode} {disturbance.topic}", "", (disturbance,), (),
+                 _DEFAULT_DURATION_S)
+
+
+def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
+    """Return field, value as text, and the field's type."""
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise UsageError(f"{option} {text}: must be FIELD=VALUE")
+    try:
+        return name, value, field_type(topic.type, name)
+    except InjectionError as error:
+        raise UsageError(str(error)) from None
+
+
+def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
+    name, value, kind = _split("--set", text, topic)
+    if is_array(name, kind):
+        kind = float  # it fills the array
+    if bare(kind) is str:
+        return name, value
+    try:
+        found = msgspec.convert(msgspec.json.decode(value), kind)
+    except (msgspec.DecodeError, msgspec.ValidationError):
+        try:
+            found = msgspec.convert(value, kind, strict=False)
+        except msgspec.ValidationError as error:
+            raise UsageError(f"--set {text}: {error}") from None
+    return name, msgspec.to_builtins(found)
+
+
+def _amount(option: str, text: str, topic: Topic[Any]) -> tuple[str, float]:
+    name, value, _ = _split(option, text, topic)
+    try:
+        return name, float(value)
+    except ValueError:
+        raise UsageError(f"{option} {text}: must be FIELD=NUMBER") from None
+
+
+def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
+    known = systems.topics_of(spec)
+    keys = published_keys(spec)
+    if as_json:
+        everything = (*PAPER_FAULTS.values(), *SENSOR_FAULTS.values(),
+                      *systematic_faults(keys, known=known))
+        print_json([{"name": f.name, "title": f.title, "group": f.group,
+                     "detected_by": f.detected_by, "duration_s": f.duration_s,
+                     "topics": [d.topic for d in f.disturbances]} for f in everything])
+        return
+    for title, faults in (("the paper's faults", PAPER_FAULTS), ("sensors", SENSOR_FAULTS)):
+        say(f"{title}:")
+        print_table(("fault", "seen by", "s", "what happens"),
+                    [(f.name, " ".join(f.detected_by), f"{f.duration_s:g}", f.title)
+                     for f in faults.values()])
+        say()
+    say(f"any topic, as MODE:TOPIC; MODE is one of {', '.join(MODES)}:")
+    print_table(("topic", "modes"), list(_modes_by_topic(keys, known).items()))
+    say()
+    say("crashes: kill-node NODE, or kill -9 PID")
+
+
+def _modes_by_topic(keys: tuple[str, ...], known: tuple[Topic[Any], ...]) -> dict[str, str]:
+    """Return key of each declared topic → its modes in words; a family counts once."""
+    rows: dict[str, str] = {}
+    for key in keys:
+        modes = modes_of(key, known)
+        if modes:
+            missing = [mode for mode in MODES if mode not in modes]
+            rows[resolve(key, known)[0].key] = f"all but {', '.join(missing)}" if missing else "all"
+    return {topic.key: rows[topic.key] for topic in known if topic.key in rows}

@@ -1,0 +1,214 @@
+"""`rampart joystick`: drive from the terminal's keyboard, or with a joystick of this machine."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import sys
+from typing import Any
+
+from rampart.actors.bus.envelope import Header
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.teleoperation.joystick_device import (
+    AUTO,
+    JoystickDevice,
+    mapping_of,
+)
+from rampart.cli import systems
+from rampart.cli.following import is_over, stopped_by_signals
+from rampart.cli.operate.keyboard_stick import KeyboardStick
+from rampart.cli.output import NoEffectError, UsageError, say
+from rampart.cli.session import Session, connect
+from rampart.cli.terminal import END, keys
+from rampart.files.plain_text import printable
+
+_PERIOD_S = 0.05
+"""Simulated seconds between two positions; not less than `_SHORTEST_S` real ones."""
+
+_SHORTEST_S = 0.01
+_SHOW_EVERY_S = 0.25
+_ANSWER_S = 1.0
+"""Real seconds within which teleoperation has to answer a stick that is held."""
+
+_RELEASES = 3
+_TELEOPERATION = "rampart.actors.osmosis.control.teleoperation.teleoperation:Teleoperation"
+
+
+def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+    """Add the verb to the parser."""
+    parser = verbs.add_parser(
+        "joystick", parents=[common], formatter_class=formatter,
+        help="drive from the keyboard, or with a joystick",
+        description="Drive the robot by the arrow keys, or by u i o j l m , . as ROS users know.\n"
+                    "Space or k lets go, + and - change the speed, q or Ctrl-C quits.\n\n"
+                    "The dead man: hold the key. A terminal tells no letting go, so the robot\n"
+                    "drives while the key repeats and stops within 0.6 s when it does not. If the\n"
+                    "robot stops once after the first moment, make the keyboard repeat sooner\n"
+                    "(X11: xset r rate 250).\n\n"
+                    "One stick is followed at a time: who holds first, drives; others are told.",
+        epilog="examples:\n  rampart joystick\n  rampart joystick --speed 0.2\n"
+               "  rampart joystick --device            the first joystick plugged in here\n"
+               "  rampart joystick --device /dev/input/js1")
+    parser.add_argument("--speed", type=float, default=0.5, metavar="SHARE",
+                        help="share of full speed to begin with, 0.1 to 1 (default 0.5)")
+    parser.add_argument("--device", nargs="?", const=AUTO, metavar="DEVICE",
+                        help="a joystick instead of the keyboard; hold its dead-man button")
+    parser.set_defaults(run=lambda options: asyncio.run(joystick(options)))
+
+
+async def joystick(options: argparse.Namespace) -> int:
+    """Drive until the user has had enough, or the run ends."""
+    if not 0.1 <= options.speed <= 1.0:
+        raise UsageError(f"--speed {options.speed:g}: must be between 0.1 and 1")
+    if options.device is None and not sys.stdin.isatty():
+        raise UsageError("standard input is no terminal, so there are no keys to drive by; "
+                         "a joystick is used with --device")
+    stop = asyncio.Event()
+    async with connect(options.port) as session:
+        drive = _Drive(session, None if options.device else KeyboardStick(options.speed), stop)
+        device = _open(options.device, session, drive) if options.device else None
+        with stopped_by_signals(stop):
+            say("hold a key to drive, q quits" if device is None
+                else f"hold the dead-man button of {device.path} to drive, q quits")
+            try:
+                with keys(drive.press):
+                    await drive.until_stopped()
+            finally:
+                if device is not None:
+                    device.close()
+                await drive.let_go()
+                say()
+        if drive.ended:
+            raise NoEffectError(drive.ended)
+        if drive.unanswered:
+            raise NoEffectError("no effect: teleoperation did not answer")
+    return 0
+
+
+def _open(name: str, session: Session, drive: _Drive) -> JoystickDevice:
+    spec = systems.load(session.run.system_file)
+    parameters = next((n.parameters for n in spec.nodes if n.actor == _TELEOPERATION), {})
+    try:
+        mapping = mapping_of(parameters)
+    except ValueError as error:
+        raise UsageError(f"{session.run.system_file}: teleoperation: {error}") from None
+    device = JoystickDevice(name, mapping, lambda: drive.moved(device.stick), drive.lost)
+    missing = device.open()
+    if missing:
+        raise UsageError(f"--device {name}: {missing}")
+    return device
+
+
+class _Drive:
+    """A stick in the user's hand, and what is heard of it.
+
+    Args:
+        session: in the run.
+        keyboard: turns keys into positions; None if a device drives.
+        stop: set when the user has had enough.
+    """
+
+    def __init__(
+        self, session: Session, keyboard: KeyboardStick | None, stop: asyncio.Event
+    ) -> None:
+        self.ended = ""
+        self.answered = False
+        self._session = session
+        self._keyboard = keyboard
+        self._device = m.Joystick(0.0, 0.0, False)
+        self._stop = stop
+        self._loop = asyncio.get_running_loop()
+        self._held_since_s: float | None = None
+        self._releases = 0
+        self._tried = False
+        self._pilot: m.PilotStatus | None = None
+        session.listen(topics.PILOT_STATUS, topics.PILOT_STATUS.at(), self._hear_pilot)
+        session.listen(topics.TELEOP_COMMAND, topics.TELEOP_COMMAND.at(), self._hear_command)
+        session.listen(topics.DIAGNOSTIC, topics.DIAGNOSTIC.pattern, self._hear_diagnostic)
+
+    @property
+    def unanswered(self) -> bool:
+        """Whether the stick was held and nobody ever made a command of it."""
+        return self._tried and not self.answered
+
+    def press(self, key: str) -> None:
+        """Take a key."""
+        if key in {"q", "Q", END}:
+            self._stop.set()
+        elif self._keyboard is not None:
+            self._keyboard.press(key, self._loop.time())
+            self._send()
+
+    def moved(self, stick: m.Joystick) -> None:
+        """Take a position of the device."""
+        self._device = stick
+        self._send()
+
+    def lost(self, why: str) -> None:
+        """The device has vanished: stop and end."""
+        self._device = m.Joystick(0.0, 0.0, False)
+        self.ended = f"the joystick vanished: {why}"
+        self._stop.set()
+
+    async def until_stopped(self) -> None:
+        """Repeat the stick while it is held, and show what comes of it."""
+        period_s = max(_PERIOD_S / self._session.clock.rate, _SHORTEST_S)
+        shown_s = 0.0
+        while not self._stop.is_set():
+            if is_over(self._session.run):
+                self.ended = "the run has ended"
+                return
+            self._send()
+            if self._loop.time() - shown_s >= _SHOW_EVERY_S:
+                shown_s = self._loop.time()
+                self._show()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._stop.wait(), period_s)
+
+    async def let_go(self) -> None:
+        """Tell that nobody holds the stick any more."""
+        for _ in range(_RELEASES):
+            self._session.publish(topics.JOYSTICK, m.Joystick(0.0, 0.0, False))
+            await asyncio.sleep(_SHORTEST_S)
+
+    def _stick(self) -> m.Joystick:
+        return self._keyboard.stick(self._loop.time()) if self._keyboard else self._device
+
+    def _send(self) -> None:
+        stick = self._stick()
+        if stick.dead_man:
+            if self._held_since_s is None:
+                self._held_since_s = self._loop.time()
+            self._tried = self._tried or self._loop.time() - self._held_since_s > _ANSWER_S
+            self._releases = _RELEASES
+        else:
+            self._held_since_s = None
+            self._releases -= 1
+        if self._releases >= 0:
+            self._session.publish(topics.JOYSTICK, stick)
+
+    def _show(self) -> None:
+        stick, pilot = self._stick(), self._pilot
+        text = (f"forward {stick.forward:+.0%} left {stick.left:+.0%}" if stick.dead_man
+                else "let go")
+        if self._keyboard is not None:
+            text += f"  speed {self._keyboard.speed:.0%}"
+        if pilot is not None:
+            text += f"  pilot {pilot.mode.value}, {'stopped' if pilot.stopped else 'driving'}"
+            text += f": {pilot.reason}" if pilot.reason else ""
+        sys.stdout.write(f"\r{printable(text)[:78]:<78}")
+        sys.stdout.flush()
+
+    def _hear_pilot(self, _key: str, _header: Header, status: m.PilotStatus) -> None:
+        self._pilot = status
+
+    def _hear_command(self, _key: str, _header: Header, _twist: m.Twist) -> None:
+        self.answered = self.answered or self._held_since_s is not None
+
+    def _hear_diagnostic(self, _key: str, _header: Header, report: m.Diagnostic) -> None:
+        if report.offender == self._session.name:
+            self.answered = True
+            sys.stdout.write("\r")
+            say(f"{report.node}: {report.reason.replace(self._session.name, 'you')}")

@@ -1,0 +1,149 @@
+"""`rampart mission`: the operator's orders to the mission under way."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import uuid
+from typing import Any
+
+from rampart.actors.bus.envelope import Header
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import (
+    MissionAction,
+    MissionOrder,
+    MissionOrderAnswer,
+    MissionPhase,
+    MissionStatus,
+)
+from rampart.cli.output import NoEffectError, UsageError, print_json, say
+from rampart.cli.session import Session, connect
+
+OPERATOR = "operator"
+"""Who asks, as the mission's state will tell."""
+
+MAX_REASON = 200
+"""Characters; a reason is kept with what comes of the order and shown on every status."""
+
+_ANSWER_S = 5.0
+"""Simulated seconds within which the Mission Manager answers, also if it is just respawned."""
+
+_STATUS_S = 1.0
+"""Simulated seconds within which it repeats its status (nominally each half second)."""
+
+_WHAT = {
+    MissionAction.PAUSE: "stop, and keep the goal",
+    MissionAction.RESUME: "go on with the goal it was paused at",
+    MissionAction.REPLAN: "drive on, by a way that is planned anew",
+    MissionAction.SKIP: "leave the present goal out; the mission cannot succeed any more",
+    MissionAction.CANCEL: "give the mission up where the robot is",
+    MissionAction.HOME: "give the mission up and drive to where it began",
+}
+
+_EPILOG = """examples:
+  rampart mission pause --reason "runway in use"
+  rampart mission resume
+  rampart mission skip --reason "goal 2 is closed"
+  rampart mission home --json
+  rampart status                                  what the mission does now
+An order that makes no sense now is refused, with the reason, e.g. to resume what is not paused.
+A robot that a recovery holds is not released by `resume`: see rampart reset.
+exit code: 0 obeyed, 1 refused or not answered, 2 bad usage or no run"""
+
+
+def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+    """Add the verb to the parser."""
+    orders = "\n".join(f"  {action.value:<8}{what}" for action, what in _WHAT.items())
+    parser = verbs.add_parser(
+        "mission", parents=[common], formatter_class=formatter,
+        help="pause, resume, replan, skip, cancel, or drive home",
+        description="Give the Mission Manager an order, wait for its answer, and say what became\n"
+                    f"of the mission.\n\norders:\n{orders}",
+        epilog=_EPILOG)
+    parser.add_argument("action", metavar="ORDER", choices=[a.value for a in MissionAction],
+                        help=", ".join(a.value for a in MissionAction))
+    parser.add_argument("--reason", metavar="TEXT", default="no reason given",
+                        help="why; it is kept and shown with the mission")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=lambda options: asyncio.run(mission(options)))
+
+
+async def mission(options: argparse.Namespace) -> int:
+    """Give an order and say what came of it.
+
+    Raises:
+        NoEffectError: it was refused, or nobody answered.
+        UsageError: the reason is none, or there is no run.
+    """
+    order = MissionOrder(f"rampart-{uuid.uuid4().hex[:10]}", MissionAction(options.action),
+                         checked_reason(options.reason), OPERATOR)
+    async with connect(options.port) as session:
+        asked = _Asked(session, order)
+        answered = await session.command(
+            topics.MISSION_ORDER, order, lambda: asked.answer is not None,
+            session.real_s(_ANSWER_S))
+        if answered:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(asked.shown.wait(), session.real_s(_STATUS_S))
+    answer, status = asked.answer, asked.status
+    if answer is None:
+        raise NoEffectError(f"no effect: the Mission Manager did not answer within {_ANSWER_S:g} s")
+    if options.json:
+        print_json({
+            "order": order.order, "action": order.action, "accepted": answer.accepted,
+            "reason": answer.reason, "plan": answer.plan,
+            "mission": None if status is None else {
+                "mission_id": status.mission_id, "name": status.name, "phase": status.phase,
+                "step": status.step, "goals": len(status.goals), "reason": status.reason}})
+    if not answer.accepted:
+        raise NoEffectError(f"{order.action.value} refused: {answer.reason}")
+    if not options.json:
+        say(f"{order.action.value} obeyed; {in_words(status)}")
+    return 0
+
+
+def checked_reason(text: str) -> str:
+    """Return a reason that fits into a status line.
+
+    Raises:
+        UsageError: it is empty, too long, or not one line of printable characters.
+    """
+    reason = text.strip()
+    if not reason or len(reason) > MAX_REASON or not reason.isprintable():
+        raise UsageError(f"--reason {text[:40]!r}: must be one line of 1 to {MAX_REASON} printable "
+                         "characters")
+    return reason
+
+
+def in_words(status: MissionStatus | None) -> str:
+    """Return where the mission is, for people."""
+    if status is None:
+        return "the Mission Manager has not shown its status since"
+    step = f", step {min(status.step + 1, len(status.goals))} of {len(status.goals)}" if (
+        status.phase in (MissionPhase.RUNNING, MissionPhase.PAUSED)) else ""
+    why = f": {status.reason}" if status.reason else ""
+    return f"mission {status.name} is {status.phase.value}{step}{why}"
+
+
+class _Asked:
+    """What the Mission Manager says about one order, and of its mission afterwards."""
+
+    def __init__(self, session: Session, order: MissionOrder) -> None:
+        self._order = order
+        self._answered_s = 0.0
+        self.answer: MissionOrderAnswer | None = None
+        self.status: MissionStatus | None = None
+        self.shown = asyncio.Event()
+        session.listen(topics.MISSION_ORDER_ANSWER, topics.MISSION_ORDER_ANSWER.at(), self._hear)
+        session.listen(topics.MISSION_STATUS, topics.MISSION_STATUS.at(), self._see)
+
+    def _hear(self, _key: str, header: Header, answer: MissionOrderAnswer) -> None:
+        if answer.order == self._order.order and self.answer is None:
+            self.answer, self._answered_s = answer, header.stamp
+
+    def _see(self, _key: str, header: Header, status: MissionStatus) -> None:
+        # Only a status of after the answer tells what the order has led to.
+        if self.answer is not None and header.stamp >= self._answered_s:
+            self.status = status
+            self.shown.set()

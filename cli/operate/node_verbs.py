@@ -1,0 +1,110 @@
+"""`rampart status` and `rampart node`: what runs, and how it is."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+from typing import Any
+
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.cli.holdings import Holdings
+from rampart.cli.output import NoEffectError, print_json, print_table, say
+from rampart.cli.session import Session, connect
+from rampart.cli.state_words import manager_in_words, mission_in_words, pilot_in_words
+
+_STATUS = (topics.MISSION_STATUS, topics.PILOT_STATUS, topics.MANAGER_STATUS, topics.NODES)
+_WAIT_S = 1.5
+"""Simulated seconds to collect states; the rarest comes twice a second."""
+
+
+def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+    """Add the verbs to the parser."""
+    parser = verbs.add_parser(
+        "status", parents=[common], formatter_class=formatter, help="the run at a glance",
+        description="Show mission, Safety Pilot, FTM Manager and nodes of the run.\n"
+                    "Whatever the system has and does not answer is shown as silent.",
+        epilog="examples:\n  rampart status\n  rampart status --json")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=lambda options: asyncio.run(status(options)))
+
+    node = verbs.add_parser("node", formatter_class=formatter, help="the nodes of the run",
+                            description="Look at the nodes of the run.",
+                            epilog="examples:\n  rampart node list\n  rampart node list --json")
+    subverbs = node.add_subparsers(dest="subverb", required=True, metavar="VERB")
+    parser = subverbs.add_parser(
+        "list", parents=[common], formatter_class=formatter, help="all nodes",
+        description="List the nodes with process id, state, incarnation and restarts.",
+        epilog="examples:\n  rampart node list\n  kill -9 $(rampart node list --json | python3 -c "
+               "'import json,sys; print(next(n[\"pid\"] for n in json.load(sys.stdin) "
+               "if n[\"name\"] == \"localization\"))')")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=lambda options: asyncio.run(node_list(options)))
+
+
+async def node_list(options: argparse.Namespace) -> int:
+    """Print the supervisor's table."""
+    async with connect(options.port) as session:
+        found = await session.latest((topics.NODES,), session.real_s(_WAIT_S) + 1.0)
+    if not found:
+        raise NoEffectError("the supervisor does not answer; it may just be restarting, try again")
+    table: m.NodeTable = found[topics.NODES.key]
+    if options.json:
+        print_json([
+            {"name": n.name, "kind": n.kind, "pid": n.pid, "state": n.state,
+             "incarnation": n.incarnation, "restarts": n.restarts} for n in table.nodes])
+    else:
+        print_table(("name", "kind", "pid", "state", "incarnation", "restarts"),
+                    [(n.name, n.kind, n.pid, n.state.value, n.incarnation, n.restarts)
+                     for n in table.nodes])
+    return 0
+
+
+async def status(options: argparse.Namespace) -> int:
+    """Print the state of the run."""
+    async with connect(options.port) as session:
+        held = Holdings(session)
+        found, _ = await asyncio.gather(
+            session.latest(_STATUS, session.real_s(_WAIT_S)), held.settle())
+        time_s = session.clock.now()
+    mission: m.MissionStatus | None = found.get(topics.MISSION_STATUS.key)
+    pilot: m.PilotStatus | None = found.get(topics.PILOT_STATUS.key)
+    manager: m.ManagerStatus | None = found.get(topics.MANAGER_STATUS.key)
+    nodes: m.NodeTable | None = found.get(topics.NODES.key)
+    if options.json:
+        run = session.run
+        print_json({
+            "run_id": run.run_id, "title": run.title, "port": run.base_port, "pid": run.pid,
+            "rate": run.rate, "system": run.system_file, "time_s": round(time_s, 3),
+            "mission": mission, "pilot": pilot, "manager": manager, "holders": held.holders,
+            "nodes": nodes.nodes if nodes else None})
+        return 0
+    _print_run(session, time_s)
+    kinds = {n.kind for n in nodes.nodes} if nodes else {"pilot", "manager"}
+    if mission is not None or session.run.plan.get("mission", True):
+        say(f"mission   {mission_in_words(mission)}")
+    if pilot is not None or "pilot" in kinds:
+        say(f"pilot     {pilot_in_words(pilot)}")
+    if manager is not None or "manager" in kinds:
+        say(f"manager   {manager_in_words(manager)}")
+    for name, what in held.holders.items():
+        say(f"held      {' and '.join(what)} by {name}, no recovery module of this system; "
+            f"rampart reset {name} lets go")
+    say(f"nodes     {_nodes(nodes)}")
+    return 0
+
+
+def _print_run(session: Session, time_s: float) -> None:
+    run = session.run
+    say(f"run       {run.title} (port {run.base_port}, pid {run.pid})")
+    page = f", page {run.page}" if run.page else ""
+    say(f"time      {time_s:.1f} s at rate {run.rate:g}{page}")
+
+
+def _nodes(table: m.NodeTable | None) -> str:
+    if table is None:
+        return "silent (supervisor)"
+    bad = [f"{n.name} {n.state.value}" for n in table.nodes if n.state is not m.NodeState.RUNNING]
+    restarts = sum(n.restarts for n in table.nodes)
+    text = f"{len(table.nodes) - len(bad)} of {len(table.nodes)} running, {restarts} restarts"
+    return f"{text}; {', '.join(bad)}" if bad else text

@@ -1,0 +1,59 @@
+"""How verbs talk: errors of the user, tables, JSON."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import msgspec
+
+from rampart.files.plain_text import one_line, printable
+
+_WARNING_CHARS = 4000
+
+
+class UsageError(Exception):
+    """The user asked for something that cannot be; one line. Exit code 2."""
+
+
+class NoEffectError(Exception):
+    """It was asked for, and nothing came of it; one line. Exit code 1."""
+
+
+def unknown(what: str, value: str, known: Iterable[str]) -> UsageError:
+    """Return the error for a name that is none; it lists those that are."""
+    return UsageError(f"unknown {what} {value!r}; known: {', '.join(known) or 'none'}")
+
+
+def say(text: str = "") -> None:
+    """Print one line now, also into a pipe; whoever it quotes cannot make it two."""
+    print(printable(text), flush=True)
+
+
+def say_text(text: str) -> None:
+    """Print a text of several lines."""
+    print(printable(text, keep="\n"), flush=True)
+
+
+def warn(text: str) -> None:
+    """Print a line on stderr."""
+    print(f"rampart: {one_line(text, _WARNING_CHARS)}", file=sys.stderr, flush=True)
+
+
+def print_json(data: Any, *, indent: bool = True) -> None:
+    """Print data as JSON; NaN and infinity become null."""
+    text = msgspec.json.encode(data)
+    say_text((msgspec.json.format(text, indent=2) if indent else text).decode())
+
+
+def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print rows in aligned columns; numbers to the right."""
+    table = [[printable(str(cell)) for cell in row] for row in (head, *rows)]
+    widths = [max(len(row[i]) for row in table) for i in range(len(head))]
+    right = [bool(rows) and all(isinstance(row[i], (int, float)) for row in rows)
+             for i in range(len(head))]
+    for line in table:
+        cells = [cell.rjust(width) if number else cell.ljust(width)
+                 for cell, width, number in zip(line, widths, right, strict=True)]
+        say("  ".join(cells).rstrip())

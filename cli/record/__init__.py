@@ -1,0 +1,1 @@
+"""Commands that record a run, read recordings, and replay them."""

@@ -1,0 +1,22 @@
+"""The operator's page on a replay: it shows everything, and nothing can be asked of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rampart.actors.operator.hmi import Hmi
+from rampart.actors.operator.requests import RefusedError, Wish
+from rampart.actors.operator.server import Visitor
+
+NAME = "replay_page"
+"""Not `hmi`, of which there is a recording."""
+
+
+class ReplayPage(Hmi):
+    """An HMI in front of the past."""
+
+    def _fulfil(self, wish: Wish, visitor: Visitor) -> str | dict[str, Any]:  # noqa: ARG002
+        raise RefusedError("this is a replay: there is no robot to obey")
+
+    def _look(self) -> None:
+        """Measure nothing: the recorded process numbers may be anybody's today."""

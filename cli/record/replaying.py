@@ -1,0 +1,312 @@
+"""Plays a recording back onto a bus of its own, where tools and an operator's page can read it.
+
+A replay must never reach a robot. It dials nobody; it listens on one socket, in a folder of its
+own; nodes of a run dial only what is in the folder of their run. Tools find it as they find a run,
+and are told that it is none: they give it no orders, and prefer a run to it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+import tempfile
+import time
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus import run_folder
+from rampart.actors.bus.bus import BusError
+from rampart.actors.bus.envelope import UNREADABLE
+from rampart.actors.bus.messages import Message
+from rampart.actors.bus.shared_bus import SharedBus
+from rampart.actors.bus.tap import Tap
+from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.bus.unix_peer import is_same_user
+from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
+from rampart.actors.recording.message_form import form_of, header_of, renumbered
+from rampart.actors.recording.run_documents import SYSTEM, restore
+from rampart.actors.run import run_info
+from rampart.actors.runtime.actor import Context
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.process_title import find_processes
+from rampart.cli.output import UsageError
+from rampart.cli.record.replay_page import NAME, ReplayPage
+from rampart.files import toml
+from rampart.files.reading import read_text
+from rampart.manager.spec.specification import check_document, read_document
+
+DEFAULT_PORT = 7400
+GAP_S = 0.1
+"""Simulated seconds between two laps."""
+
+_STRANGE: Topic[Any] = Topic("", Message, Qos.SENSOR, 0, "", "What was recorded on no topic's key.")
+_Due = tuple[int, float, str, bytes]
+"""Lap, simulated time, key, and payload as it was recorded."""
+
+_YIELD_EVERY = 50
+_LINGER_S = 0.3
+
+
+class Replay:
+    """One recording played back. Use: `run`, once.
+
+    Args:
+        path: of the recording.
+        port: number under which tools find it.
+        rate: simulated seconds per second.
+        loop: begin anew at the end.
+        start_s: simulated time at which to begin; None for the beginning.
+        wants: says of a full key whether it is played.
+        hmi_port: port of an operator's page; 0 for none.
+        said: told, in a line, what happens.
+
+    Raises:
+        BagError: the file cannot be read.
+        UsageError: it is no recording of a run, or there is nothing to play.
+    """
+
+    def __init__(self, path: Path, *, port: int = DEFAULT_PORT, rate: float = 1.0,
+                 loop: bool = False, start_s: float | None = None,
+                 wants: Callable[[str], bool] = lambda _key: True, hmi_port: int = 0,
+                 said: Callable[[str], None] = lambda _line: None) -> None:
+        self.summary = Summary(BagReader(path))
+        self.played = 0
+        self.refused = 0
+        self._path = path
+        self._port = port
+        self._rate = rate
+        self._loop = loop
+        self._wants = wants
+        self._hmi_port = hmi_port
+        self._said = said
+        self._sockets = ""
+        self._lives: dict[str, int] = {}
+        summary = self.summary
+        if not summary.reader.is_recording:
+            raise UsageError(f"{path}: an MCAP file of {summary.reader.library or 'others'}, not a "
+                             "recording of a run: nothing in it can be played onto the bus")
+        if not any(wants(key) for key in summary.keys) or summary.first_ns is None:
+            raise UsageError(f"{path}: no message to play")
+        zero_s = summary.time_zero_s
+        self._first_s = summary.first_ns / 1e9 + zero_s
+        self._last_s = summary.last_ns / 1e9 + zero_s
+        self._lap_s = self._last_s - self._first_s + GAP_S
+        self._start_s = self._first_s if start_s is None else max(start_s, self._first_s)
+        if self._start_s > self._last_s:
+            raise UsageError(f"--start {start_s:g}: the recording goes from {self._first_s:.1f} to "
+                             f"{self._last_s:.1f} simulated seconds")
+        claim_port(port)
+        if hmi_port:
+            _check_free("--hmi-port", hmi_port)
+
+    async def run(self, stop: asyncio.Event, delay_s: float = 0.0) -> None:
+        """Play to the end, or until `stop` is set; with a page or in a loop there is no end.
+
+        Args:
+            stop: ends it.
+            delay_s: real seconds before the first message, for readers to come.
+
+        Raises:
+            UsageError: the number is taken, or there is no place for a socket.
+        """
+        async with contextlib.aclosing(self._messages(stop)) as messages:
+            first = await anext(messages, None)  # may lie deep in the file: no clock runs yet
+            await self._perform(first, messages, stop, delay_s)
+
+    async def _perform(self, first: _Due | None, messages: AsyncIterator[_Due],
+                       stop: asyncio.Event, delay_s: float) -> None:
+        with _sockets(self._port) as self._sockets, tempfile.TemporaryDirectory(
+                prefix="rampart-replay-") as directory:
+            folder = Path(directory)
+            clock = Clock(time.monotonic() + delay_s - self._start_s / self._rate, self._rate)
+            bus = ZenohBus("", 0, endpoint(self._sockets, run_info.REPLAY), [], Tap(self._port))
+            with self._answering(clock, folder):
+                try:
+                    await bus.open()
+                except BusError as error:
+                    raise UsageError(str(error)) from None
+                page = self._page(bus, clock, folder)
+                showing = asyncio.create_task(page.run()) if page else None
+                if showing:
+                    showing.add_done_callback(self._page_ended)
+                try:
+                    due = first
+                    while due and await _until(clock.source_time(due[1]), stop):
+                        self._send(bus, *due)
+                        due = await anext(messages, None)
+                    if showing and not showing.done() and not stop.is_set():
+                        self._said("the recording is over; the page stays, ctrl-C ends it")
+                        await stop.wait()
+                    await asyncio.sleep(_LINGER_S)  # what was sent last is still under way
+                finally:
+                    if page and showing:
+                        page.stop()
+                        await asyncio.gather(showing, return_exceptions=True)
+                    await bus.close()
+
+    # -- playing --------------------------------------------------------------------------------
+
+    async def _messages(self, stop: asyncio.Event) -> AsyncGenerator[_Due, None]:
+        """Yield what is to be played, lap by lap, until `stop`; others get their turn meanwhile."""
+        zero_s = self.summary.time_zero_s
+        reader = BagReader(self._path)  # the summary's is asked for its channels meanwhile
+        lap, found = 0, True
+        while found:
+            found = self._loop and lap == 0  # what comes before the start is for later laps
+            for number, (channel, message) in enumerate(reader.messages()):
+                if number % _YIELD_EVERY == 0:
+                    await asyncio.sleep(0)
+                if stop.is_set():
+                    return
+                at_s = message.log_time / 1e9 + zero_s + lap * self._lap_s
+                key = key_of(channel)
+                if at_s < self._start_s or key is None or not self._wants(key):
+                    continue
+                try:
+                    payload = form_of(key).payload(message.data)
+                except (ValueError, RecursionError):  # of another version of this program
+                    self.refused += 1
+                    continue
+                found = self._loop
+                yield lap, at_s, key, payload
+            lap += 1
+
+    def _send(self, bus: ZenohBus, lap: int, _at_s: float, key: str, payload: bytes) -> None:
+        """Send a message; in later laps as of later lives, or readers would take it for a copy."""
+        if self._loop:
+            header = header_of(payload)
+            if header is not None and lap == 0:
+                self._lives[header.source] = max(
+                    header.incarnation, self._lives.get(header.source, 0))
+            elif header is not None:
+                lives = lap * self._lives.get(header.source, header.incarnation)
+                payload = renumbered(payload, lives, lap * self._lap_s)
+        bus.publish(form_of(key).topic or _STRANGE, key, payload)
+        self.played += 1
+
+    def _page_ended(self, page: asyncio.Task[None]) -> None:
+        if not page.cancelled() and (error := page.exception()) is not None:
+            words = " ".join(str(error).split())
+            self._said(f"the page has ended: {type(error).__name__}: {words}")
+
+    # -- being found ----------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def _answering(self, clock: Clock, folder: Path) -> Iterator[None]:
+        """Tell tools of this replay, as a launcher tells them of its run."""
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        loop = asyncio.get_running_loop()
+        try:
+            listener.bind(run_info.address(self._port))
+        except OSError:
+            listener.close()
+            raise UsageError(f"--port {self._port}: in use by a run or another replay") from None
+        listener.listen(8)
+        answer = msgspec.json.encode(self._info(clock, folder))
+
+        def one() -> None:
+            with contextlib.suppress(OSError):
+                connection, _ = listener.accept()
+                with connection:
+                    if is_same_user(connection):
+                        connection.send(answer)
+
+        loop.add_reader(listener, one)
+        try:
+            yield
+        finally:
+            loop.remove_reader(listener)
+            listener.close()
+
+    def _info(self, clock: Clock, folder: Path) -> run_info.RunInfo:
+        run = self.summary.run
+        try:
+            nodes = msgspec.json.decode(run.get("nodes", "[]"), type=list[str])
+        except UNREADABLE:
+            nodes = []
+        if not nodes:  # 0.5.0 wrote none of a run in virtual time
+            head = topics.HEARTBEAT.at("")
+            nodes = [key.removeprefix(head) for key in self.summary.keys if key.startswith(head)]
+        system = folder / SYSTEM
+        for name, _, data in self.summary.files:
+            if name == SYSTEM:
+                system.write_bytes(data)
+        page = f"http://127.0.0.1:{self._hmi_port}/" if self._hmi_port else ""
+        told = {name: run.get(name, "") for name in (
+            "airport", "mission", "strategy", "shadow", "seed", "obstacles", "ftm")}
+        return run_info.RunInfo(
+            os.getpid(), self._port, self._rate, clock.source_time(0.0),
+            str(system) if system.exists() else "", self._sockets, tuple(nodes or ["replay"]),
+            run.get("run_id", ""), self._hmi_port,
+            f"replay of {self._path.name}: {run.get('title', '')}", page,
+            {**told, "system_file": str(system)}, str(self._path))
+
+    def _page(self, bus: ZenohBus, clock: Clock, folder: Path) -> ReplayPage | None:
+        if not self._hmi_port:
+            return None
+        shared: dict[str, Any] = {
+            "run_id": f"replay of {self._path.name}", "hmi_port": self._hmi_port}
+        with contextlib.suppress(ValueError, OSError):  # a page without a map shows the rest
+            found = restore(self.summary.files, folder)
+            shared["airport"] = load_airport(found) if found else None
+        with contextlib.suppress(ValueError, OSError):
+            text = read_text(folder / SYSTEM, toml.MAX_SIZE)
+            shared["document"] = document = read_document(text, SYSTEM)
+            shared["system"] = check_document(document, SYSTEM)
+        return ReplayPage(Context(NAME, 1, clock, SharedBus(bus), {}, shared))
+
+
+def claim_port(port: int) -> None:
+    """Make sure that a replay is not taken for a run that lives.
+
+    Raises:
+        UsageError: a run has that number.
+    """
+    living = {process.port for process in find_processes()} | {  # either may be dead just now
+        run.base_port for run in run_info.find_runs() if not run.replay_of}
+    if port in living:
+        raise UsageError(f"--port {port}: belongs to a run; a replay must never be taken for a "
+                         "living robot, choose another --port")
+
+
+@contextlib.contextmanager
+def _sockets(port: int) -> Iterator[str]:
+    """Have a folder for the sockets of a replay.
+
+    Raises:
+        UsageError: there is no place for one.
+    """
+    try:
+        folder = run_folder.make(port, os.getpid())
+    except OSError as error:
+        raise UsageError(f"no folder for a socket: {error}") from None
+    try:
+        yield folder
+    finally:
+        run_folder.remove(folder)
+
+
+def _check_free(option: str, port: int) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            raise UsageError(f"{option} {port}: in use; choose another {option}") from None
+
+
+async def _until(due: float, stop: asyncio.Event) -> bool:
+    """Wait until a reading of the monotonic clock; False if it is to stop."""
+    left_s = due - time.monotonic()
+    if left_s > 0.001:
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), left_s)
+    return not stop.is_set()

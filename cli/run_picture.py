@@ -1,0 +1,130 @@
+"""What a tool has heard of a run: the latest of everything, counts and rates. Pure.
+
+`rampart top` shows it and `rampart metrics` counts with it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import Any
+
+from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.limits import Remembered
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+
+DECODED: tuple[Topic[Any], ...] = (
+    topics.MISSION_STATUS, topics.CONTROL_STATUS, topics.POSE, topics.PILOT_STATUS,
+    topics.MANAGER_STATUS, topics.DETECTION, topics.RECOVERY, topics.DECISION, topics.NODES,
+    topics.PROCESS_EVENT, topics.HEARTBEAT, topics.TRUTH)
+"""What is read; of all other topics the messages are counted."""
+
+COUNTED: tuple[Topic[Any], ...] = tuple(t for t in topics.ALL if t not in DECODED)
+
+STALE_S = 2.0
+"""A state that was not heard for so long is silent (simulated seconds)."""
+
+_KEPT = 50
+_SAMPLES = 13
+_NAMES = 1024
+_OTHERS = "others"
+
+
+def _count(counter: Counter[Any], key: Any) -> None:
+    """Count for a name, or for all others when there are too many names."""
+    if key not in counter and len(counter) >= _NAMES:
+        key = (_OTHERS,) * len(key) if isinstance(key, tuple) else _OTHERS
+    counter[key] += 1
+
+
+@dataclass(frozen=True, slots=True)
+class Beat:
+    """The last heartbeat of a node: which life sent it, and when it was heard."""
+
+    incarnation: int
+    heard_s: float
+    message: m.Heartbeat
+
+
+class RunPicture:
+    """One run as a tool has heard it.
+
+    Attributes:
+        messages: messages heard so far, by topic key as declared.
+        detections: newest report of each detection module.
+        recoveries: newest report of each recovery module.
+        beats: newest heartbeat of each node.
+        decisions: the last decisions, each with its stamp, newest last.
+        decisions_total: decisions heard, by strategy.
+        detections_total: how often each module was seen to become active.
+        recoveries_total: how often each recovery was seen to become activated.
+        process_events_total: process events heard, by node and event.
+    """
+
+    def __init__(self) -> None:
+        self.messages: Counter[str] = Counter()
+        self.detections: dict[str, m.DetectionReport] = Remembered(_NAMES)
+        self.recoveries: dict[str, m.RecoveryReport] = Remembered(_NAMES)
+        self.beats: dict[str, Beat] = Remembered(_NAMES)
+        self.decisions: deque[tuple[float, m.DecisionRecord]] = deque(maxlen=_KEPT)
+        self.decisions_total: Counter[str] = Counter()
+        self.detections_total: Counter[str] = Counter()
+        self.recoveries_total: Counter[str] = Counter()
+        self.process_events_total: Counter[tuple[str, str]] = Counter()
+        self._latest: dict[str, tuple[Any, float]] = {}
+        self._samples: deque[tuple[float, Counter[str]]] = deque(maxlen=_SAMPLES)
+
+    def count(self, topic: Topic[Any]) -> None:
+        """Count a message that is not read."""
+        self.messages[topic.key] += 1
+
+    def heard(self, topic: Topic[Any], header: Header, body: Any, now_s: float) -> None:
+        """Take a message of one of `DECODED`, heard at a simulated time."""
+        self.messages[topic.key] += 1
+        if topic is topics.HEARTBEAT:
+            self.beats[header.source] = Beat(header.incarnation, now_s, body)
+        elif topic is topics.DETECTION:
+            before = self.detections.get(header.source)
+            if body.state is m.DetectionState.ACTIVE and (
+                    before is None or before.state is not body.state):
+                _count(self.detections_total, header.source)
+            self.detections[header.source] = body
+        elif topic is topics.RECOVERY:
+            was = self.recoveries.get(header.source)
+            if body.state is m.RecoveryState.ACTIVATED and (
+                    was is None or was.state is not body.state):
+                _count(self.recoveries_total, header.source)
+            self.recoveries[header.source] = body
+        elif topic is topics.DECISION:
+            self.decisions.append((header.stamp, body))
+            _count(self.decisions_total, body.strategy)
+        elif topic is topics.PROCESS_EVENT:
+            _count(self.process_events_total, (body.node, body.event))
+        else:
+            self._latest[topic.key] = (body, now_s)
+
+    def latest(self, topic: Topic[Any]) -> Any:
+        """Return the newest message of a topic, None if none was heard."""
+        found = self._latest.get(topic.key)
+        return found[0] if found else None
+
+    def silence_s(self, topic: Topic[Any], now_s: float) -> float:
+        """Return for how long a state has been silent; 0 while it comes as it should."""
+        found = self._latest.get(topic.key)
+        silent_s = now_s - found[1] if found else 0.0
+        return silent_s if silent_s > STALE_S else 0.0
+
+    def sample(self, now_s: float) -> None:
+        """Note how many messages there were until now; `rates` compares such notes."""
+        self._samples.append((now_s, self.messages.copy()))
+
+    def rates(self) -> dict[str, float]:
+        """Return messages a simulated second by topic key, a family's members together."""
+        if len(self._samples) < 2:
+            return {}
+        (first_s, first), (last_s, last) = self._samples[0], self._samples[-1]
+        if last_s <= first_s:
+            return {}
+        return {key: (last[key] - first[key]) / (last_s - first_s) for key in sorted(last)}

@@ -1,0 +1,176 @@
+"""A tool's way into a run: it dials every node, announces nothing, and leaves no trace.
+
+Whoever listens only to commands cannot tell whether one arrived: so a command is sent with a
+check of its effect, and repeated as the identical message until the effect shows. Receivers drop
+the copies (see `ArrivalGuard`), a node that had just been restarted gets one of them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import uuid
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.bus import Bus, BusError
+from rampart.actors.bus.envelope import UNREADABLE, Header, decode, encode
+from rampart.actors.bus.tap import Tap
+from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
+from rampart.actors.runtime.clock import Clock
+from rampart.cli.output import UsageError
+
+RESEND_S = 0.1
+"""Real seconds between copies of a command whose effect does not show."""
+
+OVERHEAD_S = 0.5
+"""Real seconds granted for what does not run in simulated time: sockets, scheduling."""
+
+
+class Session:
+    """A tool's connection to a run.
+
+    Args:
+        run: the run.
+        bus: access to its bus, opened by `connect`.
+        clock: the run's simulated time.
+    """
+
+    def __init__(self, run: RunInfo, bus: Bus, clock: Clock) -> None:
+        self.run = run
+        self.clock = clock
+        self.name = f"rampart-{uuid.uuid4().hex[:10]}"
+        self._bus = bus
+        self._sequence = 0
+
+    def real_s(self, simulated_s: float) -> float:
+        """Return how many real seconds to wait for something due in simulated seconds."""
+        return simulated_s / self.clock.rate + OVERHEAD_S
+
+    def listen(
+        self, topic: Topic[Any], key: str,
+        heard: Callable[[str, Header, Any], None],
+        garbage: Callable[[str, bytes, str], None] | None = None,
+    ) -> None:
+        """Have `heard` called with key (below the root), header and body of each message.
+
+        Args:
+            topic: the topic that the key belongs to.
+            key: full key expression.
+            heard: called on the event loop.
+            garbage: called with key, payload and reason for what does not decode.
+        """
+
+        def deliver(full_key: str, payload: bytes) -> None:
+            short = full_key.removeprefix(f"{ROOT}/")
+            try:
+                header, body = decode(topic, payload)
+            except UNREADABLE as error:
+                if garbage is not None:
+                    garbage(short, payload, str(error))
+                return
+            heard(short, header, body)
+
+        self._bus.subscribe(topic, key, deliver)
+
+    def overhear(self, topic: Topic[Any], arrived: Callable[[str, bytes], None]) -> None:
+        """Have `arrived` called with key (below the root) and payload, undecoded, of each message.
+
+        For whoever counts messages: decoding costs most of hearing one.
+        """
+        start = len(f"{ROOT}/")
+        self._bus.subscribe(topic, topic.pattern, lambda key, load: arrived(key[start:], load))
+
+    async def latest(
+        self, topics: tuple[Topic[Any], ...], timeout_s: float
+    ) -> dict[str, Any]:
+        """Return topic key → newest body, as soon as all were heard, or after real seconds."""
+        found: dict[str, Any] = {}
+        complete = asyncio.Event()
+
+        def keeper(key: str) -> Callable[[str, Header, Any], None]:
+            def keep(_key: str, _header: Header, body: Any) -> None:
+                found[key] = body
+                if len(found) == len(topics):
+                    complete.set()
+            return keep
+
+        for topic in topics:
+            self.listen(topic, topic.pattern, keeper(topic.key))
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(complete.wait(), timeout_s)
+        return found
+
+    def publish(self, topic: Topic[Any], body: msgspec.Struct) -> None:
+        """Send a message once, stamped now; for what is repeated anyway."""
+        self._sequence += 1
+        self._bus.publish(topic, topic.at(), encode(
+            Header(self.name, 1, self._sequence, self.clock.now()), body))
+
+    async def command(
+        self, topic: Topic[Any], body: msgspec.Struct, effect: Callable[[], bool],
+        timeout_s: float,
+    ) -> bool:
+        """Send a command until `effect` holds; return False if it did not within real seconds.
+
+        Raises:
+            UsageError: the run is a replay, where nobody obeys, or the message has a value that
+                every reader would refuse.
+        """
+        if self.run.replay_of:
+            raise UsageError(f"port {self.run.base_port} is a replay of {self.run.replay_of}: "
+                             "nobody is there to obey")
+        self._sequence += 1
+        payload = _checked(
+            topic, encode(Header(self.name, 1, self._sequence, self.clock.now()), body))
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout_s
+        resend = loop.time()
+        while not effect():
+            now = loop.time()
+            if now >= deadline:
+                return False
+            if now >= resend:
+                self._bus.publish(topic, topic.at(), payload)
+                resend = now + RESEND_S
+            await asyncio.sleep(0.01)
+        return True
+
+
+def _checked(topic: Topic[Any], payload: bytes) -> bytes:
+    """Return a payload that the topic's readers will take.
+
+    Raises:
+        UsageError: they will not; field and bound are named.
+    """
+    try:
+        decode(topic, payload)
+    except UNREADABLE as error:
+        raise UsageError(f"not a {topic.type.__name__} that can be sent: {error}") from None
+    return payload
+
+
+@contextlib.asynccontextmanager
+async def connect(port: int | None = None) -> AsyncIterator[Session]:
+    """Join the run on this machine (on base port `port` if there are several).
+
+    Raises:
+        UsageError: there is no run, or it must be chosen.
+    """
+    try:
+        run = find_run(port)
+    except NoRunError as error:
+        raise UsageError(str(error)) from None
+    bus = ZenohBus("", 0, None, run.endpoints, Tap(run.base_port))
+    try:
+        await bus.open()
+    except BusError as error:
+        raise UsageError(str(error)) from None
+    try:
+        yield Session(run, bus, Clock(run.origin_s, run.rate))
+    finally:
+        await bus.close()

@@ -1,0 +1,1 @@
+"""What can be proved of a specification: verification, cut sets, barriers, Open-PSA."""

@@ -1,0 +1,91 @@
+"""Which mechanisms stand between causes and the top event.
+
+A mechanism on event *e* is a *barrier on a cut set* if the top does not occur from exactly the
+events of that set once *e* is kept from occurring. Whoever wants two barriers on every way to the
+top reads off here where one is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import msgspec
+
+from rampart.manager.model.fault_tree import FaultTree
+from rampart.manager.spec.schema import SystemSpec
+
+
+class Guarded(msgspec.Struct, frozen=True):
+    """A cut set and the barriers on it, the nearest to the top first."""
+
+    events: tuple[str, ...]
+    barriers: tuple[str, ...]
+
+
+class Outlook(msgspec.Struct, frozen=True):
+    """What is left before the top event, given what has occurred.
+
+    Attributes:
+        occurred: Events that have occurred by what is detected, or were given.
+        left: For each active mechanism the barriers above it that are still idle.
+        next_events: Basic events, each of which by itself, with what has occurred, would make the
+            top occur; with the idle barriers that are then left, those with the fewest first.
+    """
+
+    occurred: tuple[str, ...]
+    left: dict[str, tuple[str, ...]]
+    next_events: tuple[Guarded, ...]
+
+
+def guard(spec: SystemSpec, sets: Iterable[Sequence[str]]) -> tuple[Guarded, ...]:
+    """Return cut sets with the mechanisms that are barriers on each."""
+    tree = spec.build_fault_tree()
+    order = spec.build_ftm_tree().names if spec.mechanisms else ()
+    event_of = {m.name: m.event for m in spec.mechanisms}
+    return tuple(
+        Guarded(tuple(events), tuple(
+            name for name in order if not occurs_without(tree, events, event_of[name])))
+        for events in sets)
+
+
+def occurs_without(tree: FaultTree, given: Iterable[str], blocked: str = "") -> bool:
+    """Tell whether the top occurs from given events although one event is kept from occurring."""
+    occurring = set(given) - {blocked}
+    changed = True
+    while changed:
+        changed = False
+        for event in tree.events.values():
+            if event.name != blocked and event.required and event.name not in occurring and \
+                    sum(name in occurring for name in event.inputs) >= event.required:
+                occurring.add(event.name)
+                changed = True
+    return tree.top in occurring
+
+
+def outlook(spec: SystemSpec, active: Iterable[str], given: Iterable[str] = ()) -> Outlook:
+    """Return what is left before the top event.
+
+    Args:
+        spec: The system.
+        active: Active mechanisms: the event of each has occurred, for its detection says so.
+        given: Events that have occurred besides.
+    """
+    tree = spec.build_fault_tree()
+    ftms = spec.build_ftm_tree()
+    event_of = {m.name: m.event for m in spec.mechanisms}
+    wanted = set(active)
+    breached = [name for name in ftms.names if name in wanted]
+    idle = [name for name in ftms.names if name not in wanted]
+    occurred = tuple(dict.fromkeys([*(event_of[name] for name in breached), *given]))
+    left = {name: tuple(upper for upper in ftms.chain(ftms.root, name) if upper in idle)
+            for name in breached}
+    # If what has occurred suffices already, the next event is looked at by itself.
+    base = () if occurs_without(tree, occurred) else occurred
+    following = []
+    for event in tree.events.values():
+        if not event.required and event.name not in occurred \
+                and occurs_without(tree, (*base, event.name)):
+            following.append(Guarded((event.name,), tuple(
+                name for name in idle
+                if not occurs_without(tree, (*base, event.name), event_of[name]))))
+    return Outlook(occurred, left, tuple(sorted(following, key=lambda g: len(g.barriers))))

@@ -1,0 +1,425 @@
+"""Minimal cut sets: counted from decision diagrams, not listed.
+
+A minimal cut set is a set of basic events that makes the top occur, and no part of which does
+(IEC 61025). Where a formula has negations, a set means that exactly its events occur and no others
+do, and minimal are those sets of which no part makes the top occur: the minimal p-cuts of Rauzy.
+
+The way, for trees with hundreds of events and millions of cut sets:
+
+1. *Modules.* A gate whose events occur nowhere else is analysed by itself and counts as one event
+   above (Dutuit and Rauzy 1996). Inputs of a gate that nobody else uses are gathered into a gate of
+   their own first, which is a module then.
+2. *A binary decision diagram* of each module, by a library (OxiDD), with the variables in the
+   sequence of one of several depth-first searches; the first that stays within bounds is taken.
+3. *Minimal solutions* of the diagram as a zero-suppressed one (Rauzy 1993); from that the number
+   of sets of each size, by multiplication where a variable stands for a module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import msgspec
+from oxidd.bdd import BDDFunction, BDDManager
+from oxidd.util import DDMemoryError
+
+from rampart.manager.analysis.formula import GENERATED, Connective, Formula
+from rampart.manager.analysis.zbdd import (
+    EMPTY,
+    UNIT,
+    Diagram,
+    Families,
+    TooManyNodesError,
+    deep_recursion,
+)
+
+BOUNDS = (30_000, 300_000, 1_000_000, 5_000_000, 20_000_000)
+"""Nodes of a decision diagram: each bound is tried with every variable order before the next."""
+
+_LISTING_LEVELS = 800
+"""Modules within modules, and events in one, for listing; counting has no such limit."""
+
+Progress = Callable[[str], None]
+
+
+class TooLargeError(ValueError):
+    """A fault tree that no variable order makes small enough."""
+
+
+class _Module(msgspec.Struct, frozen=True):
+    """Minimal solutions of one module.
+
+    Attributes:
+        names: Of its variables, from the top.
+        families: Store of the family.
+        family: The minimal solutions.
+        sizes: How many cut sets of each size, those of the modules below multiplied out.
+    """
+
+    names: tuple[str, ...]
+    families: Families
+    family: int
+    sizes: tuple[int, ...]
+
+
+class CutSets:
+    """The minimal cut sets of a formula.
+
+    Args:
+        formula: The fault tree.
+        bounds: On the nodes of a decision diagram.
+        progress: Told in words what is being done.
+
+    Attributes:
+        sizes: How many minimal cut sets there are of each size, from 0 up.
+
+    Raises:
+        TooLargeError: No variable order keeps a diagram within the last bound.
+    """
+
+    def __init__(self, formula: Formula, bounds: Sequence[int] = BOUNDS,
+                 progress: Progress = lambda _: None) -> None:
+        self.formula = formula
+        self._gates, modules = _prepare(formula)
+        self._modules: dict[str, _Module] = {}
+        self._constants = dict(formula.house)
+        self._sizes_below: dict[int, dict[int, int]] = {}
+        for number, name in enumerate(modules, 1):
+            progress(f"module {number} of {len(modules)}: {name}")
+            module = self._modules[name] = self._solve(name, bounds, progress)
+            if module.family in {EMPTY, UNIT}:  # by house events below it
+                self._constants[name] = module.family == UNIT
+        self.sizes = self._weight(formula.top)
+
+    @property
+    def count(self) -> int:
+        """How many minimal cut sets there are."""
+        return sum(self.sizes)
+
+    def sets(self, limit: int | None = None, max_order: int | None = None
+             ) -> Iterator[tuple[str, ...]]:
+        """Yield minimal cut sets, smaller ones first.
+
+        Args:
+            limit: No more than so many.
+            max_order: None with more events than this.
+
+        Raises:
+            TooLargeError: The tree is nested too deeply to list its sets; they can be counted.
+        """
+        depth: dict[str, int] = {}
+        for name, module in self._modules.items():  # inner ones come first
+            depth[name] = 1 + max((depth.get(entry, 0) for entry in module.names), default=0)
+        levels = max((depth[name] + len(module.names) for name, module in self._modules.items()),
+                     default=0)
+        if levels > _LISTING_LEVELS:
+            raise TooLargeError(f"nested {levels} levels deep, too deeply to list the sets; they "
+                                "can be counted, --count")
+        left = self.count if limit is None else limit
+        for size in range(len(self.sizes) if max_order is None else
+                          min(len(self.sizes), max_order + 1)):
+            if not self.sizes[size]:
+                continue
+            for found in self._of_size(self.formula.top, size):
+                if left <= 0:
+                    return
+                left -= 1
+                yield tuple(sorted(found))
+
+    def _weight(self, name: str) -> tuple[int, ...]:
+        module = self._modules.get(name)
+        if module is not None:
+            return module.sizes
+        if name in self.formula.house:
+            return (1,) if self.formula.house[name] else ()
+        return (0, 1)
+
+    def _of_size(self, name: str, size: int) -> Iterator[frozenset[str]]:
+        module = self._modules.get(name)
+        if module is None:
+            if len(self._weight(name)) > size and self._weight(name)[size]:
+                yield frozenset((name,)) if size else frozenset()
+            return
+        yield from self._paths(module, module.family, size)
+
+    def _paths(self, module: _Module, node: int, size: int) -> Iterator[frozenset[str]]:
+        if node == UNIT:
+            if size == 0:
+                yield frozenset()
+            return
+        if node == EMPTY or size < 0:
+            return
+        if not self._possible(module, node) >> size & 1:
+            return
+        families = module.families
+        name = module.names[families.variable[node]]
+        weight = self._weight(name)
+        for part in range(min(size, len(weight) - 1) + 1):
+            if weight[part]:
+                for rest in self._paths(module, families.high[node], size - part):
+                    for own in self._of_size(name, part):
+                        yield own | rest
+        yield from self._paths(module, families.low[node], size)
+
+    def _possible(self, module: _Module, node: int) -> int:
+        """Return the sizes of the sets below a node as a bitmask, so that no way is a dead end."""
+        known = self._sizes_below.setdefault(id(module), {EMPTY: 0, UNIT: 1})
+        if node not in known:
+            families = module.families
+            weights = [sum(1 << size for size, count in enumerate(self._weight(name)) if count)
+                       for name in module.names]
+            for one in families.upwards(module.family):
+                own, high = weights[families.variable[one]], known[families.high[one]]
+                known[one] = known[families.low[one]]
+                for size in range(own.bit_length()):
+                    if own >> size & 1:
+                        known[one] |= high << size
+        return known[node]
+
+    def _solve(self, top: str, bounds: Sequence[int], progress: Progress) -> _Module:
+        inside = _Inside(self._gates, self._modules, self._constants, top)
+        for bound in bounds:
+            progress(f"{top}: up to {bound} nodes")
+            # To build a diagram is cheap, to find its minimal solutions is not: try all orders.
+            built = sorted(
+                ((diagram, order) for order in inside.orders()
+                 if (diagram := inside.diagram(order, bound)) is not None),
+                key=lambda found: len(found[0].level))
+            for diagram, order in built:
+                families = Families(bound)
+                try:
+                    with deep_recursion(len(order)):
+                        family = diagram.minimal_solutions(
+                            len(diagram.level) - 1, families, monotone=self.formula.is_monotone)
+                except TooManyNodesError:
+                    continue
+                weights = [self._weight(name) for name in order]
+                return _Module(order, families, family,
+                               tuple(families.sizes(family, weights.__getitem__)))
+        raise TooLargeError(f"gate {top!r} with {len(inside.leaves)} inputs and modules: more than "
+                            f"{bounds[-1]} nodes with every variable order tried")
+
+
+class _Inside:
+    """The part of a formula between a module's gate and its events and modules."""
+
+    def __init__(self, gates: dict[str, Connective], modules: dict[str, _Module],
+                 constants: dict[str, bool], top: str) -> None:
+        self._gates = gates
+        self._house = constants
+        self._top = top
+        self._modules = modules
+        self._sequence = self._upwards()
+        self.leaves = tuple(n for n in self._met(lambda inputs: inputs) if n not in self._house)
+
+    def _is_leaf(self, name: str) -> bool:
+        return name != self._top and (name in self._modules or name not in self._gates)
+
+    def _upwards(self) -> list[str]:
+        sequence: list[str] = []
+        done: set[str] = set()
+        stack = [(self._top, False)]
+        while stack:
+            name, inputs_done = stack.pop()
+            if name in done or self._is_leaf(name):
+                continue
+            if inputs_done:
+                done.add(name)
+                sequence.append(name)
+            else:
+                stack.append((name, True))
+                stack.extend((entry, False) for entry in self._gates[name].inputs)
+        return sequence
+
+    def orders(self) -> Iterator[tuple[str, ...]]:
+        """Yield variable orders to try."""
+        below: dict[str, int] = {}
+        users: dict[str, int] = {}
+        for name in self._sequence:
+            inputs = self._gates[name].inputs
+            below[name] = 1 + sum(below.get(entry, 1) for entry in inputs)
+            for entry in inputs:
+                users[entry] = users.get(entry, 0) + 1
+        ways: tuple[Callable[[tuple[str, ...]], Sequence[str]], ...] = (
+            lambda inputs: inputs,
+            lambda inputs: sorted(inputs, key=lambda n: (-users.get(n, 0), below.get(n, 1))),
+            lambda inputs: sorted(inputs, key=lambda n: below.get(n, 1)),
+            lambda inputs: sorted(inputs, key=lambda n: -below.get(n, 1)),
+            lambda inputs: inputs[::-1],
+        )
+        yield from dict.fromkeys(
+            tuple(n for n in self._met(way) if n not in self._house) for way in ways)
+
+    def _met(self, way: Callable[[tuple[str, ...]], Sequence[str]]) -> list[str]:
+        """Return the leaves in the sequence in which a depth-first search meets them."""
+        met: dict[str, None] = {}
+        seen: set[str] = set()
+        stack = [self._top]
+        while stack:
+            name = stack.pop()
+            if self._is_leaf(name):
+                met[name] = None
+            elif name not in seen:
+                seen.add(name)
+                stack.extend(reversed(way(self._gates[name].inputs)))
+        return list(met)
+
+    def diagram(self, order: tuple[str, ...], bound: int) -> Diagram | None:
+        """Return the module's decision diagram, or None if it grows beyond a bound."""
+        manager = BDDManager(bound, max(1024, bound // 4), 1)
+        try:
+            return _as_numbers(self._build(manager, order))
+        except DDMemoryError:
+            return None
+
+    def _build(self, manager: BDDManager, order: tuple[str, ...]) -> BDDFunction:
+        manager.add_vars(len(order))
+        value = {name: manager.var(i) for i, name in enumerate(order)}
+        for name, state in self._house.items():
+            value[name] = manager.true() if state else manager.false()
+        users: dict[str, int] = {}
+        for name in self._sequence:
+            for entry in self._gates[name].inputs:
+                users[entry] = users.get(entry, 0) + 1
+        for name in self._sequence:
+            gate = self._gates[name]
+            value[name] = _gate(manager, gate, [value[entry] for entry in gate.inputs])
+            for entry in gate.inputs:  # what nobody needs any more can be collected
+                users[entry] -= 1
+                if not users[entry] and entry in self._gates and not self._is_leaf(entry):
+                    del value[entry]
+        return value[self._top]
+
+
+def _gate(manager: BDDManager, gate: Connective, inputs: list[BDDFunction]) -> BDDFunction:
+    count = len(inputs)
+    if gate.low == 1 and gate.high == count:
+        result = manager.false()
+        for one in inputs:
+            result = result | one
+    elif gate.low == gate.high == count:
+        result = manager.true()
+        for one in inputs:
+            result = result & one
+    else:
+        result = _at_least(manager, inputs, gate.low)
+        if gate.high < count:
+            result = result & ~_at_least(manager, inputs, gate.high + 1)
+    return ~result if gate.negated else result
+
+
+def _at_least(manager: BDDManager, inputs: list[BDDFunction], required: int) -> BDDFunction:
+    """Build k-of-n from the last input to the first: `rest[j]` is j of those seen so far."""
+    rest = [manager.true(), *[manager.false()] * required]
+    for one in reversed(inputs):
+        for j in range(required, 0, -1):
+            rest[j] = one.ite(rest[j - 1], rest[j])
+    return rest[required]
+
+
+def _as_numbers(function: BDDFunction) -> Diagram:
+    """Copy a diagram into plain numbers; the top has the last one."""
+    diagram = Diagram()
+    known: dict[BDDFunction, int] = {}
+    stack = [function]
+    while stack:
+        f = stack[-1]
+        if f in known:
+            stack.pop()
+            continue
+        cofactors = f.cofactors()
+        if cofactors is None:
+            known[f] = UNIT if f.valid() else EMPTY
+            continue
+        missing = [c for c in cofactors if c not in known]
+        if missing:
+            stack.extend(missing)
+        else:
+            known[f] = diagram.add(f.node_level() or 0, known[cofactors[0]], known[cofactors[1]])
+    if known[function] in {EMPTY, UNIT}:
+        diagram.add(0, known[function], known[function])  # a constant, as the last number
+    return diagram
+
+
+# -- modules -------------------------------------------------------------------------------------
+
+
+def _prepare(formula: Formula) -> tuple[dict[str, Connective], list[str]]:
+    """Return the gates, with lone inputs gathered, and the modules, inner ones first."""
+    gates = {name: formula.gates[name] for name in formula.sequence}
+    if formula.top not in gates:
+        return gates, []
+    if not formula.is_monotone:
+        return gates, [formula.top]  # below a negation a module's cut sets are not its own
+    gates = _without_aliases(gates, formula.top)
+    modules = _modules(gates, formula.top)
+    users: dict[str, int] = {}
+    for gate in gates.values():
+        for entry in gate.inputs:
+            users[entry] = users.get(entry, 0) + 1
+    for name in list(gates):
+        gate = gates[name]
+        uniform = gate.low in {1, len(gate.inputs)}
+        lone = [e for e in gate.inputs if users[e] == 1 and e not in formula.house
+                and (e not in gates or e in modules)]
+        if uniform and 2 <= len(lone) < len(gate.inputs):
+            gathered = f"{name}{GENERATED}lone"
+            rest = tuple(e for e in gate.inputs if e not in lone)
+            both = (gathered, *rest)
+            gates[gathered] = Connective(
+                tuple(lone), 1 if gate.low == 1 else len(lone), len(lone))
+            gates[name] = Connective(both, 1 if gate.low == 1 else len(both), len(both))
+    modules = _modules(gates, formula.top)
+    return gates, modules
+
+
+def _without_aliases(gates: dict[str, Connective], top: str) -> dict[str, Connective]:
+    """Take out gates that only pass one input on; `gates` has inputs before what uses them."""
+    stands_for: dict[str, str] = {}
+    left: dict[str, Connective] = {}
+    for name, gate in gates.items():
+        inputs = tuple(stands_for.get(entry, entry) for entry in gate.inputs)
+        gate = msgspec.structs.replace(gate, inputs=inputs)  # noqa: PLW2901
+        if len(gate.inputs) == 1 and gate.low == 1 and name != top:
+            stands_for[name] = gate.inputs[0]
+        else:
+            left[name] = gate
+    return left
+
+
+def _modules(gates: dict[str, Connective], top: str) -> list[str]:
+    """Return the gates of which no descendant is used elsewhere, inner ones first.
+
+    Dates of a depth-first search (Dutuit and Rauzy 1996): all descendants are met for the first
+    time after the gate, and for the last time before the search leaves it.
+    """
+    first: dict[str, int] = {}
+    last: dict[str, int] = {}
+    left: dict[str, int] = {}
+    sequence: list[str] = []
+    date = 0
+    stack: list[tuple[str, bool]] = [(top, False)]
+    while stack:
+        name, leaving = stack.pop()
+        date += 1
+        if leaving:
+            left[name] = last[name] = date
+            sequence.append(name)
+            continue
+        if name in first:
+            last[name] = date
+            continue
+        first[name] = last[name] = date
+        if name in gates:
+            stack.append((name, True))
+            stack.extend((entry, False) for entry in reversed(gates[name].inputs))
+    earliest: dict[str, int] = {}
+    latest: dict[str, int] = {}
+    modules = []
+    for name in sequence:
+        inputs = gates[name].inputs
+        earliest[name] = min(min(first[e], earliest.get(e, first[e])) for e in inputs)
+        latest[name] = max(max(last[e], latest.get(e, last[e])) for e in inputs)
+        if earliest[name] > first[name] and latest[name] < left[name]:
+            modules.append(name)
+    return modules

@@ -1,0 +1,128 @@
+"""A fault tree as a Boolean formula, with all the connectives that other tools know.
+
+`rampart.manager.model.fault_tree` is what a system spec can say, coherent and with one top. This is what can be
+analysed: negation, exclusive or, cardinality, house events. Everything is a gate that holds when
+the number of its inputs that hold lies between two bounds, or when it does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import msgspec
+
+from rampart.manager.model.fault_tree import FaultTree
+from rampart.manager.model.order import find_cycle
+
+GENERATED = ".."
+"""Stands in the names of gates and events that are made up; no name in a file can hold it."""
+
+
+class FormulaError(ValueError):
+    """A formula that cannot be analysed. The message is one line."""
+
+
+class Connective(msgspec.Struct, frozen=True):
+    """A gate: between `low` and `high` of its inputs hold; or, `negated`, they do not.
+
+    An OR is 1 to n, an AND n to n, an exclusive or 1 to 1 of two, a NOT the negation of 1 to 1.
+    """
+
+    inputs: tuple[str, ...]
+    low: int
+    high: int
+    negated: bool = False
+
+    @property
+    def is_monotone(self) -> bool:
+        """Whether more inputs never make it cease to hold."""
+        return not self.negated and self.high == len(self.inputs)
+
+
+class Formula:
+    """Gates over basic events and house events, seen from one top.
+
+    Args:
+        gates: By name.
+        basic: Names of basic events; those that no gate below the top uses do not matter.
+        house: Names of house events, each with its state.
+        top: Name of the top gate or event; "" for the only gate that no other one uses.
+
+    Raises:
+        FormulaError: An unknown name, a cycle, no or several tops.
+    """
+
+    def __init__(self, gates: Mapping[str, Connective], basic: frozenset[str],
+                 house: Mapping[str, bool], top: str = "") -> None:
+        self.gates = dict(gates)
+        self.house = dict(house)
+        known = gates.keys() | basic | house.keys()
+        for name, gate in gates.items():
+            for entry in gate.inputs:
+                if entry not in known:
+                    raise FormulaError(f"gate {name!r} has the unknown input {entry!r}")
+        cycle = find_cycle({name: gate.inputs for name, gate in gates.items()})
+        if cycle:
+            raise FormulaError(f"cycle {' > '.join(cycle)}; an event cannot be its own cause")
+        self.top = top or self._only_top()
+        if self.top not in known:
+            raise FormulaError(f"unknown top {top!r}")
+        self.sequence = tuple(self._upwards())
+        """Gates below the top and the top itself, inputs before what uses them."""
+        used = {entry for name in self.sequence for entry in gates[name].inputs} | {self.top}
+        self.basic = tuple(name for name in self._leftmost() if name in basic and name in used)
+        """Basic events below the top, in the sequence in which depth-first search meets them."""
+        self.is_monotone = all(gates[name].is_monotone for name in self.sequence)
+
+    def _only_top(self) -> str:
+        used = {entry for gate in self.gates.values() for entry in gate.inputs}
+        tops = [name for name in self.gates if name not in used]
+        if len(tops) != 1:
+            found = ", ".join(sorted(tops)[:8]) + (", ..." if len(tops) > 8 else "")
+            raise FormulaError(
+                f"{len(tops)} gates are no input of another: {found or 'none'}; say which is the "
+                "top" if tops else "no gates; a top is needed")
+        return tops[0]
+
+    def _upwards(self) -> Iterator[str]:
+        done: set[str] = set()
+        stack = [(self.top, False)]
+        while stack:
+            name, inputs_done = stack.pop()
+            if name in done or name not in self.gates:
+                continue
+            if inputs_done:
+                done.add(name)
+                yield name
+            else:
+                stack.append((name, True))
+                stack.extend((entry, False) for entry in reversed(self.gates[name].inputs))
+
+    def _leftmost(self) -> Iterator[str]:
+        seen: set[str] = set()
+        stack = [self.top]
+        while stack:
+            name = stack.pop()
+            if name in seen:
+                continue
+            seen.add(name)
+            if name in self.gates:
+                stack.extend(reversed(self.gates[name].inputs))
+            else:
+                yield name
+
+    def holds(self, occurred: frozenset[str]) -> bool:
+        """Tell whether the top occurs when exactly these basic events do."""
+        value = {name: name in occurred for name in self.basic} | self.house
+        for name in self.sequence:
+            gate = self.gates[name]
+            count = sum(value[entry] for entry in gate.inputs)
+            value[name] = (gate.low <= count <= gate.high) != gate.negated
+        return value[self.top]
+
+
+def formula_of(tree: FaultTree) -> Formula:
+    """Return the formula of a spec's fault tree."""
+    gates = {name: Connective(event.inputs, event.required, len(event.inputs))
+             for name, event in tree.events.items() if event.required}
+    return Formula(gates, frozenset(tree.events) - gates.keys(), {}, tree.top)

@@ -1,0 +1,352 @@
+"""The arbiter's transition system, explored exhaustively.
+
+What is explored is the arbiter itself (`Arbiter.step`), in two compositions:
+
+* *one recovery with its module and the bus between them*: the module, as it is specified in
+  `rampart.actors.recovery.module`, obeys, finishes, fails, dies and comes back at any moment. It shows that
+  a module never holds its resources unless the arbiter knows that it may;
+* *several recoveries together*, by what the arbiter knows: anything that modules can report may be
+  reported at any moment. It shows that the arbiter never lets two hold the same resource.
+
+In both, detection modules change at any moment, a message takes any time or is lost, and any
+deadline may pass. Three reductions keep that finite and small; `docs/verification.md` argues for
+each:
+
+* *Time.* A deadline may pass whenever it runs. That is more than can happen, so what holds here
+  holds in time.
+* *Channels.* Commands and reports are states: the latest one counts, it is repeated, and no older
+  one overtakes it. So a module may at any moment take note of what is wanted of it now, and the
+  arbiter of how the module is now; a message that is lost or late is one not taken note of yet.
+* *Recoveries.* Every property speaks of one recovery or of two, and one recovery touches another
+  only by being in its way. So it is enough to explore every choice of two, while the rest of the
+  world asks for any of them at any time, as far as the strategy ever does. Any larger number can
+  be explored together as well; it takes longer and finds the same.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from itertools import combinations
+
+import msgspec
+
+from rampart.manager.arbitration.arbiter import Arbiter
+from rampart.manager.arbitration.arbiter_state import RecoveryHeard, ResetAsked, State, Tick
+from rampart.manager.arbitration.detection_track import DetectionRules, DetectionTrack
+from rampart.manager.arbitration.recovery_track import Command, Phase, RecoveryTrack
+from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms
+from rampart.manager.model.order import PartialOrder, Tree
+from rampart.manager.strategies.arrangement import Arrangement
+from rampart.manager.strategies.decision import Decision, Late
+
+_OVER = -1e9
+_OLD, _CURRENT = 5, 10
+_NUMBER = 100
+
+
+class Module(msgspec.Struct, frozen=True):
+    """A recovery module as it really is.
+
+    Attributes:
+        phase: What it does.
+        current: It has taken note of the arbiter's present command.
+        excused: It was given up on, and others no longer wait for it.
+    """
+
+    phase: Phase = Phase.IDLE
+    current: bool = True
+    excused: bool = False
+
+
+class Situation(msgspec.Struct, frozen=True):
+    """One state of the whole: the arbiter's, and each module's where modules are explored."""
+
+    state: State
+    modules: tuple[Module, ...]
+
+
+class Violation(msgspec.Struct, frozen=True):
+    """A property that fails, and the shortest way there."""
+
+    name: str
+    trace: tuple[str, ...]
+
+
+class AsTold:
+    """A strategy that runs what is asked for: the environment decides."""
+
+    name = "as-told"
+    patient = False
+    rules: dict[int, str] = {1: "it is asked for"}
+
+    def __init__(self, *, exclusive: bool) -> None:
+        self.exclusive = exclusive
+
+    def choose(self, active: tuple[str, ...], arrangement: Arrangement, late: Late  # noqa: ARG002
+               ) -> Decision:
+        """Run the recovery of every active mechanism."""
+        return Decision(active, 1, arrangement.demanded(active), active)
+
+    def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:  # noqa: ARG002
+        """There is nothing to explain."""
+        return decision
+
+
+class Transitions:
+    """The transition system for a few recoveries.
+
+    Args:
+        contracts: Of these recoveries.
+        order: The RM order over them.
+        asked: Sets of them that the strategy may ask for; the empty set is always among them.
+        exclusive: The strategy runs one at a time.
+        urgent: Those that must never wait: last resorts.
+        with_modules: Explore the modules themselves; else anything that they can report.
+        deaths: Modules may die and come back.
+    """
+
+    def __init__(self, contracts: Iterable[Contract], order: PartialOrder,
+                 asked: Iterable[frozenset[str]], urgent: Iterable[str] = (), *,
+                 exclusive: bool, with_modules: bool = False, deaths: bool = True) -> None:
+        contracts = list(contracts)
+        inside = [c.name for c in contracts]
+        self.contracts = {c.name: msgspec.structs.replace(
+            c, needs=frozenset(), escalate_to=c.escalate_to if c.escalate_to in inside else "")
+            for c in contracts}
+        self.names = tuple(self.contracts)
+        self.asked = sorted({frozenset(), *asked}, key=lambda s: (len(s), sorted(s)))
+        self.urgent = frozenset(urgent)
+        self.exclusive = exclusive
+        self.with_modules = with_modules
+        self.deaths = deaths
+        local = PartialOrder(self.names, {
+            name: [o for o in self.names if order.is_above(name, o)] for name in self.names})
+        top = local.names[0]
+        self.arbiter = Arbiter(
+            Arrangement(
+                Mechanisms([Mechanism(f"F_{n}", f"D_{n}", n) for n in self.names],
+                           list(self.contracts.values())),
+                Tree({f"F_{n}": None if n == top else f"F_{top}" for n in self.names}), local),
+            AsTold(exclusive=exclusive), DetectionRules(1.0, 0.0, 0.0, 0.0))
+
+    def initial(self) -> Situation:
+        """Return the state in which all are idle and have been heard.
+
+        Before that an arbiter adopts what an earlier one ordered; it is not explored.
+        """
+        state = self.arbiter.initial(0.0)
+        return self._canonical(msgspec.structs.replace(state, oriented=True),
+                               tuple(Module() for _ in self.names) if self.with_modules else ())
+
+    def successors(self, now: Situation) -> Iterator[tuple[str, Situation]]:
+        """Yield everything that may happen next, in words, with the state that follows."""
+        active = {t.name for t in now.state.detections if t.active}
+        for asked in self.asked:
+            if {f"D_{n}" for n in asked} != active:
+                yield (f"asked for: {', '.join(sorted(asked)) or 'nothing'}",
+                       self._ask(now, asked))
+        for index, name in enumerate(self.names):
+            if f"D_{name}" in active and self.contracts[name].kind.repairs:
+                yield f"{name}'s cause comes back", self._again(now, name)
+            yield from self._module_steps(now, index, name) if self.with_modules \
+                else self._reports(now, index, name)
+            track = now.state.recoveries[index]
+            runs = track.letting_go or (track.wanted and not track.failure)
+            if runs and track.ordered_s == 0.0:
+                yield f"{name}'s deadline passes", self.pass_deadline(now, index)
+            if track.latched:
+                yield f"{name} is reset", self._step(now, now.state, ResetAsked(name))
+
+    def _reports(self, now: Situation, index: int, name: str) -> Iterator[tuple[str, Situation]]:
+        """Yield every report that a module could send."""
+        track = now.state.recoveries[index]
+        if track.wanted:
+            for phase in (Phase.ACTING, Phase.DONE, Phase.FAILED):
+                if not track.acknowledged or track.phase is not phase:
+                    yield f"{name} reports {phase}", self._step(
+                        now, now.state, RecoveryHeard(name, True, phase, _CURRENT))
+            if track.acknowledged and self.deaths:
+                yield f"{name} reports idle, it was respawned", self._step(
+                    now, now.state, RecoveryHeard(name, False, Phase.IDLE, _OLD))
+        elif track.letting_go:
+            yield f"{name} reports that it has let go", self._step(
+                now, now.state, RecoveryHeard(name, False, Phase.IDLE, _CURRENT))
+
+    def _module_steps(self, now: Situation, index: int, name: str
+                      ) -> Iterator[tuple[str, Situation]]:
+        module, track = now.modules[index], now.state.recoveries[index]
+        acting = module.phase is Phase.ACTING
+        if not module.current and track.wanted:
+            yield f"{name} obeys", self._with_module(now, index, Module(Phase.ACTING))
+        elif not module.current and not acting:
+            yield f"{name} lets go", self._with_module(now, index, Module())
+        if acting:
+            for phase, words in ((Phase.DONE, "is done"), (Phase.FAILED, "fails")):
+                yield f"{name} {words}", self._with_module(
+                    now, index, msgspec.structs.replace(module, phase=phase))
+        yield f"the arbiter hears {name}", self._hear(now, index, name)
+        if module.phase is not Phase.IDLE and self.deaths:
+            yield f"{name} dies and comes back idle", self._with_module(
+                now, index, Module(current=False))
+
+    # -- single steps ---------------------------------------------------------------------------
+
+    def _ask(self, now: Situation, asked: frozenset[str]) -> Situation:
+        tracks = tuple(
+            track if track.active == (track.name[2:] in asked)
+            else msgspec.structs.replace(track, active=not track.active, reported=not track.active,
+                                         rises=2)
+            for track in now.state.detections)
+        return self._step(now, msgspec.structs.replace(now.state, detections=tracks), Tick())
+
+    def _again(self, now: Situation, name: str) -> Situation:
+        tracks = tuple(
+            msgspec.structs.replace(track, rises=2) if track.name == f"D_{name}" else track
+            for track in now.state.detections)
+        return self._step(now, msgspec.structs.replace(now.state, detections=tracks), Tick())
+
+    def _hear(self, now: Situation, index: int, name: str) -> Situation:
+        module = now.modules[index]
+        return self._step(now, now.state, RecoveryHeard(
+            name, module.phase is not Phase.IDLE, module.phase,
+            _CURRENT if module.current else _OLD))
+
+    def pass_deadline(self, now: Situation, index: int) -> Situation:
+        """Return what follows when the deadline of a recovery passes."""
+        tracks = list(now.state.recoveries)
+        tracks[index] = msgspec.structs.replace(tracks[index], ordered_s=_OVER)
+        return self._step(
+            now, msgspec.structs.replace(now.state, recoveries=tuple(tracks)), Tick())
+
+    def _with_module(self, now: Situation, index: int, module: Module) -> Situation:
+        excused = now.modules[index].excused and module.phase is not Phase.IDLE
+        modules = list(now.modules)
+        modules[index] = msgspec.structs.replace(module, excused=excused)
+        return Situation(now.state, tuple(modules))
+
+    def _step(self, now: Situation, state: State, event: RecoveryHeard | ResetAsked | Tick
+              ) -> Situation:
+        after, _ = self.arbiter.step(state, event, 0.0)
+        modules = []
+        for was, is_, module in zip(now.state.recoveries, after.recoveries, now.modules,
+                                    strict=self.with_modules):
+            current = module.current and is_.command == was.command
+            given_up = (was.wanted or was.letting_go) and not is_.wanted and not is_.letting_go
+            busy = module.phase is not Phase.IDLE
+            modules.append(Module(module.phase, current, busy and (
+                module.excused or given_up or bool(is_.failure))))
+        return self._canonical(after, tuple(modules))
+
+    def _canonical(self, state: State, modules: tuple[Module, ...]) -> Situation:
+        """Forget what makes no difference: numbers, times, words."""
+        rises = {t.name: t.rises for t in state.detections if t.active}
+        detections = tuple(
+            DetectionTrack(t.name, 0.0, ever_heard=True, reported=t.active, active=t.active,
+                           rises=1) for t in state.detections)
+        recoveries = tuple(
+            RecoveryTrack(
+                Command(t.name, t.wanted, _CURRENT),
+                ordered_s=_OVER if t.ordered_s < 0 and t.wanted and not (
+                    t.acknowledged and t.phase is not Phase.ACTING) else 0.0,
+                cause=frozenset(
+                    (d, 1) for d, r in t.cause if rises.get(d) == r
+                    and self.contracts[t.name].kind.repairs),
+                heard=True, phase=t.phase if t.acknowledged else Phase.IDLE,
+                acknowledged=t.acknowledged, draining=t.draining, letting_go=t.letting_go,
+                latched=t.latched, failure="failed" if t.failure else "",
+                failed_for=tuple(n for n in t.failed_for if f"D_{n[2:]}" in rises))
+            for t in state.recoveries)
+        decision = msgspec.structs.replace(state.decision, rejected=tuple(
+            (name, "") for name, _ in state.decision.rejected))
+        return Situation(msgspec.structs.replace(
+            state, detections=detections, recoveries=recoveries, number=_NUMBER,
+            decision=decision), modules)
+
+    # -- properties -----------------------------------------------------------------------------
+
+    def faults(self, now: Situation) -> Iterator[tuple[str, str]]:
+        """Yield each property that fails in a state, and what is wrong."""
+        tracks = now.state.recoveries
+        holding = [t for t in tracks if (t.wanted or t.letting_go) and not t.failure]
+        for one, other in combinations(holding, 2):
+            if self.arbiter.mechanisms.overlap(one.name, other.name):
+                yield "no-conflicting-claims", (
+                    f"{one.name} and {other.name} may both hold what they claim")
+        for track, module in zip(tracks, now.modules, strict=self.with_modules):
+            if module.phase is not Phase.IDLE and not module.excused \
+                    and not (track.wanted or track.letting_go):
+                yield "no-conflicting-claims", f"{track.name} holds on, and nobody knows"
+        in_force = [t.name for t in tracks if t.wanted and not t.draining]
+        if self.exclusive and len(in_force) > 1:
+            yield "one-decision", f"{' and '.join(in_force)} are both in force"
+        for index, track in enumerate(tracks):
+            if track.name in self.urgent and track.name in now.state.decision.recoveries \
+                    and not track.wanted:
+                yield "emergency-stop-at-once", f"{track.name} was decided on and has to wait"
+            if track.wanted and track.unfinished and not track.failure and not track.latched:
+                after = self.pass_deadline(now, index).state.recoveries[index]
+                if after.wanted and after.unfinished and not after.failure:
+                    yield "recovery-ends", f"{track.name}'s deadline passes and nothing follows"
+            if track.name in now.state.decision.recoveries and not track.wanted \
+                    and not self._starts(now, index):
+                yield "recovery-ends", f"{track.name} waits for ever"
+
+    def _starts(self, now: Situation, waiting: int) -> bool:
+        """Tell whether a recovery that waits starts once all deadlines of others have passed."""
+        for index in range(len(self.names)):
+            if index != waiting:
+                now = self.pass_deadline(now, index)
+        name = self.names[waiting]
+        return now.state.recoveries[waiting].wanted or name not in now.state.decision.recoveries
+
+    def cut_off(self, before: Situation, after: Situation) -> str:
+        """Return which recovery is released half-way in a step, "" if none.
+
+        Where modules die and come back unheard, the arbiter cannot know that one has begun anew;
+        then it is the module that finishes first (`rampart.actors.recovery.module`).
+        """
+        if self.deaths:
+            return ""
+        for was, is_, module in zip(before.state.recoveries, after.state.recoveries,
+                                    before.modules, strict=self.with_modules):
+            if was.wanted and not is_.wanted and module.current and not is_.failure \
+                    and not was.failure and module.phase is Phase.ACTING \
+                    and not self.contracts[was.name].interruptible:
+                return was.name
+        return ""
+
+
+def explore(system: Transitions) -> tuple[int, dict[str, Violation]]:
+    """Visit every reachable state, breadth first.
+
+    Returns:
+        How many states there are, and for each property that fails the shortest trace.
+    """
+    start = system.initial()
+    came_from: dict[Situation, tuple[Situation, str] | None] = {start: None}
+    found: dict[str, Violation] = {}
+    waiting = deque([start])
+
+    def trace(end: Situation, last: str) -> tuple[str, ...]:
+        steps = [last]
+        here: Situation = end
+        while (step := came_from[here]) is not None:
+            here = step[0]
+            steps.append(step[1])
+        return tuple(reversed(steps))
+
+    while waiting:
+        now = waiting.popleft()
+        for name, problem in system.faults(now):
+            if name not in found:
+                found[name] = Violation(name, trace(now, problem))
+        for event, after in system.successors(now):
+            victim = system.cut_off(now, after)
+            if victim and "none-cut-off" not in found:
+                found["none-cut-off"] = Violation("none-cut-off", (
+                    *trace(now, event), f"{victim} is released half-way"))
+            if after not in came_from:
+                came_from[after] = (now, event)
+                waiting.append(after)
+    return len(came_from), found

@@ -1,0 +1,256 @@
+"""Verification of a system's arbitration: every active set, every reachable state.
+
+`verify` puts together what `rampart.manager.analysis.active_sets` finds about decisions and what
+`rampart.manager.analysis.transitions` finds about their execution. What each property means, why it matters, and
+what was found about the paper's strategy is in `docs/verification.md`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain, combinations, permutations
+
+import msgspec
+
+from rampart.manager.analysis.active_sets import (
+    MAX_MECHANISMS,
+    ActiveSets,
+    Property,
+    order_agrees_with_tree,
+)
+from rampart.manager.analysis.transitions import Transitions, Violation, explore
+from rampart.manager.model.mechanisms import Contract
+from rampart.manager.model.order import PartialOrder
+from rampart.manager.spec.budget import patience_s
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.strategies.arrangement import Arrangement, arrange
+from rampart.manager.strategies.escalation import escalate
+from rampart.manager.strategies.registry import STRATEGIES, find_strategy
+
+MEANING = {
+    "one-decision": "there is always exactly one decision",
+    "no-conflicting-claims": "no two recoveries hold the same resource",
+    "safe-enough": "what runs is at least as safe as what each active mechanism asks for",
+    "emergency-stop-at-once": "the last resort never waits for anything",
+    "escalation-ends": "if everything fails, the last resort is tried",
+    "recovery-ends": "every recovery that was started ends or escalates",
+    "none-cut-off": "no recovery is released half-way",
+    "monotone": "one more active mechanism never leads to a less safe recovery",
+    "no-harm": "no recovery disables what it or another one needs",
+    "repairs-run": "a repair that is needed is run some time, unless the last resort latches",
+    "order-agrees-with-tree": "no mechanism is safer than one above it",
+}
+"""Names of the properties, each with its meaning in one line."""
+
+_ALL_FAILURES_OF = 10
+"""Of so many recoveries that escalation can lead to, every combination may have failed when the
+sets that can be asked for are collected; of more recoveries only
+"""
+
+_FAILURES_AT_ONCE = 3
+"""so many."""
+
+Progress = Callable[[str], None]
+
+
+class Report(msgspec.Struct, frozen=True):
+    """What verification found.
+
+    Attributes:
+        system: Name of the system.
+        strategy: The one that the system uses.
+        active_sets: How many sets of active mechanisms were decided, for each strategy.
+        states: How many states of the arbiter were visited, over all strategies.
+        permissiveness: For each strategy, in how many active sets the robot must stop until
+            somebody resets it.
+        stuck_behind_last_resort: For each strategy, in how many active sets a latched last resort
+            runs and a repair that is needed never does; `repairs-run` exempts these.
+        properties: The system's strategy first.
+    """
+
+    system: str
+    strategy: str
+    active_sets: int
+    states: int
+    permissiveness: dict[str, int]
+    stuck_behind_last_resort: dict[str, int]
+    properties: tuple[Property, ...]
+
+
+class TooLargeError(ValueError):
+    """A system with more active sets than can be looked at."""
+
+
+def verify(spec: SystemSpec, strategies: Iterable[str] = (), together: int = 2,
+           progress: Progress = lambda _: None) -> Report:
+    """Check every property of some strategies on a system.
+
+    Args:
+        spec: The system.
+        strategies: Names; the system's own and all others if none is given.
+        together: How many recoveries to explore at a time; two suffice (`rampart.manager.analysis.transitions`).
+        progress: Told in words what is being done.
+
+    Raises:
+        TooLargeError: The system has too many mechanisms.
+        UnknownStrategyError: No such strategy.
+    """
+    if len(spec.mechanisms) > MAX_MECHANISMS:
+        raise TooLargeError(
+            f"{spec.name}: {len(spec.mechanisms)} mechanisms have "
+            f"{2 ** len(spec.mechanisms) - 1} active sets; at most {MAX_MECHANISMS} mechanisms "
+            "can be verified exhaustively")
+    names = tuple(strategies) or (
+        spec.strategy, *(name for name in STRATEGIES if name != spec.strategy))
+    arrangement = arrange(
+        spec.build_mechanisms(patience_s(spec)), spec.build_ftm_tree(), spec.build_order())
+    safety = spec.build_safety_order()
+    explorer = _Explorer(arrangement, together)
+    properties = [order_agrees_with_tree(arrangement, safety)]
+    permissiveness, stuck = {}, {}
+    for name in names:
+        progress(f"{name}: {2 ** len(spec.mechanisms) - 1} active sets")
+        sets = ActiveSets(arrangement, safety, find_strategy(name))
+        permissiveness[name] = sets.stops_for_good
+        stuck[name] = sets.stuck_behind_last_resort
+        statically = {p.name: p for p in sets.check()}
+        states, violations = 0, dict[str, list[Violation]]()
+        for what, count, found in explorer.run(sets):
+            progress(f"{name}: {what}, {count} states")
+            states += count
+            for violation in found:
+                violations.setdefault(violation.name, []).append(violation)
+        properties += _merge(name, statically, states, violations)
+    return Report(spec.name, spec.strategy, 2 ** len(spec.mechanisms) - 1, explorer.states,
+                  permissiveness, stuck, tuple(properties))
+
+
+_OF_STATES = ("one-decision", "no-conflicting-claims", "emergency-stop-at-once", "recovery-ends",
+              "none-cut-off")
+
+
+def _merge(strategy: str, statically: dict[str, Property], states: int,
+           violations: dict[str, list[Violation]]) -> Iterator[Property]:
+    """Yield one verdict a property, where it was checked on sets and on states on both."""
+    for name in MEANING:
+        on_sets = statically.get(name)
+        if on_sets is None and name not in _OF_STATES:
+            continue
+        base = on_sets or Property(name, strategy, True, 0, 0, ())
+        if name in _OF_STATES:
+            found = sorted(violations.get(name, ()), key=lambda v: len(v.trace))
+            traces = tuple(v.trace for v in found)
+            base = Property(name, strategy, base.holds and not found, base.cases + states,
+                            base.count + len(found), (base.counterexamples + traces)[:3])
+        yield base
+
+
+class _Explorer:
+    """Explores the transition systems of a system's recoveries; the same one only once."""
+
+    def __init__(self, arrangement: Arrangement, together: int) -> None:
+        self.arrangement = arrangement
+        self.together = together
+        self.states = 0
+        self._known: dict[object, tuple[int, dict[str, Violation]]] = {}
+        tree, recover = arrangement.tree, arrangement.mechanisms.recover
+        self._urgent = frozenset(recover[tree.root])
+
+    def run(self, sets: ActiveSets) -> Iterator[tuple[str, int, list[Violation]]]:
+        """Yield, for each choice of recoveries, which they are, the states, the violations."""
+        asked = _askable(sets)
+        names = self.arrangement.mechanisms.recoveries
+        exclusive = sets.strategy.exclusive and not self.arrangement.compound
+        for name in names:
+            for deaths in (True, False):
+                yield self._explore((name,), asked, exclusive=exclusive, with_modules=True,
+                                    deaths=deaths)
+        size = min(self.together, len(names))
+        if size > 1:
+            for chosen in combinations(names, size):
+                yield self._explore(chosen, asked, exclusive=exclusive)
+
+    def _explore(self, names: tuple[str, ...], asked: frozenset[frozenset[str]], *,
+                 exclusive: bool, with_modules: bool = False, deaths: bool = True
+                 ) -> tuple[str, int, list[Violation]]:
+        mechanisms, order = self.arrangement.mechanisms, self.arrangement.order
+        # Whoever is not among them may make one of them wait: as if it were not asked for yet.
+        here = frozenset(
+            frozenset(part) for one in asked
+            for part in _parts(one.intersection(names)))
+        shape = _shape(names, here, self._urgent, self.arrangement)
+        key = (shape, exclusive, with_modules, deaths)
+        if key not in self._known:
+            count, found = explore(Transitions(
+                [mechanisms.contracts[n] for n in names], order, here,
+                self._urgent.intersection(names), exclusive=exclusive, with_modules=with_modules,
+                deaths=deaths))
+            self._known[key] = count, found
+            self.states += count
+        count, found = self._known[key]
+        return " and ".join(names), count, list(found.values())
+
+
+def _askable(sets: ActiveSets) -> frozenset[frozenset[str]]:
+    """Return the sets of recoveries that a strategy can ask for, after escalations as well."""
+    arrangement = sets.arrangement
+    names = arrangement.mechanisms.recoveries
+    decisions = {(c.decision.recoveries, c.decision.mechanisms): c.decision for c in sets.cases}
+    found = set()
+    for decision in decisions.values():
+        reachable = _reachable(decision.recoveries, decision.mechanisms, arrangement)
+        concerned = [n for n in names if n in reachable]
+        most = len(concerned) if len(concerned) <= _ALL_FAILURES_OF else _FAILURES_AT_ONCE
+        for size in range(most + 1):
+            for failed in combinations(concerned, size):
+                if size and not set(failed).intersection(decision.recoveries):
+                    continue  # of what runs nothing has failed
+                found.add(frozenset(escalate(
+                    decision, dict.fromkeys(failed, "failed"), arrangement).recoveries))
+    return frozenset(found)
+
+
+def _reachable(recoveries: tuple[str, ...], mechanisms: tuple[str, ...], arrangement: Arrangement
+               ) -> set[str]:
+    """Return what escalation can lead to from some recoveries."""
+    recover, tree = arrangement.mechanisms.recover, arrangement.tree
+    found = set(recoveries)
+    for mechanism in mechanisms:
+        found |= set(chain.from_iterable(arrangement.mechanisms.alternatives(mechanism)))
+        for upper in tree.chain(tree.root, mechanism):
+            found |= set(recover[upper])
+    for name in list(found):
+        following = arrangement.mechanisms.contracts[name].escalate_to
+        while following and following not in found:
+            found.add(following)
+            following = arrangement.mechanisms.contracts[following].escalate_to
+    return found
+
+
+def _parts(names: frozenset[str]) -> Iterator[tuple[str, ...]]:
+    return chain.from_iterable(combinations(sorted(names), n) for n in range(len(names) + 1))
+
+
+def _shape(names: tuple[str, ...], asked: frozenset[frozenset[str]], urgent: frozenset[str],
+           arrangement: Arrangement) -> object:
+    """Return what two choices of recoveries have in common if they behave alike."""
+    if len(names) > 3:
+        return names, asked
+
+    def seen(order: tuple[str, ...]) -> object:
+        return _profile(order, asked, urgent, arrangement.mechanisms.contracts, arrangement.order)
+
+    return min((seen(order) for order in permutations(names)), key=repr)
+
+
+def _profile(names: tuple[str, ...], asked: frozenset[frozenset[str]], urgent: frozenset[str],
+             contracts: dict[str, Contract], order: PartialOrder) -> object:
+    number = {name: i for i, name in enumerate(names)}
+    alone = tuple(
+        (c.kind.repairs, c.interruptible, c.latched, number.get(c.escalate_to, -1), n in urgent)
+        for n in names for c in [contracts[n]])
+    pairs = tuple(
+        (order.is_above(a, b), bool(contracts[a].claims & contracts[b].claims),
+         bool(contracts[a].disables & contracts[b].needs))
+        for a, b in permutations(names, 2))
+    return alone, pairs, tuple(sorted(tuple(sorted(number[n] for n in one)) for one in asked))

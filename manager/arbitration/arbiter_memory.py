@@ -1,0 +1,95 @@
+"""What of the arbiter's state must survive the FTM Manager's death, and how it is taken up again.
+
+Little: an arbiter that starts hears from the modules what is detected and what is in force, adopts
+it, and releases nothing before it has heard them all. Three things nobody else knows:
+
+* *Latches.* Whether somebody has reset an emergency stop is the arbiter's knowledge. If it dies
+  together with a recovery module that cannot find out from the world what it has done (RM1 can, by
+  the brakes), nobody is left to be asked, and the plant would go on.
+* *How much a detection module has flapped*, by which its all-clear is believed sooner or later.
+* *The number of the last decision*, so that none is given twice.
+
+What a memory says that is wrong can only stop the robot: it can latch, and never release.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from rampart.manager.arbitration.arbiter import LARGEST_NUMBER, Arbiter
+from rampart.manager.arbitration.arbiter_state import State
+from rampart.manager.arbitration.recovery_track import Command, RecoveryTrack
+
+
+class Latch(msgspec.Struct, frozen=True):
+    """A recovery that stays until it is reset: what it was told last, and for which detections.
+
+    A safer one may have taken its place for a while.
+    """
+
+    command: Command
+    cause: tuple[tuple[str, int], ...]
+
+
+class Memory(msgspec.Struct, frozen=True):
+    """What the arbiter must not forget.
+
+    Attributes:
+        number: of the last decision.
+        latches: the latched recoveries.
+        buckets: of detection modules that have flapped: name, content, and when that was true;
+            see `rampart.manager.arbitration.detection_track`.
+    """
+
+    number: int
+    latches: tuple[Latch, ...] = ()
+    buckets: tuple[tuple[str, float, float], ...] = ()
+
+
+def remember(state: State) -> Memory:
+    """Return what of a state must not be forgotten."""
+    return Memory(
+        state.number,
+        tuple(Latch(track.command, tuple(sorted(track.cause)))
+              for track in state.recoveries if track.latched),
+        tuple((track.name, track.bucket_s, track.bucket_at_s)
+              for track in state.detections if track.bucket_s > 0))
+
+
+def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
+    """Return the state in which an arbiter starts that has a memory.
+
+    Args:
+        arbiter: the rules; modules that it does not know are left out.
+        memory: of the arbiter before.
+        now: time, seconds.
+        number: decisions are numbered from here on, or from the memory's number if that is higher.
+    """
+    state = arbiter.initial(now, max(number, memory.number))
+    latches = {latch.command.recovery: latch for latch in memory.latches}
+    buckets = {name: (bucket_s, at_s) for name, bucket_s, at_s in memory.buckets}
+    return msgspec.structs.replace(
+        state,
+        detections=tuple(
+            msgspec.structs.replace(track, bucket_s=buckets[track.name][0],
+                                    bucket_at_s=min(buckets[track.name][1], now))
+            if track.name in buckets else track for track in state.detections),
+        recoveries=tuple(
+            _latched(latches[track.name], now) if track.name in latches else track
+            for track in state.recoveries))
+
+
+def _latched(latch: Latch, now: float) -> RecoveryTrack:
+    return RecoveryTrack(latch.command, ordered_s=now, cause=frozenset(latch.cause), latched=True)
+
+
+def objection(memory: Memory) -> str:
+    """Say why a memory makes no sense; "" if it does."""
+    if not 0 <= memory.number <= LARGEST_NUMBER:
+        return f"decision number {memory.number}"
+    for name, bucket_s, at_s in memory.buckets:
+        if not (math.isfinite(bucket_s) and math.isfinite(at_s) and bucket_s >= 0):
+            return f"bucket of {name} holds {bucket_s} s"
+    return ""

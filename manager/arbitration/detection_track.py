@@ -1,0 +1,161 @@
+"""What the arbiter believes about one detection module.
+
+Belief differs from the last report in two ways.
+
+*Silence counts as active.* A module that has died cannot say so, hence one of which there is no
+report younger than `silence_timeout_s` is taken for active, whatever the reason: also while it is
+being respawned, which takes a fraction of the timeout, and one that crashes again and again is not
+excused for ever. Age is that of the report, not of its arrival: what repeats old news is silent.
+
+*One that lives and is not heard is replaced* once, well before its silence counts (`overdue`): its
+way out may be broken where its heartbeat's is not. Not while others are late as well: then it is
+the machine, or who listens, and a module that is killed for being late comes later still.
+
+*Active at once, idle after a while.* A flapping module must not thrash the arbiter: a recovery
+started and released with every flap. So it has to stay idle for a hold before it is believed. The
+hold is a bucket: every rise pours in `release_hold_s`, and it leaks so slowly that a full one
+takes `release_hold_max_s` per portion. Therefore
+
+* flaps closer together than `release_hold_max_s` pour in faster than leaks out; the hold grows
+  past the gaps between them, and the flapping is seen as one long activity: no thrashing;
+* flaps further apart do not build up, and a release per `release_hold_max_s` is no thrashing;
+* the bucket is no larger than `release_hold_max_s`, so that long after the last flap the recovery
+  is released for certain: no starvation either.
+
+A single fault finds the bucket empty and is held for `release_hold_s`. With both times 0 there is
+no hold: so it is once a repair has been done (see `Arbiter`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+
+class DetectionRules(msgspec.Struct, frozen=True):
+    """Times by which belief follows reports, all in seconds; see `rampart.manager.spec.schema.Timing`."""
+
+    silence_timeout_s: float
+    startup_grace_s: float
+    release_hold_s: float
+    release_hold_max_s: float
+
+
+class DetectionTrack(msgspec.Struct, frozen=True):
+    """Belief about one detection module.
+
+    Attributes:
+        name: Of the module.
+        heard_s: When its newest report was true, or else when its time to report began to run.
+        life: Its incarnation, as last heard; 0 before.
+        ever_heard: Whether it was heard at all since the arbiter started.
+        reported: What it last said: active or not.
+        silent: Not heard for too long.
+        active: What the arbiter acts on.
+        rises: How often it became active.
+        since_s: Since when it is active, by its own report.
+        clear_s: When it was last seen to become idle.
+        bucket_s: Content of the bucket, at the time `bucket_at_s`.
+        bucket_at_s: See `bucket_s`.
+        nodes: Failed nodes that it names.
+        reason: Why it is active.
+    """
+
+    name: str
+    heard_s: float
+    ever_heard: bool = False
+    reported: bool = False
+    silent: bool = False
+    active: bool = False
+    rises: int = 0
+    since_s: float = 0.0
+    clear_s: float = 0.0
+    bucket_s: float = 0.0
+    bucket_at_s: float = 0.0
+    nodes: tuple[str, ...] = ()
+    reason: str = ""
+    life: int = 0
+
+    @property
+    def asserted(self) -> bool:
+        """Whether it is active by its own word or by its silence, rather than only held."""
+        return self.reported or self.silent
+
+    def is_calm(self, now: float, silence_timeout_s: float) -> bool:
+        """Whether it is inactive and has been heard of late: to let time pass changes nothing."""
+        return not self.active and now - self.heard_s <= silence_timeout_s
+
+
+OVERDUE_SHARE = 0.6
+"""Of the silence timeout: older news of a module, and it is overdue; half of that is late. Three
+reports fit in before, and a new life has time to be heard after."""
+
+
+def overdue(tracks: tuple[DetectionTrack, ...], rules: DetectionRules, now: float
+            ) -> DetectionTrack | None:
+    """Return the one module that is overdue while nobody else is late, if there is one."""
+    limit_s = OVERDUE_SHARE * rules.silence_timeout_s
+    found = None
+    for track in tracks:
+        age_s = now - track.heard_s
+        if age_s <= limit_s / 2:
+            continue
+        if found is not None or age_s <= limit_s:
+            return None
+        found = track
+    return found if found is not None and found.ever_heard and not found.silent else None
+
+
+def hear(track: DetectionTrack, rules: DetectionRules, now: float, *, active: bool, reason: str,
+         nodes: tuple[str, ...], since_s: float, stamp_s: float = math.inf, life: int = 0
+         ) -> DetectionTrack:
+    """Take in a report that arrives at `now` and was true at `stamp_s`, at most now."""
+    heard_s = max(track.heard_s, min(stamp_s, now))
+    heard = msgspec.structs.replace(
+        track, heard_s=heard_s, ever_heard=True, reported=active, life=life,
+        silent=track.silent and now - heard_s > rules.silence_timeout_s)
+    if active:
+        heard = msgspec.structs.replace(heard, nodes=nodes, reason=reason)
+    return _follow(track, heard, rules, now, since_s)
+
+
+def pass_time(track: DetectionTrack, rules: DetectionRules, now: float) -> DetectionTrack:
+    """Let time pass: find out silence, and let go what has been idle for long enough."""
+    patience_s = rules.silence_timeout_s
+    if not track.ever_heard:
+        patience_s = max(patience_s, rules.startup_grace_s)
+    if not track.silent and now - track.heard_s > patience_s:
+        silent = msgspec.structs.replace(
+            track, silent=True, reason="silent", nodes=track.nodes if track.reported else ())
+        return _follow(track, silent, rules, now, now)
+    if track.active and not track.asserted and now - track.clear_s >= release_hold_s(track, rules):
+        return msgspec.structs.replace(track, active=False, nodes=(), reason="")
+    return track
+
+
+def release_hold_s(track: DetectionTrack, rules: DetectionRules) -> float:
+    """How long the module must stay idle, from `clear_s` on, before that is believed."""
+    bucket_s = _bucket_s(track, rules, track.clear_s)
+    return min(max(bucket_s, rules.release_hold_s), rules.release_hold_max_s)
+
+
+def _follow(before: DetectionTrack, after: DetectionTrack, rules: DetectionRules, now: float,
+            since_s: float) -> DetectionTrack:
+    """Note a rise or a fall."""
+    if after.asserted and not before.asserted:
+        bucket_s = _bucket_s(before, rules, now) + rules.release_hold_s
+        return msgspec.structs.replace(
+            after, active=True, rises=before.rises + 1, since_s=since_s, bucket_at_s=now,
+            bucket_s=min(bucket_s, rules.release_hold_max_s))
+    if before.asserted and not after.asserted:
+        return msgspec.structs.replace(after, clear_s=now)
+    return after
+
+
+def _bucket_s(track: DetectionTrack, rules: DetectionRules, now: float) -> float:
+    """Content of the bucket now: it loses one portion in `release_hold_max_s`."""
+    if rules.release_hold_max_s == 0:
+        return 0.0
+    leak = rules.release_hold_s / rules.release_hold_max_s
+    return max(0.0, track.bucket_s - leak * max(0.0, now - track.bucket_at_s))

@@ -1,0 +1,1 @@
+"""Fault trees, mechanisms and orders as diagrams."""

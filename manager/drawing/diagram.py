@@ -1,0 +1,214 @@
+"""What there is to draw of a system: its fault tree, its FTMTree, its order of the recoveries.
+
+Each is a directed graph of boxes, ready for any renderer (`tree_text`, `tree_dot`, `tree_svg`).
+The boxes carry what is active and what was decided, so that a picture shows a situation.
+"""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Sequence
+
+import msgspec
+
+from rampart.manager.model.gates import detection_gate, recovery_gate
+from rampart.manager.model.order import PartialOrder
+from rampart.manager.model.words import decision_in_words
+from rampart.manager.spec.schema import EventSpec, MechanismSpec, SystemSpec
+
+WHATS = ("fault-tree", "ftm-tree", "order")
+"""What can be drawn."""
+
+_DIRECTION = {*"\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"}
+
+
+class Box(msgspec.Struct, frozen=True):
+    """An event, a mechanism or a recovery.
+
+    Attributes:
+        name: Unique in the diagram.
+        title: For people; may be "".
+        gate: Of an event: "or", "and", "at-least"; "" for a basic event and for what is none.
+        required: How many inputs the gate needs.
+        inputs: How many it has.
+        mechanism: The one that is a barrier on this event, or the box itself is.
+        detect: Its detection gate.
+        recover: Its recovery gate.
+        active: The mechanism is active; a recovery is that of an active mechanism.
+        decided: The recovery is to run, or the mechanism is one of those that ask for it; where
+            no active mechanism does, one of those that have it.
+    """
+
+    name: str
+    title: str = ""
+    gate: str = ""
+    required: int = 0
+    inputs: int = 0
+    mechanism: str = ""
+    detect: str = ""
+    recover: str = ""
+    active: bool = False
+    decided: bool = False
+
+    @property
+    def subtitle(self) -> str:
+        """The title, or "" if it says no more than the name."""
+        words = "".join(c if c.isalnum() else " " for c in self.title.casefold()).split()
+        return "" if words == self.name.casefold().split("_") else self.title
+
+    @property
+    def gate_words(self) -> str:
+        """The gate as people say it: "or", "and", "2 of 3"; "" if there is none."""
+        return f"{self.required} of {self.inputs}" if self.gate == "at-least" else self.gate
+
+    @property
+    def barrier_words(self) -> str:
+        """The mechanism as the paper writes it, FTMx(DMy, RMz); "" if there is none."""
+        return f"{self.mechanism}({self.detect}, {self.recover})" if self.mechanism else ""
+
+
+class Diagram(msgspec.Struct, frozen=True):
+    """A graph to draw; an edge goes from the upper box to the lower.
+
+    Attributes:
+        what: One of `WHATS`.
+        title: One line.
+        note: The situation, one line; "" if nothing is active.
+        boxes: All, uppers in no particular place.
+        edges: (upper, lower).
+    """
+
+    what: str
+    title: str
+    note: str
+    boxes: tuple[Box, ...]
+    edges: tuple[tuple[str, str], ...]
+
+    @property
+    def active_words(self) -> str:
+        """What it means for a box of this diagram to be active."""
+        return "asked for" if self.what == "order" else "active"
+
+
+class Situation(msgspec.Struct, frozen=True):
+    """What is active, and what is done about it."""
+
+    active: frozenset[str] = frozenset()
+    recoveries: tuple[str, ...] = ()
+    rule: int = 0
+    strategy: str = ""
+
+    def note(self, spec: SystemSpec) -> str:
+        """Return it in one line."""
+        if not self.active:
+            return ""
+        active = [m.name for m in spec.mechanisms if m.name in self.active]
+        return decision_in_words(active, self.rule, self.recoveries, self.strategy)
+
+
+def draw(spec: SystemSpec, what: str, order: PartialOrder, criteria: Sequence[str],
+         situation: Situation) -> Diagram:
+    """Return one of the diagrams of a system.
+
+    Args:
+        spec: The system.
+        what: One of `WHATS`.
+        order: Of the recoveries.
+        criteria: Names of the orders that it is made of.
+        situation: To show in it.
+    """
+    note = situation.note(spec)
+    title = clean(spec.title)
+    if what == "fault-tree":
+        return Diagram(what, f"Fault tree: {title}", note, *_fault_tree(spec, situation))
+    if what == "ftm-tree":
+        return Diagram(what, f"Tree of mechanisms: {title}", note, *_ftm_tree(spec, situation))
+    by = ", then ".join(map(clean, criteria))
+    return Diagram(what, f"Order of recoveries ({by}): {title}", note,
+                   *_order(spec, order, situation))
+
+
+def clean(text: str) -> str:
+    """Return text fit to be shown: one line, and nothing in it that a terminal or XML obeys.
+
+    White space becomes one space; control characters, changes of writing direction and
+    what is no character become U+FFFD.
+    """
+    return " ".join("".join(
+        " " if c.isspace() else
+        "\ufffd" if unicodedata.category(c) in {"Cc", "Cs", "Cn"} or c in _DIRECTION else c
+        for c in text).split())
+
+
+def covers(order: PartialOrder) -> tuple[tuple[str, str], ...]:
+    """Return the pairs of neighbours of an order (its transitive reduction, the Hasse diagram)."""
+    pairs = []
+    for number, name in enumerate(order.names):
+        rest = order.below[number]
+        while rest:  # whatever lies between two has a lower bit than the lower of them
+            nearest = (rest & -rest).bit_length() - 1
+            pairs.append((name, order.names[nearest]))
+            rest &= ~(order.below[nearest] | 1 << nearest)
+    return tuple(pairs)
+
+
+_Parts = tuple[tuple[Box, ...], tuple[tuple[str, str], ...]]
+
+
+def _fault_tree(spec: SystemSpec, situation: Situation) -> _Parts:
+    asked = _is_asked_for(spec, situation)
+    barriers = {m.event: m for m in spec.mechanisms}
+    boxes = []
+    for event in spec.events:
+        box = Box(event.name, clean(event.title), _gate(event), event.required,
+                  len(event.of))
+        if event.name in barriers:
+            box = _bar(box, barriers[event.name], situation, asked)
+        boxes.append(box)
+    return tuple(boxes), tuple((e.name, lower) for e in spec.events for lower in e.of)
+
+
+def _gate(event: EventSpec) -> str:
+    if not event.of:
+        return ""
+    if event.gate in {"or", "and"}:
+        return str(event.gate)
+    return "at-least"
+
+
+def _ftm_tree(spec: SystemSpec, situation: Situation) -> _Parts:
+    asked = _is_asked_for(spec, situation)
+    titles = {d.name: clean(d.title) for d in spec.detections}
+    titles |= {r.name: clean(r.title) for r in spec.recoveries}
+    boxes = []
+    for mechanism in spec.mechanisms:
+        detects, recovers = (gate.said_with(titles) for gate in (
+            detection_gate(mechanism.detect), recovery_gate(mechanism.recover)))
+        boxes.append(_bar(Box(mechanism.name, f"{detects} → {recovers}"), mechanism, situation,
+                          asked))
+    if not boxes:
+        return (), ()
+    parents = spec.build_ftm_tree().parents
+    return tuple(boxes), tuple((parent, m) for m, parent in parents.items() if parent is not None)
+
+
+def _order(spec: SystemSpec, order: PartialOrder, situation: Situation) -> _Parts:
+    asked = {r for m in spec.mechanisms if m.name in situation.active for r in m.recoveries}
+    boxes = tuple(Box(r.name, clean(r.title), active=r.name in asked,
+                      decided=r.name in situation.recoveries) for r in spec.recoveries)
+    return boxes, covers(order)
+
+
+def _is_asked_for(spec: SystemSpec, situation: Situation) -> bool:
+    """Tell whether an active mechanism has a recovery that was decided, as in block 1 to 3."""
+    return any(m.name in situation.active and not set(m.recoveries).isdisjoint(
+        situation.recoveries) for m in spec.mechanisms)
+
+
+def _bar(box: Box, mechanism: MechanismSpec, situation: Situation, asked: bool) -> Box:
+    active = mechanism.name in situation.active
+    decided = not set(mechanism.recoveries).isdisjoint(situation.recoveries)
+    return msgspec.structs.replace(
+        box, mechanism=mechanism.name, detect=clean(mechanism.detect),
+        recover=clean(mechanism.recover), active=active,
+        decided=decided and (active or not asked))

@@ -1,0 +1,1 @@
+"""Fault trees, gates, mechanisms and orders: the words in which a system is described."""

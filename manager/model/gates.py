@@ -1,0 +1,307 @@
+"""Logical gates over names: what a mechanism detects by, and what it recovers with.
+
+A mechanism joins detection modules to recovery modules by two gates (paper, section V, "logical
+gates"): `detect = "DM1 and DM3"`, `recover = "RM2 and RM4"`. The language is
+
+    DM1                      DM1 and DM3               DM1 or (DM2 and not DM3)
+    2 of (DM1, DM2, DM3)     RM2 and RM4               RM4 or RM3
+
+`and` binds tighter than `or`, `not` tighter than both. On the recovery side `and` means both
+together, and `or` means the first that can be had: the next one is taken when it has failed or
+when what it needs is not there. `not` and `k of` make no sense there.
+
+*Silence is no alibi.* A detection module that is silent counts as active, so `DM1` holds; it must
+not count as an assurance that all is well either, so `not DM1` holds too.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import lru_cache, reduce
+from itertools import chain, combinations
+from operator import and_, or_
+
+import msgspec
+
+from rampart.files.reading import plain_line
+
+MAX_NAMES = 16
+"""A gate over more modules than these is a fault tree; it belongs there."""
+
+MAX_DEPTH = 50
+
+MAX_TOKENS = 400
+"""Names, words and parentheses of a gate."""
+
+MAX_INPUTS = 64
+"""Of `k of`: each input is counted with each number of those before it."""
+
+WORDS = frozenset({"and", "or", "not", "of"})
+"""Of the language; no module can be called so."""
+
+MAX_WAYS = 64
+"""Alternatives of a recovery gate: `(A or B) and (C or D)` has four. Each is tried in turn."""
+
+
+class GateError(ValueError):
+    """A gate that cannot be read, or that makes no sense. The message is one line."""
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(plain_line(problem))
+
+
+class Gate(msgspec.Struct, frozen=True):
+    """A gate: a name, its negation, or at least `required` of some inputs.
+
+    Attributes:
+        name: Of a module; "" for a gate over inputs.
+        negated: The name must not be active.
+        required: How many inputs must hold.
+        inputs: Of the gate.
+    """
+
+    name: str = ""
+    negated: bool = False
+    required: int = 0
+    inputs: tuple[Gate, ...] = ()
+
+    @property
+    def is_name(self) -> bool:
+        """Whether it is no more than a name."""
+        return bool(self.name) and not self.negated
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in the gate, each once, as written."""
+        if self.name:
+            return (self.name,)
+        return tuple(dict.fromkeys(chain.from_iterable(i.names for i in self.inputs)))
+
+    def holds(self, active: Collection[str], silent: Collection[str] = ()) -> bool:
+        """Tell whether the gate holds when these modules are active (`silent` ones included)."""
+        if self.name:
+            if self.negated:
+                return self.name not in active or self.name in silent
+            return self.name in active
+        return sum(gate.holds(active, silent) for gate in self.inputs) >= self.required
+
+    def said_with(self, words: Mapping[str, str]) -> str:
+        """Return the gate in text, with names replaced by words for those that have some."""
+        return str(self._renamed(words))
+
+    def _renamed(self, words: Mapping[str, str]) -> Gate:
+        return Gate(words.get(self.name) or self.name, self.negated, self.required,
+                    tuple(gate._renamed(words) for gate in self.inputs))
+
+    def alternatives(self) -> Iterator[tuple[str, ...]]:
+        """Yield the sets of names that satisfy a gate without negation, preferred ones first."""
+        if self.name:
+            yield (self.name,)
+            return
+        for chosen in combinations(self.inputs, self.required):
+            yield from _product([tuple(gate.alternatives()) for gate in chosen])
+
+    def __str__(self) -> str:
+        if self.name:
+            return f"not {self.name}" if self.negated else self.name
+        inner = [str(i) if i.name or 1 < i.required < len(i.inputs) else f"({i})"
+                 for i in self.inputs]
+        if self.required == 1:
+            return " or ".join(inner)
+        if self.required == len(self.inputs):
+            return " and ".join(inner)
+        return f"{self.required} of ({', '.join(map(str, self.inputs))})"
+
+
+@lru_cache(maxsize=4096)
+def detection_gate(text: str) -> Gate:
+    """Read the gate on the detection side of a mechanism.
+
+    Raises:
+        GateError: It cannot be read, can never be active, or is active when nothing is wrong.
+    """
+    gate = _Parser(text).read()
+    names = gate.names
+    if len(names) > MAX_NAMES:
+        raise GateError(f"a gate over {len(names)} modules; at most {MAX_NAMES} are right, more "
+                        "belong into the fault tree")
+    if gate.holds(()):
+        raise GateError("it is active while all its detection modules are idle")
+    if not _truth_table(gate, names):
+        raise GateError("it can never be active")
+    return gate
+
+
+@lru_cache(maxsize=4096)
+def recovery_gate(text: str) -> Gate:
+    """Read the gate on the recovery side of a mechanism.
+
+    Raises:
+        GateError: It cannot be read, or has more in it than names, `and` and `or`.
+    """
+    gate = _Parser(text).read()
+    names = gate.names
+    if len(names) > MAX_NAMES:
+        raise GateError(f"{len(names)} recovery modules; at most {MAX_NAMES} are right")
+
+    def check(part: Gate) -> None:
+        if part.negated:
+            raise GateError(f"'not {part.name}' cannot be run; names, 'and' and 'or' are right")
+        if not part.name and 1 < part.required < len(part.inputs):
+            raise GateError(f"'{part.required} of' does not say which; names, 'and' and 'or' "
+                            "are right")
+        for inner in part.inputs:
+            check(inner)
+
+    check(gate)
+    ways = _count_ways(gate)
+    if ways > MAX_WAYS:
+        raise GateError(f"{ways} alternatives; at most {MAX_WAYS} are right")
+    return gate
+
+
+def _truth_table(gate: Gate, names: tuple[str, ...]) -> int:
+    """Return for which sets of active names a gate holds: one bit for each of the 2^n sets."""
+    sets = 1 << len(names)
+    every = (1 << sets) - 1
+    # Of name k: 2^k sets without it, 2^k sets with it, and so on.
+    with_name = {name: every // ((1 << (2 << k)) - 1) * ((1 << (1 << k)) - 1) << (1 << k)
+                 for k, name in enumerate(names)}
+
+    def table(part: Gate) -> int:
+        if part.name:
+            return every & ~with_name[part.name] if part.negated else with_name[part.name]
+        tables = [table(inner) for inner in part.inputs]
+        if part.required in {1, len(tables)}:
+            return reduce(or_ if part.required == 1 else and_, tables)
+        at_least = [every] + [0] * part.required  # of the inputs met so far
+        for holds in tables:
+            for count in range(part.required, 0, -1):
+                at_least[count] |= at_least[count - 1] & holds
+        return at_least[-1]
+
+    return table(gate)
+
+
+def _count_ways(gate: Gate) -> int:
+    """Return how many alternatives there are, without making them: there may be millions."""
+    if gate.name:
+        return 1
+    counts = [_count_ways(i) for i in gate.inputs]
+    return sum(counts) if gate.required == 1 else math.prod(counts)
+
+
+def _product(parts: list[tuple[tuple[str, ...], ...]]) -> Iterator[tuple[str, ...]]:
+    """Yield the unions of one choice from each part, earlier choices first."""
+    if not parts:
+        yield ()
+        return
+    for head in parts[0]:
+        for tail in _product(parts[1:]):
+            yield tuple(dict.fromkeys((*head, *tail)))
+
+
+_TOKEN = re.compile(r"\s*([A-Za-z][A-Za-z0-9_]*|[0-9]+|[(),])")
+_MAX_DIGITS = 9
+
+
+class _Parser:
+    """Recursive descent; the depth is bounded, so is the recursion."""
+
+    def __init__(self, text: str) -> None:
+        self._tokens: list[str] = []
+        at = 0
+        text = text.rstrip()
+        while at < len(text):
+            match = _TOKEN.match(text, at)
+            if match is None:
+                raise GateError(f"unexpected {text[at:].strip()[:1]!r}; a gate is made of names, "
+                                "'and', 'or', 'not', 'k of (...)' and parentheses")
+            self._tokens.append(match[1])
+            at = match.end()
+        self._at = 0
+        self._depth = 0
+
+    def read(self) -> Gate:
+        gate = self._joined("or", lambda: self._joined("and", self._single))
+        if self._peek():
+            raise GateError(f"unexpected {self._peek()!r} after a complete gate; join two parts "
+                            "with 'and' or 'or'")
+        if len(self._tokens) > MAX_TOKENS:
+            raise GateError(f"{len(self._tokens)} names, words and parentheses; at most "
+                            f"{MAX_TOKENS} are right, more belong into the fault tree")
+        return gate
+
+    def _peek(self) -> str:
+        return self._tokens[self._at] if self._at < len(self._tokens) else ""
+
+    def _take(self, wanted: str = "") -> str:
+        token = self._peek()
+        if wanted and token != wanted:
+            raise GateError(f"expected {wanted!r}, got {token or 'the end'!r}")
+        self._at += 1
+        return token
+
+    def _or(self) -> Gate:
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise GateError(f"nested more than {MAX_DEPTH} deep")
+        gate = self._joined("or", lambda: self._joined("and", self._single))
+        self._depth -= 1
+        return gate
+
+    def _joined(self, word: str, part: Callable[[], Gate]) -> Gate:
+        inputs = [part()]
+        while self._peek() == word:
+            self._take()
+            inputs.append(part())
+        if len(inputs) == 1:
+            return inputs[0]
+        return Gate(required=1 if word == "or" else len(inputs), inputs=tuple(inputs))
+
+    def _single(self) -> Gate:
+        token = self._take()
+        if token == "not":  # noqa: S105 a word of the language
+            self._depth += 1
+            if self._depth > MAX_DEPTH:
+                raise GateError(f"nested more than {MAX_DEPTH} deep")
+            gate = _negate(self._single())
+            self._depth -= 1
+            return gate
+        if token == "(":  # noqa: S105
+            gate = self._or()
+            self._take(")")
+            return gate
+        if token.isdigit():
+            if len(token) > _MAX_DIGITS:
+                raise GateError(f"{token[:_MAX_DIGITS]}... of: between 1 and the number of inputs "
+                                "is right")
+            return self._at_least(int(token))
+        if not token or token in WORDS or not token[0].isalpha():
+            raise GateError(f"expected a name, got {token or 'the end'!r}")
+        return Gate(name=token)
+
+    def _at_least(self, required: int) -> Gate:
+        self._take("of")
+        self._take("(")
+        inputs = [self._or()]
+        while self._peek() == ",":
+            self._take()
+            inputs.append(self._or())
+        self._take(")")
+        if len(inputs) > MAX_INPUTS:
+            raise GateError(f"{required} of {len(inputs)} inputs; at most {MAX_INPUTS} are right")
+        if not 1 <= required <= len(inputs):
+            raise GateError(f"{required} of {len(inputs)} inputs; between 1 and {len(inputs)} "
+                            "is right")
+        return Gate(required=required, inputs=tuple(inputs))
+
+
+def _negate(gate: Gate) -> Gate:
+    """Push a negation down to the names (De Morgan; not k-of-n is (n-k+1)-of-n of negations)."""
+    if gate.name:
+        return Gate(name=gate.name, negated=not gate.negated)
+    return Gate(required=len(gate.inputs) - gate.required + 1,
+                inputs=tuple(_negate(i) for i in gate.inputs))

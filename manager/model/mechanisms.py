@@ -1,0 +1,158 @@
+"""The fault-tolerance mechanisms: FTMx(DMy, RMz), and what a recovery promises.
+
+A mechanism joins a detection module to a recovery module, or gates over several of them. It is
+*active* when its detection module is (or its gate holds), and *activated* when its recovery
+module is (paper, section III-B). Two mechanisms may share a recovery: FTM2 and FTM3 both stop the
+robot with RM2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Sequence
+from enum import StrEnum
+from itertools import chain
+
+import msgspec
+
+from rampart.manager.model.gates import detection_gate, recovery_gate
+from rampart.manager.model.order import UnknownElementError
+
+
+class RecoveryKind(StrEnum):
+    """How a recovery gets rid of an error (Avizienis, Laprie, Randell, Landwehr 2004)."""
+
+    FORWARD = "forward"
+    """A new, safe state, possibly degraded: stopped, or driven by hand."""
+    BACKWARD = "backward"
+    """Back to a checkpoint from before the error."""
+    MASKING = "masking"
+    """Service goes on as if nothing had happened."""
+
+    @property
+    def repairs(self) -> bool:
+        """Whether the cause is to be gone afterwards, so that its detection must fall silent."""
+        return self is not RecoveryKind.FORWARD
+
+
+class Contract(msgspec.Struct, frozen=True):
+    """What a recovery module promises the arbiter.
+
+    Attributes:
+        name: Of the recovery module.
+        kind: How it recovers.
+        claims: Resources that it needs for itself; two recoveries that share one never act at
+            the same time.
+        interruptible: May be released while it is acting. False: it is left to finish.
+        latched: Stays in force until an operator resets it, even when the cause is gone.
+        deadline_s: From command to done (and, for a repair, to the cause being gone).
+        escalate_to: Recovery to take when this one fails; "" for that of the mechanism above.
+        needs: Preconditions: nodes or resources without which it is of no use. While a node
+            among them is reported failed, the recovery counts as failed too.
+        disables: Nodes or resources that nobody can use while it is in force.
+    """
+
+    name: str
+    kind: RecoveryKind = RecoveryKind.FORWARD
+    claims: frozenset[str] = frozenset()
+    interruptible: bool = False
+    latched: bool = False
+    deadline_s: float = 2.0
+    escalate_to: str = ""
+    needs: frozenset[str] = frozenset()
+    disables: frozenset[str] = frozenset()
+
+
+class Mechanism(msgspec.Struct, frozen=True):
+    """FTMx(DMy, RMz); `detect` and `recover` are gates in text (`rampart.manager.model.gates`).
+
+    `patience_s` is how long its recovery may take before the error has gone too far.
+    """
+
+    name: str
+    detect: str
+    recover: str
+    patience_s: float = math.inf
+
+
+class Mechanisms:
+    """All mechanisms of a system, looked up by their name or by that of one of their modules.
+
+    Args:
+        mechanisms: In the sequence in which they are shown.
+        contracts: Of all recoveries, those included that are only escalated to.
+
+    Attributes:
+        recover: The recoveries that each mechanism runs, where all can be had.
+        detect: The detection modules that each mechanism listens to.
+
+    Raises:
+        ValueError: Two of one name, or a recovery without a contract.
+        GateError: A gate that cannot be read.
+    """
+
+    def __init__(self, mechanisms: Sequence[Mechanism], contracts: Sequence[Contract]) -> None:
+        self.by_name = {mechanism.name: mechanism for mechanism in mechanisms}
+        self.contracts = {contract.name: contract for contract in contracts}
+        if len(self.by_name) != len(mechanisms) or len(self.contracts) != len(contracts):
+            raise ValueError("two mechanisms or two recoveries have the same name")
+        self._alternatives = {m.name: tuple(recovery_gate(m.recover).alternatives())
+                              for m in mechanisms}
+        self._gates = {m.name: detection_gate(m.detect) for m in mechanisms}
+        self.recover = {name: ways[0] for name, ways in self._alternatives.items()}
+        self.detect = {name: gate.names for name, gate in self._gates.items()}
+        for name, ways in self._alternatives.items():
+            for recovery in chain.from_iterable(ways):
+                if recovery not in self.contracts:
+                    raise ValueError(f"{name} names unknown recovery {recovery!r}")
+        self.names = tuple(self.by_name)
+        self.detections = tuple(dict.fromkeys(chain.from_iterable(self.detect.values())))
+        self.recoveries = tuple(self.contracts)
+        self._number = {name: index for index, name in enumerate(self.names)}
+
+    def sort(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Return mechanism names once each, in the declared sequence.
+
+        Raises:
+            UnknownElementError: One of them is no mechanism.
+        """
+        try:
+            return tuple(sorted(set(names), key=self._number.__getitem__))
+        except KeyError as error:
+            raise UnknownElementError(f"unknown mechanism {error.args[0]!r}; "
+                                      f"known: {', '.join(self.names)}") from None
+
+    def detected_by(self, active_detections: Iterable[str], silent: Iterable[str] = ()
+                    ) -> tuple[str, ...]:
+        """Return the mechanisms that are active when these detection modules are.
+
+        Args:
+            active_detections: Active modules, silent ones included.
+            silent: Those of them that are active only because they are silent.
+        """
+        active, mute = set(active_detections), set(silent)
+        if not active:
+            return ()
+        return tuple(name for name, gate in self._gates.items() if gate.holds(active, mute))
+
+    def alternatives(self, mechanism: str) -> tuple[tuple[str, ...], ...]:
+        """Return the sets of recoveries that would do for a mechanism, preferred ones first."""
+        return self._alternatives[mechanism]
+
+    def available(self, mechanism: str, failed: Collection[str]) -> tuple[str, ...]:
+        """Return the recoveries to run for a mechanism.
+
+        That is its first alternative without a failed one, else the first of all.
+        """
+        ways = self._alternatives[mechanism]
+        if not failed:
+            return ways[0]
+        return next((way for way in ways if not any(name in failed for name in way)), ways[0])
+
+    def overlap(self, one: str, other: str) -> bool:
+        """Tell whether two recoveries claim a common resource."""
+        return not self.contracts[one].claims.isdisjoint(self.contracts[other].claims)
+
+    def harms(self, one: str, other: str) -> frozenset[str]:
+        """Return what the recovery `one` disables although `other` needs it."""
+        return self.contracts[one].disables & self.contracts[other].needs

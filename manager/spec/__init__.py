@@ -1,0 +1,1 @@
+"""System specifications: their tables, what is checked before anything runs, time budgets."""

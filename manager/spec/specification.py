@@ -1,0 +1,282 @@
+"""Reads the specification of a system; what a spec can say is in `rampart.manager.spec.schema`.
+
+Reading happens in three steps, each with its own kind of error, and every error is one line that
+names file, path, value, and what would be right (`SpecificationError`):
+
+1. syntax, sizes and types: `rampart.files.toml`, then `msgspec`, strict, unknown fields forbidden;
+2. timing values left out are derived from the robot (`rampart.manager.spec.budget`), and parameters that name
+   a timing value are replaced by it;
+3. sense: names, cycles, the tree, the order, the time budget (`rampart.manager.spec.checks`).
+
+There is no file I/O here: the caller hands over the text, and the name to use in messages.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator
+from enum import Enum
+from typing import Any
+
+import msgspec
+
+from rampart.files import toml
+from rampart.files.reading import FileError
+from rampart.manager.model.mechanisms import RecoveryKind
+from rampart.manager.spec.budget import derive_timeouts
+from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
+from rampart.manager.spec.schema import (
+    NODE_KINDS,
+    AtLeast,
+    DetectionSpec,
+    EventSpec,
+    Hazard,
+    Kind,
+    Layers,
+    MechanismSpec,
+    NodeSpec,
+    RecoverySpec,
+    Robot,
+    SpecificationError,
+    SystemSpec,
+    Table,
+    Timing,
+    Within,
+)
+
+__all__ = [
+    "AtLeast", "DetectionSpec", "EventSpec", "Hazard", "Kind", "Layers", "MechanismSpec",
+    "NodeSpec", "RecoverySpec", "Robot", "SpecificationError", "SystemSpec", "Timing",
+    "check_document", "check_modules", "parse_specification", "read_document",
+]
+
+TABLES: dict[str, type[Table]] = {
+    "": SystemSpec, "robot": Robot, "timing": Timing, "layers": Layers, "node": NodeSpec,
+    "detection": DetectionSpec, "recovery": RecoverySpec, "mechanism": MechanismSpec,
+    "event": EventSpec, "gate": AtLeast, "against": Within,
+}
+
+ENUMS: dict[tuple[str, str], Iterable[Enum]] = {
+    ("node", "kind"): NODE_KINDS, ("recovery", "kind"): RecoveryKind,
+    ("mechanism", "against"): Hazard,
+}
+
+LARGEST, SMALLEST = 1e9, 1e-9
+"""Of numbers that the analyses calculate with: squares and quotients of these are far from the
+limits of a float, and a thousand million seconds are thirty years.
+"""
+
+LARGEST_INTEGER = 2 ** 63 - 1
+"""In parameters, which go to an actor as they are, by way of MessagePack."""
+
+MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
+            "orders": 16}
+"""Of each table; the shipped systems have 31 actors, and checks compare many with many."""
+
+
+def parse_specification(text: str, file: str) -> SystemSpec:
+    """Read a system spec and check it.
+
+    Args:
+        text: TOML.
+        file: Name to use in messages.
+
+    Returns:
+        The spec, with every timing value a number.
+
+    Raises:
+        SpecificationError: The text is no TOML, a field is missing, unknown or of the wrong type,
+            or the spec makes no sense.
+    """
+    return check_document(read_document(text, file), file)
+
+
+def read_document(text: str, file: str) -> dict[str, Any]:
+    """Read TOML, unchecked; a byte order mark at its beginning is no part of it.
+
+    Raises:
+        SpecificationError: The text is no TOML.
+    """
+    try:
+        return toml.parse(text)
+    except FileError as error:
+        raise SpecificationError(file, "$", str(error)) from None
+
+
+def check_modules(before: SystemSpec, after: SystemSpec) -> None:
+    """Make sure that a changed system names no module that the system it came from does not.
+
+    A class is imported when it is named, and its module is executed: which ones may be is said by
+    the file that the operator started the system with, and by no message.
+
+    Raises:
+        ValueError: It does; the message names node, field and value.
+    """
+    known = {node.actor.partition(":")[0] for node in before.actors()}
+    for node in after.actors():
+        if node.actor.partition(":")[0] not in known:
+            raise ValueError(f"{node.name}: actor = {node.actor!r}: no actor of the system that "
+                             "was started is in that module; known modules: "
+                             f"{', '.join(sorted(known))}")
+
+
+def check_document(document: dict[str, Any], file: str) -> SystemSpec:
+    """Make a spec of a document, and check it.
+
+    Mechanisms that are disabled, or of which a module is, are checked like all others and then
+    left out; what remains has to make sense as well.
+
+    Raises:
+        SpecificationError: A field is missing, unknown or of the wrong type, or the spec makes no
+            sense.
+    """
+    for path, problem, shown in _find_unwritable(document):
+        raise SpecificationError(file, path, problem, *shown)
+    for key, value in document.items():  # by hand: msgspec gives no path that ends the key here
+        if key not in _known_fields(""):
+            raise _unknown_field(file, f"$.{key}", "", value)
+    for key, most in MAX_ROWS.items():
+        rows = document.get(key, ())
+        if isinstance(rows, list | dict) and len(rows) > most:
+            raise SpecificationError(file, f"$.{key}", f"{len(rows)} of them; at most {most} are "
+                                     "right")
+    _check_orders(document.get("orders", {}), file)
+    try:
+        spec = msgspec.convert(document, SystemSpec)
+    except msgspec.ValidationError as error:
+        raise _explain(error, document, file) from None
+    spec = msgspec.structs.replace(spec, timing=derive_timeouts(spec.mobile, spec.timing))
+    spec = _resolve_timing_names(spec, file)
+    finding = find_nonsense(spec)
+    if finding is None:
+        enabled = spec.without_disabled()
+        finding = find_nonsense_of_rest(enabled) if enabled is not spec else None
+        spec = enabled
+    if finding is not None:
+        raise SpecificationError(file, finding.path, finding.problem, *finding.value)
+    return spec
+
+
+def _find_unwritable(document: dict[str, Any]) -> Iterator[tuple[str, str, tuple[object, ...]]]:
+    """Find nesting without end, and numbers that no time, distance or count is.
+
+    Yields:
+        Path, what is wrong, and the value if it can be shown.
+    """
+    left: list[tuple[object, str, int, bool]] = [(document, "$", 0, False)]
+    while left:
+        value, path, depth, free = left.pop()
+        if depth > toml.MAX_DEPTH:
+            yield "$", f"nested more than {toml.MAX_DEPTH} deep; a spec needs three levels", ()
+            return
+        if isinstance(value, dict) and any(len(key) > toml.MAX_KEY for key in value):
+            yield path, f"a key of more than {toml.MAX_KEY} characters", ()
+            return
+        if isinstance(value, dict):
+            left += [(member, f"{path}.{key}", depth + 1, free or key == "parameters")
+                     for key, member in reversed(value.items())]
+        elif isinstance(value, list):
+            left += [(member, f"{path}[{index}]", depth + 1, free)
+                     for index, member in reversed([*enumerate(value)])]
+        elif isinstance(value, float) and not math.isfinite(value):
+            yield path, "expected a finite number", (value,)
+        elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+            yield path, f"expected an integer of at most {LARGEST_INTEGER}", (value,)
+        elif isinstance(value, int | float) and not free and value and not (
+                SMALLEST <= abs(value) <= LARGEST):
+            yield path, f"out of all proportion; between {SMALLEST:g} and {LARGEST:g} is right", (
+                value,)
+
+
+def _check_orders(orders: object, file: str) -> None:
+    """Check the shape of `[orders.*]` by hand: msgspec cannot name the key of a dict."""
+    if not isinstance(orders, dict):
+        raise SpecificationError(file, "$.orders", "expected a table of orders", orders)
+    for name, relation in orders.items():
+        if not isinstance(relation, dict):
+            raise SpecificationError(file, f"$.orders.{name}", "expected a table, recovery = "
+                                     "[recoveries that it is above]", relation)
+        for upper, lowers in relation.items():
+            if not isinstance(lowers, list) or not all(isinstance(x, str) for x in lowers):
+                raise SpecificationError(file, f"$.orders.{name}.{upper}",
+                                         "expected a list of recovery names", lowers)
+
+
+def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
+    """Replace names of timing values by the values, in `within_s` and in parameters `*_s`."""
+    times = msgspec.structs.asdict(spec.timing)
+
+    def resolve(value: Any, path: str) -> Any:
+        if not isinstance(value, str):
+            return value
+        if value not in times:
+            raise SpecificationError(file, path, "unknown timing value; a number or one of: "
+                                                 f"{', '.join(times)}", value)
+        return times[value]
+
+    def resolve_parameters(parameters: dict[str, Any], path: str) -> dict[str, Any]:
+        return {key: resolve(value, f"{path}.parameters.{key}") if key.endswith("_s") else value
+                for key, value in parameters.items()}
+
+    def resolve_detection(detection: DetectionSpec, path: str) -> DetectionSpec:
+        parameters = resolve_parameters(detection.parameters, path)
+        within_s = resolve(detection.within_s, f"{path}.within_s")
+        if isinstance(within_s, float) and math.isnan(within_s):
+            within_s = parameters.get("timeout_s", within_s)
+        return replace(detection, within_s=within_s, parameters=parameters)
+
+    replace = msgspec.structs.replace
+    return replace(
+        spec,
+        nodes=tuple(
+            replace(node, parameters=resolve_parameters(node.parameters, f"$.node[{index}]"))
+            for index, node in enumerate(spec.nodes)),
+        detections=tuple(resolve_detection(detection, f"$.detection[{index}]")
+                         for index, detection in enumerate(spec.detections)),
+        recoveries=tuple(
+            replace(recovery,
+                    parameters=resolve_parameters(recovery.parameters, f"$.recovery[{index}]"))
+            for index, recovery in enumerate(spec.recoveries)))
+
+
+def _explain(error: msgspec.ValidationError, document: dict[str, Any],
+             file: str) -> SpecificationError:
+    """Turn msgspec's words into ours: add the value, and what is known where names are wrong."""
+    # A problem may quote a key of the file, the path at the end cannot.
+    found = re.fullmatch(r"(?s)(.*) - at `([^`]*)`", str(error))
+    problem, path = (found[1], found[2]) if found else (str(error), "$")
+    steps = re.findall(r"\w+", path)
+    value: Any = document
+    for step in steps:
+        value = value[int(step)] if isinstance(value, list) else value[step]
+    words = [step for step in steps if not step.isdigit()]
+    table, field = ([""] * 2 + words)[-2:]
+
+    missing = re.search(r"missing required field `(\w+)`", problem)
+    if missing:
+        return SpecificationError(file, path, f"required field {missing[1]!r} is missing")
+    if "unknown field `" in problem:
+        key = next(key for key in value if key not in _known_fields(field))
+        return _unknown_field(file, f"{path}.{key}", field, value[key])
+    if (table, field) in ENUMS:
+        known = [member.value for member in ENUMS[table, field]]
+        problem = f"unknown {field}; known: {', '.join(known)}"
+        if field == "against":
+            problem += ", or { within_s = ..., hazard = '...' }"
+    elif field == "gate":
+        problem = "unknown gate; known: 'or', 'and', { at_least = k }"
+    elif "regex" in problem and field == "actor":
+        problem = "expected 'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"
+    elif "regex" in problem:
+        problem = "expected a name: a letter, then letters, digits and underscores"
+    return SpecificationError(file, path, problem.replace("`", ""), value)
+
+
+def _known_fields(table: str) -> list[str]:
+    return [field.encode_name for field in msgspec.structs.fields(TABLES[table])]
+
+
+def _unknown_field(file: str, path: str, table: str, value: object) -> SpecificationError:
+    return SpecificationError(
+        file, path, f"unknown field; known: {', '.join(_known_fields(table))}", value)

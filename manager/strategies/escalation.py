@@ -1,0 +1,99 @@
+"""What follows a recovery that fails.
+
+An alternative that its mechanism names, all of it; else the recovery that its contract names; else
+that of the mechanism above, which is the next barrier on the way to the top event. At the root
+there is nothing above: a last resort that fails stays in force, for releasing it could only make
+things worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable, Mapping
+from itertools import pairwise
+
+import msgspec
+
+from rampart.manager.strategies.arrangement import Arrangement
+from rampart.manager.strategies.decision import Decision
+
+
+def escalate(decision: Decision, failures: Mapping[str, str], arrangement: Arrangement) -> Decision:
+    """Replace failed recoveries in a decision.
+
+    Args:
+        decision: As the strategy took it.
+        failures: Why a recovery counts as failed, by its name.
+        arrangement: Mechanisms with their contracts, and the FTMTree.
+
+    Returns:
+        The decision with other recoveries; each failed one is among the rejected, with the reason
+        and what it escalated to.
+    """
+    recover = arrangement.mechanisms.recover
+    recoveries: dict[str, None] = {}
+    rejected: list[tuple[str, str]] = []
+    for recovery in decision.recoveries:
+        sakes = [name for name in decision.mechanisms if recovery in recover[name]]
+        tried = succession(recovery, sakes or decision.mechanisms, failures, arrangement)
+        recoveries[tried[-1]] = None
+        if len(tried) > 1:
+            recoveries.update(dict.fromkeys(_companions(tried[-1], sakes, failures, arrangement)))
+        rejected.extend((failed, f"failed: {failures[failed]}; escalated to {following}")
+                        for failed, following in pairwise(tried))
+    taken = _compatible(tuple(recoveries), arrangement)
+    rejected.extend((name, "conflicts with the recovery that was escalated to")
+                    for name in recoveries if name not in taken)
+    return msgspec.structs.replace(
+        decision, recoveries=taken, rejected=decision.rejected + tuple(rejected))
+
+
+def succession(recovery: str, sakes: Iterable[str], failures: Container[str],
+               arrangement: Arrangement) -> list[str]:
+    """Return a recovery and its successors up to the first that has not failed."""
+    tree, mechanisms = arrangement.tree, arrangement.mechanisms
+    tried = [recovery]
+    wanting = tuple(sakes)
+    # Above a mechanism that wants its own recovery is its parent; above several of them, none of
+    # which is above the others, is their lowest common dominant itself. So it is above a guard
+    # that is taken for the dominant's sake but is not the dominant's own.
+    closest = tree.lowest_common_dominant(wanting)
+    above = list(reversed(tree.chain(tree.root, closest)))
+    if closest in wanting and recovery in mechanisms.recover[closest]:
+        above.pop(0)
+    alternatives = [name for mechanism in wanting
+                    for way in mechanisms.alternatives(mechanism)
+                    if not any(one in failures for one in way)
+                    for name in way]
+    while tried[-1] in failures:
+        named = mechanisms.contracts[tried[-1]].escalate_to
+        candidates = [*alternatives, *([named] if named else [])]
+        candidates += [name for mechanism in above for name in mechanisms.recover[mechanism]]
+        following = next((name for name in candidates if name not in tried), None)
+        if following is None:
+            break
+        tried.append(following)
+    return tried
+
+
+def _companions(recovery: str, sakes: Iterable[str], failures: Container[str],
+                arrangement: Arrangement) -> tuple[str, ...]:
+    """Return what an alternative runs together with a recovery, itself included; () for none."""
+    ways = (way for mechanism in sakes for way in arrangement.mechanisms.alternatives(mechanism))
+    return next((way for way in ways if recovery in way
+                 and not any(one in failures for one in way)), ())
+
+
+def _compatible(recoveries: tuple[str, ...], arrangement: Arrangement) -> tuple[str, ...]:
+    """Return the recoveries that can run together, those higher in the order first.
+
+    What was escalated to may claim what another recovery of the decision claims.
+    """
+    order = arrangement.order
+    if len(recoveries) < 2:
+        return recoveries
+    taken, mask = set(), 0
+    for name in sorted(recoveries, key=order.number.__getitem__):
+        if arrangement.can_join(name, mask):
+            taken.add(name)
+            mask |= order.bit[name]
+    return tuple(name for name in recoveries if name in taken)

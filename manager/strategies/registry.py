@@ -1,0 +1,123 @@
+"""Strategies by name: from the active mechanisms to the recoveries to run.
+
+A system spec names the strategy it wants. It can be replaced without touching any detection or
+recovery module, which know nothing of each other. Each has a file of its own:
+
+* `safety-first`: the paper's, block by block;
+* `mission-first`: the deepest barrier first, climbing the FTMTree when it takes too long;
+* `simultaneous`: all maximal recoveries that can run together;
+* `guarded-repair`: as safe as each mechanism asks for, with the repairs running beneath.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from functools import lru_cache
+
+from rampart.manager.model.mechanisms import Mechanisms
+from rampart.manager.model.order import PartialOrder, Tree
+from rampart.manager.strategies.arrangement import Arrangement, arrange
+from rampart.manager.strategies.decision import NOTHING_ACTIVE, Decision, Late, Strategy
+from rampart.manager.strategies.guarded_repair import GuardedRepair
+from rampart.manager.strategies.mission_first import MissionFirst
+from rampart.manager.strategies.safety_first import SafetyFirst
+from rampart.manager.strategies.simultaneous import Simultaneous
+
+STRATEGIES: dict[str, Strategy] = {}
+
+MEMORY = 4096
+"""Decisions to remember; seven mechanisms have 128 active sets."""
+
+
+class UnknownStrategyError(ValueError):
+    """No strategy has this name."""
+
+
+def register(strategy: Strategy) -> None:
+    """Make a strategy known under its name.
+
+    Raises:
+        ValueError: The name is taken.
+    """
+    if strategy.name in STRATEGIES:
+        raise ValueError(f"strategy {strategy.name!r} is registered twice")
+    STRATEGIES[strategy.name] = strategy
+
+
+for _strategy in (SafetyFirst(), MissionFirst(), Simultaneous(), GuardedRepair()):
+    register(_strategy)
+
+
+def find_strategy(name: str) -> Strategy:
+    """Return the strategy of that name.
+
+    Raises:
+        UnknownStrategyError: There is none; the message lists those there are.
+    """
+    try:
+        return STRATEGIES[name]
+    except KeyError:
+        raise UnknownStrategyError(
+            f"unknown strategy {name!r}; known: {', '.join(sorted(STRATEGIES))}") from None
+
+
+class Decider:
+    """A strategy applied to an arrangement; pure, so the answer to a known question is known."""
+
+    def __init__(self, strategy: Strategy, arrangement: Arrangement) -> None:
+        self.strategy = strategy
+        self.arrangement = arrangement
+        self._chosen: dict[tuple[tuple[str, ...], Late], Decision] = {}
+        self._decided: dict[tuple[tuple[str, ...], Late], Decision] = {}
+        self._explained: dict[Decision, Decision] = {}
+
+    def choose(self, active: tuple[str, ...], late: Late = frozenset()) -> Decision:
+        """Decide without a certificate; `active` is in declared sequence."""
+        if not active:
+            return NOTHING_ACTIVE
+        question = (active, late if self.strategy.patient else frozenset())
+        decision = self._chosen.get(question)
+        if decision is None:
+            if len(self._chosen) >= MEMORY:
+                self._chosen.clear()
+            decision = self._chosen[question] = self.strategy.choose(
+                active, self.arrangement, question[1])
+        return decision
+
+    def decide(self, active: tuple[str, ...], late: Late = frozenset()) -> Decision:
+        """Decide with a certificate; `active` is in declared sequence."""
+        question = (active, late)
+        decision = self._decided.get(question)
+        if decision is None:
+            if len(self._decided) >= MEMORY:
+                self._decided.clear()
+            decision = self._decided[question] = self.explain(self.choose(active, late))
+        return decision
+
+    def explain(self, decision: Decision) -> Decision:
+        """Return a decision of `choose` with its certificate."""
+        if not decision.active:
+            return decision
+        explained = self._explained.get(decision)
+        if explained is None:
+            if len(self._explained) >= MEMORY:
+                self._explained.clear()
+            explained = self._explained[decision] = self.strategy.explain(
+                decision, self.arrangement)
+        return explained
+
+
+def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,  # noqa: PLR0917
+           order: PartialOrder,
+           strategy: str = "safety-first", late: Collection[str] = ()) -> Decision:
+    """Decide by the strategy of that name, with the certificate.
+
+    Raises:
+        UnknownElementError: `active` names something that is no mechanism.
+        UnknownStrategyError: No such strategy.
+    """
+    decider = _decider(find_strategy(strategy), arrange(mechanisms, tree, order))
+    return decider.decide(mechanisms.sort(active), frozenset(late))
+
+
+_decider = lru_cache(maxsize=64)(Decider)

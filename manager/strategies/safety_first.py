@@ -1,0 +1,95 @@
+"""The paper's strategy (section IV-A, figure 7), block by block."""
+
+from __future__ import annotations
+
+import msgspec
+
+from rampart.manager.strategies.arrangement import Arrangement
+from rampart.manager.strategies.decision import Decision, Late, chains, undominated
+
+
+class SafetyFirst:
+    """The safest reading of what is active.
+
+    1. Only one mechanism is active: its recovery.
+    2. Else one active mechanism dominates all the others in the FTMTree: its recovery.
+    3. Else one of the active mechanisms' recoveries dominates all the others in the RM order:
+       that recovery.
+    4. Else the recovery of the lowest common dominant of the active mechanisms in the FTMTree,
+       which need not be active itself.
+    """
+
+    name = "safety-first"
+    patient = False
+    exclusive = True
+    rules = {
+        1: "it is the only active mechanism",
+        2: "one active mechanism dominates all the others in the FTM tree",
+        3: "one of the recoveries in question is safer than all the others",
+        4: "no mechanism and no recovery dominates, so the lowest common dominant decides",
+    }
+
+    def choose(self, active: tuple[str, ...], arrangement: Arrangement, late: Late  # noqa: ARG002
+               ) -> Decision:
+        """Decide by the four blocks."""
+        tree, recover = arrangement.tree, arrangement.mechanisms.recover
+        ftms, rms = arrangement.masks(active)
+        ftm = tree.greatest_in(ftms)
+        if ftm >= 0:
+            chosen = tree.names[ftm]
+            return Decision(active, 1 if len(active) == 1 else 2, recover[chosen], (chosen,))
+        # Block 3 asks for a recovery that dominates all *others*, and mechanisms may share one:
+        # FTM5 and FTM7 active is {RM4}, a set with no others, which RM4 therefore dominates.
+        # Counting recoveries per mechanism instead (RM4 against RM4) would find no strict
+        # dominance and fall through to block 4: an emergency stop for two crashes that one
+        # respawn cures.
+        taken = _dominating(active, arrangement, rms)
+        if taken:
+            return Decision(active, 3, taken,
+                            tuple(name for name in active if set(recover[name]) & set(taken)))
+        chosen = tree.names[tree.lowest_common_in(ftms)]
+        return Decision(active, 4, recover[chosen], (chosen,))
+
+    def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:
+        """Give the path of dominance, and why the others were rejected."""
+        tree, order = arrangement.tree, arrangement.order
+        recover = arrangement.mechanisms.recover
+        names, taken = decision.active, decision.recoveries
+        if decision.rule == 1:
+            return msgspec.structs.replace(decision, path=names)
+        if decision.rule == 2:
+            chosen = decision.mechanisms[0]
+            return msgspec.structs.replace(
+                decision, path=chains(tree, chosen, names), rejected=tuple(
+                    (recovery, f"{name} is dominated by {chosen}")
+                    for name in names for recovery in recover[name] if recovery not in taken))
+        no_block_2 = undominated(tree, names)
+        candidates = arrangement.demanded(names)
+        if decision.rule == 3:
+            path = tuple(chain for one in taken for chain in chains(
+                order, one, (c for c in candidates if order.is_above(one, c))))
+            return msgspec.structs.replace(
+                decision, path=path or taken, rejected=no_block_2 + tuple(
+                    (name, f"{next(o for o in taken if order.is_above(o, name))} is safer")
+                    for name in candidates if name not in taken))
+        return msgspec.structs.replace(
+            decision, path=chains(tree, decision.mechanisms[0], names),
+            rejected=no_block_2 + tuple(
+                pair for pair in undominated(order, candidates) if pair[0] not in taken))
+
+
+def _dominating(active: tuple[str, ...], arrangement: Arrangement, rms: int) -> tuple[str, ...]:
+    """Return the recoveries of one active mechanism that dominate those of all others, or ()."""
+    order = arrangement.order
+    rm = order.greatest_in(rms)
+    if rm >= 0:
+        return (order.names[rm],)
+    if arrangement.compound:
+        for name in active:
+            way = arrangement.mechanisms.recover[name]
+            reach = order.mask(way)
+            for one in way:
+                reach |= order.below[order.number[one]]
+            if not rms & ~reach:
+                return way
+    return ()

@@ -1,0 +1,64 @@
+"""All that is needed at once: the paper's outlook, "simultaneous recoveries", made precise."""
+
+from __future__ import annotations
+
+import msgspec
+
+from rampart.manager.strategies.arrangement import Arrangement
+from rampart.manager.strategies.decision import Decision, Late, chains
+
+
+class Simultaneous:
+    """Run every maximal recovery, as far as they can run together.
+
+    1. Only one mechanism is active: its recovery.
+    2. Else all recoveries of the active mechanisms that no other of them dominates, if no two of
+       them claim the same resource and none disables what another needs.
+    3. Else the mechanisms whose recoveries are in conflict give way to their lowest common
+       dominant in the FTMTree (block 4 of safety-first, but for them alone), and again rule 2.
+    """
+
+    name = "simultaneous"
+    patient = False
+    exclusive = False
+    rules = {
+        1: "it is the only active mechanism",
+        2: "these are the recoveries that no other dominates, and they can run together",
+        3: "recoveries in conflict give way to that of their lowest common dominant",
+    }
+
+    def choose(self, active: tuple[str, ...], arrangement: Arrangement, late: Late  # noqa: ARG002
+               ) -> Decision:
+        """Decide by the three rules."""
+        tree, order = arrangement.tree, arrangement.order
+        recover = arrangement.mechanisms.recover
+        sakes, rule = active, 1 if len(active) == 1 else 2
+        while True:
+            if len(sakes) == 1:  # all its parts, even if one dominates another
+                return Decision(active, rule, recover[sakes[0]], sakes)
+            maximal = order.maximal_in(arrangement.masks(sakes)[1])
+            mask = order.mask(maximal)
+            clash = order.mask(n for n in maximal if not arrangement.can_join(n, mask))
+            if not clash:
+                mechanisms = tuple(n for n in sakes if arrangement.asks[n] & mask)
+                return Decision(active, rule, maximal, mechanisms)
+            rule = 3
+            involved = tuple(name for name in sakes if arrangement.asks[name] & clash)
+            upper = tree.lowest_common_dominant(involved)
+            sakes = arrangement.mechanisms.sort(
+                (upper, *(n for n in sakes if n != upper and not tree.is_above(upper, n))))
+
+    def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:
+        """Give what dominates what, and why the others were rejected."""
+        tree, order = arrangement.tree, arrangement.order
+        taken = decision.recoveries
+        candidates = arrangement.demanded(decision.active)
+        path = tuple(chain for one in taken for chain in chains(
+            order, one, (c for c in candidates if order.is_above(one, c))))
+        path += tuple(chain for upper in decision.mechanisms if upper not in decision.active
+                      for chain in chains(tree, upper, (
+                          n for n in decision.active if tree.is_above(upper, n))))
+        return msgspec.structs.replace(decision, path=path or taken, rejected=tuple(
+            (name, next((f"{one} is safer" for one in taken if order.is_above(one, name)),
+                        "conflicts with another recovery")) for name in candidates
+            if name not in taken))

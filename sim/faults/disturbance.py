@@ -1,0 +1,96 @@
+"""What a fault on topics is: disturbances of single topics, under a name, for a while.
+
+A disturbance acts in the process that publishes its topic (see `rampart.actors.runtime.injection`), so
+what the rest of the system sees is what a real failure of that node would show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from rampart.actors.osmosis.messages import Injection
+
+
+class UnknownFaultError(ValueError):
+    """No fault of this name; the message is one line and says where the known ones are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """What happens to one topic; the fields are those of `Injection`."""
+
+    topic: str
+    mode: str
+    delay_s: float = 0.0
+    set_fields: Mapping[str, Any] = field(default_factory=dict)
+    ramp_fields: Mapping[str, float] = field(default_factory=dict)
+    keep_ends: tuple[str, ...] = ()
+    add_fields: Mapping[str, float] = field(default_factory=dict)
+    noise_fields: Mapping[str, float] = field(default_factory=dict)
+    share: float = 1.0
+    on_s: float = 0.0
+    off_s: float = 0.0
+    seed: int = 0
+    stamp_s: float = 0.0
+
+    def order(self, injection: str, duration_s: float) -> Injection:
+        """Return the message that orders it, under an id, for simulated seconds."""
+        return Injection(
+            injection, self.topic, self.mode, duration_s, self.delay_s,
+            dict(self.set_fields), dict(self.ramp_fields), self.keep_ends,
+            dict(self.add_fields), dict(self.noise_fields),
+            self.share, self.on_s, self.off_s, self.seed, self.stamp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A named fault.
+
+    Args:
+        name: as typed by the user.
+        title: one line for people.
+        disturbances: what it does.
+        detected_by: detection modules that should see it; empty if none is meant to.
+        duration_s: how long it lasts unless told otherwise, simulated seconds; infinity for ever.
+        group: part of the catalogue that it belongs to.
+    """
+
+    name: str
+    title: str
+    disturbances: tuple[Disturbance, ...]
+    detected_by: tuple[str, ...]
+    duration_s: float
+    group: str = ""
+
+    def orders(self, injection: str, duration_s: float | None = None) -> tuple[Injection, ...]:
+        """Return the injections that make up the fault.
+
+        Args:
+            injection: id; several disturbances get "ID.1", "ID.2" and so on.
+            duration_s: simulated seconds, infinity for permanent; the fault's own if None.
+        """
+        lasts_s = self.duration_s if duration_s is None else duration_s
+        if len(self.disturbances) == 1:
+            return (self.disturbances[0].order(injection, lasts_s),)
+        return tuple(d.order(f"{injection}.{i}", lasts_s)
+                     for i, d in enumerate(self.disturbances, start=1))
+
+    def varied(self, *, share: float | None = None, on_s: float | None = None,
+               off_s: float | None = None, seed: int | None = None) -> Fault:
+        """Return the fault for a share of the messages, intermittent, or with other chance.
+
+        Args:
+            share: probability that a message is affected.
+            on_s: how long an intermittent fault is in force, simulated seconds.
+            off_s: how long it is away in between, simulated seconds.
+            seed: of all that is random; each disturbance gets one of its own. None keeps.
+        """
+        return replace(self, disturbances=tuple(
+            replace(d,
+                    share=d.share if share is None else share,
+                    on_s=d.on_s if on_s is None else on_s,
+                    off_s=d.off_s if off_s is None else off_s,
+                    seed=d.seed if seed is None else seed + i)
+            for i, d in enumerate(self.disturbances)))

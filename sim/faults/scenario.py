@@ -1,0 +1,226 @@
+"""What goes wrong in a run, and when: faults planned for a time or a point of the mission. Pure.
+
+A planned fault is written `FAULT[@WHEN][+DURATION]`:
+
+* FAULT is a name of the catalogue (`rampart inject --list`), `MODE:TOPIC` for any topic,
+  `kill:NODE`, `stop:NODE`, `wedge:NODE` or `slow:NODE[:SECONDS]` for any process,
+  `stuck-wheel[:WHEEL]`, `weak-wheel[:WHEEL[:STRENGTH]]` or `brake-failure[:STRENGTH]` for the
+  actuators, `obstacle-ahead[:METRES]` for the world.
+* WHEN is simulated seconds, or `goalN` for the moment in which goal N of the mission begins,
+  or `goalN:SECONDS` for so long after it. Left out it is 10 s.
+* DURATION is simulated seconds, or `inf` for the rest of the run. Left out it is the fault's own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.messages import ActuatorFault, ActuatorFaultKind, Injection
+from rampart.sim.faults.disturbance import Fault
+from rampart.sim.faults.faults import find_fault
+from rampart.sim.osmosis.robot import WHEEL_NAMES
+
+DEFAULT_AT_S = 10.0
+PROCESS_FAULTS = ("kill", "stop", "wedge", "slow")
+ACTUATOR_FAULTS = ("stuck-wheel", "weak-wheel", "brake-failure")
+OBSTACLE = "obstacle-ahead"
+
+_MAX_DIGITS = 9
+_SLOW_S, _AHEAD_M, _OBSTACLE_RADIUS_M = 0.1, 3.0, 0.4
+_WEAK, _NO_BRAKE = 0.2, 0.0
+_LASTS_S = {"kill": 0.0, "wedge": math.inf, "stop": 5.0, "slow": 10.0, "stuck-wheel": 10.0,
+            "weak-wheel": 10.0, "brake-failure": 30.0, OBSTACLE: math.inf}
+
+
+class ScenarioError(ValueError):
+    """A planned fault that makes no sense; the message is one line."""
+
+
+class PlannedFault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One fault, when it comes, and how long it stays.
+
+    Args:
+        fault: What, as described above, without WHEN and DURATION.
+        at_s: Simulated seconds; after the beginning of `goal`, if there is one.
+        goal: Goal of the mission, counted from 1; 0 for none.
+        duration_s: Simulated seconds; None for the fault's own.
+        share: Of the messages that are affected, for faults of topics.
+        on_s: For an intermittent fault of a topic: in force so long ...
+        off_s: ... and then away so long.
+        seed: Of all that is random in it.
+    """
+
+    fault: str
+    at_s: float = DEFAULT_AT_S
+    goal: int = 0
+    duration_s: float | None = None
+    share: float = 1.0
+    on_s: float = 0.0
+    off_s: float = 0.0
+    seed: int = 0
+
+    def text(self) -> str:
+        """Return it as it is typed; what cannot be typed is put in brackets."""
+        when = f"{self.at_s:g}"
+        if self.goal:
+            when = f"goal{self.goal}:{when}" if self.at_s else f"goal{self.goal}"
+        lasts = "" if self.duration_s is None else f"+{self.duration_s:g}"
+        more = [f"share {self.share:g}"] if self.share < 1 else []
+        if self.on_s or self.off_s:
+            more.append(f"on {self.on_s:g} off {self.off_s:g}")
+        return f"{self.fault}@{when}{lasts}" + (f" [{', '.join(more)}]" if more else "")
+
+
+@dataclass(frozen=True, slots=True)
+class OnTopics:
+    """Orders for the nodes that publish the topics."""
+
+    orders: tuple[Injection, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class OnProcess:
+    """Something done to the process of a node; `pace_s` is for slow."""
+
+    what: str
+    node: str
+    pace_s: float = 0.0
+    duration_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class OnActuators:
+    """An order for the base."""
+
+    order: ActuatorFault
+
+
+@dataclass(frozen=True, slots=True)
+class OnWorld:
+    """An obstacle that appears ahead of the robot, `distance_m` from its centre to its own."""
+
+    distance_m: float
+    radius_m: float
+    duration_s: float
+
+
+Action = OnTopics | OnProcess | OnActuators | OnWorld
+
+
+def parse_fault(text: str) -> PlannedFault:
+    """Read `FAULT[@WHEN][+DURATION]`.
+
+    Raises:
+        ScenarioError: It is not of this form.
+    """
+    rest, plus, lasts = text.strip().partition("+")
+    fault, at, when = rest.partition("@")
+    if not fault:
+        raise ScenarioError(f"fault {text!r}: must be FAULT[@WHEN][+DURATION], e.g. "
+                            "kill:osmosis_control@30 or gps-bias@goal2+5")
+    duration_s = _seconds(text, lasts, "DURATION", infinite=True) if plus else None
+    if not at:
+        return PlannedFault(fault, duration_s=duration_s)
+    if not when.startswith("goal"):
+        return PlannedFault(fault, _seconds(text, when, "WHEN"), duration_s=duration_s)
+    number, colon, after = when.removeprefix("goal").partition(":")
+    if not number.isdecimal() or len(number) > _MAX_DIGITS or int(number) < 1:
+        raise ScenarioError(f"fault {text!r}: goal{number}: goals are counted from 1")
+    return PlannedFault(fault, _seconds(text, after, "WHEN") if colon else 0.0, int(number),
+                        duration_s)
+
+
+def _seconds(text: str, value: str, what: str, *, infinite: bool = False) -> float:
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = math.nan
+    if not seconds >= 0 or (not infinite and math.isinf(seconds)):
+        raise ScenarioError(f"fault {text!r}: {what} {value!r}: must be simulated seconds"
+                            + (", or inf" if infinite else ", or goalN, or goalN:SECONDS"))
+    return seconds
+
+
+def action_of(planned: PlannedFault, injection: str, nodes: Collection[str],
+              known: Sequence[Topic[Any]] = topics.ALL) -> Action:
+    """Return what is to be done.
+
+    Args:
+        planned: The fault.
+        injection: Id under which its effect is reported.
+        nodes: Names of all nodes with a process that a fault may hit.
+        known: All topics of the system, see `system_topics`.
+
+    Raises:
+        ScenarioError: There is no such node, wheel or strength.
+        UnknownFaultError: There is no such fault.
+    """
+    kind, *details = planned.fault.split(":")
+    lasts_s = planned.duration_s
+    if kind not in _LASTS_S:
+        fault: Fault = find_fault(planned.fault, planned.seed, known).varied(
+            share=planned.share, on_s=planned.on_s, off_s=planned.off_s)
+        return OnTopics(fault.orders(injection, lasts_s))
+    lasts_s = _LASTS_S[kind] if lasts_s is None else lasts_s
+    if kind in PROCESS_FAULTS:
+        node = details[0] if details else ""
+        if node not in nodes:
+            raise ScenarioError(f"fault {planned.fault!r}: no node {node!r}; there are: "
+                                f"{', '.join(nodes)}")
+        pace_s = _number(planned, details[1:], _SLOW_S, most=60.0) if kind == "slow" else 0.0
+        return OnProcess(kind, node, pace_s, lasts_s)
+    if kind == OBSTACLE:
+        return OnWorld(_number(planned, details, _AHEAD_M, most=50.0), _OBSTACLE_RADIUS_M, lasts_s)
+    if kind == "brake-failure":
+        return OnActuators(ActuatorFault(
+            injection, ActuatorFaultKind.BRAKE_FAILURE, "", _number(planned, details, _NO_BRAKE),
+            lasts_s))
+    wheel = details[0].replace("-", " ") if details else WHEEL_NAMES[0]
+    if wheel not in WHEEL_NAMES:
+        raise ScenarioError(f"fault {planned.fault!r}: no wheel {wheel!r}; there are: "
+                            f"{', '.join(name.replace(' ', '-') for name in WHEEL_NAMES)}")
+    what = ActuatorFaultKind.STUCK_WHEEL if kind == "stuck-wheel" else ActuatorFaultKind.WEAK_WHEEL
+    return OnActuators(ActuatorFault(
+        injection, what, wheel, _number(planned, details[1:], _WEAK), lasts_s))
+
+
+def _number(planned: PlannedFault, details: Sequence[str], default: float,
+            most: float = 1.0) -> float:
+    if not details:
+        return default
+    try:
+        value = float(details[0])
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= most or len(details) > 1:
+        raise ScenarioError(f"fault {planned.fault!r}: {':'.join(details)!r}: must be one number "
+                            f"between 0 and {most:g}")
+    return value
+
+
+class FaultOutcome(msgspec.Struct, frozen=True):
+    """What became of a planned fault.
+
+    Attributes:
+        fault: As planned, in text.
+        injected_s: When it was injected, simulated seconds; None if its moment never came.
+        affected: How many messages or ticks it changed, or 1 for a process or an obstacle.
+        reason: Why it had no effect, else empty.
+    """
+
+    fault: str
+    injected_s: float | None = None
+    affected: int = 0
+    reason: str = ""
+
+    @property
+    def effective(self) -> bool:
+        """Whether it changed anything."""
+        return self.affected > 0

@@ -1,0 +1,1 @@
+"""The world of Osmosis in MuJoCo: Summit XL, sensors, judge, report."""

@@ -1,0 +1,217 @@
+"""A picture of the robot from behind and above, for the operator's page; a program of its own.
+
+It is run as `python -m rampart.sim.osmosis.camera`, by whoever shows the picture, and reads from standard input:
+one line that says what to build, then one line for each picture that is wanted. It answers each
+with the picture, a JPEG behind its length in four bytes (big-endian). So it renders only what is
+asked for, no faster than it is read, and ends when its input does.
+
+It has a scene of its own and follows what the controller believes: published pose and obstacles.
+The physics never waits for it. It runs at the lowest priority, and where nothing can be rendered
+(no EGL) it says why on standard error, in one line, and ends with exit code 1.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import io
+import math
+import os
+import signal
+import struct
+import sys
+from typing import Any
+
+import msgspec
+import mujoco
+import numpy as np
+import shapely
+from PIL import Image, ImageDraw
+
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.airport.model import Airport
+from rampart.sim.osmosis.scene import Scene, Solid, WorldError
+
+PIXELS_PER_M = 10
+MAX_PIXELS = 8192
+"""Longer side of the ground's picture; of an airport too large for it there are fewer a metre."""
+
+MARGIN_M = 30.0
+"""Grass that is drawn round the airport."""
+
+_GRASS, _PAVEMENT, _RUNWAY = (96, 122, 78), (150, 155, 160), (112, 117, 123)
+_LIGHT, _LINE = (255, 244, 200), (210, 190, 90)
+_SKY, _HORIZON = (0.55, 0.72, 0.9), (0.86, 0.91, 0.96)
+_PR_SET_PDEATHSIG = 1
+_JPEG_QUALITY = 72
+
+
+class Order(msgspec.Struct, forbid_unknown_fields=True):
+    """The first line: which airport, and how large the pictures are."""
+
+    airport: str
+    width: int = 416
+    height: int = 260
+
+
+class View(msgspec.Struct, forbid_unknown_fields=True):
+    """A line that asks for a picture: the pose, and obstacles as (name, x, y, radius) in `map`.
+
+    Numbers that are not finite come as null: JSON has no other way to say them.
+    """
+
+    x_m: float | None
+    y_m: float | None
+    yaw_rad: float | None
+    obstacles: tuple[tuple[str, float | None, float | None, float | None], ...] = ()
+
+
+class Camera:
+    """Renders an airport.
+
+    Raises:
+        Exception: whatever MuJoCo raises where nothing can be rendered.
+    """
+
+    def __init__(self, airport: Airport, width: int, height: int) -> None:
+        self._scene = Scene(airport, lambda spec: dress(spec, airport))
+        self._renderer = mujoco.Renderer(self._scene.model, height, width)
+        self._camera = mujoco.MjvCamera()
+        self._camera.distance, self._camera.elevation = 4.6, -22.0
+        self._options = mujoco.MjvOption()
+        self._options.geomgroup[:] = (1, 1, 1, 1, 0, 0)  # obstacles that are not there are in 4
+
+    def picture(self, view: View) -> bytes:
+        """Return a JPEG of what there is to see; NaN poses are taken for the last one."""
+        scene = self._scene
+        x_m, y_m, yaw_rad = map(_number, (view.x_m, view.y_m, view.yaw_rad))
+        if all(map(math.isfinite, (x_m, y_m, yaw_rad))):
+            scene.data.qpos[0:2] = x_m, y_m
+            scene.data.qpos[3:7] = math.cos(yaw_rad / 2), 0, 0, math.sin(yaw_rad / 2)
+            ahead = 1.2
+            self._camera.lookat[:] = (x_m + ahead * math.cos(yaw_rad),
+                                      y_m + ahead * math.sin(yaw_rad), 0.3)
+            self._camera.azimuth = math.degrees(yaw_rad)
+        self._put(view.obstacles)
+        mujoco.mj_forward(scene.model, scene.data)
+        self._renderer.update_scene(scene.data, self._camera, self._options)
+        out = io.BytesIO()
+        Image.fromarray(self._renderer.render()).save(out, "JPEG", quality=_JPEG_QUALITY)
+        return out.getvalue()
+
+    def _put(
+        self, obstacles: tuple[tuple[str, float | None, float | None, float | None], ...]
+    ) -> None:
+        wanted = {name: (_number(x), _number(y), _number(r)) for name, x, y, r in obstacles}
+        for name in [n for n in self._scene.present if n not in wanted]:
+            self._scene.remove(name)
+        for name, (x, y, r) in wanted.items():
+            there = self._scene.present.get(name)
+            if there is None or (there.x_m, there.y_m, there.radius_m) != (x, y, r):
+                preset = self._scene.preset(name)
+                try:
+                    self._scene.put(Solid(name, preset.shape if preset else "cylinder", x, y, r),
+                                    shapely.Polygon())
+                except WorldError:
+                    continue  # one too many, or one that makes no sense: the others are shown
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def dress(spec: Any, airport: Airport) -> None:
+    """Give a model what makes it worth looking at: ground, sky, light, colours."""
+    x0, y0, x1, y1 = _extent(airport)
+    ground = spec.add_texture(
+        name="ground", type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
+    image = ground_image(airport)
+    ground.width, ground.height = image.size
+    ground.data = np.asarray(image, dtype=np.uint8).tobytes()
+    spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+                     builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, width=64, height=64,
+                     rgb1=list(_SKY), rgb2=list(_HORIZON))
+    material = spec.add_material(name="ground", reflectance=0.0)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
+    floor = spec.geom("floor")
+    floor.material = "ground"
+    floor.size = [(x1 - x0) / 2, (y1 - y0) / 2, 1]
+    floor.pos = [(x0 + x1) / 2, (y0 + y1) / 2, 0]
+    spec.worldbody.add_light(
+        pos=[(x0 + x1) / 2, (y0 + y1) / 2, 60], dir=[0.3, 0.2, -1],
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False,
+        diffuse=[0.75, 0.75, 0.72], ambient=[0.3, 0.3, 0.32])
+    spec.geom("chassis").rgba = [0.16, 0.17, 0.2, 1]
+    for geom in spec.geoms:
+        if geom.name.startswith("obstacle/"):
+            geom.rgba = [0.86, 0.42, 0.1, 1]
+        elif geom.name.startswith("building/"):
+            geom.rgba = [0.62, 0.64, 0.68, 1]
+        elif geom.name.startswith(("front_", "rear_")):
+            geom.rgba = [0.06, 0.06, 0.07, 1]
+    spec.visual.map.zfar = 60.0
+    spec.visual.quality.shadowsize = 0
+    spec.visual.quality.offsamples = 2
+
+
+def ground_image(airport: Airport) -> Image.Image:
+    """Return the ground from above, north up: grass, pavement, graph and lights."""
+    x0, y0, x1, y1 = _extent(airport)
+    pixels_per_m = min(PIXELS_PER_M, MAX_PIXELS / max(x1 - x0, y1 - y0))
+    image = Image.new(
+        "RGB", (round((x1 - x0) * pixels_per_m), round((y1 - y0) * pixels_per_m)), _GRASS)
+    pen = ImageDraw.Draw(image)
+
+    def at(x: float, y: float) -> tuple[float, float]:
+        return (x - x0) * pixels_per_m, (y1 - y) * pixels_per_m
+
+    def fill(shape: Any, colour: tuple[int, int, int]) -> None:
+        for part in shapely.get_parts(shape):
+            if part.geom_type == "Polygon" and not part.is_empty:
+                mask = Image.new("1", image.size)  # what lies in a hole stays as it is
+                mask_pen = ImageDraw.Draw(mask)
+                mask_pen.polygon([at(x, y) for x, y in part.exterior.coords], 1)
+                for hole in part.interiors:
+                    mask_pen.polygon([at(x, y) for x, y in hole.coords], 0)
+                image.paste(colour, mask=mask)
+
+    for surface in sorted(airport.surfaces, key=lambda s: s.kind == "runway"):
+        fill(surface.polygon, _RUNWAY if surface.kind == "runway" else _PAVEMENT)
+    fill(airport.prohibited_polygon(0.0), _GRASS)
+    for a, b in airport.edges:
+        pen.line([at(*airport.nodes[a]), at(*airport.nodes[b])], _LINE, 2)
+    for light in airport.lights:
+        x, y = at(light.x_m, light.y_m)
+        pen.ellipse((x - 3, y - 3, x + 3, y + 3), _LIGHT, (60, 60, 60))
+    return image
+
+
+def _extent(airport: Airport) -> tuple[float, float, float, float]:
+    x0, y0, x1, y1 = airport.bounds_m
+    return x0 - MARGIN_M, y0 - MARGIN_M, x1 + MARGIN_M, y1 + MARGIN_M
+
+
+def main() -> int:
+    """Read lines, write pictures, until there are no more lines."""
+    # Whoever started it may be killed at any moment; a hung driver would not see the pipe close.
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    os.nice(19)
+    source, out = sys.stdin.buffer, sys.stdout.buffer
+    try:
+        order = msgspec.json.decode(source.readline(), type=Order)
+        camera = Camera(load_airport(order.airport), order.width, order.height)
+        decoder = msgspec.json.Decoder(View)
+        for line in source:
+            picture = camera.picture(decoder.decode(line))
+            out.write(struct.pack(">I", len(picture)) + picture)
+            out.flush()
+    except (BrokenPipeError, KeyboardInterrupt):
+        return 0
+    except Exception as error:  # the last stop before the exit code
+        words = " ".join(str(error).split()) or "no reason given"
+        print(f"{type(error).__name__}: {words}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

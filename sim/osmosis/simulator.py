@@ -1,0 +1,268 @@
+"""The simulator actor: stands behind the Summit XL layer's keys, as a real robot's driver would.
+
+It alone knows ground truth, which it publishes on `world/` for the judge and the tests.
+One timer of 20 ms steps the physics to the clock's time and publishes whatever has become due
+on the way, each message with the stamp of its reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rampart.actors.bus.bounds import clip
+from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm.holders import Holders
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_world
+from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.timer import Timer
+from rampart.manager.spec.schema import SystemSpec
+from rampart.sim.osmosis.scene import WorldError
+from rampart.sim.osmosis.schedule import Schedule
+from rampart.sim.osmosis.sensors import LaserSpec
+from rampart.sim.osmosis.world import World
+
+WAKE_UP_S = 0.02
+DEAD_MAN_TIMEOUT_S = 0.4
+MAX_CATCH_UP_S = 1.0
+
+_JOBS = (
+    topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE, topics.SCAN, topics.UPPER_SCAN,
+    topics.LIGHT, topics.GPS, topics.BASE_STATUS, topics.TRUTH, topics.OBSTACLES,
+)  # fmt: skip
+
+
+class Simulator(Actor):
+    """Runs the `World` on the actor's clock.
+
+    Parameters (all optional): `seed`; `obstacles`, number of presets that take part;
+    `dead_man`, False switches it off; `dead_man_timeout_s`; `laser_range_m`; `laser_rays`;
+    `upper_laser`, True for a robot with a second one.
+    Shared: `airport`; `world` (`rampart.actors.osmosis.airport.world.WorldTruth`), read from the airport's file if absent.
+    """
+
+    outputs = (*_JOBS, topics.HOLDS)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        parameters = self.parameters
+        self._airport: Airport = context.shared["airport"]
+        self._laser = LaserSpec(
+            rays=int(parameters.get("laser_rays", 181)),
+            range_max_m=float(parameters.get("laser_range_m", 8.0)),
+        )
+        timeout_s = float(parameters.get("dead_man_timeout_s", DEAD_MAN_TIMEOUT_S))
+        self._dead_man_s = timeout_s if parameters.get("dead_man", True) else None
+        self._asked_s = self._skipped_s = 0.0
+        self._real_time_factor = 1.0
+        system: SystemSpec | None = context.shared.get("system")
+        self._brakes: Holders[bool] = Holders(
+            [recovery.name for recovery in system.recoveries] if system else None, True)
+        self._holds_timer: Timer | None = None
+
+    def on_start(self) -> None:
+        """Build the world at the present time."""
+        now_s = self.clock.now()
+        truth = self.context.shared.get("world")
+        if truth is None and self._airport.source:
+            truth = load_world(self._airport.source)
+        self._world = World(
+            self._airport,
+            truth,
+            seed=int(self.parameters.get("seed", 0)),
+            obstacles=int(self.parameters.get("obstacles", 0)),
+            dead_man_timeout_s=self._dead_man_s,
+            laser=self._laser,
+            start_s=now_s,
+            max_catch_up_s=MAX_CATCH_UP_S,
+        )
+        self._asked_s = now_s
+        readings: dict[Topic[Any], Callable[[], Any]] = {
+            topics.IMU: self._imu,
+            topics.ODOMETRY: self._odometry,
+            topics.ABSOLUTE_POSE: self._absolute_pose,
+            topics.SCAN: lambda: self._scan(0),
+            topics.LIGHT: self._light,
+            topics.GPS: self._gps,
+            topics.BASE_STATUS: self._base_status,
+            topics.TRUTH: self._truth,
+            topics.OBSTACLES: self._obstacles,
+        }
+        if self.parameters.get("upper_laser", False):
+            readings[topics.UPPER_SCAN] = lambda: self._scan(1)
+        self._readings = {topic.key: (topic, read) for topic, read in readings.items()}
+        self._schedule = Schedule(
+            {topic.key: topic.rate_hz for topic in _JOBS if topic in readings},
+            now_s, keep_s=MAX_CATCH_UP_S)
+
+    # -- inputs ---------------------------------------------------------------------------------
+
+    @on(topics.BASE_COMMAND)
+    def command(self, message: m.BaseCommand, header: Header) -> None:
+        """Pass a velocity command to the base; it is as fresh as its stamp says."""
+        self._advance()
+        stamp_s = min(header.stamp, self.clock.now())
+        if not self._world.command(message.linear_mps, message.angular_radps, stamp_s):
+            self.report_diagnostic("velocity command", "not finite, refused", header.source)
+
+    @on(topics.BRAKE)
+    def brake(self, message: m.BrakeCommand, header: Header) -> None:
+        """Have the source hold the brake or let go of it; nobody lets go for another."""
+        self._advance()
+        unknown = self._brakes.unknown
+        if message.engaged:
+            self._brakes.hold(header.source, True)
+            if self._brakes.is_unknown(header.source):
+                self.report_diagnostic("brake", f"held by {header.source!r}, no recovery module of "
+                                       "this system; rampart reset lets go", header.source)
+        else:
+            self._brakes.let_go(header.source)
+        self._braked(unknown)
+
+    @on(topics.RESET)
+    def reset(self, message: m.Reset, _header: Header) -> None:
+        """Let go of the brake in the place of a holder that is no recovery module."""
+        self._advance()
+        unknown = self._brakes.unknown
+        if self._brakes.reset(message.recovery):
+            self._braked(unknown)
+
+    def _braked(self, unknown_before: tuple[str, ...]) -> None:
+        self._world.brake(bool(self._brakes))
+        if self._brakes.unknown != unknown_before:
+            self._tell_holds()
+
+    def _tell_holds(self) -> None:
+        """Tell who holds the brake and should not, again and again as long as somebody does."""
+        unknown = self._brakes.unknown
+        self.publish(topics.HOLDS, m.Holds("brake", unknown))
+        if self._holds_timer is not None:
+            self._holds_timer.cancel()
+        self._holds_timer = self.call_later(
+            1.0 / topics.HOLDS.rate_hz, self._tell_holds) if unknown else None
+
+    @on(topics.OBSTACLE)
+    def obstacle(self, message: m.ObstacleCommand, header: Header) -> None:
+        """Put an obstacle into the world or take it away."""
+        self._advance()
+        try:
+            if message.present:
+                self._world.add_obstacle(
+                    message.name, message.x_m, message.y_m, message.radius_m
+                )
+            else:
+                self._world.remove_obstacle(message.name)
+        except WorldError as error:
+            self.report_diagnostic("obstacle", str(error), header.source)
+            return
+        self.publish(topics.OBSTACLES, self._obstacles())
+
+    @on(topics.ACTUATOR_FAULT)
+    def actuator_fault(self, message: m.ActuatorFault, header: Header) -> None:
+        """Put a fault of the actuators in force or end it, and report how it fares.
+
+        Reports go out when it is taken, when it first changes something, and when it is over; a
+        refused one is reported as finished with the reason.
+        """
+        self._advance()
+        try:
+            self._world.order_fault(message)
+        except WorldError as error:
+            self.report_diagnostic("actuator fault", str(error), header.source)
+            self._report_fault(message.injection, 0, finished=True, reason=str(error))
+        self._report_faults()
+
+    # -- time -----------------------------------------------------------------------------------
+
+    @every(WAKE_UP_S)
+    def tick(self) -> None:
+        """Step the physics to now and publish what has become due."""
+        self._advance()
+
+    def _advance(self) -> None:
+        now_s = self.clock.now()
+        for due_s, job in self._schedule.due(now_s):
+            topic, read = self._readings[job]
+            if self.has_readers(topic):
+                self._world.step_to(due_s)
+                self.publish(topic, read(), stamp=due_s)
+        self._world.step_to(now_s)
+        self._report_faults()
+        self._measure_speed(now_s)
+
+    def _report_faults(self) -> None:
+        for news in self._world.fault_news():
+            self._report_fault(news.injection, news.affected_ticks, finished=news.finished)
+
+    def _report_fault(
+        self, injection: str, affected: int, *, finished: bool, reason: str = ""
+    ) -> None:
+        report = m.InjectionReport(injection, self.name, affected, finished, clip(reason))
+        self.publish(topics.INJECTION_REPORT, report)
+
+    def _measure_speed(self, now_s: float) -> None:
+        """Over each second, the share of the clock's time that was simulated and not skipped."""
+        asked_s = now_s - self._asked_s
+        if asked_s >= 1.0:
+            skipped_s = self._world.skipped_s - self._skipped_s
+            self._real_time_factor = self.clock.rate * max(0.0, 1.0 - skipped_s / asked_s)
+            self._asked_s, self._skipped_s = now_s, self._world.skipped_s
+
+    # -- readings -------------------------------------------------------------------------------
+
+    def _imu(self) -> m.Imu:
+        r = self._world.imu()
+        return m.Imu(r.yaw_rad, r.yaw_rate_radps, r.accel_x_mps2, r.accel_y_mps2)
+
+    def _odometry(self) -> m.Odometry:
+        r = self._world.odometry()
+        return m.Odometry(m.Pose(r.x_m, r.y_m, r.yaw_rad), m.Twist(r.linear_mps, r.angular_radps))
+
+    def _absolute_pose(self) -> m.Pose:
+        return m.Pose(*self._world.pose)
+
+    def _scan(self, which: int) -> m.LaserScan:
+        ranges = self._world.scan(which).astype(np.dtype("<f4")).tobytes()
+        laser = self._laser
+        return m.LaserScan(
+            laser.angle_min_rad, laser.angle_increment_rad, laser.range_max_m, ranges,
+            self._world.laser_reference(which),
+        )
+
+    def _light(self) -> m.LightSample:
+        return m.LightSample(self._world.light())
+
+    def _gps(self) -> m.GpsFix:
+        r = self._world.gps()
+        return m.GpsFix(r.x_m, r.y_m, r.velocity_x_mps, r.velocity_y_mps, r.accuracy_m)
+
+    def _base_status(self) -> m.BaseStatus:
+        r = self._world.base_state()
+        return m.BaseStatus(
+            r.brake_engaged, r.dead_man_tripped, r.command_age_s, r.wheel_speeds_radps
+        )
+
+    def _truth(self) -> m.GroundTruth:
+        t = self._world.truth()
+        return m.GroundTruth(
+            pose=m.Pose(t.x_m, t.y_m, t.yaw_rad),
+            twist=m.Twist(t.linear_mps, t.angular_radps),
+            collisions=t.collisions,
+            prohibited_s=t.prohibited_s,
+            obstacle_clearance_m=t.obstacle_clearance_m,
+            prohibited_clearance_m=t.prohibited_clearance_m,
+            real_time_factor=self._real_time_factor,
+        )
+
+    def _obstacles(self) -> m.ObstacleList:
+        return m.ObstacleList(
+            tuple(
+                m.ObstacleCommand(solid.name, True, solid.x_m, solid.y_m, solid.radius_m)
+                for solid in self._world.obstacles
+            )
+        )

@@ -1,0 +1,409 @@
+"""The world: airport, Summit XL, obstacles, and the ground truth about them. Synchronous.
+
+Time is the caller's: `step_to(t)` advances the physics to t. Nothing here reads a clock, so the
+same world runs in real time and, many times faster, on a virtual clock.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import mujoco
+import numpy as np
+import shapely
+
+from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.airport.world import WorldTruth
+from rampart.actors.osmosis.messages import ActuatorFault
+from rampart.sim.osmosis.actuator_faults import ActuatorFaults, FaultNews, motor_of
+from rampart.sim.osmosis.clearance import Clearance, Pose, footprint
+from rampart.sim.osmosis.robot import (
+    CIRCUMRADIUS_M,
+    Drive,
+    DriveLimits,
+    WheelSpeeds,
+    twist_from_wheels,
+)
+from rampart.sim.osmosis.scene import Scene, Solid, WorldError
+from rampart.sim.osmosis.sensors import (
+    Floats,
+    Gps,
+    GpsReading,
+    Imu,
+    ImuReading,
+    Laser,
+    LaserSpec,
+    LightSensor,
+    OdometryReading,
+    WheelOdometry,
+    wrap,
+)
+
+TICK_S = 0.01
+"""The drive electronics' period, and the grain of `step_to`."""
+
+TRUTH_PERIOD_S, CLOSE_TRUTH_PERIOD_S = 0.05, 0.02
+"""Ground truth is examined this often; the second when something is near."""
+
+NEVER_S = 1e6
+"""Age that is reported for a command before the first one."""
+
+NEAR_M = 0.3
+"""Nearer than this, things are looked at more often."""
+
+SAME_CONTACT_S = 0.5
+"""A contact with the same thing after a shorter break is the same collision."""
+
+LOCKED_DAMPING = 300.0
+"""Wheel damping, N m s/rad, of a blocked wheel, braked or stuck: all that moves is the tyre."""
+
+
+class Truth(msgspec.Struct, frozen=True, gc=False):
+    """Ground truth now; counters are cumulative.
+
+    `obstacle_clearance_m` is from the footprint to the nearest obstacle or building
+    (`rampart.sim.osmosis.scene.NOTHING_M` if there is none), `prohibited_clearance_m` from the footprint's nearest
+    corner to the prohibited area, negative in it. Both are exact below 1 m and lower bounds above
+    (see `rampart.sim.osmosis.clearance`).
+    """
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    linear_mps: float
+    angular_radps: float
+    collisions: int
+    prohibited_s: float
+    obstacle_clearance_m: float
+    prohibited_clearance_m: float
+
+
+class BaseState(msgspec.Struct, frozen=True, gc=False):
+    """What the base reports about itself."""
+
+    brake_engaged: bool
+    dead_man_tripped: bool
+    command_age_s: float
+    wheel_speeds_radps: WheelSpeeds
+
+
+class World:
+    """An airport with the robot in it.
+
+    Args:
+        airport: geometry, start pose, obstacle presets.
+        truth: what the lights really give.
+        seed: of all noise; the same seed and calls give the same world, bit for bit.
+        obstacles: how many of the airport's presets take part, the first ones first.
+        dead_man_timeout_s: see `rampart.sim.osmosis.robot.Drive`.
+        limits: of the drive.
+        laser: field of view, range, number of rays.
+        start_s: time at which the world begins.
+        max_catch_up_s: the most that one `step_to` simulates. If the caller was held up longer,
+            the world has stood still meanwhile instead of holding it up further.
+
+    Raises:
+        WorldError: more obstacles asked for than the airport has presets.
+    """
+
+    def __init__(
+        self,
+        airport: Airport,
+        truth: WorldTruth | None = None,
+        seed: int = 0,
+        obstacles: int = 0,
+        *,
+        dead_man_timeout_s: float | None = 0.4,
+        limits: DriveLimits | None = None,
+        laser: LaserSpec | None = None,
+        start_s: float = 0.0,
+        max_catch_up_s: float = 1.0,
+    ) -> None:
+        if not 0 <= obstacles <= len(airport.obstacles):
+            raise WorldError(
+                f"obstacles: {obstacles}: {airport.name} has presets for 0 to "
+                f"{len(airport.obstacles)}"
+            )
+        self.airport = airport
+        self.time_s = start_s
+        self.skipped_s = 0.0
+        self._start_s = start_s
+        self._max_catch_up_s = max_catch_up_s
+        self._scene = Scene(airport)
+        self._model, self._data = self._scene.model, self._scene.data
+        self._steps_per_tick = round(TICK_S / self._model.opt.timestep)
+        self._ticks = 0
+        # Views into MuJoCo's memory, kept because each look-up by name costs as much as a reading.
+        # The free joint of the base comes first: 7 positions, 6 velocities; then the wheels.
+        self._base_q, self._base_v = self._data.qpos[:7], self._data.qvel[:6]
+        self._wheel_q, self._wheel_v = self._data.qpos[7:11], self._data.qvel[6:10]
+        self._servos = self._data.ctrl
+        self._targets: WheelSpeeds | None = None
+        self._damping = self._model.dof_damping[6:10]
+        self._free_damping = self._damping.copy()
+        self._locked = False
+        self._drive = Drive(limits or DriveLimits(), dead_man_timeout_s)
+        self._torque_ranges = self._model.actuator_forcerange
+        self._faults = ActuatorFaults(motor_of(self._model, self._drive.limits))
+        self._faulty = False
+        self.laser = laser or LaserSpec()
+        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5)]
+        self._lasers = (Laser(self.laser, streams[0]), Laser(self.laser, streams[4]))
+        self._echoes: tuple[int, Floats] = (-1, np.empty(0))
+        self._gps = Gps(streams[1])
+        self._imu = Imu(streams[2], self.pose[2], start_s)
+        self._light = LightSensor(airport, truth or WorldTruth(), streams[3])
+        self._odometry = WheelOdometry(self._wheel_angles(), start_s)
+        self._collisions = 0
+        self._contact_s: dict[str, float] = {}
+        self._prohibited_s = 0.0
+        self._near_obstacle = Clearance(lambda pose: self._scene.clearance_m(footprint(pose)))
+        self._near_prohibited = Clearance(self._prohibited_exactly)
+        self._obstacle_clearance_m = math.inf
+        self._prohibited_clearance_m = math.inf
+        self._examined_s = start_s
+        self._examine_at_s = start_s
+        self._waiting = list(airport.obstacles[:obstacles])
+        self._leaving: dict[str, float] = {}
+        self._bring_obstacles()
+        self._examine()
+
+    # -- actuators ------------------------------------------------------------------------------
+
+    def command(
+        self, linear_mps: float, angular_radps: float, stamp_s: float | None = None
+    ) -> bool:
+        """Give the base a velocity command; returns False if it was refused as not finite.
+
+        For the dead man the command is as old as its stamp says; without one it is from now.
+        """
+        stamp_s = self.time_s if stamp_s is None else stamp_s
+        return self._drive.command(linear_mps, angular_radps, stamp_s)
+
+    def brake(self, engaged: bool) -> None:
+        """Engage or release the brake."""
+        self._drive.brake_ordered = engaged
+
+    def order_fault(self, order: ActuatorFault) -> None:
+        """Put a fault of the actuators in force from now on, or end it (duration 0).
+
+        Raises:
+            WorldError: unknown wheel, strength not in 0 to 1, impossible duration, nothing to end.
+        """
+        self._faults.order(order, self.time_s)
+        self._faulty = True
+
+    def fault_news(self) -> list[FaultNews]:
+        """Return what has happened to actuator faults since the last call, oldest first."""
+        return self._faults.take_news()
+
+    # -- time -----------------------------------------------------------------------------------
+
+    def step_to(self, t_s: float) -> None:
+        """Advance to time `t_s` in ticks of 10 ms; a remainder waits for the next call.
+
+        Raises:
+            WorldError: time that is not finite.
+        """
+        if not math.isfinite(t_s):
+            raise WorldError(f"step_to: {t_s}: time must be finite")
+        behind_s = t_s - self.time_s
+        if behind_s > self._max_catch_up_s:
+            skip_s = math.floor((behind_s - self._max_catch_up_s) / TICK_S) * TICK_S
+            self.skipped_s += skip_s
+            self._set_time()
+        while self.time_s + TICK_S <= t_s + 1e-9:
+            self._tick()
+
+    def _set_time(self) -> None:
+        # From a tick count, so that rounding does not add up over a long mission.
+        self.time_s = self._start_s + self.skipped_s + self._ticks * TICK_S
+
+    def _tick(self) -> None:
+        if self._faulty:
+            self._actuate_with_faults()
+        else:
+            targets = self._drive.update(self.time_s, TICK_S)
+            if targets != self._targets:  # MuJoCo keeps them, and to write them is dear
+                self._servos[:] = self._targets = targets
+            if self._drive.locked != self._locked:
+                self._locked = self._drive.locked
+                self._damping[:] = LOCKED_DAMPING if self._locked else self._free_damping
+        mujoco.mj_step(self._model, self._data, self._steps_per_tick)
+        self._ticks += 1
+        self._set_time()
+        if self._data.ncon != 4 or self._obstacle_clearance_m < NEAR_M:
+            self._count_contacts()
+        if self.time_s >= self._examine_at_s - 1e-9:
+            self._bring_obstacles()
+            self._examine()
+
+    def _actuate_with_faults(self) -> None:
+        """Apply the actuator faults; in the tick after the last one this heals the model."""
+        self._faults.expire(self.time_s)
+        self._faulty = bool(self._faults)
+        drive = self._drive
+        drive.brake_share = self._faults.brake_share
+        targets = drive.update(self.time_s, TICK_S)
+        fl, fr, rl, rr = self._wheel_v.tolist()
+        speeds = (fl, fr, rl, rr)
+        actuation = self._faults.actuate(targets, speeds, drive.braking)
+        self._servos[:] = actuation.targets_radps
+        self._targets = None
+        self._torque_ranges[:] = actuation.torques_nm
+        self._locked = drive.locked
+        blocked = np.array(actuation.blocked) | self._locked
+        self._damping[:] = np.where(blocked, LOCKED_DAMPING, self._free_damping)
+        if drive.braking and drive.brake_share < 1:
+            drive.give_way(*twist_from_wheels(speeds))
+
+    # -- sensors --------------------------------------------------------------------------------
+
+    @property
+    def pose(self) -> Pose:
+        """True pose of `base_link` in `map`: x m, y m, yaw rad. Also the absolute localization."""
+        x, y, _, qw, qx, qy, qz = self._base_q.tolist()
+        return x, y, math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+
+    def scan(self, laser: int = 0) -> Floats:
+        """One sweep of a laser, m: 0 is the lower one, 1 the upper one."""
+        # The clearance is from the footprint's edge, the laser in its middle: nothing in range
+        # needs no rays. It may be one look old, in which the robot moves less than the radius.
+        if self._obstacle_clearance_m > self.laser.range_max_m:
+            return np.full(self.laser.rays, self.laser.range_max_m)
+        # Both sweep at the same time, the lower one first: the rays are cast once.
+        if laser == 0 or self._echoes[0] != self._ticks:
+            self._echoes = (
+                self._ticks, self._lasers[0].cast(self._model, self._data, self.pose))
+        return self._lasers[laser].sweep(self._echoes[1])
+
+    def laser_reference(self, laser: int = 0) -> float:
+        """A laser's measurement of the target in its housing, m; one a sweep."""
+        return self._lasers[laser].reference()
+
+    def gps(self) -> GpsReading:
+        """One GPS fix."""
+        x_m, y_m, _ = self.pose
+        vx, vy, *_ = self._base_v.tolist()
+        return self._gps.read(x_m, y_m, vx, vy)
+
+    def imu(self) -> ImuReading:
+        """One IMU reading."""
+        vx, vy, *_ = self._base_v.tolist()
+        return self._imu.read(self.time_s, self.pose[2], vx, vy)
+
+    def odometry(self) -> OdometryReading:
+        """Wheel odometry up to now."""
+        return self._odometry.read(self._wheel_angles(), self.time_s)
+
+    def light(self) -> float:
+        """One reading of the light sensor, lux."""
+        return self._light.read(self.pose)
+
+    def base_state(self) -> BaseState:
+        """Brake, dead man and wheel speeds."""
+        fl, fr, rl, rr = self._wheel_v.tolist()
+        return BaseState(
+            brake_engaged=self._drive.braking,
+            dead_man_tripped=self._drive.dead_man_tripped(self.time_s),
+            command_age_s=max(0.0, min(NEVER_S, self._drive.command_age_s(self.time_s))),
+            wheel_speeds_radps=(fl, fr, rl, rr),
+        )
+
+    def _wheel_angles(self) -> WheelSpeeds:
+        fl, fr, rl, rr = self._wheel_q.tolist()
+        return fl, fr, rl, rr
+
+    # -- obstacles ------------------------------------------------------------------------------
+
+    @property
+    def obstacles(self) -> tuple[Solid, ...]:
+        """Obstacles present."""
+        return tuple(self._scene.present.values())
+
+    def add_obstacle(self, name: str, x_m: float, y_m: float, radius_m: float) -> None:
+        """Make an obstacle appear or move it; a preset's name keeps the preset's shape.
+
+        Raises:
+            WorldError: not finite, out of bounds, on the robot, or too many.
+        """
+        preset = self._scene.preset(name)
+        shape = preset.shape if preset else "cylinder"
+        self._scene.put(Solid(name, shape, x_m, y_m, radius_m), footprint(self.pose))
+        self._waiting = [waiting for waiting in self._waiting if waiting.name != name]
+        self._leaving.pop(name, None)
+        self._look_again()
+
+    def remove_obstacle(self, name: str) -> bool:
+        """Take an obstacle away, or keep a preset from appearing; returns whether it was there."""
+        self._waiting = [waiting for waiting in self._waiting if waiting.name != name]
+        self._leaving.pop(name, None)
+        self._look_again()
+        return self._scene.remove(name)
+
+    def _look_again(self) -> None:
+        """The obstacles have changed: what was known about the distance to them is void."""
+        self._near_obstacle.forget()
+        self._examine_at_s = self.time_s
+
+    def _bring_obstacles(self) -> None:
+        """Let presets appear and go by their time windows."""
+        elapsed_s = self.time_s - self._start_s
+        for name in [name for name, until in self._leaving.items() if elapsed_s >= until]:
+            self.remove_obstacle(name)
+        x_m, y_m, _ = self.pose
+        for preset in list(self._waiting):
+            near_m = preset.appears_within_m
+            if elapsed_s < preset.present_from_s or (
+                near_m is not None and math.dist((x_m, y_m), (preset.x_m, preset.y_m)) > near_m
+            ):
+                continue
+            try:
+                self.add_obstacle(preset.name, preset.x_m, preset.y_m, preset.radius_m)
+            except WorldError:
+                continue  # The robot stands there now: it appears once the place is clear.
+            if preset.gone_after_s is not None:
+                self._leaving[preset.name] = elapsed_s + preset.gone_after_s
+
+    # -- ground truth ---------------------------------------------------------------------------
+
+    def truth(self) -> Truth:
+        """Ground truth; clearances are at most 50 ms old."""
+        x_m, y_m, yaw_rad = self.pose
+        vx, vy, *_ = self._base_v.tolist()
+        return Truth(
+            x_m=x_m,
+            y_m=y_m,
+            yaw_rad=wrap(yaw_rad),
+            linear_mps=vx * math.cos(yaw_rad) + vy * math.sin(yaw_rad),
+            angular_radps=float(self._base_v[5]),
+            collisions=self._collisions,
+            prohibited_s=self._prohibited_s,
+            obstacle_clearance_m=self._obstacle_clearance_m,
+            prohibited_clearance_m=self._prohibited_clearance_m,
+        )
+
+    def _count_contacts(self) -> None:
+        for name in self._scene.touched():
+            last_s = self._contact_s.get(name, -math.inf)
+            if self.time_s - last_s > SAME_CONTACT_S:
+                self._collisions += 1
+            self._contact_s[name] = self.time_s
+
+    def _examine(self) -> None:
+        pose = self.pose
+        self._obstacle_clearance_m = self._near_obstacle.measure(pose)
+        self._prohibited_clearance_m = self._near_prohibited.measure(pose)
+        if self._prohibited_clearance_m <= CIRCUMRADIUS_M and (
+            self.airport.footprint_in_prohibited(footprint(pose))
+        ):
+            self._prohibited_s += self.time_s - self._examined_s
+        near = min(self._obstacle_clearance_m, self._prohibited_clearance_m) < NEAR_M
+        self._examined_s = self.time_s
+        self._examine_at_s = self.time_s + (CLOSE_TRUTH_PERIOD_S if near else TRUTH_PERIOD_S)
+
+    def _prohibited_exactly(self, pose: Pose) -> float:
+        """Distance of the footprint's nearest corner to the prohibited area, m."""
+        corners = shapely.get_coordinates(footprint(pose))[:4]
+        return float(self.airport.prohibited_distances_m(corners).min())

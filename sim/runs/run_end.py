@@ -1,0 +1,124 @@
+"""When is a run over? Pure: fed with what the observer hears, asked once in a while.
+
+A run ends when the mission has ended, when it was lost (the Mission Manager forgot it), or when
+nothing has progressed for the patience of the person who started it; and then when the robot
+stands. One that drives on is looked at for a minute: it may be on its way into the grass. A run
+without a world ends at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from rampart.actors.osmosis.messages import (
+    ControlPhase,
+    ControlStatus,
+    MissionPhase,
+    MissionStatus,
+    Twist,
+)
+
+SETTLE_S = 1.5
+"""After the mission's end the robot gets this long to come to rest, and the records to arrive."""
+
+WATCH_S = 60.0
+"""After the mission's end a robot that does not come to rest is looked at this long."""
+
+STANDING_MPS, STANDING_RADPS = 0.05, 0.1
+"""Slower than this, by ground truth, it stands."""
+
+LOST_AFTER_S = 3.0
+ACCEPT_WITHIN_S = 30.0
+WORLD_SILENT_S = 3.0
+_STEP_TOWARDS_GOAL_M = 0.5
+_WAYS = 10
+"""So many ways round something are followed patiently; who finds more goes to and fro."""
+
+
+@dataclass(slots=True)
+class RunEnd:
+    """Decides the end of one run. Times are simulated seconds.
+
+    Args:
+        patience_s: longest time without progress: no new step, no light measured, not half
+            a metre nearer to the goal, and no way round something that is on the way.
+        waits: whether the mission comes when the operator wants it, however late.
+    """
+
+    patience_s: float
+    waits: bool = False
+    _mission_id: str = ""
+    _progress: tuple[int, int] = (-1, -1)
+    _nearest_m: float = float("inf")
+    _ways: set[str] = field(default_factory=lambda: {""})
+    _progress_at_s: float = 0.0
+    _over_at_s: float | None = None
+    _over: str = ""
+    _lost_at_s: float | None = None
+    _truth_at_s: float | None = None
+    _moves: bool = False
+
+    def mission(self, status: MissionStatus, now_s: float) -> None:
+        """Take the mission's state."""
+        running = status.phase not in (MissionPhase.IDLE,)
+        if self._mission_id and status.mission_id != self._mission_id:
+            self._lost_at_s = self._lost_at_s or now_s
+            return
+        self._lost_at_s = None
+        if not running:
+            return
+        self._mission_id = status.mission_id
+        progress = (status.step, len(status.lights))
+        another_way = status.phase is MissionPhase.RUNNING and status.reason not in self._ways \
+            and len(self._ways) < _WAYS
+        if another_way:
+            self._ways.add(status.reason)
+        if progress != self._progress or another_way:
+            self._progress, self._progress_at_s = progress, now_s
+            self._nearest_m = float("inf")
+        if status.phase in (MissionPhase.SUCCEEDED, MissionPhase.FAILED, MissionPhase.CANCELLED):
+            if self._over_at_s is None:
+                self._over_at_s = now_s
+            self._over = status.reason or f"mission {status.phase.value}"
+
+    def control(self, status: ControlStatus, now_s: float) -> None:
+        """Take the progress along the route; only who follows it knows how far it is."""
+        if status.phase is ControlPhase.FOLLOWING and \
+                status.distance_to_go_m < self._nearest_m - _STEP_TOWARDS_GOAL_M:
+            self._nearest_m, self._progress_at_s = status.distance_to_go_m, now_s
+
+    def truth(self, twist: Twist, now_s: float) -> None:
+        """Note that the world turns, and whether the robot moves in it."""
+        self._truth_at_s = now_s
+        self._moves = (abs(twist.linear_mps) > STANDING_MPS
+                       or abs(twist.angular_radps) > STANDING_RADPS)
+
+    def excuse(self, stall_s: float) -> None:
+        """Do not count a time in which nobody here listened: the launcher itself was stopped."""
+        self._progress_at_s += stall_s
+        if self._truth_at_s is not None:
+            self._truth_at_s += stall_s
+        if self._lost_at_s is not None:
+            self._lost_at_s += stall_s
+
+    def ended(self, now_s: float) -> str | None:
+        """Return why the run is over, or None while it goes on."""
+        if self._truth_at_s is not None and now_s - self._truth_at_s > WORLD_SILENT_S:
+            return "the world is gone: no ground truth from the simulator"
+        why, since_s = self._outcome(now_s)
+        if not why or (self._moves and now_s - since_s < WATCH_S):
+            return None
+        return why
+
+    def _outcome(self, now_s: float) -> tuple[str, float]:
+        """Return what became of the mission, and since when that is certain; "" if it is not."""
+        if self._over_at_s is not None:
+            return (self._over if now_s - self._over_at_s >= SETTLE_S else ""), self._over_at_s
+        if self._lost_at_s is not None and now_s - self._lost_at_s > LOST_AFTER_S:
+            return "mission lost: the Mission Manager came back without it", self._lost_at_s
+        if not self._mission_id and not self.waits and now_s > ACCEPT_WITHIN_S:
+            return f"no mission was accepted within {ACCEPT_WITHIN_S:.0f} s", ACCEPT_WITHIN_S
+        stuck_s = self._progress_at_s + self.patience_s
+        if (self._mission_id or not self.waits) and now_s > stuck_s:
+            return f"no progress for {self.patience_s:.0f} s", stuck_s
+        return "", now_s

@@ -1,0 +1,149 @@
+"""The network of a virtual run: seeded delay, jitter, loss, duplication, reordering.
+
+Zenoh carries the messages of one process to another over one TCP link, so without further ado
+nothing is lost and nothing overtakes; `measured` is that. The other networks are for finding out
+what the controller makes of worse ones.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rampart.sim.virtual.timing import Stock, Timing, drawer, measured
+from rampart.sim.virtual.virtual_bus import Link
+
+__all__ = ["NETWORKS", "NetworkModel", "SeededNetwork", "find_network"]
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkModel:
+    """What a network does to messages.
+
+    Args:
+        name: As typed by the user.
+        title: One line for people.
+        delay: Whether messages take the measured time; else none.
+        extra_s: Added to it, at most: a message is held up by a uniform share of it.
+        loss: Probability that a copy never arrives.
+        duplication: Probability that a second copy arrives.
+        reordering: Probability that a message may be overtaken by those after it.
+    """
+
+    name: str
+    title: str
+    delay: bool = True
+    extra_s: float = 0.0
+    loss: float = 0.0
+    duplication: float = 0.0
+    reordering: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in ("loss", "duplication", "reordering"):
+            if not 0 <= getattr(self, field) <= 1:
+                raise ValueError(f"{field} = {getattr(self, field)}: must be between 0 and 1")
+        if not 0 <= self.extra_s < 60:
+            raise ValueError(f"extra_s = {self.extra_s}: must be between 0 and 60")
+
+
+NETWORKS: Mapping[str, NetworkModel] = {model.name: model for model in (
+    NetworkModel("measured", "as between processes on one machine over Zenoh"),
+    NetworkModel("ideal", "no delay at all", delay=False),
+    NetworkModel("jittery", "up to 20 ms more, in order", extra_s=0.02),
+    NetworkModel("lossy", "as between robots: up to 20 ms more, 1 % lost, 1 % twice, 2 % overtaken",
+                 extra_s=0.02, loss=0.01, duplication=0.01, reordering=0.02),
+)}
+"""Networks by name."""
+
+
+def find_network(name: str) -> NetworkModel:
+    """Return a network by name.
+
+    Raises:
+        ValueError: There is none.
+    """
+    try:
+        return NETWORKS[name]
+    except KeyError:
+        raise ValueError(f"unknown network {name!r}; known: {', '.join(NETWORKS)}") from None
+
+
+class SeededNetwork:
+    """Says when messages arrive; the same seed and the same questions give the same answers.
+
+    Args:
+        model: What it does to messages.
+        seed: Of all its dice.
+        timing: Distribution of the delay; the measured one if None.
+        local: Nodes that share a process with everybody: nothing happens on the way to them.
+    """
+
+    def __init__(self, model: NetworkModel, seed: Any, timing: Timing | None = None,
+                 local: Sequence[str] = ()) -> None:
+        self.model = model
+        self.lost = self.duplicated = self.overtaken = 0
+        self._rng = random.Random(f"network {seed}")  # noqa: S311 no secret
+        delays_ms = (timing or measured()).message_ms
+        self._delay_s = drawer(delays_ms, self._rng)
+        self._stock = Stock(delays_ms, self._rng)
+        self._local = frozenset(local)
+        self._links: dict[tuple[str, str], Link] = {}
+
+    def link(self, source: str, reader: str) -> Link | None:
+        """Return the one link between two nodes; None if everything arrives at once."""
+        if source in self._local or reader in self._local:
+            return None
+        ends = (source, reader)
+        link = self._links.get(ends)
+        if link is None:
+            model = self.model
+            plain = not (model.extra_s or model.loss or model.duplication or model.reordering)
+            link = self._links[ends] = (
+                self._in_order() if plain and model.delay else self._troubled())
+        return link
+
+    def _in_order(self) -> Link:
+        """Return a link that delays messages and does no more: most runs have only these."""
+        fill, delays_s, last_s = self._stock.fill, self._stock.draws_s, 0.0
+
+        def arrivals(now_s: float) -> Sequence[float]:
+            nonlocal last_s
+            if not delays_s:
+                fill()
+            at_s = now_s + delays_s.pop()
+            last_s = at_s if at_s > last_s else last_s
+            return (last_s,)
+
+        return arrivals
+
+    def _troubled(self) -> Link:
+        """Return a link that does to messages whatever the model says."""
+        model, dice, last_s = self.model, self._rng.random, 0.0
+
+        def arrivals(now_s: float) -> Sequence[float]:
+            if model.loss and dice() < model.loss:
+                self.lost += 1
+                return ()
+            if model.duplication and dice() < model.duplication:
+                self.duplicated += 1
+                return (arrival(now_s), arrival(now_s))
+            return (arrival(now_s),)
+
+        def arrival(now_s: float) -> float:
+            nonlocal last_s
+            at_s = now_s
+            if model.delay:
+                at_s += self._delay_s()
+            if model.extra_s:
+                at_s += model.extra_s * dice()
+            if at_s < last_s:
+                if model.reordering and dice() < model.reordering:
+                    self.overtaken += 1
+                    return at_s
+                at_s = last_s
+            last_s = at_s
+            return at_s
+
+        return arrivals

@@ -1,0 +1,178 @@
+"""A bus inside one process, for virtual time and tests: no sockets, no threads.
+
+What lies between two nodes is up to a `Network`: it says when each copy of a message arrives,
+which takes a virtual loop. Without one everything arrives at once, on any loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from rampart.actors.bus.bus import Deliver, PeerChange
+from rampart.actors.bus.topic import Topic
+from rampart.sim.virtual.virtual_loop import VirtualLoop
+
+Tap = Callable[[float, str, str, bytes], None]
+"""Sees each message as it is sent: when by the loop's clock, source, key, payload."""
+
+Link = Callable[[float], Sequence[float]]
+"""Way from one node to another: returns when the copies of a message sent now arrive, if any."""
+
+
+class Network(Protocol):
+    """When messages arrive."""
+
+    def link(self, source: str, reader: str) -> Link | None:
+        """Return the one link between two nodes; None if everything arrives at once."""
+
+
+Route = tuple[Link | None, Deliver, Callable[[Deliver, str, bytes], None]]
+"""The way to a reader, who there takes the message, and its bus's `arrive`, for other loops."""
+
+
+class Hub:
+    """What the buses of one virtual system share: subscriptions and living nodes."""
+
+    def __init__(self, network: Network | None = None) -> None:
+        self.network = network
+        self.taps: list[Tap] = []
+        self.alive: dict[str, set[int]] = {}
+        self._subscriptions: list[tuple[re.Pattern[str], Deliver, VirtualBus]] = []
+        self._routes: dict[str, dict[str, list[Route]]] = {}
+        self._watchers: list[tuple[str, PeerChange, VirtualBus]] = []
+
+    def subscribe(self, expression: str, deliver: Deliver, bus: VirtualBus) -> None:
+        """Have messages on keys that match delivered to a bus."""
+        pattern = re.compile(re.escape(expression).replace(r"\*", "[^/]+"))
+        self._subscriptions.append((pattern, deliver, bus))
+        self._forget_routes()
+
+    def watch(self, node: str, changed: PeerChange, bus: VirtualBus) -> None:
+        """Have the coming and going of a node told to a bus."""
+        self._watchers.append((node, changed, bus))
+
+    def remove(self, bus: VirtualBus) -> None:
+        """Forget a bus."""
+        self._subscriptions = [s for s in self._subscriptions if s[2] is not bus]
+        self._watchers = [w for w in self._watchers if w[2] is not bus]
+        self._forget_routes()
+
+    def routes_from(self, source: str) -> dict[str, list[Route]]:
+        """Return the table of a node's routes by key: always the same object, filled by `route`."""
+        return self._routes.setdefault(source, {})
+
+    def route(self, source: str, key: str) -> list[Route]:
+        """Return the ways from a node to all who hear a key, in the order of subscription."""
+        link = self.network.link if self.network else _at_once
+        found = self.routes_from(source)[key] = [
+            (link(source, bus.node), deliver, bus.arrive)
+            for pattern, deliver, bus in self._subscriptions if pattern.fullmatch(key)]
+        return found
+
+    def _forget_routes(self) -> None:
+        for table in self._routes.values():
+            table.clear()
+
+    def announce(self, node: str, incarnation: int, *, alive: bool) -> None:
+        """Tell the watchers that a node appeared or vanished."""
+        lives = self.alive.setdefault(node, set())
+        if alive:
+            lives.add(incarnation)
+        else:
+            lives.discard(incarnation)
+        for watched, changed, bus in list(self._watchers):
+            if watched == node:
+                bus.soon(lambda c=changed: c(node, incarnation, alive))  # type: ignore[misc]
+
+
+def _at_once(_source: str, _reader: str) -> Link | None:
+    return None
+
+
+class VirtualBus:
+    """One node's access to a `Hub`."""
+
+    bursts = False
+
+    def __init__(self, hub: Hub, node: str, incarnation: int = 1) -> None:
+        self.node = node
+        self._hub = hub
+        self._routes = hub.routes_from(node)
+        self._incarnation = incarnation
+        self._open = False
+        self._readers: list[Deliver] = []
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._virtual: VirtualLoop | None = None
+
+    async def open(self) -> None:
+        """Join the hub."""
+        self._loop = loop = asyncio.get_running_loop()
+        self._virtual = loop if isinstance(loop, VirtualLoop) else None
+        self._open = True
+        self._hub.announce(self.node, self._incarnation, alive=True)
+
+    def soon(self, call: Callable[[], None]) -> None:
+        """Run a call on the event loop after the present one, if this bus is open then."""
+        asyncio.get_running_loop().call_soon(lambda: call() if self._open else None)
+
+    def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:  # noqa: ARG002
+        """Send to all present subscribers of the key."""
+        loop, virtual, hub = self._loop, self._virtual, self._hub
+        if not self._open or loop is None:
+            return
+        now_s = loop.time() if virtual is None else virtual.now_s
+        for tap in hub.taps:
+            tap(now_s, self.node, key, payload)
+        routes = self._routes.get(key)
+        if routes is None:
+            routes = hub.route(self.node, key)
+        for link, deliver, arrive in routes:
+            if virtual is None:
+                loop.call_soon(arrive, deliver, key, payload)
+            elif link is None:
+                virtual.post_at(now_s, deliver, key, payload)
+            else:
+                for at_s in link(now_s):
+                    virtual.post_at(at_s, deliver, key, payload)
+
+    def arrive(self, deliver: Deliver, key: str, payload: bytes) -> None:
+        """Hand a message over, if somebody is still there to take it.
+
+        On a virtual loop nobody asks: `cut` takes back what is posted.
+        """
+        if self._open:
+            deliver(key, payload)
+
+    def has_readers(self, key: str) -> bool:
+        """Whether somebody hears a key now."""
+        routes = self._routes.get(key)
+        return bool(self._hub.route(self.node, key) if routes is None else routes)
+
+    def subscribe(self, topic: Topic[Any], key_expression: str, deliver: Deliver) -> None:  # noqa: ARG002
+        """Have `deliver` called for each message on keys that match; no other bus may have it."""
+        self._readers.append(deliver)
+        self._hub.subscribe(key_expression, deliver, self)
+
+    def watch(self, node: str, changed: PeerChange) -> None:
+        """Have `changed` called now if the node lives, and whenever it appears or vanishes."""
+        self._hub.watch(node, changed, self)
+        for incarnation in sorted(self._hub.alive.get(node, ())):
+            self.soon(lambda i=incarnation: changed(node, i, True))  # type: ignore[misc]
+
+    def cut(self) -> None:
+        """Send and receive nothing any more, as when the process is killed; nobody is told yet."""
+        self._open = False
+        self._hub.remove(self)
+        if self._virtual is not None:
+            self._virtual.withdraw(self._readers)
+        self._readers = []
+
+    async def close(self) -> None:
+        """Leave the hub."""
+        if not self._open:
+            return
+        self.cut()
+        self._hub.announce(self.node, self._incarnation, alive=False)

@@ -1,0 +1,341 @@
+"""The processes of a virtual run: actors as tasks, and what can happen to a process.
+
+Stands in for the kernel, the spawners and the launcher: it forks, kills, stops, wedges and slows
+down, tells the supervisor and the liveliness watchers of a death after the time that was measured
+for it, and brings the supervisor back. The actors, the supervisor included, are the real ones.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
+from typing import Any
+
+from rampart.actors.osmosis.messages import AdaptedSystem, NodeTable
+from rampart.actors.run.run_plan import SUPERVISOR, Layout, adapted_system
+from rampart.actors.runtime.actor import Actor, Context
+from rampart.actors.runtime.checkpoint import (
+    CheckpointStore,
+    MemoryCheckpoints,
+    NoCheckpoints,
+    Shelf,
+)
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.patience import AT_LEISURE, Usage
+from rampart.actors.supervision.processes import Living, SpawnerUnavailableError
+from rampart.sim.virtual.timing import Timing, draw, measured
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+
+FIRST_PID = 1000
+SUPERVISOR_PATIENCE_S = 1.5
+"""A supervisor whose table was not heard for so long is replaced, as by the launcher."""
+
+_PATIENCE_CHECK_S = 0.25
+
+
+class Condition(Enum):
+    """What a process is doing."""
+
+    STARTING = "starting"
+    RUNNING = "running"
+    STOPPED = "stopped"
+    WEDGED = "wedged"
+    ENDED = "ended"
+
+
+class VirtualProcess:
+    """One process: its actors and their tasks."""
+
+    def __init__(self, pid: int, names: tuple[str, ...], incarnation: int) -> None:
+        self.pid = pid
+        self.names = names
+        self.incarnation = incarnation
+        self.condition = Condition.STARTING
+        self.failure: BaseException | None = None
+        self.actors: list[Actor] = []
+        self.buses: list[VirtualBus] = []
+        self.tasks: list[asyncio.Task[None]] = []
+        self.holders: list[Callable[[], None]] = []
+        self.gone = False
+
+
+class _Handle:
+    """The supervisor's hold on a process."""
+
+    def __init__(self, machine: VirtualMachine, process: VirtualProcess,
+                 ended: Callable[[], None]) -> None:
+        self._machine = machine
+        self._process = process
+        self._ended = ended
+        process.holders.append(ended)
+
+    def kill(self) -> None:
+        self._machine.kill_process(self._process)
+
+    def gone(self) -> bool:
+        return self._process.gone
+
+    def stopped(self) -> bool:
+        return self._process.condition is Condition.STOPPED
+
+    def usage(self) -> Usage:
+        return AT_LEISURE
+
+    def ignore(self) -> None:
+        if self._ended in self._process.holders:
+            self._process.holders.remove(self._ended)
+
+    def close(self) -> None:
+        self.ignore()
+
+
+class VirtualMachine:
+    """A machine on a virtual loop; to the supervisor it is `Processes`.
+
+    Args:
+        layout: What to run.
+        shared: Objects that actors share.
+        hub: Where their buses meet.
+        clock: Simulated time; its source is the loop's time.
+        seed: Of the dice for how long things take.
+        timing: Distributions; the measured ones if None.
+
+    Attributes:
+        failures: Actors that ended by an error, with the error.
+        on_restart: Called with the name when the supervisor was brought back.
+        shelves: What the nodes have kept; it outlives their processes.
+    """
+
+    def __init__(self, layout: Layout, shared: Mapping[str, Any], hub: Hub, clock: Clock, *,
+                 seed: Any, timing: Timing | None = None) -> None:
+        self.failures: list[tuple[str, BaseException]] = []
+        self.on_restart: Callable[[str], None] = lambda _name: None
+        self.slow_start_s: dict[str, float] = {}
+        self.shelves: dict[str, Shelf] = {}
+        self._layout = layout
+        self._shared: dict[str, Any] = {**shared, "processes": self}
+        self._hub = hub
+        self._clock = clock
+        self._rng = random.Random(f"processes {seed}")  # noqa: S311 no secret
+        self._timing = timing or measured()
+        self._loop = asyncio.get_running_loop()
+        self._next_pid = FIRST_PID
+        self._processes: dict[int, VirtualProcess] = {}
+        self._slow: dict[str, float] = {}
+        self._known: dict[str, int] = {}
+        self._supervisor = 0
+        self._supervisor_heard_s = 0.0
+        self._down = False
+
+    # -- the launcher's part --------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Start the supervisor, which starts the rest."""
+        self._start_supervisor()
+        self._loop.call_later(_PATIENCE_CHECK_S, self._guard)
+
+    def supervisor_heard(self, table: NodeTable) -> None:
+        """Note that the supervisor lives, and which incarnations it has reached."""
+        self._supervisor_heard_s = self._loop.time()
+        for row in table.nodes:
+            self._known[row.name] = max(self._known.get(row.name, 0), row.incarnation)
+
+    def _start_supervisor(self) -> None:
+        self._supervisor += 1
+        self._shared["known_incarnations"] = dict(self._known)
+        self.fork((SUPERVISOR,), self._supervisor)
+        self._supervisor_heard_s = self._loop.time()
+
+    def _supervisor_back(self) -> None:
+        if not self._down:
+            self._start_supervisor()
+            self.on_restart(SUPERVISOR)
+
+    def _guard(self) -> None:
+        if self._down:
+            return
+        self._loop.call_later(_PATIENCE_CHECK_S, self._guard)
+        if self._loop.time() - self._supervisor_heard_s > SUPERVISOR_PATIENCE_S:
+            self.kill(SUPERVISOR)
+
+    def shut_down(self) -> None:
+        """End everything at once: the run is over."""
+        self._down = True
+        for process in list(self._processes.values()):
+            self._end(process)
+
+    # -- Processes: what the supervisor asks for ------------------------------------------------
+
+    def living(self) -> list[Living]:
+        """Return the processes that are there, the supervisor's own included."""
+        return [Living(p.names, p.pid, p.incarnation) for p in self._processes.values()]
+
+    def fork(self, names: tuple[str, ...], incarnation: int) -> int:
+        """Start a process; its first word comes after the measured time."""
+        if self._down:
+            raise SpawnerUnavailableError("the machine is down")
+        pid = self._next_pid
+        self._next_pid += 1
+        process = self._processes[pid] = VirtualProcess(pid, names, incarnation)
+        for name in names:
+            self._known[name] = max(self._known.get(name, 0), incarnation)
+        delay_s = draw(self._timing.start_ms, self._rng) + max(
+            self.slow_start_s.get(name, 0.0) for name in names)
+        self._loop.call_later(delay_s, self._begin, process)
+        return pid
+
+    def hold(self, pid: int, ended: Callable[[], None]) -> _Handle:
+        """Take hold of a process."""
+        process = self._processes.get(pid)
+        if process is None:
+            raise ProcessLookupError(pid)
+        return _Handle(self, process, ended)
+
+    def adapt(self, adapted: AdaptedSystem) -> None:
+        """Start processes by a changed system from now on."""
+        self._layout, self._shared = adapted_system(self._layout, self._shared, adapted)
+
+    def end(self, handles: Sequence[_Handle], grace_s: float) -> None:  # noqa: ARG002
+        """End processes."""
+        for handle in handles:
+            handle.kill()
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    # -- what can happen to a process -----------------------------------------------------------
+
+    def pid_of(self, node: str) -> int | None:
+        """Return the pid of a node's newest process, or None if it has none."""
+        process = self._process_of(node)
+        return process.pid if process else None
+
+    def condition(self, node: str) -> Condition:
+        """Return what a node's process is doing."""
+        process = self._process_of(node)
+        return process.condition if process else Condition.ENDED
+
+    def kill(self, node: str) -> bool:
+        """SIGKILL; return whether there was somebody to kill."""
+        process = self._process_of(node)
+        if process is not None:
+            self.kill_process(process)
+        return process is not None
+
+    def stop(self, node: str) -> bool:
+        """SIGSTOP."""
+        return self._hold(node, Condition.STOPPED)
+
+    def wedge(self, node: str) -> bool:
+        """Have its event loop turn no more, process and token alive."""
+        return self._hold(node, Condition.WEDGED)
+
+    def resume(self, node: str) -> bool:
+        """SIGCONT; helps a stopped process, not a wedged one."""
+        process = self._process_of(node)
+        if process is None or process.condition is not Condition.STOPPED:
+            return False
+        process.condition = Condition.RUNNING
+        for actor in process.actors:
+            actor.hold(False)
+        return True
+
+    def slow_down(self, node: str, pace_s: float) -> bool:
+        """Have each message take a node so long, its successors included; 0 ends that."""
+        self._slow[node] = pace_s
+        process = self._process_of(node)
+        for name, actor in zip(process.names, process.actors, strict=False) if process else ():
+            if name == node:
+                actor.slow_down(pace_s)
+        return process is not None
+
+    def kill_process(self, process: VirtualProcess) -> None:
+        """End a process, and let it be noticed as fast as a SIGKILL is."""
+        if process.condition is Condition.ENDED:
+            return
+        self._end(process)
+        exit_s = draw(self._timing.exit_ms, self._rng)
+        death_s = draw(self._timing.death_ms, self._rng)
+        self._loop.call_later(exit_s, self._exited, process)
+        if SUPERVISOR in process.names:
+            self._loop.call_later(
+                draw(self._timing.supervisor_back_ms, self._rng), self._supervisor_back)
+        self._loop.call_later(max(death_s, exit_s), self._token_gone, process)
+
+    # -- inside ---------------------------------------------------------------------------------
+
+    def _process_of(self, node: str) -> VirtualProcess | None:
+        return next((p for p in reversed(self._processes.values()) if node in p.names), None)
+
+    def _hold(self, node: str, condition: Condition) -> bool:
+        process = self._process_of(node)
+        if process is None or process.condition is not Condition.RUNNING:
+            return False
+        process.condition = condition
+        for actor in process.actors:
+            actor.hold(True)
+        return True
+
+    def _begin(self, process: VirtualProcess) -> None:
+        if process.condition is not Condition.STARTING:
+            return
+        process.condition = Condition.RUNNING
+        for name in process.names:
+            member = self._layout.members[name]
+            bus = VirtualBus(self._hub, name, process.incarnation)
+            process.buses.append(bus)
+            try:
+                actor = member.actor(Context(
+                    name, process.incarnation, self._clock, bus, member.parameters, self._shared,
+                    process.pid, self._store(name, process.incarnation),
+                    self._layout.spec.timing.heartbeat_period_s, register=self._known.get,
+                    members=frozenset(self._layout.members)))
+            except Exception as error:
+                self._failed(process, name, error)
+                return
+            if self._slow.get(name):
+                actor.slow_down(self._slow[name])
+            process.actors.append(actor)
+            task = self._loop.create_task(actor.run())
+            process.tasks.append(task)
+            task.add_done_callback(
+                lambda done, n=name: self._task_done(process, n, done))  # type: ignore[misc]
+
+    def _store(self, name: str, incarnation: int) -> CheckpointStore:
+        if not self._layout.spec.layers.checkpoints:
+            return NoCheckpoints()
+        return MemoryCheckpoints(self.shelves.setdefault(name, Shelf()), incarnation)
+
+    def _task_done(self, process: VirtualProcess, name: str, task: asyncio.Task[None]) -> None:
+        if process.condition is Condition.ENDED:
+            if not task.cancelled():
+                task.exception()  # it was being killed: nobody reads what it had to say
+            return
+        error = None if task.cancelled() else task.exception()
+        self._failed(process, name, error or RuntimeError("ended by itself"))
+
+    def _failed(self, process: VirtualProcess, name: str, error: BaseException) -> None:
+        self.failures.append((name, error))
+        self.kill_process(process)
+
+    def _end(self, process: VirtualProcess) -> None:
+        process.condition = Condition.ENDED
+        self._processes.pop(process.pid, None)
+        for bus in process.buses:
+            bus.cut()
+        for actor, task in zip(process.actors, process.tasks, strict=False):
+            actor.abandon()
+            task.cancel()
+
+    def _exited(self, process: VirtualProcess) -> None:
+        process.gone = True
+        for ended in list(process.holders):
+            ended()
+        process.holders.clear()
+
+    def _token_gone(self, process: VirtualProcess) -> None:
+        for name in process.names:
+            if process.incarnation in self._hub.alive.get(name, ()):
+                self._hub.announce(name, process.incarnation, alive=False)

@@ -1,0 +1,214 @@
+"""A mission in virtual time: the real actors as tasks on one loop, many times faster than real.
+
+The same seed gives the same run, to the byte: sensors, network, processes and faults draw from
+dice of their own, all seeded from the plan, and time is the loop's. A hash over every message with
+its time of sending, and over whatever happens to processes, is the proof.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import hashlib
+import struct
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis.messages import NodeTable
+from rampart.actors.run.run_plan import OBSERVER, Layout, RunPlan, load_shared
+from rampart.actors.run.system_topics import system_topics
+from rampart.actors.runtime.actor import Actor, Context, Header
+from rampart.manager.spec.schema import SystemSpec
+from rampart.sim.faults.injector import INJECTOR, Injector, can_be_hit
+from rampart.sim.faults.scenario import PlannedFault
+from rampart.sim.osmosis.judge import Verdict
+from rampart.sim.osmosis.report_record import RunRecord
+from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.runs.observer import Observer, Sink
+from rampart.sim.virtual.network import NETWORKS, NetworkModel, SeededNetwork
+from rampart.sim.virtual.virtual_bus import Hub, Tap, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
+from rampart.sim.virtual.virtual_processes import VirtualMachine
+
+LEAD_S = 1.0
+"""Virtual seconds before simulated time 0, in which the processes start."""
+
+_LOOK_S = 0.05
+_CHUNK = 3000
+_HEAD = struct.Struct("<dI").pack
+
+
+@dataclass(frozen=True, slots=True)
+class VirtualResult:
+    """What came of a virtual run.
+
+    Attributes:
+        record: The story of the run.
+        verdict: Of the judge.
+        why: Why it ended.
+        trace: SHA-256 over everything that was sent, in hexadecimal.
+        messages: How many were sent.
+        wall_s: How long it took, without loading.
+        failures: Actors that ended by an error, with the error's text.
+        tracebacks: Of these, as text.
+    """
+
+    record: RunRecord
+    verdict: Verdict
+    why: str
+    trace: str
+    messages: int
+    wall_s: float
+    failures: tuple[tuple[str, str], ...]
+    tracebacks: str
+
+    @property
+    def speed(self) -> float:
+        """Simulated seconds per second."""
+        return (self.record.duration_s + LEAD_S) / self.wall_s if self.wall_s > 0 else 0.0
+
+
+class Trace:
+    """A hash over all messages in the order of sending."""
+
+    def __init__(self) -> None:
+        self.messages = 0
+        self._hash = hashlib.sha256()
+        self._names: dict[tuple[str, str], bytes] = {}
+        self._waiting: list[bytes] = []
+
+    def __call__(self, now_s: float, source: str, key: str, payload: bytes) -> None:
+        """Take one message."""
+        self.messages += 1
+        name = self._names.get((source, key))
+        if name is None:
+            name = self._names[source, key] = f"{source} {key} ".encode()
+        self._waiting += (_HEAD(now_s, len(payload)), name, payload)
+        if len(self._waiting) > _CHUNK:
+            self._flush()
+
+    def _flush(self) -> None:
+        self._hash.update(b"".join(self._waiting))
+        self._waiting.clear()
+
+    def digest(self) -> str:
+        """Return the hash of what was seen so far."""
+        self._flush()
+        return self._hash.hexdigest()
+
+
+def _tap(take: Callable[[float, str, bytes], None], zero_s: float) -> Tap:
+    return lambda now_s, _source, key, payload: take(now_s - zero_s, key, payload)
+
+
+class VirtualRun:
+    """One mission in virtual time. Use: `run`, once.
+
+    Args:
+        plan: What to run; its id, rate and ports do not matter.
+        spec: The system, as `run_plan.load_system` gives it.
+        mission: Judge, end and record.
+        network: What lies between the nodes; as measured if None.
+        scenario: What goes wrong, and when.
+        nodes: That faults may name, whether they run or not; those of the spec if None.
+        taps: Hear each message as it is sent: simulated time, key, payload.
+        shared: What actors share, as `run_plan.load_shared` gives it, perhaps for another seed or
+            number of obstacles; loaded if None.
+
+    Raises:
+        ValueError: an actor class named in the spec cannot be had.
+
+    Attributes:
+        interrupted: Whoever sets it, perhaps from a signal handler, ends the run for this reason.
+    """
+
+    def __init__(self, plan: RunPlan, spec: SystemSpec, mission: MissionRun,
+                 *, network: NetworkModel | None = None, scenario: Sequence[PlannedFault] = (),
+                 nodes: Sequence[str] | None = None,
+                 taps: Sequence[Callable[[float, str, bytes], None]] = (),
+                 shared: Mapping[str, Any] | None = None) -> None:
+        # Nothing that differs from run to run may get into a message.
+        self.plan = msgspec.structs.replace(
+            plan, run_id=f"virtual-{plan.seed}", rate=1.0, hmi_port=0, launcher_pid=1)
+        self.mission = mission
+        self.interrupted: str | None = None
+        self._layout = Layout(self.plan, spec)
+        self._network = network or NETWORKS["measured"]
+        self._scenario = tuple(scenario)
+        self._taps = tuple(taps)
+        self._nodes = can_be_hit(spec) if nodes is None else tuple(nodes)
+        loaded = shared if shared is not None else load_shared(self.plan, spec)
+        self._shared = {
+            **loaded, "system": spec, "plan": self.plan, "run_id": self.plan.run_id,
+            "seed": plan.seed, "obstacles": plan.obstacles, "hmi_port": 0,
+            "joystick": None}
+
+    def run(self) -> VirtualResult:
+        """Run to the end, on a loop of its own."""
+        # What is loaded stays; what a run leaves behind goes without a collector, nearly all of it.
+        gc.collect()
+        gc.freeze()
+        threshold = gc.get_threshold()
+        gc.set_threshold(50_000, 20, 100)
+        try:
+            with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+                return runner.run(self._run())
+        finally:
+            gc.set_threshold(*threshold)
+            gc.unfreeze()
+
+    async def _run(self) -> VirtualResult:
+        begun_s = time.perf_counter()
+        loop = asyncio.get_running_loop()
+        if not isinstance(loop, VirtualLoop):
+            raise TypeError(f"{loop!r}: a virtual run needs a virtual loop")
+        clock = VirtualClock(loop, loop.time() + LEAD_S)
+        hub = Hub(SeededNetwork(self._network, self.plan.seed, local=(OBSERVER, INJECTOR)))
+        trace = Trace()
+        hub.taps.append(trace)
+        hub.taps += [_tap(take, loop.time() + LEAD_S) for take in self._taps]
+        machine = VirtualMachine(self._layout, self._shared, hub, clock, seed=self.plan.seed)
+        machine.on_restart = lambda name: self.mission.brought_back(name, clock.now())
+
+        def to_machine(_topic: Topic[Any], message: Any, _header: Header) -> None:
+            if isinstance(message, NodeTable):
+                machine.supervisor_heard(message)
+
+        sinks: list[Sink] = [to_machine, *self.mission.sinks(clock)]
+        observer = Observer(Context(
+            OBSERVER, 1, clock, VirtualBus(hub, OBSERVER), {}, {"sinks": sinks}, pid=1,
+            members=frozenset(self._layout.members)))
+        actors: list[Actor] = [observer]
+        injector = None
+        if self._scenario:
+            injector = Injector(Context(
+                INJECTOR, 1, clock, VirtualBus(hub, INJECTOR), {},
+                {"scenario": self._scenario, "hand": machine, "nodes": self._nodes,
+                 "topics": system_topics(self._layout.spec)},
+                pid=1, members=frozenset(self._layout.members)))
+            actors.append(injector)
+        watching = [asyncio.create_task(actor.run()) for actor in actors]
+        machine.start()
+        why = None
+        while why is None and not any(task.done() for task in watching):
+            await asyncio.sleep(_LOOK_S)
+            why = self.interrupted or self.mission.over(clock.now())
+        now_s = clock.now()
+        machine.shut_down()
+        for actor in actors:
+            actor.stop()
+        await asyncio.gather(*watching)
+        record = self.mission.conclude(
+            now_s, why or "ended", injector.outcomes() if injector else ())
+        return VirtualResult(
+            record, self.mission.verdict(), why or "ended", trace.digest(), trace.messages,
+            time.perf_counter() - begun_s,
+            tuple((name, f"{type(error).__name__}: {error}") for name, error in machine.failures),
+            "".join(f"--- {name}\n{''.join(traceback.format_exception(error))}"
+                    for name, error in machine.failures))
