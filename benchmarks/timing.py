@@ -144,7 +144,7 @@ def main() -> int:
     options = parser.parse_args()
     found = asyncio.run(measure(options.port, options.kills))
     print("# Measured on real processes by `python -m benchmarks.timing`; milliseconds, evenly\n"
-          "# spaced quantiles from minimum to maximum. See sim/virtual/timing.py for what each one is.")
+          "# spaced quantiles from minimum to maximum. See timing.py beside it for what each is.")
     for name, samples in found.items():
         print(f"\n# {len(samples)} samples\n{name} = {quantiles_ms(samples)}")
     return 0

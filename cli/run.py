@@ -44,9 +44,9 @@ from rampart.sim.osmosis.report_record import RunRecord
 from rampart.sim.runs.console import Console
 from rampart.sim.runs.mission_run import MissionRun, summary
 from rampart.sim.runs.process_run import ProcessRun
+from rampart.sim.runs.virtual_run import LEAD_S, VirtualRun
 from rampart.sim.runs.watched_run import WatchedRun
 from rampart.sim.virtual.network import NETWORKS, find_network
-from rampart.sim.virtual.virtual_run import LEAD_S, VirtualRun
 
 ROOT = Path(__file__).resolve().parents[1]
 LAST_PORT = 32_000

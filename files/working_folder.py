@@ -12,6 +12,8 @@ import stat
 import sys
 from pathlib import Path
 
+import rampart
+
 
 def admit() -> None:
     """Have modules in the working folder found, after all others, if only this user can write it.
@@ -20,6 +22,17 @@ def admit() -> None:
     """
     if not why_not() and (here := str(Path.cwd())) not in sys.path:
         sys.path.append(here)
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of a process of a run: it finds this Rampart, from any folder.
+
+    The mathematical libraries get one thread: there are as many processes as there is work.
+    """
+    found = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    own = str(Path(rampart.__file__).resolve().parents[1])
+    found["PYTHONPATH"] = os.pathsep.join([own, *filter(None, [os.environ.get("PYTHONPATH")])])
+    return found
 
 
 def why_not() -> str:

@@ -7,8 +7,9 @@ in force, show that the manager lives, and let the arbiter notice silence.
 
 One that was killed finds out what is in force from the recovery modules themselves, and adopts it;
 until it knows, it releases nothing. What they cannot tell it has from its checkpoint
-(`rampart.manager.arbitration.arbiter_memory`). That is kept *after* the commands are on their way, unlike elsewhere: an
-emergency stop does not wait for a disk, and what a command says its module knows as well.
+(`rampart.manager.arbitration.arbiter_memory`). That is kept *after* the commands are on their way,
+unlike elsewhere: an emergency stop does not wait for a disk, and what a command says its module
+knows as well.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ from rampart.actors.run.run_plan import RunPlan, load_shared, load_system
 from rampart.actors.runtime.checkpoint import Shelf
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun
 from rampart.sim.virtual.virtual_processes import VirtualMachine
-from rampart.sim.virtual.virtual_run import VirtualResult, VirtualRun
 
 CONTROL = ("mission_manager", "graph_planner", "osmosis_control")
 TRUE_VERDICTS = {"A03": "out", "A06": "dim", "A10": "out", "B02": "dim", "B07": "out", "B09": "dim"}

@@ -63,7 +63,8 @@ class SickManager(Sick, FtmManager):
 
 
 ACTORS = {
-    "osmosis_control": ("rampart.actors.osmosis.control.following.osmosis_control:OsmosisControl", SickControl),
+    "osmosis_control": (
+        "rampart.actors.osmosis.control.following.osmosis_control:OsmosisControl", SickControl),
     "safety_pilot": ("rampart.actors.osmosis.control.pilot.safety_pilot:SafetyPilot", SickPilot),
     "DM2": ("rampart.actors.osmosis.detection.freshness:CommandFreshness", SickModule),
     "ftm_manager": ("rampart.manager.actor:FtmManager", SickManager),

@@ -215,4 +215,5 @@ async def test_the_renderer_starts_when_somebody_looks_and_the_page_says_what_is
 
 
 def test_the_command_of_a_renderer_is_this_python():
-    assert renderer("rampart.sim.osmosis.camera") == (sys.executable, "-m", "rampart.sim.osmosis.camera")
+    module = "rampart.sim.osmosis.camera"
+    assert renderer(module) == (sys.executable, "-m", module)

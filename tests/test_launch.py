@@ -300,7 +300,8 @@ def test_the_paper_s_strategy_leaves_a_dead_node_dead_where_repair_under_guard_r
                      "--shadow", shadow) as run:
             run.wait_for("goal 1/3")
             freeze = subprocess.Popen(
-                [sys.executable, "-m", "rampart.cli.main", "inject", "command-not-updated", "--port",
+                [sys.executable, "-m", "rampart.cli.main", "inject", "command-not-updated",
+                  "--port",
                  str(run.port)], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             try:
                 run.wait_for("for FTM2")

@@ -289,12 +289,14 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
     ("disable", "FTM7", "[]", "Expected `object`"),
     ("disable", "FTM7", "{", "Input data was truncated"),
     ("disable", "FTM1", "{}", "the FTMTree has 3 roots"),
-    ("retune", "DM1", '{"actor": "rampart.actors.osmosis.detection.bounds:Nobody"}', "no such actor class"),
+    ("retune", "DM1", '{"actor": "rampart.actors.osmosis.detection.bounds:Nobody"}',
+     "no such actor class"),
     ("retune", "DM3", '{"actor": "rampart.actors.osmosis.recovery.emergency_stop:EmergencyStop"}',
      "it does not publish detection/{name}, as the modules of this table do"),
     ("retune", "DM3", '{"actor": "rampart.actors.detection.stub:StubDetection"}',
      "no actor of the system that was started is in that module"),
-    ("retune", "RM5", '{"actor": "rampart.actors.osmosis.control.localization.localization:Localization"}',
+    ("retune", "RM5",
+     '{"actor": "rampart.actors.osmosis.control.localization.localization:Localization"}',
      "it does not publish recovery/{name}/state, as the modules of this table do"),
 ])
 def test_what_is_refused_changes_nothing(action, name, values, words):

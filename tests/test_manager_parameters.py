@@ -24,7 +24,8 @@ from rampart.sim.virtual.virtual_bus import VirtualBus
 BASES = {"Freshness", "HoldingRecovery", "PilotRecovery"}
 NODES = ("osmosis_control", "standby_control", "safety_pilot")
 STARTABLE = {"watch": ["osmosis_control"], "nodes": ["osmosis_control"]}
-FOR_THE_ANALYSES = {"rampart.actors.detection.stub:StubDetection": {"timeout_s", "margin_m", "watch"},
+FOR_THE_ANALYSES = {"rampart.actors.detection.stub:StubDetection":
+                        {"timeout_s", "margin_m", "watch"},
                     "rampart.actors.osmosis.detection.freshness:CommandFreshness": {"topic"},
                     "rampart.actors.osmosis.detection.freshness:LocalizationFreshness": {"topic"}}
 VALUES = (-1, 0, 1, 2.5, True, "x", "done", "acting", "safety_pilot", "control/command", [], {},

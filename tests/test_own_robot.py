@@ -12,7 +12,8 @@ import pytest
 from stub_actors import ROOT, free_base_port
 
 PAPER = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
-WORLD = ('[[node]]\nname = "simulator"\nactor = "rampart.sim.osmosis.simulator:Simulator"\nkind = "world"\n'
+WORLD = ('[[node]]\nname = "simulator"\nactor = "rampart.sim.osmosis.simulator:Simulator"\n'
+         'kind = "world"\n'
          'respawn = "supervisor"\n')
 
 
@@ -116,7 +117,8 @@ def test_actors_beside_the_caller_are_found_in_virtual_time_and_tell_where_they_
 
 def test_actors_beside_the_caller_are_found_by_the_toolbox(tmp_path):
     (tmp_path / "own.py").write_text(OWN_ACTOR)
-    (tmp_path / "own.toml").write_text(changed(TANK, ("rampart.actors.ftm.stub_node:StubNode", "own:Own")))
+    (tmp_path / "own.toml").write_text(
+        changed(TANK, ("rampart.actors.ftm.stub_node:StubNode", "own:Own")))
     done = subprocess.run(
         [str(Path(sys.executable).with_name("rampart")), "topic", "list", "--system",
          "own.toml"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -127,7 +129,8 @@ def test_actors_beside_the_caller_are_found_by_the_toolbox(tmp_path):
 @pytest.mark.processes
 def test_a_run_without_a_mission_tells_where_its_tracebacks_are(tmp_path):
     (tmp_path / "own.py").write_text(OWN_ACTOR)
-    (tmp_path / "own.toml").write_text(changed(TANK, ("rampart.actors.ftm.stub_node:StubNode", "own:Own")))
+    (tmp_path / "own.toml").write_text(
+        changed(TANK, ("rampart.actors.ftm.stub_node:StubNode", "own:Own")))
     report = tmp_path / "report"
     done = launched(tmp_path, "--system", "own.toml", "--duration", "2", "--port",
                     str(free_base_port()), "--report", str(report))

@@ -214,7 +214,8 @@ def test_a_launcher_that_has_ended_before_its_recorder_has_begun_leaves_no_recor
     unread, answers = os.pipe()
     os.close(unread)
     order = msgspec.json.encode(Order(port, str(tmp_path / "run.mcap"), dead)).decode()
-    done = subprocess.run([sys.executable, "-m", "rampart.actors.recording.process", order], cwd=ROOT,
+    done = subprocess.run([sys.executable, "-m", "rampart.actors.recording.process", order],
+                          cwd=ROOT,
                           stdout=answers, stderr=subprocess.PIPE, check=False, timeout=60)
     os.close(answers)
     assert (done.returncode, done.stderr) == (0, b"")

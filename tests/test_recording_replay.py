@@ -243,7 +243,8 @@ def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(tmp_path, po
     folder = tmp_path / "folder"
     folder.mkdir()
     verb = subprocess.Popen(
-        [*HEEDS_SIGNALS, sys.executable, "-m", "rampart.cli.main", "replay", str(tmp_path / "run.mcap"),
+        [*HEEDS_SIGNALS, sys.executable, "-m", "rampart.cli.main", "replay",
+         str(tmp_path / "run.mcap"),
          "--loop", "--port", str(port)], cwd=HERE, stdout=subprocess.PIPE, text=True,
         env={**os.environ, "TMPDIR": str(folder)})
     assert "playing" in verb.stdout.readline()

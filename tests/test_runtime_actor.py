@@ -316,12 +316,16 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
     ("rampart.actors.operator.hmi:Hmi", "actors.operator.himi:Hmi",
      "$.node[4].actor = 'actors.operator.himi:Hmi': No module named 'actors.operator.himi'"),
     ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.ftm.stub_node:StubNode",
-     "$.detection[2].actor = 'rampart.actors.ftm.stub_node:StubNode': it does not publish detection/{name}, as "
+     "$.detection[2].actor = 'rampart.actors.ftm.stub_node:StubNode': it does not publish "
+     "detection/{name}, as "
      "the modules of this table do"),
     ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.recovery.stub:StubRecovery",
-     "$.detection[2].actor = 'rampart.actors.recovery.stub:StubRecovery': it does not publish detection/"),
-    ("rampart.actors.osmosis.recovery.controlled_stop:ControlledStop", "rampart.actors.detection.stub:StubDetection",
-     "$.recovery[1].actor = 'rampart.actors.detection.stub:StubDetection': it does not publish recovery/"),
+     "$.detection[2].actor = 'rampart.actors.recovery.stub:StubRecovery': it does not publish "
+     "detection/"),
+    ("rampart.actors.osmosis.recovery.controlled_stop:ControlledStop",
+     "rampart.actors.detection.stub:StubDetection",
+     "$.recovery[1].actor = 'rampart.actors.detection.stub:StubDetection': it does not publish "
+     "recovery/"),
 ])
 def test_a_class_that_is_not_there_or_of_another_table_is_named_with_its_place(
         tmp_path, old, new, message):

@@ -117,7 +117,8 @@ def test_the_worked_example_is_a_sound_system(tmp_path):
     file = tmp_path / "tank.toml"
     file.write_text(EXAMPLE, encoding="utf-8")
     done = subprocess.run(
-        [sys.executable, "-m", "rampart.cli.main", "table", "--system", str(file), "--json"], cwd=ROOT,
+        [sys.executable, "-m", "rampart.cli.main", "table", "--system", str(file), "--json"],
+        cwd=ROOT,
         capture_output=True, text=True, check=True, timeout=30)
     assert [row["rm"] for row in json.loads(done.stdout)] == [
         ["R_SHUT"], ["R_RESTART"], ["R_SHUT", "R_RESTART"]]

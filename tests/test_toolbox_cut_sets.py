@@ -11,7 +11,8 @@ from stub_actors import ROOT
 
 
 def rampart(*arguments: str, cwd=ROOT) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "rampart.cli.main", *arguments], cwd=cwd, check=False,
+    return subprocess.run([sys.executable, "-m", "rampart.cli.main", *arguments], cwd=cwd,
+                          check=False,
                           capture_output=True, text=True, timeout=60)
 
 

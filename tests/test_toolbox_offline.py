@@ -174,7 +174,8 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     (["topic", "echo", "localization/pose", "--duration", "0"], ["--duration 0"]),
 ])
 def test_nonsense_is_refused_in_one_line_that_names_it(capsys, monkeypatch, arguments, words):
-    monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: pytest.fail("looked for a run"))
+    monkeypatch.setattr("rampart.cli.session.find_run",
+                        lambda _port: pytest.fail("looked for a run"))
     monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)
     assert main(arguments) == 2
     captured = capsys.readouterr()

@@ -20,7 +20,7 @@ from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.cli import run as launch
 from rampart.sim.campaign.job import Job, run_job, run_virtually
 from rampart.sim.faults.scenario import PlannedFault, parse_fault
-from rampart.sim.virtual.virtual_run import LEAD_S
+from rampart.sim.runs.virtual_run import LEAD_S
 
 SHORT = parse_fault("kill:mission_manager@6")
 """Loses the mission, so the run is over after ten simulated seconds."""

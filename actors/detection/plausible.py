@@ -2,7 +2,8 @@
 
 A stamp from the future would shut out all honest ones after it and stay fresh for ever. A number
 beyond all measure would overflow in a square, or stay in a sum for good. Localization has the same
-rules in code of its own (`rampart.actors.osmosis.control.plausible`): who checks shares nothing with the checked.
+rules in code of its own (`rampart.actors.osmosis.control.plausible`): who checks shares nothing
+with the checked.
 """
 
 from __future__ import annotations

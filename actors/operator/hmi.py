@@ -58,7 +58,8 @@ class Hmi(Actor):
     "airport" (for the map and its missions), "hmi_port" (0 or None: no page; the parameter `port`
     has precedence), "hmi_host" and "hmi_token" (see `PageServer`), and those of
     `Operating`.
-    Parameters: `camera`, the module that renders the picture of the robot (`rampart.sim.osmosis.camera`), if any.
+    Parameters: `camera`, the module that renders the picture of the robot
+        (`rampart.sim.osmosis.camera`), if any.
     """
 
     outputs = (topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.RESET, *OUTPUTS)

@@ -4,9 +4,9 @@ Header data (source, incarnation, sequence, stamp) is not in these structs: the 
 round them (see `rampart.actors.bus.envelope`). Angles are in (-pi, pi], x forward, y left, yaw
 counter-clockwise. A field named `*_f32` is a little-endian float32 array as bytes.
 
-Every field but a measurement or a command is bounded, by the types of `rampart.actors.bus.bounds`: a
-payload beyond the bounds never reaches an actor. Those that are plain `float` may be anything, NaN
-and infinity included: to judge them is the business of whoever reads them.
+Every field but a measurement or a command is bounded, by the types of `rampart.actors.bus.bounds`:
+a payload beyond the bounds never reaches an actor. Those that are plain `float` may be anything,
+NaN and infinity included: to judge them is the business of whoever reads them.
 """
 
 from __future__ import annotations
@@ -90,7 +90,8 @@ class LaserScan(Message, frozen=True):
     """One sweep of the 2D laser in `base_link`; a range of `range_max_m` means no echo.
 
     `reference_m` is the range to the target in the laser's housing, measured once a sweep, by which
-    it can be checked (`rampart.actors.osmosis.control.pilot.laser_check`); exactly -1 for a device without one.
+    it can be checked (`rampart.actors.osmosis.control.pilot.laser_check`); exactly -1 for a device
+    without one.
     """
 
     angle_min_rad: float
@@ -465,7 +466,7 @@ class DecisionRecord(Message, frozen=True):
 
 
 class AdaptationRequest(Message, frozen=True):
-    """Asks the manager to change a mechanism while running (`rampart.manager.spec.adaptation.Change`).
+    """Asks the manager to change a mechanism while running (`manager.spec.adaptation.Change`).
 
     `values` is a JSON object. The answer carries the same `request`.
     """

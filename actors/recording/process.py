@@ -20,10 +20,9 @@ import setproctitle
 
 from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.recording.recorder import RUN_ENDED, Recorder
-from rampart.files import streams
+from rampart.files import streams, working_folder
 from rampart.files.plain_text import one_line
 
-_ROOT = Path(__file__).resolve().parents[2]
 _READY = "ready"
 _PR_SET_PDEATHSIG = 1
 _START_S, _END_S = 30.0, 10.0
@@ -55,13 +54,11 @@ class RecorderProcess:
         Raises:
             BagError: it cannot begin.
         """
-        environment = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
-        environment["PYTHONPATH"] = os.pathsep.join(
-            [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         self._process = subprocess.Popen(  # noqa: S603 our own interpreter and module
             [sys.executable, "-P", "-m", "rampart.actors.recording.process",
              msgspec.json.encode(self._order).decode()],
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, env=environment)
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
+            env=working_folder.environment())
         assert self._process.stdout is not None  # noqa: S101 for the type checker
         with self._process.stdout as answers:
             if not select.select([answers], [], [], _START_S)[0]:

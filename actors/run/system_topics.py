@@ -1,4 +1,4 @@
-"""All topics of a system: those of `actors/osmosis/topics.py`, and what its actors declare besides."""
+"""All topics of a system: the common ones, and what its actors declare besides."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ _ANY_RUN = RunPlan("", DEFAULT_PORT, rate=1.0, seed=0, system_file="", strategy=
                    mission="", obstacles=0, ftm=True, hmi_port=0)
 """Which keys a system publishes follows from its spec; nothing in the plan of a run matters."""
 
-_SHIPPED = ("actors.", "manager.", "sim.")
+_SHIPPED = "rampart."
 """Where the actors that ship are; that their topics are common is a test's business."""
 
 
 def system_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
     """Return every topic of a system once: the common ones first, then the robot's own.
 
-    The own ones are in the order of the spec. A key of `actors/osmosis/topics.py` keeps its contract.
+    The own ones are in the order of the spec. A key of `actors/osmosis/topics.py` keeps its
+    contract.
 
     Raises:
         ValueError: the spec names an actor class that does not exist, or one of them declares a
@@ -108,5 +109,5 @@ def _flaw(topic: Topic[Any]) -> str:
     if topic.key.count("{name}") > 1:
         return "one {name} at most is right"
     if not (isinstance(topic.type, type) and issubclass(topic.type, msgspec.Struct)):
-        return f"type = {topic.type!r}: must be derived from rampart.actors.osmosis.messages.Message"
+        return f"type = {topic.type!r}: must be derived from rampart.actors.bus.messages.Message"
     return ""

@@ -1,6 +1,7 @@
 """What an actor does about fault injections: takes orders, ends them in time, tells what became.
 
-`rampart.actors.runtime.injection` decides what happens to a message; here are the timers and the reports.
+`rampart.actors.runtime.injection` decides what happens to a message; here are the timers and the
+reports.
 """
 
 from __future__ import annotations

@@ -17,7 +17,6 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import msgspec
 
@@ -38,6 +37,7 @@ from rampart.actors.supervision.spawner_client import (
     SpawnerUnavailableError,
 )
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
+from rampart.files import working_folder
 
 LOAD_TIMEOUT_S = 60.0
 STARTUP_S = (1.0, 5.0)
@@ -47,7 +47,6 @@ long the machine took to load the first process."""
 
 STOP_TIMEOUT_S = 1.2
 _PR_SET_CHILD_SUBREAPER = 36
-_ROOT = Path(__file__).resolve().parents[2]
 
 
 class LaunchError(Exception):
@@ -110,14 +109,11 @@ class Launcher:
         self._first = self._load(NAMES[0])
 
     def _load(self, name: str) -> subprocess.Popen[bytes]:
-        environment = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
-        environment["PYTHONPATH"] = os.pathsep.join(
-            [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         spawner = subprocess.Popen(  # noqa: S603 our own interpreter and module
             [sys.executable, "-P", "-m", "rampart.actors.supervision.spawner", name,
              str(self._lifeline[0])],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[self._lifeline[0]],
-            env=environment, process_group=0)  # see `lifeline`
+            env=working_folder.environment(), process_group=0)  # see `lifeline`
         assert spawner.stdin is not None  # noqa: S101 for the type checker
         with contextlib.suppress(BrokenPipeError):  # it has died: whoever waits for it will notice
             spawner.stdin.write(msgspec.json.encode(self.plan))

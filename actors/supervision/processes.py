@@ -1,7 +1,8 @@
 """What the supervisor can do to processes, and how the kernel does it.
 
 The supervisor decides (who is dead, who is respawned when); this is the mechanism. `Processes` is
-what it asks for; `OsProcesses` is the machine. In virtual time `rampart.sim.virtual.virtual_processes` stands here.
+what it asks for; `OsProcesses` is the machine. In virtual time
+`rampart.sim.virtual.virtual_processes` stands here.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ def markdown(spec: SystemSpec) -> str:
     lines = [
         "# Topics",
         "",
-        "The contract of every Zenoh key. Written from `actors/osmosis/topics.py` and the actor classes "
+        "The contract of every Zenoh key. Written from `actors/osmosis/topics.py` and the actors "
         f"of `systems/{spec.name}.toml` by `rampart topic list --markdown`; a test keeps it true.",
         "",
         f"All keys are below `{ROOT}/`. A payload is a msgpack array `[source, incarnation, "

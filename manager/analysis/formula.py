@@ -1,8 +1,8 @@
 """A fault tree as a Boolean formula, with all the connectives that other tools know.
 
-`rampart.manager.model.fault_tree` is what a system spec can say, coherent and with one top. This is what can be
-analysed: negation, exclusive or, cardinality, house events. Everything is a gate that holds when
-the number of its inputs that hold lies between two bounds, or when it does not.
+`rampart.manager.model.fault_tree` is what a system spec can say, coherent and with one top. This is
+what can be analysed: negation, exclusive or, cardinality, house events. Everything is a gate that
+holds when the number of its inputs that hold lies between two bounds, or when it does not.
 """
 
 from __future__ import annotations

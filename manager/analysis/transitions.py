@@ -3,10 +3,10 @@
 What is explored is the arbiter itself (`Arbiter.step`), in two compositions:
 
 * *one recovery with its module and the bus between them*: the module, as it is specified in
-  `rampart.actors.recovery.module`, obeys, finishes, fails, dies and comes back at any moment. It shows that
-  a module never holds its resources unless the arbiter knows that it may;
-* *several recoveries together*, by what the arbiter knows: anything that modules can report may be
-  reported at any moment. It shows that the arbiter never lets two hold the same resource.
+  `rampart.actors.recovery.module`, obeys, finishes, fails, dies and comes back at any moment. It
+  shows that a module never holds its resources unless the arbiter knows that it may; * *several
+  recoveries together*, by what the arbiter knows: anything that modules can report may be reported
+  at any moment. It shows that the arbiter never lets two hold the same resource.
 
 In both, detection modules change at any moment, a message takes any time or is lost, and any
 deadline may pass. Three reductions keep that finite and small; `docs/verification.md` argues for

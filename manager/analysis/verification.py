@@ -1,8 +1,8 @@
 """Verification of a system's arbitration: every active set, every reachable state.
 
 `verify` puts together what `rampart.manager.analysis.active_sets` finds about decisions and what
-`rampart.manager.analysis.transitions` finds about their execution. What each property means, why it matters, and
-what was found about the paper's strategy is in `docs/verification.md`.
+`rampart.manager.analysis.transitions` finds about their execution. What each property means, why it
+matters, and what was found about the paper's strategy is in `docs/verification.md`.
 """
 
 from __future__ import annotations
@@ -88,7 +88,8 @@ def verify(spec: SystemSpec, strategies: Iterable[str] = (), together: int = 2,
     Args:
         spec: The system.
         strategies: Names; the system's own and all others if none is given.
-        together: How many recoveries to explore at a time; two suffice (`rampart.manager.analysis.transitions`).
+        together: How many recoveries to explore at a time; two suffice
+            (`rampart.manager.analysis.transitions`).
         progress: Told in words what is being done.
 
     Raises:

@@ -34,7 +34,7 @@ import msgspec
 
 
 class DetectionRules(msgspec.Struct, frozen=True):
-    """Times by which belief follows reports, all in seconds; see `rampart.manager.spec.schema.Timing`."""
+    """Times by which belief follows reports, all in seconds; see `schema.Timing`."""
 
     silence_timeout_s: float
     startup_grace_s: float

@@ -54,12 +54,14 @@ _FRESH = {"timeout_s": _above_zero, "hold_s": _amount, "suspects": _list_of_node
 TAKES: dict[str, dict[str, Check]] = {
     "rampart.actors.osmosis.detection.actuator_failure:ActuatorFailure": {
         "wheel_radius_m": _amount, "hold_s": _amount},
-    "rampart.actors.osmosis.detection.bounds:Bounds": {"hold_s": _amount, "suspects": _list_of_nodes},
+    "rampart.actors.osmosis.detection.bounds:Bounds": {
+        "hold_s": _amount, "suspects": _list_of_nodes},
     "rampart.actors.osmosis.detection.command_disagreement:CommandDisagreement": {
         "suspects": _osmosis_and_standby, "linear_mps": _amount, "angular_radps": _amount,
         "linear_s": _amount, "angular_s": _amount, "hold_s": _amount},
     "rampart.actors.osmosis.detection.erroneous_route:ErroneousRoute": {"hold_s": _amount},
-    "rampart.actors.osmosis.detection.area.estimation_error:EstimationError": {"startup_grace_s": _amount},
+    "rampart.actors.osmosis.detection.area.estimation_error:EstimationError": {
+        "startup_grace_s": _amount},
     "rampart.actors.osmosis.detection.freshness:CommandFreshness": {
         **_FRESH, "topic": _one_of("control/command")},
     "rampart.actors.osmosis.detection.freshness:LocalizationFreshness": {
@@ -93,7 +95,8 @@ TAKES: dict[str, dict[str, Check]] = {
 is read by nobody but the analyses: it stands for a module that is not written yet.
 """
 
-NEEDS = {"rampart.actors.detection.watchdog:Watchdog": "watch", "rampart.actors.recovery.respawn:Respawn": "nodes",
+NEEDS = {"rampart.actors.detection.watchdog:Watchdog": "watch",
+         "rampart.actors.recovery.respawn:Respawn": "nodes",
          "rampart.actors.osmosis.recovery.respawn_braked:RespawnBraked": "nodes"}
 """Without this one the module does not start."""
 

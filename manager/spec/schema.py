@@ -24,7 +24,7 @@ from rampart.manager.model.order import PartialOrder, Tree, refine
 
 OptionalName = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z][A-Za-z0-9_]{0,63})?\Z")]
 Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
-"""As long as the address of a node's socket has room for (`rampart.actors.bus.run_folder`), and well
+"""As long as the address of a node's socket has room for (`actors.bus.run_folder`), and well
 below what a message takes as a name (`rampart.actors.bus.bounds`), which may add to it."""
 
 ClassPath = Annotated[str, msgspec.Meta(pattern=r"^[a-z_]\w*(\.[a-z_]\w*)*:[A-Z]\w*\Z")]
@@ -247,7 +247,7 @@ class DetectionSpec(Table, frozen=True):
 
 
 class RecoverySpec(Table, frozen=True):
-    """A recovery module; the contract fields are those of `rampart.manager.model.mechanisms.Contract`."""
+    """A recovery module; the contract fields are those of `mechanisms.Contract`."""
 
     name: Name
     title: str
@@ -290,7 +290,8 @@ class MechanismSpec(Table, frozen=True):
 
     Attributes:
         name: Of the mechanism, e.g. "FTM1".
-        detect: A detection module, or a gate over several; `rampart.manager.model.gates` has the language.
+        detect: A detection module, or a gate over several; `rampart.manager.model.gates` has the
+            language.
         recover: A recovery module, or a gate over several.
         event: Of the fault tree, on which it is a barrier.
         against: What it races.
@@ -410,7 +411,8 @@ class SystemSpec(Table, frozen=True):
         """Build the registry of mechanisms and recovery contracts.
 
         Args:
-            patience_s: How long each mechanism's recovery may take (`rampart.manager.spec.budget.patience_s`).
+            patience_s: How long each mechanism's recovery may take
+                (`rampart.manager.spec.budget.patience_s`).
         """
         return Mechanisms(
             [Mechanism(m.name, m.detect, m.recover, patience_s.get(m.name, math.inf))

@@ -26,8 +26,8 @@ from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.report_record import RunRecord
 from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun
 from rampart.sim.virtual.network import find_network
-from rampart.sim.virtual.virtual_run import VirtualResult, VirtualRun
 
 
 class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -1,7 +1,7 @@
 """What a fault on topics is: disturbances of single topics, under a name, for a while.
 
-A disturbance acts in the process that publishes its topic (see `rampart.actors.runtime.injection`), so
-what the rest of the system sees is what a real failure of that node would show.
+A disturbance acts in the process that publishes its topic (see `rampart.actors.runtime.injection`),
+so what the rest of the system sees is what a real failure of that node would show.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ SENSOR_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in sensor_faul
 """The faults of the sensors."""
 
 CATALOGUE: Mapping[str, Fault] = {**PAPER_FAULTS, **SENSOR_FAULTS}
-"""All faults with a name of their own; `MODE:TOPIC` comes on top (`rampart.sim.faults.topic_faults`)."""
+"""All faults with a name of their own; `MODE:TOPIC` comes on top (`topic_faults`)."""
 
 
 def find_fault(name: str, seed: int = 0, known: Sequence[Topic[Any]] = topics.ALL) -> Fault:

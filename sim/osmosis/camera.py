@@ -1,9 +1,9 @@
 """A picture of the robot from behind and above, for the operator's page; a program of its own.
 
-It is run as `python -m rampart.sim.osmosis.camera`, by whoever shows the picture, and reads from standard input:
-one line that says what to build, then one line for each picture that is wanted. It answers each
-with the picture, a JPEG behind its length in four bytes (big-endian). So it renders only what is
-asked for, no faster than it is read, and ends when its input does.
+It is run as `python -m rampart.sim.osmosis.camera`, by whoever shows the picture, and reads from
+standard input: one line that says what to build, then one line for each picture that is wanted. It
+answers each with the picture, a JPEG behind its length in four bytes (big-endian). So it renders
+only what is asked for, no faster than it is read, and ends when its input does.
 
 It has a scene of its own and follows what the controller believes: published pose and obstacles.
 The physics never waits for it. It runs at the lowest priority, and where nothing can be rendered

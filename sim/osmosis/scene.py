@@ -58,7 +58,8 @@ class Scene:
 
     Args:
         airport: buildings, obstacle presets and the start pose are taken from it.
-        dress: adds to the model what is only to be seen (`rampart.sim.osmosis.camera`), before it is compiled.
+        dress: adds to the model what is only to be seen (`rampart.sim.osmosis.camera`), before it
+            is compiled.
     """
 
     def __init__(

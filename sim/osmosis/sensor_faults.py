@@ -8,9 +8,9 @@
   cannot see it; a frozen *driver*, which repeats old stamps too, is `freeze:TOPIC`.
 
 The magnitudes are those of a device that has failed, ten times and more beyond the noise that
-`rampart.sim.osmosis.sensors` gives a healthy one, and within what the device could report. No receiver notices
-its own error: `accuracy_m` stays what it was. The shipped controller hears neither the odometry
-nor the IMU (`rampart topic info`): these faults change messages there, and no mission.
+`rampart.sim.osmosis.sensors` gives a healthy one, and within what the device could report. No
+receiver notices its own error: `accuracy_m` stays what it was. The shipped controller hears neither
+the odometry nor the IMU (`rampart topic info`): these faults change messages there, and no mission.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ SENSORS = (
             seen_by={"bias": ("DM1",), "drift": ("DM1",), "dropout": ("DM6",)}),
 )
 """The sensors of the robot. Bias of the light sensor: 200 cd at 0.35 m give 1633 lux
-(`rampart.actors.osmosis.airport.photometry`), so 800 lux lift a dead light near the limit of half its intensity."""
+(`rampart.actors.osmosis.airport.photometry`), so 800 lux lift a dead light near the limit of half
+its intensity."""
 
 LEFT_OUT: Mapping[str, str] = {
     "laser-drift": "time of flight is held by a quartz: it drifts by millimetres an hour",

@@ -254,7 +254,7 @@ class WheelOdometry:
 
 
 class LightSensor:
-    """Lux meter over the ground ahead of the robot; formula and place in `rampart.actors.osmosis.airport.photometry`."""
+    """Lux meter over the ground ahead of the robot; formula and place in `airport.photometry`."""
 
     NOISE_SHARE = 0.01
     NOISE_LUX = 0.5

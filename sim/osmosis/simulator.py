@@ -43,7 +43,8 @@ class Simulator(Actor):
     Parameters (all optional): `seed`; `obstacles`, number of presets that take part;
     `dead_man`, False switches it off; `dead_man_timeout_s`; `laser_range_m`; `laser_rays`;
     `upper_laser`, True for a robot with a second one.
-    Shared: `airport`; `world` (`rampart.actors.osmosis.airport.world.WorldTruth`), read from the airport's file if absent.
+    Shared: `airport`; `world` (`rampart.actors.osmosis.airport.world.WorldTruth`), read from the
+        airport's file if absent.
     """
 
     outputs = (*_JOBS, topics.HOLDS)

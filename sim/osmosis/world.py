@@ -63,9 +63,9 @@ class Truth(msgspec.Struct, frozen=True, gc=False):
     """Ground truth now; counters are cumulative.
 
     `obstacle_clearance_m` is from the footprint to the nearest obstacle or building
-    (`rampart.sim.osmosis.scene.NOTHING_M` if there is none), `prohibited_clearance_m` from the footprint's nearest
-    corner to the prohibited area, negative in it. Both are exact below 1 m and lower bounds above
-    (see `rampart.sim.osmosis.clearance`).
+    (`rampart.sim.osmosis.scene.NOTHING_M` if there is none), `prohibited_clearance_m` from the
+    footprint's nearest corner to the prohibited area, negative in it. Both are exact below 1 m and
+    lower bounds above (see `rampart.sim.osmosis.clearance`).
     """
 
     x_m: float

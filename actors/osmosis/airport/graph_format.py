@@ -2,7 +2,8 @@
 
     blagnac.graph      {"nodes": [{"id": "N1", "x": 24, "y": -62}], "edges": [["N1", "N2"]]}
     MISSION_A.miss     x=20,y=-57,taxi=1      one goal a line; taxi=0 is light verification
-    blagnac_area.jpg   red pixels (R > 250) are prohibited; see `rampart.actors.osmosis.airport.mask`
+    blagnac_area.jpg   red pixels (R > 250) are prohibited; see
+    `rampart.actors.osmosis.airport.mask`
 
 These files know no lights and no start pose: the robot starts at the graph's first node,
 looking along its first edge.

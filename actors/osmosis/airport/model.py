@@ -132,7 +132,7 @@ class Attachment:
 
 @dataclass(frozen=True)
 class Airport:
-    """An airport. Build it with `rampart.actors.osmosis.airport.formats.load_airport`, which checks it.
+    """An airport. Build it with `formats.load_airport`, which checks it.
 
     Args:
         name: for people and file names.

@@ -2,7 +2,8 @@
 
 The comparison cannot tell who is wrong. It accuses one after the other, the one whose restart
 costs least first; if they still differ when that one has come back, it was the other. Meanwhile
-the Safety Pilot drives what is safe whoever is right (`rampart.actors.osmosis.control.pilot.command_pair`).
+the Safety Pilot drives what is safe whoever is right
+(`rampart.actors.osmosis.control.pilot.command_pair`).
 
 A turn rate that is wrong leads out of the lane and is not waited for. A speed may differ for as
 long as a respawned follower needs to accelerate; the slower one drives meanwhile.

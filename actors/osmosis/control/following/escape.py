@@ -1,11 +1,11 @@
 """Tangential escape: on which side to pass an obstacle, and how far aside.
 
-Works in route coordinates (s, n), see `rampart.actors.osmosis.control.polyline`. Every echo forbids an interval
-of lateral offsets, as wide as the robot and its clearance. Zero is where the robot wants to be;
-if it is forbidden, the nearest free offset to the right or the left is taken, and the side is
-kept until the obstacle is behind: that commitment is what leaves no local minimum in front of an
-obstacle exactly on the line. A robot that starts in the middle of an escape picks the side it is
-already on. If neither side is free within the corridor there is no way, and the robot waits.
+Works in route coordinates (s, n), see `rampart.actors.osmosis.control.polyline`. Every echo forbids
+an interval of lateral offsets, as wide as the robot and its clearance. Zero is where the robot
+wants to be; if it is forbidden, the nearest free offset to the right or the left is taken, and the
+side is kept until the obstacle is behind: that commitment is what leaves no local minimum in front
+of an obstacle exactly on the line. A robot that starts in the middle of an escape picks the side it
+is already on. If neither side is free within the corridor there is no way, and the robot waits.
 """
 
 from __future__ import annotations

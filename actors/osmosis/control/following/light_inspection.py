@@ -1,10 +1,10 @@
 """Light inspection: the intensity of each light of a row, measured in passing.
 
 The illuminance under the sensor is linear in the intensities of the lights near it,
-E = sum(I_j * g(d_j)), with g the photometric model of `rampart.actors.osmosis.airport.photometry`. Samples are matched
-to poses by their stamps, the intensity is the least-squares fit over the samples near a light,
-and what is left of a pose error along the way is fitted too, as a shift. So neither noise nor a
-late pose makes a good light look dim.
+E = sum(I_j * g(d_j)), with g the photometric model of `rampart.actors.osmosis.airport.photometry`.
+Samples are matched to poses by their stamps, the intensity is the least-squares fit over the
+samples near a light, and what is left of a pose error along the way is fitted too, as a shift. So
+neither noise nor a late pose makes a good light look dim.
 
 A light is judged once, when the sensor has passed it with samples before, over and behind it.
 With samples missing it is not judged: no result rather than a false accusation. Below half its
@@ -247,6 +247,6 @@ class LightInspection:
 
 
 def _per_candela(distance_m: Array) -> Array:
-    """Illuminance per candela, as `rampart.actors.osmosis.airport.photometry.illuminance_per_candela`, on arrays."""
+    """Illuminance per candela, as `photometry.illuminance_per_candela`, on arrays."""
     square = distance_m**2 + SENSOR_HEIGHT_M**2
     return np.asarray(SENSOR_HEIGHT_M / (square * np.sqrt(square)))

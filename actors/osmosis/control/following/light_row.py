@@ -6,9 +6,10 @@ over it. In front of an obstacle it stops, and goes on when the way has been fre
 after a while: it drives round as in taxi mode, if the pavement has room, and comes back to the row
 behind. The lights that it thereby misses remain unmeasured.
 
-A light that was missed for another reason can be had by going back (`rampart.actors.osmosis.control.following.light_ledger`
-decides that): the robot turns round, drives back as far as it is told, and turns round again. It
-never drives in reverse, because the laser looks ahead.
+A light that was missed for another reason can be had by going back
+(`rampart.actors.osmosis.control.following.light_ledger` decides that): the robot turns round,
+drives back as far as it is told, and turns round again. It never drives in reverse, because the
+laser looks ahead.
 """
 
 from __future__ import annotations

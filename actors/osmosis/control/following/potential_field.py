@@ -6,8 +6,8 @@ alpha*(1/d - 1/d_s) (Khatib 1986), which grows without bound towards contact ins
 
 A field alone has a local minimum in front of an obstacle that stands exactly on the line. The
 tangential part of the escape is therefore not a force but a choice, made in
-`rampart.actors.osmosis.control.following.escape`: the point of attraction moves sideways, to one side, and stays there.
-What is left to the field is the last half metre, for which it is good.
+`rampart.actors.osmosis.control.following.escape`: the point of attraction moves sideways, to one
+side, and stays there. What is left to the field is the last half metre, for which it is good.
 """
 
 from __future__ import annotations

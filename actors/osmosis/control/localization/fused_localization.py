@@ -1,7 +1,8 @@
 """Localization by fusion: odometry, IMU, GPS and the absolute pose, any one of which may fail.
 
-In the place of `rampart.actors.osmosis.control.localization.localization`, the paper's, if a system's spec says so. It keeps
-nothing that a restart would lose: a new life starts from the first absolute pose and fix.
+In the place of `rampart.actors.osmosis.control.localization.localization`, the paper's, if a
+system's spec says so. It keeps nothing that a restart would lose: a new life starts from the first
+absolute pose and fix.
 """
 
 from __future__ import annotations

@@ -6,9 +6,10 @@ never trusts its inputs to be there: each has an age, and what is too old counts
 
 The strictest engaged order wins: stop > teleoperation > auto. A fresh joystick pre-empts auto.
 In auto there may be two computers of the command, Osmosis Control and its standby; which of them
-drives, and what they drive when they disagree, is `rampart.actors.osmosis.control.pilot.command_pair`.
-In the paper's unprotected baseline (`Checks` all off) only three things are left: the last
-command is kept and repeated, obstacles stop the robot, the joystick pre-empts.
+drives, and what they drive when they disagree, is
+`rampart.actors.osmosis.control.pilot.command_pair`. In the paper's unprotected baseline (`Checks`
+all off) only three things are left: the last command is kept and repeated, obstacles stop the
+robot, the joystick pre-empts.
 """
 
 from __future__ import annotations
