@@ -28,7 +28,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
@@ -49,14 +53,14 @@ from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.bus.messages import Hello
 from rampart.actors.bus.zenoh_bus import session_config
 kind, per_s, seconds, dial = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), sys.argv[4:]
-report = m.DetectionReport(m.DetectionState.IDLE, "", (), 0.0)
+report = fm.DetectionReport(fm.DetectionState.IDLE, "", (), 0.0)
 def message(i):
     if kind == "garbage":
-        return topics.DETECTION.at("DM1"), b"\\xff" * 200
+        return ftm_topics.DETECTION.at("DM1"), b"\\xff" * 200
     if kind == "reports":
-        return topics.DETECTION.at("DM99"), encode(Header("DM99", 1, i, 0.0), report)
+        return ftm_topics.DETECTION.at("DM99"), encode(Header("DM99", 1, i, 0.0), report)
     name = f"stranger{i % 26_000}" if kind == "names" else "stranger"
-    return topics.HELLO.at("stranger"), encode(Header(name, 1, i, 0.0), Hello())
+    return bus_topics.HELLO.at("stranger"), encode(Header(name, 1, i, 0.0), Hello())
 with zenoh.open(session_config(None, dial)) as session:
     time.sleep(1)
     publishers, begun, sent = {}, time.monotonic(), 0
@@ -82,11 +86,11 @@ class Watch:
         self.reported_s: float | None = None
         self.braked_s: float | None = None
         self._released = 0
-        session.listen(topics.DETECTION, topics.DETECTION.at("DM1"), self._report)
+        session.listen(ftm_topics.DETECTION, ftm_topics.DETECTION.at("DM1"), self._report)
         session.listen(topics.BRAKE, topics.BRAKE.at(), self._brake)
 
-    def _report(self, _key: str, header: Header, body: m.DetectionReport) -> None:
-        if header.source == "DM1" and body.state is m.DetectionState.ACTIVE \
+    def _report(self, _key: str, header: Header, body: fm.DetectionReport) -> None:
+        if header.source == "DM1" and body.state is fm.DetectionState.ACTIVE \
                 and self.reported_s is None:
             self.reported_s = header.stamp
 
@@ -101,10 +105,10 @@ class Watch:
         """Make the receiver lie once; seconds to the brake, None if it did not come."""
         self.reported_s = self.braked_s = None
         clock = self._session.clock
-        lie = m.Injection(f"{self._session.name}-{number}", topics.GPS.key, "corrupt", 0.5,
+        lie = bm.Injection(f"{self._session.name}-{number}", topics.GPS.key, "corrupt", 0.5,
                           set_fields={"x_m": _GRASS[0], "y_m": _GRASS[1]})
         await self._session.command(
-            topics.INJECT, lie, lambda: self.reported_s is not None, 3.0)
+            bus_topics.INJECT, lie, lambda: self.reported_s is not None, 3.0)
         deadline_s = clock.now() + 3.0
         while self.braked_s is None and clock.now() < deadline_s:  # noqa: ASYNC110 or never
             await asyncio.sleep(0.01)
@@ -118,7 +122,7 @@ class Watch:
         self._released = 0
         while self._released < 3:
             if not self._released:
-                self._session.publish(topics.RESET, m.Reset("RM1", "benchmark"))
+                self._session.publish(ftm_topics.RESET, fm.Reset("RM1", "benchmark"))
             await asyncio.sleep(0.1)
 
 

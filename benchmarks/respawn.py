@@ -20,14 +20,11 @@ import time
 from collections import deque
 from typing import Any
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ftm.messages import DecisionRecord, DetectionReport, DetectionState, NodeTable
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import (
-    DecisionRecord,
-    DetectionReport,
-    DetectionState,
-    NodeTable,
-)
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
@@ -38,12 +35,12 @@ OUTPUT: dict[str, Topic[Any]] = {
     "graph_planner": topics.ROUTE,
     "osmosis_control": topics.COMMAND,
     "localization": topics.POSE,
-    "teleoperation": topics.HEARTBEAT,
-    "hmi": topics.HEARTBEAT,
+    "teleoperation": bus_topics.HEARTBEAT,
+    "hmi": bus_topics.HEARTBEAT,
     "safety_pilot": topics.BASE_COMMAND,
-    "ftm_manager": topics.MANAGER_STATUS,
-    "DM2": topics.DETECTION,
-    "RM2": topics.RECOVERY,
+    "ftm_manager": ftm_topics.MANAGER_STATUS,
+    "DM2": ftm_topics.DETECTION,
+    "RM2": ftm_topics.RECOVERY,
     "mission_manager": topics.MISSION_STATUS,  # last: without checkpoints it loses the mission
 }
 """Nodes to kill and the topic whose first message shows that the replacement works."""
@@ -61,29 +58,29 @@ class Stopwatch(Actor):
         self.detected_s: float | None = None
         self.decided_s: float | None = None
 
-    @on(topics.NODES)
+    @on(ftm_topics.NODES)
     def nodes(self, table: NodeTable, _header: Header) -> None:
         """Keep the launcher's guard informed."""
         self._launcher.supervisor_heard(table)
 
-    @on(topics.DETECTION)
+    @on(ftm_topics.DETECTION)
     def detection(self, report: DetectionReport, header: Header) -> None:
         """Note the first active report."""
-        self._note(header, topics.DETECTION)
+        self._note(header, ftm_topics.DETECTION)
         if report.state is DetectionState.ACTIVE:
             self.story.append(f"{header.stamp:.2f} {header.source} {report}")
         if report.state is DetectionState.ACTIVE and self.detected_s is None:
             self.detected_s = time.monotonic()
 
-    @on(topics.DECISION)
+    @on(ftm_topics.DECISION)
     def decision(self, record: DecisionRecord, _header: Header) -> None:
         """Note the first decision with a recovery."""
         self.story.append(str(record))
         if record.recoveries and self.decided_s is None:
             self.decided_s = time.monotonic()
 
-    @on(topics.PROCESS_EVENT)
-    @on(topics.DIAGNOSTIC)
+    @on(ftm_topics.PROCESS_EVENT)
+    @on(bus_topics.DIAGNOSTIC)
     def event(self, message: Any, header: Header) -> None:
         """Keep the story, for when a node does not come back."""
         self.story.append(f"{header.stamp:.2f} {header.source} {message}")
@@ -113,20 +110,20 @@ class Stopwatch(Actor):
         """Note the first message of each incarnation."""
         self._note(header, topics.BASE_COMMAND)
 
-    @on(topics.MANAGER_STATUS)
+    @on(ftm_topics.MANAGER_STATUS)
     def manager(self, _message: Any, header: Header) -> None:
         """Note the first message of each incarnation."""
-        self._note(header, topics.MANAGER_STATUS)
+        self._note(header, ftm_topics.MANAGER_STATUS)
 
-    @on(topics.RECOVERY)
+    @on(ftm_topics.RECOVERY)
     def recovery(self, _message: Any, header: Header) -> None:
         """Note the first message of each incarnation."""
-        self._note(header, topics.RECOVERY)
+        self._note(header, ftm_topics.RECOVERY)
 
-    @on(topics.HEARTBEAT)
+    @on(bus_topics.HEARTBEAT)
     def heartbeat(self, _message: Any, header: Header) -> None:
         """Note the first message of each incarnation."""
-        self._note(header, topics.HEARTBEAT)
+        self._note(header, bus_topics.HEARTBEAT)
 
     def _note(self, header: Header, topic: Topic[Any]) -> None:
         self.newest[header.source] = max(self.newest.get(header.source, 0), header.incarnation)

@@ -17,8 +17,9 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import NodeTable, ProcessEvent
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import NodeTable, ProcessEvent
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
@@ -51,7 +52,7 @@ class Ear(Actor):
         """Keep the launcher's guard informed."""
         self._launcher.supervisor_heard(table)
 
-    @on(topics.HEARTBEAT)
+    @on(bus_topics.HEARTBEAT)
     def heartbeat(self, _message: Any, header: Header) -> None:
         """Note how long it took, and a new process's first word."""
         self.messages.append(self.clock.now() - header.stamp)

@@ -6,8 +6,8 @@ import asyncio
 
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
 from rampart.cli.session import Session
 
 HEARD_S = 0.3

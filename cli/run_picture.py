@@ -9,16 +9,19 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import messages as m
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 
 DECODED: tuple[Topic[Any], ...] = (
     topics.MISSION_STATUS, topics.CONTROL_STATUS, topics.POSE, topics.PILOT_STATUS,
-    topics.MANAGER_STATUS, topics.DETECTION, topics.RECOVERY, topics.DECISION, topics.NODES,
-    topics.PROCESS_EVENT, topics.HEARTBEAT, topics.TRUTH)
+    ftm_topics.MANAGER_STATUS, ftm_topics.DETECTION, ftm_topics.RECOVERY, ftm_topics.DECISION,
+    ftm_topics.NODES, ftm_topics.PROCESS_EVENT, bus_topics.HEARTBEAT, topics.TRUTH)
 """What is read; of all other topics the messages are counted."""
 
 COUNTED: tuple[Topic[Any], ...] = tuple(t for t in topics.ALL if t not in DECODED)
@@ -45,7 +48,7 @@ class Beat:
 
     incarnation: int
     heard_s: float
-    message: m.Heartbeat
+    message: bm.Heartbeat
 
 
 class RunPicture:
@@ -83,24 +86,24 @@ class RunPicture:
     def heard(self, topic: Topic[Any], header: Header, body: Any, now_s: float) -> None:
         """Take a message of one of `DECODED`, heard at a simulated time."""
         self.messages[topic.key] += 1
-        if topic is topics.HEARTBEAT:
+        if topic is bus_topics.HEARTBEAT:
             self.beats[header.source] = Beat(header.incarnation, now_s, body)
-        elif topic is topics.DETECTION:
+        elif topic is ftm_topics.DETECTION:
             before = self.detections.get(header.source)
             if body.state is m.DetectionState.ACTIVE and (
                     before is None or before.state is not body.state):
                 _count(self.detections_total, header.source)
             self.detections[header.source] = body
-        elif topic is topics.RECOVERY:
+        elif topic is ftm_topics.RECOVERY:
             was = self.recoveries.get(header.source)
             if body.state is m.RecoveryState.ACTIVATED and (
                     was is None or was.state is not body.state):
                 _count(self.recoveries_total, header.source)
             self.recoveries[header.source] = body
-        elif topic is topics.DECISION:
+        elif topic is ftm_topics.DECISION:
             self.decisions.append((header.stamp, body))
             _count(self.decisions_total, body.strategy)
-        elif topic is topics.PROCESS_EVENT:
+        elif topic is ftm_topics.PROCESS_EVENT:
             _count(self.process_events_total, (body.node, body.event))
         else:
             self._latest[topic.key] = (body, now_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rampart.actors.ftm import messages as fm
 from rampart.actors.osmosis import messages as m
 
 SILENT = "silent"
@@ -28,7 +29,7 @@ def pilot_in_words(status: m.PilotStatus | None) -> str:
     return f"{text}: {status.reason}" if status.reason else text
 
 
-def manager_in_words(status: m.ManagerStatus | None) -> str:
+def manager_in_words(status: fm.ManagerStatus | None) -> str:
     """Return what the FTM Manager sees and does."""
     if status is None:
         return SILENT

@@ -21,8 +21,8 @@ import msgspec
 
 from rampart.actors.bus.bounds import DOCUMENT_CHARS, clip
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.actors.runtime.wiring import load_class

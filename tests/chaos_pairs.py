@@ -27,8 +27,8 @@ from typing import Any
 from chaos import SPAWNERS, WORLD_PAUSE_S, Targets, tells_end
 from real_run import RealRun
 
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import NodeState, NodeTable
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import NodeState, NodeTable
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import HEARTBEAT
 from rampart.actors.supervision.kill_node import SIGNALS

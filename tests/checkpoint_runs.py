@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 
 from stub_actors import ROOT
 
+from rampart.actors.bus import messages as bm
 from rampart.actors.osmosis import messages as m
 from rampart.actors.run.run_plan import RunPlan, load_shared, load_system
 from rampart.actors.runtime.checkpoint import Shelf
@@ -42,7 +43,7 @@ class Watched:
     status: m.MissionStatus
     measured: list[m.LightMeasurement] = field(default_factory=list)
     steps: list[int] = field(default_factory=list)
-    diagnostics: list[m.Diagnostic] = field(default_factory=list)
+    diagnostics: list[bm.Diagnostic] = field(default_factory=list)
     shelves: dict[str, Shelf] = field(default_factory=dict)
 
 
@@ -50,13 +51,13 @@ class _Mission(MissionRun):
     def watch(self) -> None:
         self.measured: list[m.LightMeasurement] = []
         self.statuses: list[m.MissionStatus] = []
-        self.diagnostics: list[m.Diagnostic] = []
+        self.diagnostics: list[bm.Diagnostic] = []
 
     def sinks(self, clock):
         def take(_topic, message, _header):
             for kind, where in ((m.LightMeasurement, self.measured),
                                 (m.MissionStatus, self.statuses),
-                                (m.Diagnostic, self.diagnostics)):
+                                (bm.Diagnostic, self.diagnostics)):
                 if isinstance(message, kind):
                     where.append(message)
 

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from rampart.actors.detection.module import Monitor
-from rampart.actors.osmosis import messages as m
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 
@@ -56,7 +57,7 @@ class Ear(Actor):
         super().__init__(context)
         self.heard: list[tuple[float, m.DetectionReport]] = []
 
-    @on(topics.DETECTION)
+    @on(ftm_topics.DETECTION)
     def detection(self, message: m.DetectionReport, _header: Header) -> None:
         self.heard.append((self.clock.now(), message))
 

@@ -11,6 +11,8 @@ import numpy as np
 from hmi_browser import browser
 from hmi_world import AIRPORT, Others, World, free_port, served
 
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.manager.spec.specification import parse_specification
@@ -30,9 +32,9 @@ class Everybody(Others):
                 latched: tuple[str, ...] = ()) -> None:
         """Publish the manager's status: some mechanisms are active, and so are their modules."""
         detecting = {d for x in SPEC.mechanisms if x.name in active for d in x.detections}
-        self.publish(topics.MANAGER_STATUS, m.ManagerStatus(
+        self.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus(
             active, (), activated, latched, "guarded-repair", 1, tuple(
-                m.DetectionView(d.name, d.name in detecting, "a test" * (d.name in detecting), ())
+                fm.DetectionView(d.name, d.name in detecting, "a test" * (d.name in detecting), ())
                 for d in SPEC.detections)))
 
     def sweep(self) -> None:
@@ -52,8 +54,8 @@ class Everybody(Others):
             "r1/first", "AB", m.MissionPhase.RUNNING, 1, goals, (12.0,), (), "",
             orders=tuple(m.MissionAction)))
         self.publish(topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.AUTO, False, "", 0))
-        self.publish(topics.NODES, m.NodeTable(tuple(
-            m.NodeInfo(n.name, n.kind.value, os.getpid(), m.NodeState.RUNNING, 1, 0)
+        self.publish(ftm_topics.NODES, fm.NodeTable(tuple(
+            fm.NodeInfo(n.name, n.kind.value, os.getpid(), fm.NodeState.RUNNING, 1, 0)
             for n in SPEC.actors())))
 
 

@@ -7,6 +7,10 @@ import json
 import socket
 from contextlib import asynccontextmanager
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -22,28 +26,28 @@ RATE = 20.0
 class Others(Actor):
     """Stands for the rest of the system."""
 
-    outputs = (topics.MISSION_STATUS, topics.MANAGER_STATUS, topics.POSE, topics.DETECTION,
-               topics.MISSION_ORDER_ANSWER, topics.PILOT_STATUS, topics.NODES,
-               topics.BASE_STATUS, topics.ADAPTATION, topics.INJECTION_RESULT,
-               topics.ERROR_REPORT)
+    outputs = (topics.MISSION_STATUS, ftm_topics.MANAGER_STATUS, topics.POSE, ftm_topics.DETECTION,
+               topics.MISSION_ORDER_ANSWER, topics.PILOT_STATUS, ftm_topics.NODES,
+               topics.BASE_STATUS, ftm_topics.ADAPTATION, bus_topics.INJECTION_RESULT,
+               ftm_topics.ERROR_REPORT)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.requests: list[m.MissionRequest] = []
-        self.resets: list[m.Reset] = []
+        self.resets: list[fm.Reset] = []
         self.orders: list[m.MissionOrder] = []
-        self.diagnostics: list[m.Diagnostic] = []
+        self.diagnostics: list[bm.Diagnostic] = []
         self.stick: list[m.Joystick] = []
-        self.adaptations: list[m.AdaptationRequest] = []
-        self.injections: list[m.Injection] = []
+        self.adaptations: list[fm.AdaptationRequest] = []
+        self.injections: list[bm.Injection] = []
         self.actuator_faults: list[m.ActuatorFault] = []
 
     @on(topics.MISSION_REQUEST)
     def request(self, message: m.MissionRequest, _header: Header) -> None:
         self.requests.append(message)
 
-    @on(topics.RESET)
-    def reset(self, message: m.Reset, _header: Header) -> None:
+    @on(ftm_topics.RESET)
+    def reset(self, message: fm.Reset, _header: Header) -> None:
         self.resets.append(message)
 
     @on(topics.MISSION_ORDER)
@@ -54,20 +58,20 @@ class Others(Actor):
     def joystick(self, message: m.Joystick, _header: Header) -> None:
         self.stick.append(message)
 
-    @on(topics.ADAPT)
-    def adapt(self, message: m.AdaptationRequest, _header: Header) -> None:
+    @on(ftm_topics.ADAPT)
+    def adapt(self, message: fm.AdaptationRequest, _header: Header) -> None:
         self.adaptations.append(message)
 
-    @on(topics.INJECTION_REQUEST)
-    def injection(self, message: m.Injection, _header: Header) -> None:
+    @on(bus_topics.INJECTION_REQUEST)
+    def injection(self, message: bm.Injection, _header: Header) -> None:
         self.injections.append(message)
 
     @on(topics.ACTUATOR_FAULT)
     def actuator_fault(self, message: m.ActuatorFault, _header: Header) -> None:
         self.actuator_faults.append(message)
 
-    @on(topics.DIAGNOSTIC)
-    def diagnostic(self, message: m.Diagnostic, _header: Header) -> None:
+    @on(bus_topics.DIAGNOSTIC)
+    def diagnostic(self, message: bm.Diagnostic, _header: Header) -> None:
         self.diagnostics.append(message)
 
 
@@ -110,7 +114,7 @@ class World:
             "r1/first", "A", phase, 0, goals, (), (), "", orders=possible))
 
     def say_latched(self, *names: str) -> None:
-        self.others.publish(topics.MANAGER_STATUS, m.ManagerStatus(
+        self.others.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus(
             (), (), names, names, "safety-first", 1))
 
 

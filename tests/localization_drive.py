@@ -14,6 +14,7 @@ from typing import Any
 
 from shapely.geometry import box
 
+from rampart.actors.bus import messages as bm
 from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -91,7 +92,7 @@ def _command(now_s: float) -> tuple[float, float]:
     return 0.0, 0.0
 
 
-def _read(world: World, key: str) -> m.Message:
+def _read(world: World, key: str) -> bm.Message:
     if key == topics.GPS.key:
         g = world.gps()
         return m.GpsFix(g.x_m, g.y_m, g.velocity_x_mps, g.velocity_y_mps, g.accuracy_m)

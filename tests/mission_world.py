@@ -8,6 +8,8 @@ from typing import Any
 from control_world import World
 from test_control_actors import NODES, Base, House, system
 
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Context, on
@@ -36,10 +38,10 @@ class Operator(Base):
         self._orders = 0
 
     def publish(self, topic, body, stamp=None, name=None):
-        if topic is topics.MANAGER_STATUS:
-            views = tuple(m.DetectionView("DM6", True, "localization not updated", ())
+        if topic is ftm_topics.MANAGER_STATUS:
+            views = tuple(fm.DetectionView("DM6", True, "localization not updated", ())
                           for _ in self.holding)
-            body = m.ManagerStatus((), (), self.holding, (), "safety-first", 0, views)
+            body = fm.ManagerStatus((), (), self.holding, (), "safety-first", 0, views)
         super().publish(topic, body, stamp, name)
 
     @on(topics.MISSION_STATUS)

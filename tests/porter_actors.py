@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 from stub_actors import ROOT
 
+from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
-from rampart.actors.osmosis.messages import Message
 from rampart.actors.runtime.actor import Actor, Header, every, on
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import msgspec
 
 from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
@@ -40,9 +42,9 @@ def pose(number: int, at_s: float, yaw_rad: float = 0.0, incarnation: int = 1) -
 def sample(count: int = 20) -> list[Sent]:
     """Poses, one of them with NaN, garbage, and a detection that comes and goes."""
     sent = [pose(i + 1, i * 0.05, NAN if i == 3 else 0.1) for i in range(count)]
-    report = m.DetectionReport(m.DetectionState.ACTIVE, "it is there", (), 0.2)
-    idle = m.DetectionReport(m.DetectionState.IDLE, "", (), 0.2)
-    key = topics.DETECTION.at("DM1")
+    report = fm.DetectionReport(fm.DetectionState.ACTIVE, "it is there", (), 0.2)
+    idle = fm.DetectionReport(fm.DetectionState.IDLE, "", (), 0.2)
+    key = ftm_topics.DETECTION.at("DM1")
     sent += [(0.2, key, encode(Header("DM1", 1, 1, 0.2), report)),
              (0.4, key, encode(Header("DM1", 1, 2, 0.4), idle)),
              (0.5, topics.POSE.at(), b"\xc1 is no msgpack"),

@@ -9,6 +9,8 @@ from typing import Any
 from virtual_loop import System
 
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
@@ -17,20 +19,20 @@ from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 class Boss(Actor):
     """Commands recovery modules as it is told, and keeps their reports."""
 
-    outputs = (topics.RECOVERY_COMMAND,)
+    outputs = (ftm_topics.RECOVERY_COMMAND,)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.reports: list[tuple[float, m.RecoveryReport]] = []
+        self.reports: list[tuple[float, fm.RecoveryReport]] = []
 
     @classmethod
     def output_names(
         cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]
     ) -> tuple[str, ...] | None:
-        return None if topic is topics.RECOVERY_COMMAND else (name,)
+        return None if topic is ftm_topics.RECOVERY_COMMAND else (name,)
 
-    @on(topics.RECOVERY)
-    def recovery(self, message: m.RecoveryReport, _header: Header) -> None:
+    @on(ftm_topics.RECOVERY)
+    def recovery(self, message: fm.RecoveryReport, _header: Header) -> None:
         self.reports.append((self.clock.now(), message))
 
     @property
@@ -41,11 +43,11 @@ class Boss(Actor):
 
     def order(self, recovery: str, decision: int = 1, nodes: tuple[str, ...] = (),
               reason: str = "a fault") -> None:
-        self.publish(topics.RECOVERY_COMMAND, m.RecoveryCommand(True, decision, nodes, reason),
+        self.publish(ftm_topics.RECOVERY_COMMAND, fm.RecoveryCommand(True, decision, nodes, reason),
                      name=recovery)
 
     def release(self, recovery: str, decision: int = 2) -> None:
-        self.publish(topics.RECOVERY_COMMAND, m.RecoveryCommand(False, decision, (), "gone"),
+        self.publish(ftm_topics.RECOVERY_COMMAND, fm.RecoveryCommand(False, decision, (), "gone"),
                      name=recovery)
 
 
@@ -112,18 +114,18 @@ class Node(Actor):
 class Supervisor(Actor):
     """Respawns what it is asked to, after `delay_s`; `answer` is what it says then."""
 
-    outputs = (topics.PROCESS_EVENT,)
+    outputs = (ftm_topics.PROCESS_EVENT,)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.system: System = context.shared["world"]
         self.answer = "respawned"
         self.delay_s = 0.05
-        self.requests: list[tuple[float, m.RespawnRequest]] = []
+        self.requests: list[tuple[float, fm.RespawnRequest]] = []
         self.tasks: list[asyncio.Task[None]] = []
 
-    @on(topics.RESPAWN)
-    def respawn(self, message: m.RespawnRequest, _header: Header) -> None:
+    @on(ftm_topics.RESPAWN)
+    def respawn(self, message: fm.RespawnRequest, _header: Header) -> None:
         self.requests.append((self.clock.now(), message))
         life = self.system.incarnations.get(message.node, 0)
         alive = message.node in self.system.tasks
@@ -136,7 +138,7 @@ class Supervisor(Actor):
         else:
             self.tasks.append(asyncio.create_task(self._replace(message, alive)))
 
-    async def _replace(self, message: m.RespawnRequest, alive: bool) -> None:
+    async def _replace(self, message: fm.RespawnRequest, alive: bool) -> None:
         if alive:
             await self.system.kill(message.node)
         await asyncio.sleep(self.delay_s)
@@ -144,8 +146,8 @@ class Supervisor(Actor):
             self.system.start(message.node, Node)
         self._say(message, "respawned", self.system.incarnations[message.node])
 
-    def _say(self, message: m.RespawnRequest, event: str, incarnation: int) -> None:
-        self.publish(topics.PROCESS_EVENT, m.ProcessEvent(
+    def _say(self, message: fm.RespawnRequest, event: str, incarnation: int) -> None:
+        self.publish(ftm_topics.PROCESS_EVENT, fm.ProcessEvent(
             message.node, event, 1, incarnation, message.by, ""))
 
 

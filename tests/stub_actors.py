@@ -12,6 +12,7 @@ from pathlib import Path
 
 import msgspec
 
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import RunPlan
@@ -40,7 +41,7 @@ _BASES = bases()
 class Idler(Actor):
     """Beats its heart and does nothing else; it may stand in every table of a spec."""
 
-    outputs = (topics.POSE, topics.DETECTION, topics.RECOVERY)
+    outputs = (topics.POSE, ftm_topics.DETECTION, ftm_topics.RECOVERY)
 
 
 def write_stub_system(directory: Path) -> Path:

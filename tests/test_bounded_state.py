@@ -16,8 +16,12 @@ from msgspec import inspect
 
 import rampart.sim.osmosis.report_record
 import rampart.sim.runs.console
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Header, encode
 from rampart.actors.bus.limits import REPORTS_PER_S, RateLimit, Remembered, ReportLimit
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.recording.views import Views
@@ -144,7 +148,7 @@ def test_what_remembers_without_bound_is_found(monkeypatch):
             super().__init__(context)
             self.heard = {}
 
-        @on(topics.RESET)
+        @on(ftm_topics.RESET)
         def reset(self, message, _header):
             self.heard[message.by] = message
 
@@ -192,11 +196,11 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
 def test_a_flood_of_strangers_does_not_bring_a_superseded_node_back():
     taken, refused, crowded = [], [], []
     guard = ArrivalGuard(lambda: 0.0, {"localization"}, lambda: crowded.append(1))
-    receive = guard.receiver(topics.RESET, lambda _key, message: taken.append(message.source),
+    receive = guard.receiver(ftm_topics.RESET, lambda _key, message: taken.append(message.source),
                              lambda _key, reason: refused.append(reason))
 
     def say(source, incarnation, sequence):
-        receive("k", encode(Header(source, incarnation, sequence, 0.0), m.Reset("RM1", "")))
+        receive("k", encode(Header(source, incarnation, sequence, 0.0), fm.Reset("RM1", "")))
 
     say("localization", 2, 1)
     for number in range(3 * STRANGERS):
@@ -287,15 +291,15 @@ def test_a_node_with_too_much_to_report_says_how_much_it_left_out():
 def test_a_crowd_of_sources_is_reported_once_a_second():
     def crowd(_actor, stranger):
         for number in range(2 * STRANGERS):
-            stranger.publish(topics.HELLO, topics.HELLO.at("x"),
-                             encode(Header(f"s{number}", 1, 1, 0.0), m.Hello()))
+            stranger.publish(bus_topics.HELLO, bus_topics.HELLO.at("x"),
+                             encode(Header(f"s{number}", 1, 1, 0.0), bm.Hello()))
 
     reports = during(Quiet, crowd)
     assert [(report["context"], report["count"]) for report in reports] == [("many sources", 1)]
 
 
 def order(number):
-    return m.Injection(f"i{number}", topics.POSE.key, "delay", 1e6, delay_s=1e6)
+    return bm.Injection(f"i{number}", topics.POSE.key, "delay", 1e6, delay_s=1e6)
 
 
 def test_injections_of_one_node_are_bounded_and_so_is_what_they_hold_back():
@@ -341,15 +345,15 @@ def test_the_supervisor_passes_on_a_bounded_number_of_reports_and_says_what_it_l
         await stranger.open()
         await asyncio.sleep(0.1)
         for number in range(1000):
-            stranger.publish(topics.DIAGNOSTIC, topics.DIAGNOSTIC.at("x"), encode(
-                Header("x", 1, number, 0.0), m.Diagnostic("x", "c", "r", f"{number}", 1)))
+            stranger.publish(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.at("x"), encode(
+                Header("x", 1, number, 0.0), bm.Diagnostic("x", "c", "r", f"{number}", 1)))
         await asyncio.sleep(2.0)
         actor.stop()
         await task
 
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
         runner.run(run())
-    told = [body["node"] for key, body in sent if key == topics.ERROR_REPORT.at()]
+    told = [body["node"] for key, body in sent if key == ftm_topics.ERROR_REPORT.at()]
     assert told.count("x") == 200
     assert [body["reason"] for key, body in sent if key == "rampart/diagnostic/supervisor"] == [
         "800 more messages were not passed on"]

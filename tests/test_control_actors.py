@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from control_world import Circle, World
 
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
@@ -44,7 +46,7 @@ def system(**layers: bool) -> SystemSpec:
 class Base(Actor):
     """Stands for the Summit XL layer and the FTM Manager's sign of life."""
 
-    outputs = (topics.ABSOLUTE_POSE, topics.SCAN, topics.LIGHT, topics.MANAGER_STATUS,
+    outputs = (topics.ABSOLUTE_POSE, topics.SCAN, topics.LIGHT, ftm_topics.MANAGER_STATUS,
                topics.MISSION_REQUEST, topics.PILOT_ORDER, topics.JOYSTICK, topics.COMMAND)
     world: World
 
@@ -92,7 +94,7 @@ class Base(Actor):
         self.publish(topics.LIGHT, m.LightSample(sum(
             illuminance_lux(BROKEN.get(li.name, 0.95) * li.nominal_cd, d)
             for li in AIRPORT.lights if (d := math.dist(sensor, (li.x_m, li.y_m))) < 6.0)))
-        self.publish(topics.MANAGER_STATUS, m.ManagerStatus((), (), (), (), "safety-first", 0))
+        self.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus((), (), (), (), "safety-first", 0))
 
 
 NODES = {

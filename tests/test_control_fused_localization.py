@@ -9,6 +9,8 @@ import pytest
 from localization_drive import field_airport
 from virtual_loop import System, run, shipped_system
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.localization.fused_localization import FusedLocalization
@@ -22,7 +24,7 @@ from rampart.sim.osmosis.simulator import Simulator
 class Ear(Actor):
     """Drives in a circle, orders faults, and compares the pose with the truth."""
 
-    outputs = (topics.BASE_COMMAND, topics.INJECT)
+    outputs = (topics.BASE_COMMAND, bus_topics.INJECT)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -49,7 +51,7 @@ class Ear(Actor):
 
     def fail(self, name: str, number: str = "f") -> None:
         for order in find_fault(name).orders(number, math.inf):
-            self.publish(topics.INJECT, order)
+            self.publish(bus_topics.INJECT, order)
 
     def error_m(self, since_s: float) -> float:
         """Worst distance of a pose to the truth nearest in time, less the way in between."""
@@ -118,7 +120,7 @@ def test_without_both_positions_it_bridges_and_then_falls_silent_and_comes_back(
         silent_s = ear.poses[-1][1]
         assert ear.truth[-1][0] - silent_s > 1.0
         for number in "ab":
-            ear.publish(topics.INJECT, m.Injection(number, *(
+            ear.publish(bus_topics.INJECT, bm.Injection(number, *(
                 ("summit_xl/gps", "drop") if number == "a" else
                 ("summit_xl/absolute_pose", "drop")), 0.0))
         await ear.drive(2.0)

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from laser_sweeps import full_sweep
 from virtual_loop import System, run, shipped_system
 
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.pilot.laser_check import LaserReach
@@ -232,7 +234,7 @@ def test_a_number_that_is_none_hides_no_echo_of_the_other():
 class Rest(Actor):
     """All that the pilot hears, and the base."""
 
-    outputs = (topics.COMMAND, topics.SCAN, topics.MANAGER_STATUS)
+    outputs = (topics.COMMAND, topics.SCAN, ftm_topics.MANAGER_STATUS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -251,7 +253,7 @@ def test_one_sweep_from_the_future_neither_blinds_the_safety_pilot_nor_stops_it_
             system.start("safety_pilot", SafetyPilot)
             await system.settle()
             for i in range(80):
-                rest.publish(topics.MANAGER_STATUS, m.ManagerStatus((), (), (), (), "", 0))
+                rest.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus((), (), (), (), "", 0))
                 rest.publish(topics.COMMAND, m.Twist(0.8, 0.0))
                 rest.publish(topics.SCAN, full_sweep(8.0 if i < 60 else 0.6, i),
                              stamp=stamp_s if i == 30 else None)

@@ -11,6 +11,7 @@ from virtual_loop import System, VirtualLoop, run
 
 from rampart.actors.detection.module import EXCUSE_S, DetectionModule, IllegalTransitionError
 from rampart.actors.detection.stub import StubDetection
+from rampart.actors.ftm import messages as fm
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.freshness import CommandFreshness, LocalizationFreshness
@@ -92,7 +93,7 @@ def test_the_actor_reports_at_once_and_repeats_at_5_hz():
                 source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
                 await asyncio.sleep(0.05)
             assert ear.states == ["idle", "active", "idle"]
-            assert dm2.state is m.DetectionState.IDLE
+            assert dm2.state is fm.DetectionState.IDLE
             assert ear.heard[-1][1].reason == ""
 
     run(scenario)
@@ -220,7 +221,7 @@ def test_an_illegal_transition_names_both_states():
             module.activate("a fault", ("a",))
             module.activate("two faults", ("a", "b"))
             module.clear()
-            assert module.state is m.DetectionState.IDLE
+            assert module.state is fm.DetectionState.IDLE
 
     run(scenario)
 

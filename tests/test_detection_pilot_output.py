@@ -13,6 +13,8 @@ from laser_sweeps import full_sweep
 from virtual_loop import System, run
 
 from rampart import systems
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
@@ -187,7 +189,7 @@ def test_a_respawned_module_claims_nothing_of_a_pilot_whose_output_is_old_when_i
 class Rest(Actor):
     """All that the pilot hears."""
 
-    outputs = (topics.COMMAND, topics.STANDBY_COMMAND, topics.SCAN, topics.MANAGER_STATUS)
+    outputs = (topics.COMMAND, topics.STANDBY_COMMAND, topics.SCAN, ftm_topics.MANAGER_STATUS)
 
 
 @pytest.mark.parametrize("silent_s", [0.5, 5.0])
@@ -200,9 +202,9 @@ def test_a_sound_pilot_is_not_accused_when_both_computers_of_the_command_fall_si
             system.start("safety_pilot", SafetyPilot)
             system.start("DM12", PilotOutput)
             await system.settle()
-            told = m.ManagerStatus((), (), (), (), "safety-first", 0)
+            told = fm.ManagerStatus((), (), (), (), "safety-first", 0)
             for i in range(round((3.0 + silent_s) * 20)):
-                rest.publish(topics.MANAGER_STATUS, told)
+                rest.publish(ftm_topics.MANAGER_STATUS, told)
                 rest.publish(topics.SCAN, full_sweep(number=i))
                 if i < 40 or i >= 40 + silent_s * 20:
                     rest.publish(topics.COMMAND, m.Twist(0.8, 0.1))

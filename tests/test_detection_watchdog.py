@@ -11,7 +11,7 @@ from virtual_loop import System, run
 
 from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.detection.watchdog_core import WatchdogCore
-from rampart.actors.osmosis import messages as m
+from rampart.actors.ftm import messages as m
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.wiring import Member, heard
 

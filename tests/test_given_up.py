@@ -13,8 +13,8 @@ from test_supervision import eventually, running
 from test_supervisor import running as played
 from virtual_loop import run, until
 
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import RespawnRequest
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import RespawnRequest
 from rampart.actors.supervision import supervisor
 from rampart.actors.supervision.restart_policy import RestartPolicy
 from rampart.sim.campaign.job import Job, run_virtually

@@ -9,7 +9,8 @@ import pytest
 from handler_fuzz import SYSTEMS, cases, fuzz_actor, fuzz_tools, system
 
 from rampart.actors.bus.envelope import Header, encode
-from rampart.actors.osmosis import messages as m
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.run.run_plan import SUPERVISOR, adapted_system
 from rampart.actors.runtime.actor import Actor, Context, on
@@ -77,7 +78,7 @@ def heard_by_the_supervisor(*bodies):
         await stranger.open()
         await asyncio.sleep(0.1)
         for number, body in enumerate(bodies, start=1):
-            stranger.publish(topics.ADAPTED_SYSTEM, topics.ADAPTED_SYSTEM.at(), encode(
+            stranger.publish(ftm_topics.ADAPTED_SYSTEM, ftm_topics.ADAPTED_SYSTEM.at(), encode(
                 Header("ftm_manager", 1, number, 0.0), body))
             await asyncio.sleep(0.1)
         actor.stop()

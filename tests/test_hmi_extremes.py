@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from test_hmi_operating import open_page
 
 from rampart.actors.bus.envelope import Header
+from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.bounds import SHOWN, Bounds, clip
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.state import MAX_LIGHTS, HmiState
@@ -79,7 +80,7 @@ async def test_all_extremes_together_make_a_frame_that_a_page_can_take(world):
 async def test_a_system_that_is_none_is_reported_and_the_one_before_stays(world, document):
     async with world.running(node(world, Hmi, hmi_port=free_port())) as hmi:
         drawn = hmi._state.picture.value("system")
-        hmi._adapted(m.AdaptedSystem(7, "a change", "somebody", document),
+        hmi._adapted(fm.AdaptedSystem(7, "a change", "somebody", document),
                      Header("ftm_manager", 1, 1, 0.0))
         assert hmi._state.picture.value("system") == drawn
         await eventually(lambda: any(
@@ -138,7 +139,7 @@ async def test_the_page_draws_so_many_lights_and_says_how_many_it_leaves_out(wor
                     Header("mission_manager", 1, int(mission), 0.0))
             await tab.until(f"{state} === 0")
             many = ("x",) * 5000
-            hmi._manager(m.ManagerStatus(many, (), (), ("RM1",), "", 1), Header("x", 1, 1, 0.0))
+            hmi._manager(fm.ManagerStatus(many, (), (), ("RM1",), "", 1), Header("x", 1, 1, 0.0))
             await tab.until("document.getElementById('left-out').textContent"
                             ".endsWith('4800 of the manager left out.')")
             assert await tab.value("document.getElementById('resets').children.length") == 1
@@ -192,7 +193,7 @@ def test_what_is_too_long_is_cut_and_what_is_missing_is_counted():
 
 
 def test_a_long_list_takes_nothing_from_the_one_beside_it():
-    status = m.ManagerStatus((LONG,) * 5000, (), (), ("RM1",), "x", 1)
+    status = fm.ManagerStatus((LONG,) * 5000, (), (), ("RM1",), "x", 1)
     shown, left_out = SHOWN.fit(status)
     assert shown["latched"] == ["RM1"]
     assert left_out > 4000

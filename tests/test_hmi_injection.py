@@ -10,7 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from porter_actors import write_porter_system
 
+from rampart.actors.bus import messages as bm
 from rampart.actors.bus.envelope import AHEAD_S
+from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.adaptation import GIVE_UP_S, ChoiceError, StrategyChoice
 from rampart.actors.operator.injection import (
     FIRST_EFFECT_S,
@@ -39,8 +41,8 @@ def injections() -> Injections:
 
 
 def report(order, affected: int = 0, *, finished: bool = False, reason: str = "",
-           node: str = "localization") -> m.InjectionReport:
-    return m.InjectionReport(order.injection, node, affected, finished, reason)
+           node: str = "localization") -> bm.InjectionReport:
+    return bm.InjectionReport(order.injection, node, affected, finished, reason)
 
 
 def test_a_fault_is_sent_until_its_publisher_reports_and_its_effect_is_told_once():
@@ -185,7 +187,7 @@ def test_all_that_is_offered_survives_the_plan_and_is_sound():
         ordered = faults.order(offered.name, 0.0, None, 0.0)
         for order in ordered.orders:
             assert ordered.injection in order.injection
-            if isinstance(order, m.Injection):
+            if isinstance(order, bm.Injection):
                 assert flaw(order) == ""
         faults.end(ordered.injection, 0.0)
 
@@ -226,7 +228,7 @@ def test_each_fault_is_concluded_once_whatever_is_reported(events):
             names.append(faults.order("gps-bias", 0.0, 3.0, now_s).injection)
         elif kind == "report" and names:
             name = names[number % len(names)]
-            told.append(faults.hear(m.InjectionReport(
+            told.append(faults.hear(bm.InjectionReport(
                 f"{name}.1", "simulator", number, number > 3, "")))
         elif kind == "end" and names:
             try:
@@ -245,8 +247,8 @@ def test_each_fault_is_concluded_once_whatever_is_reported(events):
 NAMES = ("safety-first", "mission-first")
 
 
-def answer(request: m.AdaptationRequest, reason: str = "") -> m.AdaptationAnswer:
-    return m.AdaptationAnswer(request.request, not reason, reason, 3)
+def answer(request: fm.AdaptationRequest, reason: str = "") -> fm.AdaptationAnswer:
+    return fm.AdaptationAnswer(request.request, not reason, reason, 3)
 
 
 def test_a_strategy_is_asked_for_until_the_manager_answers():
@@ -257,7 +259,7 @@ def test_a_strategy_is_asked_for_until_the_manager_answers():
     assert choice.pending is request
     with pytest.raises(ChoiceError, match="waits for its answer"):
         choice.ask("mission-first", "safety-first", 0.1)
-    assert choice.answer(m.AdaptationAnswer("another's", True, "", 1)) == ""
+    assert choice.answer(fm.AdaptationAnswer("another's", True, "", 1)) == ""
     told = choice.answer(answer(request))
     assert told == "strategy mission-first is in force, change 3 of the run"
     assert choice.answer(answer(request)) == ""

@@ -20,6 +20,7 @@ from hmi_world import (
     served,
 )
 
+from rampart.actors.ftm import messages as fm
 from rampart.actors.operator import feed as hmi_feed
 from rampart.actors.operator import server as hmi_server
 from rampart.actors.operator.hmi import Hmi
@@ -82,7 +83,7 @@ async def test_the_emergency_stop_is_reset_from_the_page(world):
             await eventually(lambda: hmi._state.latched == ("RM1",))
             await page.send('{"type": "reset", "recovery": "RM1"}')
             await hear(page, "done")
-            await eventually(lambda: world.others.resets == [m.Reset("RM1", "hmi")])
+            await eventually(lambda: world.others.resets == [fm.Reset("RM1", "hmi")])
 
 
 async def test_a_mission_is_started_from_the_page_unless_one_runs(world):
@@ -246,7 +247,7 @@ async def test_chromium_shows_the_system_resets_the_stop_and_reconnects_by_itsel
             world.say_latched("RM1")
             await tab.until("!document.getElementById('alarm').hidden")
             await tab.value("document.querySelector('#resets button').click()")
-            await eventually(lambda: world.others.resets == [m.Reset("RM1", "hmi")])
+            await eventually(lambda: world.others.resets == [fm.Reset("RM1", "hmi")])
             assert tab.errors == []
         await tab.until("document.body.classList.contains('offline')")
         async with world.hmi(incarnation=2, hmi_port=port):

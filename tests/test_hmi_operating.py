@@ -11,6 +11,10 @@ import pytest
 import websockets
 from hmi_world import eventually, free_port, hear, repeated, served
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.supervision.kill_node import SignalError
@@ -194,7 +198,7 @@ async def test_a_strategy_is_asked_for_from_the_page_and_the_answer_shown(world)
             request = world.others.adaptations[0]
             assert (request.action, request.name, json.loads(request.values)) == (
                 "set", "strategy", {"value": "mission-first"})
-            world.others.publish(topics.ADAPTATION, m.AdaptationAnswer(
+            world.others.publish(ftm_topics.ADAPTATION, fm.AdaptationAnswer(
                 request.request, False, "not in the middle of a recovery: RM2", 0))
             async with asyncio.timeout(5):
                 while "RM2" not in (state := await hear(page, "state"))["order"]["text"]:
@@ -245,7 +249,7 @@ async def test_a_fault_is_injected_from_the_page_and_its_effect_shown(world):
             order = world.others.injections[0]
             assert (order.topic, order.set_fields["linear_mps"], order.duration_s) == (
                 "control/command", 3.0, 3.0)
-            world.others.publish(topics.INJECTION_RESULT, m.InjectionReport(
+            world.others.publish(bus_topics.INJECTION_RESULT, bm.InjectionReport(
                 order.injection, "osmosis_control", 60, True, ""))
             shown = await operating(page, lambda o: o["faults"] and o["faults"][0]["ended"])
             assert shown["faults"][0]["state"] == "over, 60 messages changed"

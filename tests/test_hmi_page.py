@@ -10,8 +10,8 @@ from hmi_browser import CHROMIUM, browser
 from hmi_page import LIVE, SPEC, events, page, speaking_world
 from hmi_world import free_port, repeated, served
 
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 

@@ -10,6 +10,10 @@ import websockets
 from hmi_browser import CHROMIUM, browser
 from hmi_world import World, eventually, free_port, hear, repeated, served
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.page import stick as hmi_stick
@@ -31,7 +35,7 @@ def alive(world: World):
     """Have the Safety Pilot and the manager heard, as in a run in which all is well."""
     def say() -> None:
         world.others.publish(topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.AUTO, False, "", 0))
-        world.others.publish(topics.MANAGER_STATUS, m.ManagerStatus(
+        world.others.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus(
             (), (), (), (), "safety-first", 0))
     return repeated(say)
 
@@ -154,7 +158,7 @@ async def test_a_connection_that_is_too_slow_is_told_so_and_not_flooded(world, m
 async def test_the_page_says_why_teleoperation_does_not_follow_it(world):
     async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
         await drive_ahead(tab, world, hmi)
-        world.others.publish(topics.ERROR_REPORT, m.Diagnostic(
+        world.others.publish(ftm_topics.ERROR_REPORT, bm.Diagnostic(
             "teleoperation", "joystick", "not followed: /dev/input/js0 has the stick", "hmi", 1))
         await tab.until("document.getElementById('stick-state').textContent === 'not followed'")
         assert "/dev/input/js0 has the stick" in await tab.value(WORDS)
@@ -295,9 +299,9 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world):
         sent.append((node, name))
         return RunProcess(77, 7450, 1, (node,), 1)
 
-    def table(state: m.NodeState, restarts: int) -> None:
-        world.others.publish(topics.NODES, m.NodeTable(tuple(
-            m.NodeInfo(name, "control", 77, state, 1 + restarts, restarts)
+    def table(state: fm.NodeState, restarts: int) -> None:
+        world.others.publish(ftm_topics.NODES, fm.NodeTable(tuple(
+            fm.NodeInfo(name, "control", 77, state, 1 + restarts, restarts)
             for name in ("safety_pilot", "osmosis_control"))))
 
     row = "document.querySelector('tr[data-node=osmosis_control]')"
@@ -305,7 +309,7 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world):
                 world.hmi(hmi_port=free_port(), signal_node=signal_node) as hmi):
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until(LIVE)
-        async with repeated(lambda: table(m.NodeState.RUNNING, 0)):
+        async with repeated(lambda: table(fm.NodeState.RUNNING, 0)):
             await tab.until(f"{row} !== null")
             await tab.value(f"{row}.querySelector('button').click()")
             assert await tab.value("document.getElementById('signal-dialog').open") is True
@@ -332,7 +336,7 @@ async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world):
         await tab.value("document.getElementById('strategy-name').value = 'mission-first';"
                         "document.getElementById('strategy-set').click()")
         await eventually(lambda: bool(world.others.adaptations))
-        world.others.publish(topics.ADAPTATION, m.AdaptationAnswer(
+        world.others.publish(ftm_topics.ADAPTATION, fm.AdaptationAnswer(
             world.others.adaptations[0].request, True, "", 1))
         await tab.until("document.getElementById('toast').textContent"
                         " === 'strategy mission-first is in force, change 1 of the run'")
@@ -348,7 +352,7 @@ async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world):
                 o.topic == topic for o in world.others.injections))
             order = next(o for o in world.others.injections if o.topic == topic)
             assert order.duration_s == 4.0
-            world.others.publish(topics.INJECTION_RESULT, m.InjectionReport(
+            world.others.publish(bus_topics.INJECTION_RESULT, bm.InjectionReport(
                 order.injection, "simulator", 12, True, ""))
             await tab.until("document.querySelector('#faults li').textContent"
                             f".startsWith('{chosen}')")

@@ -5,6 +5,7 @@ import math
 
 import msgspec
 
+from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.state import STALE_S, TRACK_POINTS, HmiState
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.drawing import draw
@@ -50,8 +51,8 @@ def test_a_detection_is_logged_when_it_begins_and_when_it_ends():
     state = HmiState()
     active, idle = True, False
     for at_s, which in enumerate([idle, idle, active, active, idle, idle]):
-        view = m.DetectionView("DM2", which, "stale" if which else "", ())
-        state.manager(m.ManagerStatus((), (), (), (), "safety-first", 0, (view,)), float(at_s))
+        view = fm.DetectionView("DM2", which, "stale" if which else "", ())
+        state.manager(fm.ManagerStatus((), (), (), (), "safety-first", 0, (view,)), float(at_s))
     assert [(e["t"], e["kind"], e["text"]) for e in shown(state)["events"]] == [
         (2.0, "fault", "DM2 detects: stale"), (4.0, "clear", "DM2 is idle again")]
 
@@ -59,7 +60,7 @@ def test_a_detection_is_logged_when_it_begins_and_when_it_ends():
 def test_that_all_nodes_start_at_the_start_is_no_news_but_a_crash_is():
     state = HmiState()
     for event in ("started", "running", "crashed", "respawned"):
-        state.process_event(m.ProcessEvent("hmi", event, 1, 1, "RM4", ""), 1.0)
+        state.process_event(fm.ProcessEvent("hmi", event, 1, 1, "RM4", ""), 1.0)
     assert [e["text"] for e in shown(state)["events"]] == ["hmi crashed", "hmi respawned by RM4"]
 
 
@@ -78,7 +79,7 @@ def test_lights_come_from_the_status_and_from_passing_and_a_new_mission_forgets_
 
 def test_a_decision_is_told_with_its_certificate():
     state = HmiState()
-    state.decision(m.DecisionRecord(
+    state.decision(fm.DecisionRecord(
         4, "safety-first", ("FTM1", "FTM6"), 2, ("RM1",), ("FTM1 > FTM6",),
         (("RM5", "FTM6 is dominated by FTM1"),), 1.0), 1.1)
     told = shown(state)["decisions"][0]

@@ -8,9 +8,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from rampart.actors.ftm import messages as m
 from rampart.actors.operator.processes import SEARCH_EVERY, ProcessObserver
 from rampart.actors.operator.system import BARRIER, MAX_BOXES, draw_system
-from rampart.actors.osmosis import messages as m
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.actors.supervision.process_usage import ProcessCount, UsageMeter
 from rampart.manager.spec.schema import EventSpec

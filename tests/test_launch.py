@@ -154,7 +154,7 @@ def test_an_emergency_stop_stays_until_it_is_reset_and_then_the_mission_goes_on(
 def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
     script = (
         "import sys, zenoh, time\n"
-        "from actors import topics\n"
+        "from rampart.actors.osmosis import topics\n"
         "from rampart.actors.bus.zenoh_bus import session_config\n"
         "s = zenoh.open(session_config(None, sys.argv[1:]))\n"
         "time.sleep(1)\n"

@@ -14,8 +14,12 @@ from recovery_world import Base, Node, Pilot, Supervisor, hang
 from shapely.geometry import box
 from virtual_loop import System, VirtualLoop, run, shipped_system
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.detection.watchdog import Watchdog
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
@@ -40,7 +44,7 @@ RESPAWN = {"RM3": CONTROL, "RM4": (*OTHERS, "localization")}
 class Robot(Actor):
     """Publishes command, pose and GPS at 20 Hz, until one of them is told to cease."""
 
-    outputs = (topics.COMMAND, topics.POSE, topics.GPS, topics.RESET)
+    outputs = (topics.COMMAND, topics.POSE, topics.GPS, ftm_topics.RESET)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -62,25 +66,25 @@ class Recorder(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.decisions: list[m.DecisionRecord] = []
-        self.statuses: list[m.ManagerStatus] = []
+        self.decisions: list[fm.DecisionRecord] = []
+        self.statuses: list[fm.ManagerStatus] = []
         self.problems: list[str] = []
         self.recoveries: list[tuple[str, str]] = []
 
-    @on(topics.DECISION)
-    def decision(self, message: m.DecisionRecord, _header: Header) -> None:
+    @on(ftm_topics.DECISION)
+    def decision(self, message: fm.DecisionRecord, _header: Header) -> None:
         self.decisions.append(message)
 
-    @on(topics.MANAGER_STATUS)
-    def status(self, message: m.ManagerStatus, _header: Header) -> None:
+    @on(ftm_topics.MANAGER_STATUS)
+    def status(self, message: fm.ManagerStatus, _header: Header) -> None:
         self.statuses.append(message)
 
-    @on(topics.DIAGNOSTIC)
-    def problem(self, message: m.Diagnostic, _header: Header) -> None:
+    @on(bus_topics.DIAGNOSTIC)
+    def problem(self, message: bm.Diagnostic, _header: Header) -> None:
         self.problems.append(f"{message.context}: {message.reason}")
 
-    @on(topics.RECOVERY)
-    def recovery(self, message: m.RecoveryReport, header: Header) -> None:
+    @on(ftm_topics.RECOVERY)
+    def recovery(self, message: fm.RecoveryReport, header: Header) -> None:
         entry = (header.source, message.phase.value)
         if entry not in self.recoveries:
             self.recoveries.append(entry)
@@ -96,17 +100,17 @@ class Obedient(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.heard: list[m.RecoveryCommand] = []
+        self.heard: list[fm.RecoveryCommand] = []
 
-    @on(topics.RECOVERY_COMMAND)
-    def command(self, message: m.RecoveryCommand, _header: Header) -> None:
+    @on(ftm_topics.RECOVERY_COMMAND)
+    def command(self, message: fm.RecoveryCommand, _header: Header) -> None:
         self.heard.append(message)
 
 
 class Tool(Actor):
     """Injects faults."""
 
-    outputs = (topics.INJECT,)
+    outputs = (bus_topics.INJECT,)
 
 
 class Whole(System):
@@ -154,7 +158,7 @@ class Whole(System):
         return self.actors[name]
 
     @property
-    def status(self) -> m.ManagerStatus:
+    def status(self) -> fm.ManagerStatus:
         """What the manager said last."""
         return self.recorder.statuses[-1]
 
@@ -251,15 +255,15 @@ def test_an_emergency_stop_comes_with_the_fix_and_stays_until_it_is_reset():
         system.robot.talk()
         await system.settle()
         assert system.base.engaged
-        reset = m.Reset("RM1", "operator")
-        system.robot.publish(topics.RESET, reset)
+        reset = fm.Reset("RM1", "operator")
+        system.robot.publish(ftm_topics.RESET, reset)
         await system.settle()
         assert system.recorder.problems == ["reset refused: the cause persists: FTM1 active"]
         system.robot.y_m = 0.0
         await asyncio.sleep(5.0)
         assert system.base.engaged
         assert system.status.latched == ("RM1",)
-        system.robot.publish(topics.RESET, reset)
+        system.robot.publish(ftm_topics.RESET, reset)
         await system.settle()
         assert not system.base.engaged
         assert system.status.latched == ()
@@ -379,7 +383,7 @@ def test_a_detection_module_whose_reports_are_old_news_is_silent():
         system.supervisor.answer = "nothing"
         tool = system.start("tool", Tool)
         await system.settle()
-        tool.publish(topics.INJECT, m.Injection("i.1", "detection/DM3", "freeze", 60.0))
+        tool.publish(bus_topics.INJECT, bm.Injection("i.1", "detection/DM3", "freeze", 60.0))
         await asyncio.sleep(0.5)
         assert system.status.silent == ()
         await asyncio.sleep(1.0)
@@ -411,7 +415,7 @@ def test_a_respawned_manager_adopts_a_latched_emergency_stop():
             await asyncio.sleep(0.05)
             assert system.base.engaged
         assert system.status.latched == ("RM1",)
-        system.robot.publish(topics.RESET, m.Reset("RM1", "operator"))
+        system.robot.publish(ftm_topics.RESET, fm.Reset("RM1", "operator"))
         await asyncio.sleep(0.5)
         assert not system.base.engaged
 

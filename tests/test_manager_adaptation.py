@@ -14,8 +14,8 @@ from manager_bench import PAPER, paper
 from test_manager_actor import Whole
 from virtual_loop import run, turns
 
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.manager.spec.adaptation import (
     Action,

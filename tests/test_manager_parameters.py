@@ -13,8 +13,8 @@ from virtual_loop import System, run, shipped_system
 
 import actors.detection
 import actors.recovery
+from rampart.actors.bus import topics
 from rampart.actors.detection.module import DetectionModule
-from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context

@@ -11,8 +11,12 @@ from message_extremes import HEADER, all_topics, edges, pack, smallest, unbounde
 from msgspec import inspect
 
 from rampart.actors.bus import envelope
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, TEXT_CHARS, bare, clip, oversized
 from rampart.actors.bus.envelope import ArrivalGuard
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor, Context, on
@@ -37,7 +41,7 @@ def test_the_header_is_bounded():
 
 
 def test_a_field_without_bounds_is_found():
-    class Loose(m.Message, frozen=True):
+    class Loose(bm.Message, frozen=True):
         names: tuple[str, ...]
         rows: dict[str, bytes]
 
@@ -70,13 +74,13 @@ def test_a_header_beyond_its_bounds_is_refused():
     for path, value, fits in edges(HEADER):
         name = path.removeprefix("$.")
         parts = {**good, name: value[name]}
-        taken, _ = judged(topics.HELLO, pack(*parts.values(), {}))
+        taken, _ = judged(bus_topics.HELLO, pack(*parts.values(), {}))
         assert taken is fits, (name, value[name])
 
 
 def test_the_incarnation_that_killed_the_supervisor_is_refused():
-    taken, reason = judged(topics.HEARTBEAT, pack(
-        "DM1", 2**64 - 1, 1, 0.0, smallest(bounds_of(topics.HEARTBEAT))))
+    taken, reason = judged(bus_topics.HEARTBEAT, pack(
+        "DM1", 2**64 - 1, 1, 0.0, smallest(bounds_of(bus_topics.HEARTBEAT))))
     assert not taken
     assert "Expected `int` <= 2147483647" in reason
 
@@ -85,8 +89,8 @@ def test_a_payload_that_is_too_long_is_refused_before_it_is_decoded(monkeypatch)
     def never(_payload):
         raise AssertionError("it was decoded")
 
-    monkeypatch.setitem(envelope._decoders, m.Reset, never)
-    taken, reason = judged(topics.RESET, b"\x95" + bytes(MAX_PAYLOAD_BYTES))
+    monkeypatch.setitem(envelope._decoders, fm.Reset, never)
+    taken, reason = judged(ftm_topics.RESET, b"\x95" + bytes(MAX_PAYLOAD_BYTES))
     assert not taken
     assert reason == (f"not a Reset: {MAX_PAYLOAD_BYTES + 1} bytes, "
                       f"at most {MAX_PAYLOAD_BYTES} are right")
@@ -97,7 +101,7 @@ class Reader(Actor):
 
     heard: list = []
 
-    @on(topics.STUB_TRIGGER)
+    @on(ftm_topics.STUB_TRIGGER)
     def take(self, message, _header):
         self.heard.append(message)
 
@@ -140,12 +144,12 @@ def lived(kind, during=lambda _hub: None):
 
 def test_what_is_beyond_a_bound_is_reported_counted_and_never_handled():
     Reader.heard = []
-    key = topics.STUB_TRIGGER.at()
+    key = ftm_topics.STUB_TRIGGER.at()
 
     def during(stranger):
         body = {"name": "n" * 257, "active": True, "reason": ""}
-        stranger.publish(topics.STUB_TRIGGER, key, pack("x", 1, 1, 0.0, body))
-        stranger.publish(topics.STUB_TRIGGER, key, pack("x", 1, 2, 0.0, {**body, "name": "n"}))
+        stranger.publish(ftm_topics.STUB_TRIGGER, key, pack("x", 1, 1, 0.0, body))
+        stranger.publish(ftm_topics.STUB_TRIGGER, key, pack("x", 1, 2, 0.0, {**body, "name": "n"}))
 
     sent = lived(Reader, during)
     assert [message.name for message in Reader.heard] == ["n"]
@@ -188,11 +192,11 @@ def test_oversized_counts_bytes_and_depth(value, too_much):
 
 def test_a_value_to_be_injected_is_bounded_where_it_is_made_as_well():
     with pytest.raises(ValueError, match="set_fields: more than"):
-        m.Injection("i", "t", "corrupt", 1.0, set_fields={"x": ["y" * 1000] * 1000})
+        bm.Injection("i", "t", "corrupt", 1.0, set_fields={"x": ["y" * 1000] * 1000})
 
 
 def test_bare_takes_the_bounds_off_a_field_s_type():
-    fields = {f.name: f.type for f in msgspec.structs.fields(m.NodeInfo)}
+    fields = {f.name: f.type for f in msgspec.structs.fields(fm.NodeInfo)}
     assert (bare(fields["pid"]), bare(fields["name"]), bare(m.Pose)) == (int, str, m.Pose)
 
 

@@ -11,6 +11,8 @@ import pytest
 from test_toolbox_live import RATE, Run
 
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.mission import mission_state
@@ -30,7 +32,7 @@ REQUEST = m.MissionRequest("r1/first", "AB", GOALS)
 class Planner(Actor):
     """Stands for the rest: it tells the first route, so that home is known."""
 
-    outputs = (topics.MISSION_REQUEST, topics.ROUTE, topics.MANAGER_STATUS)
+    outputs = (topics.MISSION_REQUEST, topics.ROUTE, ftm_topics.MANAGER_STATUS)
 
 
 @pytest.fixture
@@ -105,7 +107,7 @@ async def test_an_order_that_makes_no_sense_is_refused_with_the_reason_and_exit_
 
 async def test_a_robot_that_a_recovery_holds_is_not_released_by_an_order(run, capsys):
     begin(run)
-    run.node.manager(m.ManagerStatus((), (), ("RM2",), (), "safety-first", 1), None)
+    run.node.manager(fm.ManagerStatus((), (), ("RM2",), (), "safety-first", 1), None)
     code, _, err = await run.call(capsys, "mission", "resume")
     assert code == 1
     assert err == ("rampart: resume refused: held by RM2; it goes on by itself when the robot is "

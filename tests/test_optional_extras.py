@@ -14,7 +14,11 @@ import pytest
 from stub_actors import ROOT
 from test_top_view import busy
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
@@ -94,10 +98,10 @@ def test_the_handbook_lists_every_metric_with_its_labels():
 
     picture = busy()
     for topic, body in (
-            (topics.HEARTBEAT, m.Heartbeat(1, 0, 0.1, 0, 0)),
-            (topics.PROCESS_EVENT, m.ProcessEvent("hmi", "crashed", 1, 1, "", "")),
-            (topics.RECOVERY, m.RecoveryReport(
-                m.RecoveryState.ACTIVATED, m.RecoveryPhase.ACTING, 1, ""))):
+            (bus_topics.HEARTBEAT, bm.Heartbeat(1, 0, 0.1, 0, 0)),
+            (ftm_topics.PROCESS_EVENT, fm.ProcessEvent("hmi", "crashed", 1, 1, "", "")),
+            (ftm_topics.RECOVERY, fm.RecoveryReport(
+                fm.RecoveryState.ACTIVATED, fm.RecoveryPhase.ACTING, 1, ""))):
         picture.heard(topic, Header("somebody", 1, 1, 1.0), body, 1.0)
     for time_s in (0.0, 1.0):
         picture.sample(time_s)
@@ -129,7 +133,7 @@ async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a
     from rampart.cli.look import metrics_server
 
     run = msgspec.structs.replace(RUN, pid=os.getpid(), replay_of=replay_of)
-    mine = m.NodeTable((m.NodeInfo("hmi", "operator", os.getpid(), m.NodeState.RUNNING, 1, 0),))
+    mine = fm.NodeTable((fm.NodeInfo("hmi", "operator", os.getpid(), fm.NodeState.RUNNING, 1, 0),))
     looks = []
 
     async def one(*_, **__):
@@ -147,7 +151,7 @@ async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a
     monkeypatch.setattr(metrics_server, "ProcessObserver", Observer)
     monkeypatch.setattr(metrics_server, "LOOK_S", 0.001)
     monkeypatch.setattr(metrics_server, "draw", lambda _session, picture: picture.heard(
-        topics.NODES, Header("supervisor", 1, 1, 0.0), mine, 0.0))
+        ftm_topics.NODES, Header("supervisor", 1, 1, 0.0), mine, 0.0))
     exporter, stop = metrics_server.Exporter(), asyncio.Event()
     following = asyncio.create_task(exporter.follow(None, stop))
     await asyncio.sleep(0.2)
@@ -217,7 +221,7 @@ def test_rerun_writes_a_file_with_map_robot_laser_and_log(tmp_path):
             (topics.OBSTACLES, m.ObstacleList((m.ObstacleCommand("c", True, 1.0, 1.0, 0.4),))),
             (topics.LIGHT_MEASURED, m.LightMeasurement(
                 airport.lights[0].name, 100.0, 0.4, m.LightVerdict.DIM)),
-            (topics.PROCESS_EVENT, m.ProcessEvent("hmi", "crashed", 1, 1, "", ""))):
+            (ftm_topics.PROCESS_EVENT, fm.ProcessEvent("hmi", "crashed", 1, 1, "", ""))):
         found += views.of(topic, f"rampart/{topic.key}", header, body, 1_000_000_000)
     for channel, record in found:
         viewer.show(channel, record, 1_000_000_000)

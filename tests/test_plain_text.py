@@ -12,6 +12,9 @@ from msgspec import convert, inspect
 from rich.console import Console as RichConsole
 from test_bounded_state import told
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Header
@@ -61,7 +64,7 @@ def test_what_tools_print_is_harmless_whatever_they_are_told(text, capsys):
     warn(text)
     print_table(("node",), [(text,)])
     print_json({"by": text})
-    say(in_line(m.Reset(text, text)))
+    say(in_line(fm.Reset(text, text)))
     _complain(text)
     out, err = capsys.readouterr()
     assert harmless(out + err)
@@ -108,14 +111,14 @@ def hostile(kind, number, text):
 
 
 def report(number):
-    return m.Diagnostic("x" * 200, "c" * 2000, "r" * 2000, f"{number}", 1)
+    return bm.Diagnostic("x" * 200, "c" * 2000, "r" * 2000, f"{number}", 1)
 
 
 def test_a_flood_of_reports_is_some_clipped_lines_and_a_count_and_other_news_come_through():
     stream, now = io.StringIO(), [0.0]
     console = Console(stream, lambda: now[0])
     for number in range(10_000):
-        console.take(topics.ERROR_REPORT, report(number), Header("x", 1, number, 1.0))
+        console.take(ftm_topics.ERROR_REPORT, report(number), Header("x", 1, number, 1.0))
     console.line(1.0, "news")
     lines = stream.getvalue().splitlines()
     assert (len(lines), lines[-1]) == (REPORTS_PER_S + 1, "[   1.00 s] news")

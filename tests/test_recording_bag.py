@@ -14,7 +14,10 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from recording_samples import NAN, PLAN, documents, pose, sample, write
 
+from rampart.actors.bus import messages as bm
 from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
@@ -199,18 +202,19 @@ def test_the_robot_is_as_large_as_the_system_says(text, size):
 def test_the_log_tells_decisions_detections_and_processes_once_each():
     views = Views()
     header = Header("ftm_manager", 1, 4, 0.0)
-    decision = m.DecisionRecord(3, "safety-first", ("FTM1",), 1, ("RM1",), (), (), 0.0)
-    lines = [view for _ in range(2) for view in views.of(topics.DECISION, "d", header, decision, 0)]
+    decision = fm.DecisionRecord(3, "safety-first", ("FTM1",), 1, ("RM1",), (), (), 0.0)
+    lines = [view for _ in range(2)
+             for view in views.of(ftm_topics.DECISION, "d", header, decision, 0)]
     assert [line.message for _, line in lines] == [
         "decision 3: FTM1 is active: run RM1, because it is the only active mechanism (block 1)."]
-    states = [m.DetectionState.IDLE, m.DetectionState.ACTIVE, m.DetectionState.ACTIVE,
-              m.DetectionState.IDLE]
+    states = [fm.DetectionState.IDLE, fm.DetectionState.ACTIVE, fm.DetectionState.ACTIVE,
+              fm.DetectionState.IDLE]
     told = [line.message for number, state in enumerate(states) for _, line in views.of(
-        topics.DETECTION, "DM1", Header("DM1", 1, number, 0.0),
-        m.DetectionReport(state, "fence", (), 0.0), 0)]
+        ftm_topics.DETECTION, "DM1", Header("DM1", 1, number, 0.0),
+        fm.DetectionReport(state, "fence", (), 0.0), 0)]
     assert told == ["detects: fence", "is idle again"]
-    died = m.ProcessEvent("hmi", "crashed", 1, 1, "", "killed by SIGKILL")
-    [(_, line)] = views.of(topics.PROCESS_EVENT, "e", header, died, 0)
+    died = fm.ProcessEvent("hmi", "crashed", 1, 1, "", "killed by SIGKILL")
+    [(_, line)] = views.of(ftm_topics.PROCESS_EVENT, "e", header, died, 0)
     assert (line.level, line.message) == (fg.LogLevel.WARNING, "hmi crashed: killed by SIGKILL")
 
 
@@ -250,7 +254,7 @@ def test_topics_that_only_the_robot_knows_are_neither_garbage_nor_lost(tmp_path)
         writer = BagWriter(file, documents(), from_start=True)
         for number in range(1, 11):
             key = "rampart/heartbeat/driver" if number % 5 == 0 else "rampart/porter/speed/driver"
-            body = m.Heartbeat(1, 2, 0.1, 0, 0) if number % 5 == 0 else m.Twist(0.5, 0.0)
+            body = bm.Heartbeat(1, 2, 0.1, 0, 0) if number % 5 == 0 else m.Twist(0.5, 0.0)
             writer.take(number / 10, key, encode(Header("driver", 1, number, number / 10), body))
         writer.take(2.0, "rampart/porter/speed/driver", b"\xc1")
         writer.close()

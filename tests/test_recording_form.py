@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.envelope import Header, encode, pack
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.recording.json_schema import plain_schema
@@ -103,7 +105,7 @@ def test_garbage_in_the_form_of_an_envelope_with_a_text_that_is_none_is_garbage_
     for name, body in ((b"\xa1\xff", b"\x93" + 3 * (b"\xcb" + struct.pack(">d", 1.0))),
                        (b"\xa1x", b"\x92\xa1\xff\xa0")):
         payload = b"\x95" + name + b"\x01\x01\xcb" + struct.pack(">d", 1.0) + body
-        form = MessageForm(topics.POSE if b"\xff" in name else topics.RESET)
+        form = MessageForm(topics.POSE if b"\xff" in name else ftm_topics.RESET)
         text, header, _ = form.recorded(payload)
         assert header is None
         assert "error" in json.loads(text)
@@ -137,8 +139,8 @@ def test_a_sound_message_in_other_bytes_than_ours_keeps_them():
 
 
 def test_the_text_raw_in_a_message_is_no_payload():
-    payload = encode(Header('"raw":', 1, 1, 0.0), m.Reset('"raw":"AAAA"', "raw"))
-    form = form_of(topics.RESET.at())
+    payload = encode(Header('"raw":', 1, 1, 0.0), fm.Reset('"raw":"AAAA"', "raw"))
+    form = form_of(ftm_topics.RESET.at())
     assert form.payload(form.recorded(payload)[0]) == payload
 
 

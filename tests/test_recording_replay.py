@@ -25,6 +25,8 @@ from websockets.asyncio.client import connect as open_socket
 from rampart.actors.bus.envelope import ArrivalGuard, Header, encode
 from rampart.actors.bus.topic import ROOT
 from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator.requests import Wish
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -155,8 +157,9 @@ async def test_only_what_is_wanted_is_played_from_where_it_is_wanted(tmp_path, p
                     wants=lambda key: key.startswith(f"{ROOT}/detection/"))
     async with playing(player) as task, reading(port, f"{ROOT}/**") as heard:
         await task
-    assert heard == [(topics.DETECTION.at("DM1"), sent_payload) for at_s, key, sent_payload in sent
-                     if key == topics.DETECTION.at("DM1") and at_s >= 0.3]
+    key_of_dm1 = ftm_topics.DETECTION.at("DM1")
+    assert heard == [(key_of_dm1, sent_payload) for at_s, key, sent_payload in sent
+                     if key == key_of_dm1 and at_s >= 0.3]
     assert len(heard) == 1
 
 
@@ -280,7 +283,7 @@ async def test_tools_find_a_replay_and_give_it_no_orders(tmp_path, port):
             found = await session.latest((topics.POSE,), 10.0)
             assert isinstance(found[topics.POSE.key], m.Pose)
             with pytest.raises(UsageError, match=f"port {port} is a replay of"):
-                await session.command(topics.RESET, m.Reset("RM1", "me"), lambda: True, 1.0)
+                await session.command(ftm_topics.RESET, fm.Reset("RM1", "me"), lambda: True, 1.0)
 
 
 async def test_who_names_no_port_means_the_robot_and_not_the_replay(tmp_path, port, monkeypatch):
@@ -382,17 +385,17 @@ def test_messages_of_another_version_are_left_out_and_counted(tmp_path, port, ca
 
 async def test_the_page_shows_the_past_and_obeys_nobody(tmp_path, port):
     status = m.MissionStatus("1", "AB", m.MissionPhase.RUNNING, 0, (), (), (), "")
-    manager = m.ManagerStatus(("FTM1",), (), ("RM1",), ("RM1",), "safety-first", 1)
+    manager = fm.ManagerStatus(("FTM1",), (), ("RM1",), ("RM1",), "safety-first", 1)
     sent = [*(pose(n + 1, n * 0.05) for n in range(20)),
             *((n * 0.1, topics.MISSION_STATUS.at(),
                encode(Header("mission_manager", 1, n + 1, n * 0.1), status)) for n in range(10)),
-            *((n * 0.1, topics.MANAGER_STATUS.at(),
+            *((n * 0.1, ftm_topics.MANAGER_STATUS.at(),
                encode(Header("ftm_manager", 1, n + 1, n * 0.1), manager)) for n in range(10))]
     write(tmp_path / "run.mcap", sorted(sent))
     page_port = port + 30
     player = Replay(tmp_path / "run.mcap", port=port, loop=True, hmi_port=page_port)
     wish = next(kind for kind in Wish.__args__ if kind.__name__ == "ResetWish")
-    async with playing(player), reading(port, topics.RESET.at()) as heard:
+    async with playing(player), reading(port, ftm_topics.RESET.at()) as heard:
         url = f"http://127.0.0.1:{page_port}/"
         document = await asyncio.to_thread(lambda: urllib.request.urlopen(url).read())
         assert b"<html" in document

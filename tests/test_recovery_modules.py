@@ -8,6 +8,7 @@ import pytest
 from recovery_world import Base, Boss, Node, Pilot, Supervisor, hang
 from virtual_loop import System, run
 
+from rampart.actors.ftm import messages as fm
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import PilotMode
@@ -18,7 +19,7 @@ from rampart.actors.recovery.module import TRANSITIONS, IllegalTransitionError, 
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.wiring import Member, heard
 
-P = m.RecoveryPhase
+P = fm.RecoveryPhase
 
 
 def test_there_is_no_way_to_cut_an_action_off():
@@ -243,8 +244,8 @@ def test_the_same_decision_again_is_one_and_a_new_one_is_acknowledged():
             assert pilot.heard == 1
             boss.order("RM2", decision=2)
             await system.settle()
-            assert boss.reports[-1][1] == m.RecoveryReport(
-                m.RecoveryState.ACTIVATED, P.DEGRADED, 2, "safety pilot in mode stop")
+            assert boss.reports[-1][1] == fm.RecoveryReport(
+                fm.RecoveryState.ACTIVATED, P.DEGRADED, 2, "safety pilot in mode stop")
 
     run(scenario)
 

@@ -9,6 +9,10 @@ import re
 import msgspec
 import pytest
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
@@ -24,7 +28,7 @@ from rampart.sim.osmosis.report import (
 
 AIRPORT = load_airport("vallombre")
 MISSION = AIRPORT.mission("AB")
-ACTIVE, IDLE = m.DetectionState.ACTIVE, m.DetectionState.IDLE
+ACTIVE, IDLE = fm.DetectionState.ACTIVE, fm.DetectionState.IDLE
 
 
 class Story:
@@ -44,8 +48,8 @@ class Story:
         self.tell(t_s, topics.TRUTH, m.GroundTruth(
             m.Pose(x_m, y_m, 0.0), m.Twist(0.0, 0.0), **fields))
 
-    def detect(self, t_s: float, name: str, state: m.DetectionState, reason: str = "") -> None:
-        self.tell(t_s, topics.DETECTION, m.DetectionReport(state, reason, (), t_s), name)
+    def detect(self, t_s: float, name: str, state: fm.DetectionState, reason: str = "") -> None:
+        self.tell(t_s, ftm_topics.DETECTION, fm.DetectionReport(state, reason, (), t_s), name)
 
     def end(self, t_s: float = 100.0, *, mission="success", safety="safe", reasons=()) -> RunRecord:
         return self.recorder.record(mission, safety, reasons, t_s)
@@ -94,9 +98,9 @@ def test_what_was_measured_and_reached_outlives_a_mission_manager_that_forgets()
 
 def test_a_crash_is_a_bar_from_the_event_to_the_respawn_and_a_restart():
     story = Story()
-    crash = m.ProcessEvent("hmi", "crashed", 7, 1, "supervisor", "SIGKILL")
-    story.tell(10.0, topics.PROCESS_EVENT, crash)
-    story.tell(10.5, topics.PROCESS_EVENT, m.ProcessEvent("hmi", "respawned", 8, 2, "RM4", ""))
+    crash = fm.ProcessEvent("hmi", "crashed", 7, 1, "supervisor", "SIGKILL")
+    story.tell(10.0, ftm_topics.PROCESS_EVENT, crash)
+    story.tell(10.5, ftm_topics.PROCESS_EVENT, fm.ProcessEvent("hmi", "respawned", 8, 2, "RM4", ""))
     run = story.end()
     assert bars(run) == [("down", "hmi", 10.0, 10.5)]
     assert run.restarts == {"hmi": 1}
@@ -117,17 +121,17 @@ def test_repeated_states_make_one_bar_and_one_that_never_ends_lasts_to_the_end()
 def test_recoveries_follow_what_the_manager_says():
     story = Story()
     for t_s, activated in ((1.0, ("RM3",)), (1.1, ("RM3", "RM2")), (2.0, ("RM2",)), (3.0, ())):
-        story.tell(t_s, topics.MANAGER_STATUS, m.ManagerStatus(
+        story.tell(t_s, ftm_topics.MANAGER_STATUS, fm.ManagerStatus(
             (), (), activated, (), "safety-first", 1))
     assert bars(story.end()) == [("recovery", "RM3", 1.0, 2.0), ("recovery", "RM2", 1.1, 3.0)]
 
 
 def test_an_injection_is_told_with_its_effect_whether_or_not_its_order_was_heard():
     story = Story()
-    story.tell(4.0, topics.INJECT, m.Injection("i1", "localization/pose", "freeze", 2.0))
+    story.tell(4.0, bus_topics.INJECT, bm.Injection("i1", "localization/pose", "freeze", 2.0))
     for injection in ("i1", "command-not-updated-3f"):
         for t_s, affected, finished in ((5.0, 0, False), (7.0, 40, True)):
-            story.tell(t_s, topics.INJECTION_REPORT, m.InjectionReport(
+            story.tell(t_s, bus_topics.INJECTION_REPORT, bm.InjectionReport(
                 injection, "localization", affected, finished, ""))
     texts = [e.text for e in story.end().events]
     assert "fault injected: freeze localization/pose at localization" in texts
@@ -174,7 +178,7 @@ def full_story() -> Story:
         m.ObstacleCommand("crate", True, 1.0, 2.0, 0.4),
         m.ObstacleCommand("gone", False, 1.0, 2.0, 0.4))))
     story.detect(20.0, "DM1", ACTIVE, "<script>alert(1)</script> & more")
-    story.tell(20.1, topics.DECISION, m.DecisionRecord(
+    story.tell(20.1, ftm_topics.DECISION, fm.DecisionRecord(
         1, "safety-first", ("FTM1", "FTM6"), 2, ("RM1",), ("FTM1 > FTM6",),
         (("RM5", "FTM6 is dominated by FTM1"),), 20.0))
     return story

@@ -14,9 +14,13 @@ from contextlib import asynccontextmanager
 import msgspec
 import pytest
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.envelope import ArrivalGuard, encode
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.run.run_plan import (
@@ -38,7 +42,7 @@ from rampart.systems import SHIPPED
 class Talker(Actor):
     """Publishes poses on demand."""
 
-    outputs = (topics.POSE, topics.RESET)
+    outputs = (topics.POSE, ftm_topics.RESET)
 
 
 class Listener(Actor):
@@ -46,7 +50,7 @@ class Listener(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.heard: list[tuple[m.Message, Header]] = []
+        self.heard: list[tuple[bm.Message, Header]] = []
         self.peers: list[tuple[str, int, bool]] = []
         self.ticks = 0
 
@@ -58,8 +62,8 @@ class Listener(Actor):
     def pose(self, message: m.Pose, header: Header) -> None:
         self.heard.append((message, header))
 
-    @on(topics.RESET)
-    def reset(self, message: m.Reset, header: Header) -> None:
+    @on(ftm_topics.RESET)
+    def reset(self, message: fm.Reset, header: Header) -> None:
         if message.by == "poison":
             raise RuntimeError("poisoned")
         self.heard.append((message, header))
@@ -137,12 +141,12 @@ async def test_garbage_is_counted_and_reported_and_the_actor_goes_on(make_bus):
         async with running(Talker, "talker", make_bus) as talker:
             await eventually(lambda: bool(listener.peers))
             pose = encode(Header("talker", 1, 900, 0.0), m.Pose(0.0, 0.0, 0.0))
-            no_text = encode(Header("talker", 1, 901, 0.0), m.Reset("RM1", "x")).replace(
+            no_text = encode(Header("talker", 1, 901, 0.0), fm.Reset("RM1", "x")).replace(
                 b"talker", b"talk\xff\xff")
             # On a key that Zenoh does not thin out when a burst finds its queue full.
             for garbage in (b"", b"\xff\x00 garbage", b"\x91" * 100_000, pose, no_text):
-                talker._bus.publish(topics.RESET, topics.RESET.at(), garbage)
-            talker.publish(topics.RESET, m.Reset("RM1", "operator"))
+                talker._bus.publish(ftm_topics.RESET, ftm_topics.RESET.at(), garbage)
+            talker.publish(ftm_topics.RESET, fm.Reset("RM1", "operator"))
             await eventually(lambda: listener._rejected == 5)
             await eventually(lambda: len(listener.heard) == 1)
 
@@ -189,10 +193,10 @@ async def test_a_command_that_comes_twice_is_handled_once(make_bus):
     async with running(Listener, "listener", make_bus) as listener:
         async with running(Talker, "talker", make_bus) as talker:
             await eventually(lambda: bool(listener.peers))
-            twice = encode(Header("talker", 1, 5, 0.0), m.Reset("RM1", "operator"))
-            talker._bus.publish(topics.RESET, topics.RESET.at(), twice)
-            talker._bus.publish(topics.RESET, topics.RESET.at(), twice)
-            talker.publish(topics.RESET, m.Reset("RM2", "operator"))
+            twice = encode(Header("talker", 1, 5, 0.0), fm.Reset("RM1", "operator"))
+            talker._bus.publish(ftm_topics.RESET, ftm_topics.RESET.at(), twice)
+            talker._bus.publish(ftm_topics.RESET, ftm_topics.RESET.at(), twice)
+            talker.publish(ftm_topics.RESET, fm.Reset("RM2", "operator"))
             await eventually(lambda: any(b.recovery == "RM2" for b, _ in listener.heard))
             assert [b.recovery for b, _ in listener.heard] == ["RM1", "RM2"]
 
@@ -209,7 +213,7 @@ async def test_a_handler_that_raises_ends_its_actor_only(make_bus):
     task = asyncio.create_task(victim.run())
     async with running(Talker, "talker", make_bus) as talker:
         await eventually(lambda: bool(victim.peers))
-        talker.publish(topics.RESET, m.Reset("RM1", "poison"))
+        talker.publish(ftm_topics.RESET, fm.Reset("RM1", "poison"))
         with pytest.raises(RuntimeError, match="poisoned"):
             await asyncio.wait_for(task, 5)
         talker.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
@@ -245,7 +249,7 @@ async def test_an_injected_fault_changes_what_is_published(make_bus, mode, expec
             await eventually(lambda: bool(listener.peers))
             talker.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0), stamp=0.5)
             await eventually(lambda: len(listener.heard) == 1)
-            fault = m.Injection("i1", "localization/pose", mode, 60.0,
+            fault = bm.Injection("i1", "localization/pose", mode, 60.0,
                                 set_fields={"x_m": 99.0} if mode == "corrupt" else {})
             talker._on_injection(fault, Header("tool", 1, 1, 0.0))
             for x in (1.0, 2.0, 3.0):
@@ -285,9 +289,9 @@ async def test_what_a_node_has_no_use_for_in_this_life_does_not_reach_it(make_bu
         async with running(Talker, "talker", make_bus) as talker:
             await eventually(lambda: bool(deaf.peers))
             talker.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
-            talker.publish(topics.RESET, m.Reset("RM1", "you"))
+            talker.publish(ftm_topics.RESET, fm.Reset("RM1", "you"))
             await eventually(lambda: bool(deaf.heard))
-            assert [message for message, _ in deaf.heard] == [m.Reset("RM1", "you")]
+            assert [message for message, _ in deaf.heard] == [fm.Reset("RM1", "you")]
 
 
 def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
@@ -338,7 +342,7 @@ def test_a_class_that_is_not_there_or_of_another_table_is_named_with_its_place(
 
 async def test_the_heart_beats_at_the_period_that_the_system_states():
     hub, beats = Hub(), []
-    hub.taps.append(lambda at_s, _source, key, _payload: key == topics.HEARTBEAT.at("talker")
+    hub.taps.append(lambda at_s, _source, key, _payload: key == bus_topics.HEARTBEAT.at("talker")
                     and beats.append(at_s))
     clock = Clock(asyncio.get_running_loop().time(), 100.0)
     node = Talker(Context("talker", 1, clock, VirtualBus(hub, "talker"), heartbeat_period_s=3.0))

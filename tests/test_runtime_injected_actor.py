@@ -7,7 +7,11 @@ import math
 
 from virtual_loop import System, run
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import decode
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
@@ -17,7 +21,7 @@ from rampart.sim.virtual.virtual_bus import VirtualBus
 class Talker(Actor):
     """Says where it is ten times a second, and asks for a reset once a second."""
 
-    outputs = (topics.POSE, topics.RESET)
+    outputs = (topics.POSE, ftm_topics.RESET)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -28,7 +32,7 @@ class Talker(Actor):
         self.said += 1
         self.publish(topics.POSE, m.Pose(float(self.said), 0.0, 0.0))
         if self.said % 10 == 0:
-            self.publish(topics.RESET, m.Reset("RM1", str(self.said)))
+            self.publish(ftm_topics.RESET, fm.Reset("RM1", str(self.said)))
 
 
 class Listener(Actor):
@@ -38,23 +42,23 @@ class Listener(Actor):
         super().__init__(context)
         self.poses: list[float] = []
         self.resets: list[str] = []
-        self.reports: list[m.InjectionReport] = []
-        self.diagnostics: list[m.Diagnostic] = []
+        self.reports: list[bm.InjectionReport] = []
+        self.diagnostics: list[bm.Diagnostic] = []
 
     @on(topics.POSE)
     def pose(self, message: m.Pose, header: Header) -> None:
         self.poses.append(message.x_m)
 
-    @on(topics.RESET)
-    def reset(self, message: m.Reset, header: Header) -> None:
+    @on(ftm_topics.RESET)
+    def reset(self, message: fm.Reset, header: Header) -> None:
         self.resets.append(message.by)
 
-    @on(topics.INJECTION_REPORT)
-    def report(self, message: m.InjectionReport, header: Header) -> None:
+    @on(bus_topics.INJECTION_REPORT)
+    def report(self, message: bm.InjectionReport, header: Header) -> None:
         self.reports.append(message)
 
-    @on(topics.DIAGNOSTIC)
-    def diagnostic(self, message: m.Diagnostic, header: Header) -> None:
+    @on(bus_topics.DIAGNOSTIC)
+    def diagnostic(self, message: bm.Diagnostic, header: Header) -> None:
         self.diagnostics.append(message)
 
     @property
@@ -65,7 +69,7 @@ class Listener(Actor):
 class Tool(Actor):
     """Orders injections."""
 
-    outputs = (topics.INJECT,)
+    outputs = (bus_topics.INJECT,)
 
 
 class Scene:
@@ -81,13 +85,13 @@ class Scene:
     async def open(self) -> None:
         tap = VirtualBus(self.system.hub, "tap")
         await tap.open()
-        for topic in (topics.POSE, topics.RESET):
+        for topic in (topics.POSE, ftm_topics.RESET):
             tap.subscribe(topic, topic.at(), lambda _key, payload: self.wire.append(payload))
         await self.system.settle()
 
     def inject(self, mode: str, duration_s: float, topic: str = "localization/pose",
                **fields: object) -> None:
-        self.tool.publish(topics.INJECT, m.Injection("i", topic, mode, duration_s, **fields))
+        self.tool.publish(bus_topics.INJECT, bm.Injection("i", topic, mode, duration_s, **fields))
 
 
 def play(scenario):
@@ -109,7 +113,7 @@ async def wait(seconds: float) -> None:
 def test_a_duplicate_is_the_same_payload_twice_and_reaches_no_actor_twice():
     async def scenario(scene: Scene) -> None:
         scene.inject("duplicate", 9.0)
-        scene.tool.publish(topics.INJECT, m.Injection("j", "manager/reset", "duplicate", 9.0))
+        scene.tool.publish(bus_topics.INJECT, bm.Injection("j", "manager/reset", "duplicate", 9.0))
         await wait(3.05)
         assert len(scene.wire) == 2 * (30 + 3)
         for first, second in zip(scene.wire[::2], scene.wire[1::2], strict=True):
@@ -126,7 +130,8 @@ def test_a_duplicate_is_the_same_payload_twice_and_reaches_no_actor_twice():
 def test_a_delayed_duplicate_is_late_twice_and_heard_once():
     async def scenario(scene: Scene) -> None:
         scene.inject("delay", 5.0, delay_s=0.25)
-        scene.tool.publish(topics.INJECT, m.Injection("j", "localization/pose", "duplicate", 5.0))
+        scene.tool.publish(
+            bus_topics.INJECT, bm.Injection("j", "localization/pose", "duplicate", 5.0))
         await wait(0.32)
         assert scene.listener.poses == []
         await wait(0.1)

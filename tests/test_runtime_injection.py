@@ -11,17 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rampart.actors.bus.messages import Injection
+from rampart.actors.ftm.messages import NodeInfo, NodeState, NodeTable
 from rampart.actors.osmosis.messages import (
     BaseStatus,
     Goal,
     Imu,
-    Injection,
     LaserScan,
     MissionRequest,
     Mode,
-    NodeInfo,
-    NodeState,
-    NodeTable,
     Odometry,
     Pose,
     Route,

@@ -9,6 +9,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
@@ -482,7 +483,7 @@ class Bench:
         self.reports, self.complaints = [], []
         self.actor.publish = lambda topic, body, **_: (
             self.reports.append((body.injection, body.affected, body.finished, body.reason))
-            if topic is topics.INJECTION_REPORT else None)  # fmt: skip
+            if topic is bus_topics.INJECTION_REPORT else None)  # fmt: skip
         self.actor.report_diagnostic = lambda *complaint: self.complaints.append(complaint)
         self.actor.on_start()
 

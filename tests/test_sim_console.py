@@ -8,8 +8,8 @@ import msgspec
 import pytest
 from stub_actors import ROOT
 
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header

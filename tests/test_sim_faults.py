@@ -11,6 +11,7 @@ import pytest
 from porter_actors import AXLE, LOAD
 from virtual_loop import shipped_system
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.envelope import Header, decode, encode
 from rampart.actors.bus.topic import ROOT, Topic
@@ -345,7 +346,7 @@ def test_an_order_survives_the_wire_also_a_permanent_one():
     for fault in CATALOGUE.values():
         for order in fault.orders("i", math.inf):
             payload = encode(Header("tool", 1, 1, 0.0), order)
-            assert decode(topics.INJECT, payload)[1] == order
+            assert decode(bus_topics.INJECT, payload)[1] == order
 
 
 def test_a_topic_of_the_robot_s_own_fails_like_any_other():

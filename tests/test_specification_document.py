@@ -14,8 +14,8 @@ import pytest
 from stub_actors import ROOT
 from virtual_loop import System, run
 
+from rampart.actors.ftm.messages import DetectionState
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import DetectionState
 from rampart.actors.run.system_topics import system_topics
 from rampart.actors.runtime.wiring import load_class
 from rampart.manager.model.gates import GateError, detection_gate

@@ -19,9 +19,11 @@ from pathlib import Path
 import pytest
 from stub_actors import ROOT, launched, stub_plan, write_stub_system
 
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.messages import Diagnostic
 from rampart.actors.bus.run_folder import socket_path
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import Diagnostic, NodeTable, ProcessEvent, RespawnRequest
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import NodeTable, ProcessEvent, RespawnRequest
 from rampart.actors.run import run_info
 from rampart.actors.run.run_info import find_runs
 from rampart.actors.run.run_plan import Layout, load_system
@@ -165,10 +167,10 @@ async def test_a_request_for_an_unknown_node_is_refused(tmp_path):
 
 async def test_error_reports_of_all_nodes_and_its_own_are_passed_on_by_the_supervisor(tmp_path):
     async with running(tmp_path) as (_, witness):
-        witness.context.bus.publish(topics.INJECT, topics.INJECT.at(), b"garbage")
+        witness.context.bus.publish(bus_topics.INJECT, bus_topics.INJECT.at(), b"garbage")
         names = {r.name for r in witness.table.nodes}
         await eventually(lambda: names <= {e.node for e in witness.errors})
-        assert {e.offender for e in witness.errors} == {topics.INJECT.at()}
+        assert {e.offender for e in witness.errors} == {bus_topics.INJECT.at()}
 
 
 async def test_the_world_and_nobody_else_goes_before_others_where_that_is_permitted(tmp_path):

@@ -14,16 +14,12 @@ import pytest
 from stub_actors import ROOT
 from virtual_loop import run, turns, until
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import decode, pack
+from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import (
-    AdaptedSystem,
-    Heartbeat,
-    ManagerStatus,
-    NodeState,
-    RespawnRequest,
-)
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import AdaptedSystem, ManagerStatus, NodeState, RespawnRequest
 from rampart.actors.run.run_plan import (
     SUPERVISOR,
     Layout,
@@ -196,8 +192,8 @@ class World:
 
     def beat(self, process: Process) -> None:
         for name in process.names:
-            self.say(topics.HEARTBEAT, Heartbeat(process.pid, 0, 0.1, 0, 0), name,
-                     process.incarnation, key=topics.HEARTBEAT.at(name))
+            self.say(bus_topics.HEARTBEAT, Heartbeat(process.pid, 0, 0.1, 0, 0), name,
+                     process.incarnation, key=bus_topics.HEARTBEAT.at(name))
 
     async def beats(self) -> None:
         while True:
@@ -282,8 +278,8 @@ def test_a_supervisor_that_is_told_to_stop_ends_all_in_reverse():
 def test_a_heartbeat_of_a_node_that_it_does_not_start_is_nothing_to_it():
     async def scenario() -> None:
         async with running() as world:
-            world.say(topics.HEARTBEAT, Heartbeat(1, 1, 0.1, 0, 0), "stranger", 1,
-                      key=topics.HEARTBEAT.at("hmi"))
+            world.say(bus_topics.HEARTBEAT, Heartbeat(1, 1, 0.1, 0, 0), "stranger", 1,
+                      key=bus_topics.HEARTBEAT.at("hmi"))
             await turns()
             assert not world.task.done()
 
@@ -521,8 +517,8 @@ def test_a_heartbeat_that_names_a_process_of_somebody_elses_has_nobody_adopted_o
             stranger = world.machine.add(("editor",), 1)
             world.machine.kill(own)
             for _ in range(20):
-                world.say(topics.HEARTBEAT, Heartbeat(stranger.pid, 0, 0.1, 0, 0), "DM1", life,
-                          key=topics.HEARTBEAT.at("DM1"))
+                world.say(bus_topics.HEARTBEAT, Heartbeat(stranger.pid, 0, 0.1, 0, 0), "DM1", life,
+                          key=bus_topics.HEARTBEAT.at("DM1"))
                 await asyncio.sleep(0.05)
             assert not stranger.killed
             assert world.row("DM1")[0] == "running"

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from stub_actors import ROOT
 
-from rampart.actors.osmosis.messages import AdaptedSystem
+from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.run.run_plan import Layout, RunPlan, adapted_system, load_system
 
 FILE = ROOT / "systems" / "paper.toml"

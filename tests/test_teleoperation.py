@@ -12,6 +12,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.teleoperation.joystick_device import (
@@ -47,7 +49,7 @@ class Page(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.commands: list[m.Twist] = []
-        self.diagnostics: list[m.Diagnostic] = []
+        self.diagnostics: list[bm.Diagnostic] = []
         self.changed = asyncio.Event()
 
     @on(topics.TELEOP_COMMAND)
@@ -55,8 +57,8 @@ class Page(Actor):
         self.commands.append(message)
         self.changed.set()
 
-    @on(topics.DIAGNOSTIC)
-    def diagnostic(self, message: m.Diagnostic, _header: Header) -> None:
+    @on(bus_topics.DIAGNOSTIC)
+    def diagnostic(self, message: bm.Diagnostic, _header: Header) -> None:
         self.diagnostics.append(message)
         self.changed.set()
 

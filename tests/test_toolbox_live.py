@@ -10,7 +10,10 @@ import msgspec
 import pytest
 from porter_actors import AXLE, LOAD, Axle, Load, write_porter_system
 
+from rampart.actors.bus import messages as bm
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.run.run_info import RunInfo
@@ -29,8 +32,8 @@ class Everything(Actor):
     """Publishes what verbs look at; one node that plays them all."""
 
     outputs = (topics.POSE, topics.ROUTE, topics.MISSION_STATUS, topics.PILOT_STATUS,
-               topics.MANAGER_STATUS, topics.NODES, topics.OBSTACLES, topics.DETECTION, LOAD, AXLE,
-               topics.HOLDS)
+               ftm_topics.MANAGER_STATUS, ftm_topics.NODES, topics.OBSTACLES,
+               ftm_topics.DETECTION, LOAD, AXLE, ftm_topics.HOLDS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -39,7 +42,7 @@ class Everything(Actor):
         self.holders: tuple[str, ...] = ()
         self.obstacles: dict[str, m.ObstacleCommand] = {}
         self.resets = 0
-        self.orders: list[m.Injection] = []
+        self.orders: list[bm.Injection] = []
         self.time_s = 0.0
 
     @every(0.1)
@@ -52,25 +55,25 @@ class Everything(Actor):
         self.publish(topics.MISSION_STATUS, m.MissionStatus(
             "1", "AB", m.MissionPhase.RUNNING, 0, (m.Goal(0.0, 0.0, m.Mode.TAXI),), (), (), ""))
         self.publish(topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.STOP, True, "RM2", 0))
-        self.publish(topics.MANAGER_STATUS, m.ManagerStatus(
+        self.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus(
             ("FTM1",), (), self.latched, self.latched, "safety-first", 1))
-        self.publish(topics.NODES, m.NodeTable((
-            m.NodeInfo("hmi", "non-control", 42, m.NodeState.CRASHED, 3, 2),
-            m.NodeInfo("DM1", "detection", 43, m.NodeState.RUNNING, 1, 0))))
+        self.publish(ftm_topics.NODES, fm.NodeTable((
+            fm.NodeInfo("hmi", "non-control", 42, fm.NodeState.CRASHED, 3, 2),
+            fm.NodeInfo("DM1", "detection", 43, fm.NodeState.RUNNING, 1, 0))))
         self.list_obstacles()
         if self.holders:
-            self.publish(topics.HOLDS, m.Holds("brake", self.holders))
+            self.publish(ftm_topics.HOLDS, fm.Holds("brake", self.holders))
 
     def list_obstacles(self) -> None:
         self.publish(topics.OBSTACLES, m.ObstacleList(tuple(self.obstacles.values())))
 
-    @on(topics.RESET)
-    def reset(self, message: m.Reset, _header: Header) -> None:
+    @on(ftm_topics.RESET)
+    def reset(self, message: fm.Reset, _header: Header) -> None:
         self.resets += 1
         if not self.obstinate:
             self.latched = ()
             self.holders = tuple(name for name in self.holders if name != message.recovery)
-            self.publish(topics.HOLDS, m.Holds("brake", self.holders))
+            self.publish(ftm_topics.HOLDS, fm.Holds("brake", self.holders))
 
     @on(topics.OBSTACLE)
     def obstacle(self, message: m.ObstacleCommand, header: Header) -> None:
@@ -81,7 +84,7 @@ class Everything(Actor):
         else:
             del self.obstacles[message.name]
 
-    def _on_injection(self, order: m.Injection, _header: Header) -> None:
+    def _on_injection(self, order: bm.Injection, _header: Header) -> None:
         self.orders.append(order)
         super()._on_injection(order, _header)
 
@@ -139,7 +142,7 @@ async def test_status_shows_the_run_at_a_glance(run, capsys):
 async def test_status_shows_nothing_that_the_system_has_not(run, capsys, monkeypatch):
     publish = run.node.publish
     monkeypatch.setattr(run.node, "publish", lambda topic, *rest, **more: None if topic in (
-        topics.MISSION_STATUS, topics.PILOT_STATUS, topics.MANAGER_STATUS
+        topics.MISSION_STATUS, topics.PILOT_STATUS, ftm_topics.MANAGER_STATUS
         ) else publish(topic, *rest, **more))
     run.info.plan["mission"] = ""
     _, out, _ = await run.call(capsys, "status")

@@ -11,6 +11,8 @@ import pytest
 from porter_actors import write_porter_system
 
 import systems as shipped
+from rampart.actors.bus import messages as bm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.run.run_info import RunInfo
@@ -236,7 +238,7 @@ def test_biases_and_noise_are_put_together_from_options_also_for_arrays():
         "inject", "--topic", "summit_xl/scan", "--mode", "corrupt", "--add", "ranges_f32=0.4",
         "--noise", "ranges_f32=0.2", "--set", "range_max_m=9", "--seed", "3"])
     (order,) = choose(options).orders("i1", 4.0)
-    assert order == m.Injection(
+    assert order == bm.Injection(
         "i1", "summit_xl/scan", "corrupt", 4.0, set_fields={"range_max_m": 9.0},
         add_fields={"ranges_f32": 0.4}, noise_fields={"ranges_f32": 0.2}, seed=3)
 
@@ -246,7 +248,7 @@ def test_a_fault_of_ones_own_is_put_together_from_options():
         "inject", "--topic", "rampart/plan/route", "--mode", "corrupt", "--set", "reason=why not",
         "--set", "step=3", "--keep-ends", "waypoints"])
     (order,) = choose(options).orders("i1", 4.0)
-    assert order == m.Injection("i1", "plan/route", "corrupt", 4.0,
+    assert order == bm.Injection("i1", "plan/route", "corrupt", 4.0,
                                 set_fields={"reason": "why not", "step": 3},
                                 keep_ends=("waypoints",))
 
@@ -261,10 +263,10 @@ def test_a_nested_field_can_be_ramped():
 @pytest.mark.parametrize(("key", "topic", "full"), [
     ("plan/route", topics.ROUTE, "rampart/plan/route"),
     ("/rampart/plan/route", topics.ROUTE, "rampart/plan/route"),
-    ("detection/DM1", topics.DETECTION, "rampart/detection/DM1"),
-    ("detection/*", topics.DETECTION, "rampart/detection/*"),
-    ("recovery/RM2/state", topics.RECOVERY, "rampart/recovery/RM2/state"),
-    ("recovery/{name}/command", topics.RECOVERY_COMMAND, "rampart/recovery/*/command"),
+    ("detection/DM1", ftm_topics.DETECTION, "rampart/detection/DM1"),
+    ("detection/*", ftm_topics.DETECTION, "rampart/detection/*"),
+    ("recovery/RM2/state", ftm_topics.RECOVERY, "rampart/recovery/RM2/state"),
+    ("recovery/{name}/command", ftm_topics.RECOVERY_COMMAND, "rampart/recovery/*/command"),
 ])
 def test_a_key_is_found_however_it_is_written(key, topic, full):
     assert resolve(key) == (topic, full)

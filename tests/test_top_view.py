@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 
 from rampart.actors.bus.envelope import Header
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.run.run_info import RunInfo
@@ -23,12 +25,12 @@ from rampart.cli.run_picture import COUNTED, DECODED, RunPicture
 MISSION = m.MissionStatus(
     "id", "AB", m.MissionPhase.RUNNING, 1,
     tuple(m.Goal(x, 0.0, m.Mode.TAXI) for x in (1.0, 2.0, 3.0)), (1.0,), (), "")
-CRASH = m.DecisionRecord(4, "safety-first", ("FTM4",), 1, ("RM3",), ("FTM4",), (), 1.0)
-NODES = m.NodeTable((
-    m.NodeInfo("mission_manager", "control", 11, m.NodeState.RUNNING, 1, 0),
-    m.NodeInfo("localization", "control", 12, m.NodeState.CRASHED, 3, 2),
-    m.NodeInfo("hmi", "operator", 13, m.NodeState.RUNNING, 1, 0)))
-MANAGER = m.ManagerStatus(("FTM4",), (), ("RM3",), ("RM1",), "safety-first", 4)
+CRASH = fm.DecisionRecord(4, "safety-first", ("FTM4",), 1, ("RM3",), ("FTM4",), (), 1.0)
+NODES = fm.NodeTable((
+    fm.NodeInfo("mission_manager", "control", 11, fm.NodeState.RUNNING, 1, 0),
+    fm.NodeInfo("localization", "control", 12, fm.NodeState.CRASHED, 3, 2),
+    fm.NodeInfo("hmi", "operator", 13, fm.NodeState.RUNNING, 1, 0)))
+MANAGER = fm.ManagerStatus(("FTM4",), (), ("RM3",), ("RM1",), "safety-first", 4)
 TRUTH = m.GroundTruth(m.Pose(0, 0, 0), m.Twist(0, 0), 0, 0.0, 2.5, 1.25, 1.0)
 USAGE = {"mission_manager": {"cpu": 1.0, "mb": 60.0, "age_s": 75.0},
          "localization": {"cpu": 2.0, "mb": 61.0, "age_s": 3700.0},
@@ -44,13 +46,14 @@ def busy() -> RunPicture:
     told(picture, topics.MISSION_STATUS, MISSION)
     told(picture, topics.POSE, m.Pose(1.5, -2.0, 1.5708))
     told(picture, topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.STOP, True, "RM1: brake", 0))
-    told(picture, topics.MANAGER_STATUS, MANAGER)
-    told(picture, topics.NODES, NODES)
+    told(picture, ftm_topics.MANAGER_STATUS, MANAGER)
+    told(picture, ftm_topics.NODES, NODES)
     told(picture, topics.TRUTH, TRUTH)
-    told(picture, topics.DETECTION, m.DetectionReport(
-        m.DetectionState.ACTIVE, "localization crashed", ("localization",), 9.0), "DM7")
-    told(picture, topics.DETECTION, m.DetectionReport(m.DetectionState.IDLE, "", (), 0.0), "DM1")
-    told(picture, topics.DECISION, CRASH)
+    told(picture, ftm_topics.DETECTION, fm.DetectionReport(
+        fm.DetectionState.ACTIVE, "localization crashed", ("localization",), 9.0), "DM7")
+    told(picture, ftm_topics.DETECTION,
+         fm.DetectionReport(fm.DetectionState.IDLE, "", (), 0.0), "DM1")
+    told(picture, ftm_topics.DECISION, CRASH)
     return picture
 
 
@@ -84,7 +87,8 @@ def test_a_screen_of_80_by_24_tells_what_matters():
 
 def test_a_silent_module_is_told_where_there_is_room_for_it():
     picture = busy()
-    told(picture, topics.MANAGER_STATUS, msgspec.structs.replace(MANAGER, silent=("DM7", "DM9")))
+    told(picture, ftm_topics.MANAGER_STATUS,
+         msgspec.structs.replace(MANAGER, silent=("DM7", "DM9")))
     assert "2 of 3: DM7 silent; DM9 silent" in line_of(screen(picture), "detection")
 
 
@@ -152,11 +156,11 @@ def test_rates_are_in_messages_a_simulated_second():
 def test_an_activity_is_counted_when_it_begins():
     picture = RunPicture()
     for state in ("active", "active", "idle", "active"):
-        told(picture, topics.DETECTION, m.DetectionReport(m.DetectionState(state), "", (), 0.0),
-             "DM1")
+        told(picture, ftm_topics.DETECTION,
+             fm.DetectionReport(fm.DetectionState(state), "", (), 0.0), "DM1")
     for state in ("idle", "activated", "activated"):
-        told(picture, topics.RECOVERY, m.RecoveryReport(
-            m.RecoveryState(state), m.RecoveryPhase.ACTING, 1, ""), "RM1")
+        told(picture, ftm_topics.RECOVERY, fm.RecoveryReport(
+            fm.RecoveryState(state), fm.RecoveryPhase.ACTING, 1, ""), "RM1")
     assert (picture.detections_total["DM1"], picture.recoveries_total["RM1"]) == (2, 1)
 
 
@@ -174,18 +178,19 @@ def test_the_same_can_be_had_as_data():
         "incarnation": 3, "restarts": 2, "cpu": 2.0, "mb": 61.0, "age_s": 3700.0}
 
 
-@pytest.mark.parametrize("state", [s for s in m.NodeState if s is not m.NodeState.RUNNING])
+@pytest.mark.parametrize("state", [s for s in fm.NodeState if s is not fm.NodeState.RUNNING])
 def test_no_state_is_told_by_colour_alone(state):
     picture = busy()
-    told(picture, topics.NODES, m.NodeTable((m.NodeInfo("hmi", "operator", 13, state, 1, 0),)))
+    told(picture, ftm_topics.NODES,
+         fm.NodeTable((fm.NodeInfo("hmi", "operator", 13, state, 1, 0),)))
     assert state.value in line_of(screen(picture), "hmi")
 
 
 @pytest.mark.parametrize("replay_of", ["", "run.mcap"])
 def test_on_a_replay_nobodys_processes_are_measured(monkeypatch, replay_of):
-    mine = m.NodeTable((m.NodeInfo("hmi", "operator", os.getpid(), m.NodeState.RUNNING, 1, 0),))
+    mine = fm.NodeTable((fm.NodeInfo("hmi", "operator", os.getpid(), fm.NodeState.RUNNING, 1, 0),))
     monkeypatch.setattr(top_screen, "draw", lambda _session, picture: told(
-        picture, topics.NODES, mine))
+        picture, ftm_topics.NODES, mine))
     run = RunInfo(os.getpid(), 7450, 1.0, 0.0, "", "", (), "run", 0, "AB",
                   replay_of=replay_of)
     shown = top_screen._Watch(SimpleNamespace(run=run, clock=Clock(0.0))).frame()

@@ -11,6 +11,8 @@ import msgspec
 from handler_fuzz import system
 
 from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.holders import OTHERS, UNKNOWN, Holders
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -102,7 +104,7 @@ def test_an_unknown_holder_of_the_brake_is_obeyed_reported_shown_and_can_be_made
         told = len(world.sent)
         await asyncio.sleep(0.5)
         assert [key for key, _ in world.sent[told:]].count("rampart/holds/simulator") == 2
-        await world.tell(topics.RESET, m.Reset("nobody", "operator"), "tool")
+        await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
         assert not is_braked(world)
         assert world.holders == ()
         told = len(world.sent)
@@ -124,7 +126,7 @@ def test_an_unknown_holder_may_let_go_by_itself():
 def test_a_recovery_module_s_brake_is_its_own_to_release_and_is_no_stranger_s():
     async def script(world):
         await world.tell(topics.BRAKE, brake(True), "RM1")
-        await world.tell(topics.RESET, m.Reset("RM1", "operator"), "tool")
+        await world.tell(ftm_topics.RESET, fm.Reset("RM1", "operator"), "tool")
         assert is_braked(world)
         assert not any(key.startswith("rampart/holds") for key, _ in world.sent)
         assert world.reports == []
@@ -144,7 +146,7 @@ def test_a_crowd_of_holders_is_one_that_an_operator_can_make_let_go():
             await world.tell(topics.BRAKE, brake(False), f"s{number}", wait_s=1e-4)
         assert is_braked(world)
         assert world.holders == (OTHERS,)
-        await world.tell(topics.RESET, m.Reset(OTHERS, "operator"), "tool")
+        await world.tell(ftm_topics.RESET, fm.Reset(OTHERS, "operator"), "tool")
         assert not is_braked(world)
 
     during("simulator", script)
@@ -185,7 +187,7 @@ def test_an_order_of_an_unknown_module_is_obeyed_reported_shown_and_can_be_ended
         assert world.last("rampart/pilot/status")["mode"] == "stop"
         assert world.holders == ("nobody",)
         assert ("pilot order", "nobody") in world.reports
-        await world.tell(topics.RESET, m.Reset("nobody", "operator"), "tool")
+        await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
         assert world.last("rampart/pilot/status")["mode"] == "auto"
         assert world.holders == ()
 
@@ -196,7 +198,7 @@ def test_an_order_of_a_recovery_module_is_not_ended_by_a_reset_and_not_muted_by_
     async def script(world):
         await world.tell(topics.PILOT_ORDER, stop(False), "RM2", FORGED)
         await world.tell(topics.PILOT_ORDER, stop(True), "RM2")
-        await world.tell(topics.RESET, m.Reset("RM2", "operator"), "tool")
+        await world.tell(ftm_topics.RESET, fm.Reset("RM2", "operator"), "tool")
         assert world.last("rampart/pilot/status")["mode"] == "stop"
         assert not any(key.startswith("rampart/holds") for key, _ in world.sent)
 

@@ -11,7 +11,8 @@ from stub_actors import ROOT
 
 from rampart.files import working_folder
 
-LOOK = ("from actors.runtime import working_folder, wiring\n"
+LOOK = ("from rampart.actors.runtime import wiring\n"
+        "from rampart.files import working_folder\n"
         "working_folder.admit()\n"
         "wiring.load_class('intruder:Node')\n")
 

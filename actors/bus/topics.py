@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection, InjectionReport
 from rampart.actors.bus.topic import Qos, Topic
 
@@ -20,3 +22,5 @@ INJECTION_RESULT = Topic("inject/result", InjectionReport, Qos.COMMAND, 0, "",
                          "How an injection took hold, passed on: who shows it needs one link only.")
 INJECTION_REPORT = Topic("inject/report", InjectionReport, Qos.COMMAND, 0, "",
                          "How an injection took hold.")
+
+ALL: tuple[Topic[Any], ...] = tuple(v for v in globals().values() if isinstance(v, Topic))

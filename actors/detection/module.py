@@ -21,8 +21,8 @@ from typing import Any, ClassVar, Protocol
 
 from rampart.actors.bus.bounds import NAME_CHARS, clip
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import DetectionReport, DetectionState
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import DetectionReport, DetectionState
 from rampart.actors.runtime.actor import Actor, Context, every
 from rampart.actors.runtime.parameters import amount
 

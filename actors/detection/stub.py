@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from rampart.actors.detection.module import DetectionModule
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import Header, on
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from rampart.actors.bus import messages as m
+from rampart.actors.bus import topics
 from rampart.actors.bus.topic import Topic
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.detection.watchdog_core import WatchdogCore
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import amount
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import msgspec
 
-from rampart.actors.osmosis import messages as m
+from rampart.actors.ftm import messages as m
 
 GIVE_UP_S = 5.0
 """Simulated seconds after which a request that nobody answers is withdrawn."""

@@ -14,8 +14,12 @@ from typing import Any
 
 import msgspec
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator.bounds import MAX_NAME, clip
 from rampart.actors.operator.camera_eye import CameraEye, renderer
 from rampart.actors.operator.feed import Feed
@@ -62,7 +66,7 @@ class Hmi(Actor):
         (`rampart.sim.osmosis.camera`), if any.
     """
 
-    outputs = (topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.RESET, *OUTPUTS)
+    outputs = (topics.MISSION_REQUEST, topics.MISSION_ORDER, ftm_topics.RESET, *OUTPUTS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -81,7 +85,7 @@ class Hmi(Actor):
         self._orders = Orders(f"{run_id}/{context.name}.{context.incarnation}", "operator")
         self._state = HmiState(lights_shown(self._airport) if self._airport else None)
         self._operating = Operating(self, self._state)
-        self._table: m.NodeTable | None = None
+        self._table: fm.NodeTable | None = None
         self._server: PageServer | None = None
         self._starting: asyncio.Task[None] | None = None
         plan: RunPlan | None = shared.get("plan")
@@ -89,7 +93,7 @@ class Hmi(Actor):
         self._observer = ProcessObserver(
             plan.base_port if plan else 0, plan.launcher_pid if plan else 0)
         self._version = -1
-        adapted: m.AdaptedSystem | None = shared.get("adapted")
+        adapted: fm.AdaptedSystem | None = shared.get("adapted")
         self._show_system(shared.get("system"), adapted.version if adapted else 0)
 
     def listens(self, topic: Topic[Any]) -> bool:
@@ -174,7 +178,7 @@ class Hmi(Actor):
             waiting = ", ".join(self._state.latched) or "none"
             raise RefusedError(f"{wish.recovery[:40]!r} does not wait for a reset; "
                                f"waiting: {waiting}")
-        self.publish(topics.RESET, m.Reset(wish.recovery, self.name))
+        self.publish(ftm_topics.RESET, fm.Reset(wish.recovery, self.name))
         return f"reset of {wish.recovery} asked for"
 
     def _start(self, name: str) -> str:
@@ -242,8 +246,8 @@ class Hmi(Actor):
 
     # -- hearing --------------------------------------------------------------------------------
 
-    @on(topics.ADAPTED_SYSTEM)
-    def _adapted(self, message: m.AdaptedSystem, _header: Header) -> None:
+    @on(ftm_topics.ADAPTED_SYSTEM)
+    def _adapted(self, message: fm.AdaptedSystem, _header: Header) -> None:
         if message.version <= self._version:
             return
         try:
@@ -289,13 +293,13 @@ class Hmi(Actor):
         self._operating.pilot(message)
         self._state.keep("pilot", message, self.clock.now())
 
-    @on(topics.MANAGER_STATUS)
-    def _manager(self, message: m.ManagerStatus, _header: Header) -> None:
+    @on(ftm_topics.MANAGER_STATUS)
+    def _manager(self, message: fm.ManagerStatus, _header: Header) -> None:
         self._operating.manager(message)
         self._state.manager(message, self.clock.now())
 
-    @on(topics.NODES)
-    def _nodes(self, message: m.NodeTable, _header: Header) -> None:
+    @on(ftm_topics.NODES)
+    def _nodes(self, message: fm.NodeTable, _header: Header) -> None:
         self._operating.nodes(message)
         self._table = message
         self._state.keep("nodes", message, self.clock.now())
@@ -304,25 +308,25 @@ class Hmi(Actor):
     def _obstacles(self, message: m.ObstacleList, _header: Header) -> None:
         self._state.obstacles(message)
 
-    @on(topics.DECISION)
-    def _decision(self, message: m.DecisionRecord, header: Header) -> None:
+    @on(ftm_topics.DECISION)
+    def _decision(self, message: fm.DecisionRecord, header: Header) -> None:
         self._state.decision(message, header.stamp)
 
-    @on(topics.PROCESS_EVENT)
-    def _process_event(self, message: m.ProcessEvent, header: Header) -> None:
+    @on(ftm_topics.PROCESS_EVENT)
+    def _process_event(self, message: fm.ProcessEvent, header: Header) -> None:
         self._state.process_event(message, header.stamp)
 
-    @on(topics.ERROR_REPORT)
-    def _diagnostic(self, message: m.Diagnostic, header: Header) -> None:
+    @on(ftm_topics.ERROR_REPORT)
+    def _diagnostic(self, message: bm.Diagnostic, header: Header) -> None:
         self._state.diagnostic(message, header.stamp)
         self._operating.diagnostic(message)
 
-    @on(topics.ADAPTATION)
-    def _adaptation(self, message: m.AdaptationAnswer, _header: Header) -> None:
+    @on(ftm_topics.ADAPTATION)
+    def _adaptation(self, message: fm.AdaptationAnswer, _header: Header) -> None:
         self._operating.answered(message)
 
-    @on(topics.INJECTION_RESULT)
-    def _injection(self, message: m.InjectionReport, _header: Header) -> None:
+    @on(bus_topics.INJECTION_RESULT)
+    def _injection(self, message: bm.InjectionReport, _header: Header) -> None:
         self._operating.injected(message)
 
     @on(topics.BASE_STATUS)
@@ -336,8 +340,8 @@ class Hmi(Actor):
 
 _SHOWN = (
     topics.POSE, topics.SCAN, topics.UPPER_SCAN, topics.ROUTE, topics.CONTROL_STATUS,
-    topics.PILOT_STATUS, topics.OBSTACLES, topics.ADAPTED_SYSTEM,
-    topics.PROCESS_EVENT, topics.ERROR_REPORT, topics.LIGHT_MEASURED, *SHOWN)
+    topics.PILOT_STATUS, topics.OBSTACLES, ftm_topics.ADAPTED_SYSTEM,
+    ftm_topics.PROCESS_EVENT, ftm_topics.ERROR_REPORT, topics.LIGHT_MEASURED, *SHOWN)
 """What is heard for the page alone."""
 
 

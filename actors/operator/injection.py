@@ -14,9 +14,11 @@ from typing import Any
 
 import msgspec
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import topics
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
 from rampart.actors.runtime.injection import UNTOUCHED, flaw
 
 TAKE_HOLD_S = 3.0
@@ -55,7 +57,7 @@ class Ordered:
 
     injection: str
     fault: str
-    orders: tuple[m.Injection | m.ActuatorFault, ...]
+    orders: tuple[bm.Injection | m.ActuatorFault, ...]
     begins_s: float
     duration_s: float
     affected: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -146,7 +148,7 @@ class Injections:
             self._ordered.remove(old)
         return ordered
 
-    def end(self, injection: str, now_s: float) -> tuple[m.Injection | m.ActuatorFault, ...]:
+    def end(self, injection: str, now_s: float) -> tuple[bm.Injection | m.ActuatorFault, ...]:
         """End a fault now: return the orders that do it.
 
         Raises:
@@ -164,10 +166,10 @@ class Injections:
         raise FaultError(f"no fault {injection[:60]!r} is under way")
 
     def _find(self, fault: str, injection: str
-              ) -> tuple[tuple[m.Injection | m.ActuatorFault, ...], float]:
+              ) -> tuple[tuple[bm.Injection | m.ActuatorFault, ...], float]:
         named = self._catalogue.get(fault)
         if named is not None:
-            orders: list[m.Injection | m.ActuatorFault] = [
+            orders: list[bm.Injection | m.ActuatorFault] = [
                 *named.injections, *named.actuator_faults]
             return tuple(msgspec.structs.replace(o, injection=f"{injection}.{i}")
                          for i, o in enumerate(orders, start=1)), named.duration_s
@@ -179,7 +181,7 @@ class Injections:
         if key not in self._places:
             raise FaultError(f"topic {key[:60]!r}: this system has none of that key that can be "
                              "disturbed")
-        order = m.Injection(f"{injection}.1", key, mode, OWN_DURATION_S,
+        order = bm.Injection(f"{injection}.1", key, mode, OWN_DURATION_S,
                             delay_s=DELAY_S if mode == "delay" else 0.0,
                             stamp_s=STAMP_S if mode == "restamp" else 0.0)
         if reason := flaw(order):
@@ -188,7 +190,7 @@ class Injections:
 
     # -- the run --------------------------------------------------------------------------------
 
-    def due(self, now_s: float) -> list[m.Injection | m.ActuatorFault]:
+    def due(self, now_s: float) -> list[bm.Injection | m.ActuatorFault]:
         """Return the orders to send now, first or again: those that nobody has answered."""
         begun = [o for o in self._ordered if not o.outcome and now_s >= o.begins_s]
         for ordered in begun:
@@ -196,7 +198,7 @@ class Injections:
         return [order for o in begun for order in o.orders
                 if order.injection not in (o.finished if o.ending else o.affected)]
 
-    def hear(self, report: m.InjectionReport) -> str:
+    def hear(self, report: bm.InjectionReport) -> str:
         """Take a report; return what to tell, "" if there is nothing to say yet."""
         for o in self._ordered:
             if o.outcome or report.injection not in {x.injection for x in o.orders}:
@@ -224,7 +226,7 @@ class Injections:
                 continue
             missing = [x for x in o.orders if x.injection not in o.affected]
             if missing and now_s > o.begins_s + TAKE_HOLD_S:
-                where = ", ".join(x.topic if isinstance(x, m.Injection) else "the base"
+                where = ", ".join(x.topic if isinstance(x, bm.Injection) else "the base"
                                   for x in missing)
                 o.reason = o.reason or f"nobody that publishes {where} answers"
                 told.append(self._conclude(o))
@@ -263,7 +265,7 @@ def places(all_topics: Iterable[Topic[Any]], nodes: Iterable[str], detections: I
         recoveries: names of recovery modules.
     """
     members: Mapping[str, Iterable[str]] = {
-        topics.HEARTBEAT.key: [*nodes, *detections, *recoveries],
+        bus_topics.HEARTBEAT.key: [*nodes, *detections, *recoveries],
         topics.DETECTION.key: detections,
         topics.RECOVERY.key: recoveries,
         topics.RECOVERY_COMMAND.key: recoveries,

@@ -11,6 +11,10 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator.adaptation import ChoiceError, StrategyChoice
 from rampart.actors.operator.injection import FaultError, Injections, places
 from rampart.actors.operator.requests import (
@@ -34,8 +38,8 @@ if TYPE_CHECKING:
     from rampart.actors.operator.state import HmiState
     from rampart.actors.runtime.actor import Actor
 
-OUTPUTS = (topics.JOYSTICK, topics.ADAPT, topics.INJECTION_REQUEST, topics.ACTUATOR_FAULT)
-SHOWN = (topics.ADAPTATION, topics.INJECTION_RESULT, topics.BASE_STATUS)
+OUTPUTS = (topics.JOYSTICK, ftm_topics.ADAPT, bus_topics.INJECTION_REQUEST, topics.ACTUATOR_FAULT)
+SHOWN = (ftm_topics.ADAPTATION, bus_topics.INJECTION_RESULT, topics.BASE_STATUS)
 """What is heard for the page alone."""
 
 OperatingWish = StickWish | AdaptWish | SignalWish | InjectWish | EndFaultWish
@@ -114,7 +118,7 @@ class Operating:
                     return self._stick(wish, page)
                 case AdaptWish():
                     request = self._choice.ask(wish.name, self._strategy, self._now())
-                    self._actor.publish(topics.ADAPT, request)
+                    self._actor.publish(ftm_topics.ADAPT, request)
                     told = f"strategy {wish.name} asked for"
                 case SignalWish():
                     told = self._send_signal(wish, page)
@@ -162,9 +166,9 @@ class Operating:
         for order in self._injections.due(self._now()):
             self._order(order)
 
-    def _order(self, order: m.Injection | m.ActuatorFault) -> None:
+    def _order(self, order: bm.Injection | m.ActuatorFault) -> None:
         topic = (topics.ACTUATOR_FAULT if isinstance(order, m.ActuatorFault)
-                 else topics.INJECTION_REQUEST)
+                 else bus_topics.INJECTION_REQUEST)
         self._actor.publish(topic, order)
 
     # -- the stick ------------------------------------------------------------------------------
@@ -230,17 +234,17 @@ class Operating:
         now = self._now()
         self._announce(self._choice.expire(now))
         if self._choice.pending is not None:
-            self._actor.publish(topics.ADAPT, self._choice.pending)
+            self._actor.publish(ftm_topics.ADAPT, self._choice.pending)
         for told in self._injections.expire(now):
             self._announce(told)
         self._send_due()
         self.show()
 
-    def answered(self, message: m.AdaptationAnswer) -> None:
+    def answered(self, message: fm.AdaptationAnswer) -> None:
         """Hear whether a strategy was accepted."""
         self._announce(self._choice.answer(message))
 
-    def injected(self, message: m.InjectionReport) -> None:
+    def injected(self, message: bm.InjectionReport) -> None:
         """Hear what came of a fault."""
         self._announce(self._injections.hear(message))
         self.show()
@@ -257,21 +261,21 @@ class Operating:
             self._brake = message.brake_engaged
             self.show()
 
-    def manager(self, message: m.ManagerStatus) -> None:
+    def manager(self, message: fm.ManagerStatus) -> None:
         """Hear the FTM Manager: its strategy."""
         if message.strategy != self._strategy:
             self._strategy = message.strategy
             self.show()
 
-    def nodes(self, table: m.NodeTable) -> None:
+    def nodes(self, table: fm.NodeTable) -> None:
         """Hear the supervisor: whether those between stick and wheels run."""
-        running = {row.name for row in table.nodes if row.state is m.NodeState.RUNNING}
+        running = {row.name for row in table.nodes if row.state is fm.NodeState.RUNNING}
         dead = tuple(name for name in _DRIVEN_BY if name not in running)
         if dead != self._dead:
             self._dead = dead
             self.show()
 
-    def diagnostic(self, report: m.Diagnostic) -> None:
+    def diagnostic(self, report: bm.Diagnostic) -> None:
         """Hear why Teleoperation does not follow this stick, e.g. since somebody else drives."""
         if (report.node == _DRIVEN_BY[0] and report.offender == self._actor.name
                 and report.context == "joystick"):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from rampart.actors.osmosis.messages import NodeTable
+from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.supervision.process_title import RunProcess, find_processes, process_state
 from rampart.actors.supervision.process_usage import ProcessUsage, UsageMeter
 

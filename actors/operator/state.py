@@ -13,6 +13,8 @@ from typing import Any
 
 import msgspec
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.bounds import MAX_NAME, SHOWN, Bounds, clip
 from rampart.actors.operator.picture import Picture
 from rampart.actors.osmosis import messages as m
@@ -66,7 +68,7 @@ class HmiState:
         self.track: deque[tuple[float, float]] = deque(maxlen=TRACK_POINTS)
         self.picture = picture = Picture()
         self._heard_s: dict[str, float] = {}
-        self._detections: dict[str, m.DetectionView] = {}
+        self._detections: dict[str, fm.DetectionView] = {}
         self._mission_id = ""
         self._outcomes = 0
         picture.section("system", bounds=_SYSTEM)
@@ -134,7 +136,7 @@ class HmiState:
                 "verdict": measured.verdict, "ratio": round(measured.ratio, 3),
                 "intensity_cd": round(measured.intensity_cd, 1)})
 
-    def manager(self, status: m.ManagerStatus, now_s: float) -> None:
+    def manager(self, status: fm.ManagerStatus, now_s: float) -> None:
         """Keep the manager's view, and log which detections have come and gone."""
         before = self._detections
         self._detections = {view.name: view for view in status.detections[:SHOWN.items]}
@@ -146,7 +148,7 @@ class HmiState:
                 text = f"{name} detects: {view.reason}" if view.active else f"{name} is idle again"
                 self.log(now_s, "fault" if view.active else "clear", text)
 
-    def decision(self, record: m.DecisionRecord, now_s: float) -> None:
+    def decision(self, record: fm.DecisionRecord, now_s: float) -> None:
         """Add a decision of the manager to the decision log."""
         strategy = STRATEGIES.get(record.strategy)
         rules = strategy.rules if strategy else {}
@@ -165,7 +167,7 @@ class HmiState:
             "rejected": [f"{name}: {why}" for name, why in record.rejected],
         })
 
-    def process_event(self, event: m.ProcessEvent, now_s: float) -> None:
+    def process_event(self, event: fm.ProcessEvent, now_s: float) -> None:
         """Log what happened to a process; that all start at the start is no news."""
         if event.event in _ROUTINE:
             return
@@ -186,7 +188,7 @@ class HmiState:
         self.picture.put("order", {"number": self._outcomes, "text": text})
         self.log(now_s, "note", text)
 
-    def diagnostic(self, report: m.Diagnostic, now_s: float) -> None:
+    def diagnostic(self, report: bm.Diagnostic, now_s: float) -> None:
         """Log an error report of a node."""
         times = f" ({report.count} times)" if report.count > 1 else ""
         self.log(now_s, "note",

@@ -1,17 +1,11 @@
-"""Every key of the system, declared once. `topics.md` is written from this file."""
+"""The keys of Osmosis, declared once."""
 
 from __future__ import annotations
 
+from typing import Any
+
 from rampart.actors.bus.topic import Qos, Topic
-from rampart.actors.bus.topics import (  # noqa: F401
-    DIAGNOSTIC,
-    HEARTBEAT,
-    HELLO,
-    INJECT,
-    INJECTION_REPORT,
-    INJECTION_REQUEST,
-    INJECTION_RESULT,
-)
+from rampart.actors.ftm import topics as engine
 from rampart.actors.osmosis import messages as m
 
 # Summit XL layer: a real robot's driver stands behind these keys just as well.
@@ -59,46 +53,11 @@ JOYSTICK = Topic("teleoperation/joystick", m.Joystick, Qos.SENSOR, 20, "",
 TELEOP_COMMAND = Topic("teleoperation/command", m.Twist, Qos.SENSOR, 20, "base_link",
                        "Velocity from the stick; silent while the dead man is released.")
 
-# Safety pilot, fault tolerance.
+# Safety Pilot.
 PILOT_ORDER = Topic("pilot/order/{name}", m.PilotOrder, Qos.STATE, 5, "",
                     "Order of the recovery module {name} to the Safety Pilot.")
 PILOT_STATUS = Topic("pilot/status", m.PilotStatus, Qos.STATE, 5, "",
                      "What the Safety Pilot does, and why.")
-HOLDS = Topic("holds/{name}", m.Holds, Qos.STATE, 5, "",
-              "Who makes {name} stand and is no recovery module of the system; silent while "
-              "nobody does. `rampart reset` lets go in its place.")
-DETECTION = Topic("detection/{name}", m.DetectionReport, Qos.STATE, 5, "",
-                  "State of detection module {name}.")
-RECOVERY_COMMAND = Topic("recovery/{name}/command", m.RecoveryCommand, Qos.STATE, 5, "",
-                         "The manager's wish for recovery module {name}.")
-RECOVERY = Topic("recovery/{name}/state", m.RecoveryReport, Qos.STATE, 5, "",
-                 "State of recovery module {name}.")
-DECISION = Topic("manager/decision", m.DecisionRecord, Qos.COMMAND, 0, "",
-                 "Each decision of the FTM Manager with its certificate.")
-SHADOW = Topic("manager/shadow", m.ShadowRecord, Qos.COMMAND, 0, "",
-               "What the strategy in shadow would have decided, where it differs.")
-ADAPT = Topic("manager/adapt", m.AdaptationRequest, Qos.COMMAND, 0, "",
-              "Change a module, a mechanism or the strategy while running.")
-ADAPTATION = Topic("manager/adaptation", m.AdaptationAnswer, Qos.COMMAND, 0, "",
-                   "Whether a change was made, and why not.")
-ADAPTED_SYSTEM = Topic("manager/system", m.AdaptedSystem, Qos.STATE, 1, "",
-                       "The changed system, whole; silent while nothing was changed.")
-MANAGER_STATUS = Topic("manager/status", m.ManagerStatus, Qos.STATE, 10, "",
-                       "The FTM Manager's view; its silence stops the robot.")
-RESET = Topic("manager/reset", m.Reset, Qos.COMMAND, 0, "", "Release a latched recovery.")
-
-# Runtime and supervision.
-NODES = Topic("supervisor/nodes", m.NodeTable, Qos.STATE, 2, "", "The supervisor's node table.")
-RESPAWN = Topic("supervisor/respawn", m.RespawnRequest, Qos.COMMAND, 0, "",
-                "Ask for a node to be respawned.")
-ERROR_REPORT = Topic("supervisor/error", m.Diagnostic, Qos.COMMAND, 0, "",
-                     "Diagnostics of all nodes, passed on: who shows them needs one link only.")
-PROCESS_EVENT = Topic("supervisor/event", m.ProcessEvent, Qos.COMMAND, 0, "",
-                      "What happened to processes.")
-
-# Stand-ins for modules that are not written yet.
-STUB_TRIGGER = Topic("stub/trigger", m.StubTrigger, Qos.COMMAND, 0, "",
-                     "Make the stand-in of a detection module active or idle.")
 
 # World: ground truth is for the judge, never for the controller.
 TRUTH = Topic("world/truth", m.GroundTruth, Qos.STATE, 20, "map", "Ground truth.")
@@ -109,4 +68,6 @@ ACTUATOR_FAULT = Topic("world/actuator_fault", m.ActuatorFault, Qos.COMMAND, 0, 
 OBSTACLES = Topic("world/obstacles", m.ObstacleList, Qos.STATE, 1, "map",
                   "Obstacles present, for maps shown to people.")
 
-ALL: tuple[Topic, ...] = tuple(v for v in globals().values() if isinstance(v, Topic))  # type: ignore[type-arg]
+ALL: tuple[Topic[Any], ...] = (
+    *engine.ALL, *(v for v in globals().values() if isinstance(v, Topic)))
+"""Those of the engine as well."""

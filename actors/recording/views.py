@@ -14,10 +14,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import MANY, MOST
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport
@@ -59,9 +63,9 @@ class Views:
             topics.SCAN.key: self._scan, topics.UPPER_SCAN.key: self._upper_scan,
             topics.OBSTACLES.key: self._obstacles, topics.ROUTE.key: self._route,
             topics.LIGHT_MEASURED.key: self._light, topics.MISSION_STATUS.key: self._mission,
-            topics.DECISION.key: self._decision, topics.PROCESS_EVENT.key: self._process,
-            topics.DIAGNOSTIC.key: self._diagnostic, topics.DETECTION.key: self._detection,
-            topics.INJECTION_REPORT.key: self._injection,
+            ftm_topics.DECISION.key: self._decision, ftm_topics.PROCESS_EVENT.key: self._process,
+            bus_topics.DIAGNOSTIC.key: self._diagnostic, ftm_topics.DETECTION.key: self._detection,
+            bus_topics.INJECTION_REPORT.key: self._injection,
             topics.MISSION_ORDER.key: self._order,
             topics.MISSION_ORDER_ANSWER.key: self._answer}
 
@@ -159,13 +163,13 @@ class Views:
                 f"reached{why}"))
         return views
 
-    def _decision(self, key: str, header: Header, body: m.DecisionRecord, at_ns: int
+    def _decision(self, key: str, header: Header, body: fm.DecisionRecord, at_ns: int
                   ) -> list[View]:
         words = decision_in_words(body.active, body.rule, body.recoveries, body.strategy)
         level = fg.LogLevel.WARNING if body.active else fg.LogLevel.INFO
         return self._event(key, header, at_ns, level, f"decision {body.decision}: {words}")
 
-    def _process(self, key: str, header: Header, body: m.ProcessEvent, at_ns: int) -> list[View]:
+    def _process(self, key: str, header: Header, body: fm.ProcessEvent, at_ns: int) -> list[View]:
         if body.event in _ROUTINE:
             return []
         level = fg.LogLevel.INFO if body.event in _GOOD_NEWS else fg.LogLevel.WARNING
@@ -173,21 +177,21 @@ class Views:
         detail = f": {body.detail}" if body.detail else ""
         return self._event(key, header, at_ns, level, f"{body.node} {body.event}{by}{detail}")
 
-    def _diagnostic(self, key: str, header: Header, body: m.Diagnostic, at_ns: int) -> list[View]:
+    def _diagnostic(self, key: str, header: Header, body: bm.Diagnostic, at_ns: int) -> list[View]:
         return self._event(key, header, at_ns, fg.LogLevel.ERROR,
                            f"{body.context}: {body.reason} [{body.offender}]")
 
-    def _detection(self, key: str, header: Header, body: m.DetectionReport, at_ns: int
+    def _detection(self, key: str, header: Header, body: fm.DetectionReport, at_ns: int
                    ) -> list[View]:
         was = self._seen.get(key)
         if not self._is_new(key, body.state) or (
-                was is None and body.state is m.DetectionState.IDLE):
+                was is None and body.state is fm.DetectionState.IDLE):
             return []
-        active = body.state is m.DetectionState.ACTIVE
+        active = body.state is fm.DetectionState.ACTIVE
         return [_line(at_ns, fg.LogLevel.WARNING if active else fg.LogLevel.INFO, header.source,
                       f"detects: {body.reason}" if active else "is idle again")]
 
-    def _injection(self, key: str, header: Header, body: m.InjectionReport, at_ns: int
+    def _injection(self, key: str, header: Header, body: bm.InjectionReport, at_ns: int
                    ) -> list[View]:
         if not self._is_new(f"{key} {body.injection}", (body.affected > 0, body.finished)):
             return []

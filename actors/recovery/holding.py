@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 
-from rampart.actors.osmosis.messages import RecoveryCommand, RecoveryPhase
+from rampart.actors.ftm.messages import RecoveryCommand, RecoveryPhase
 from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context
 

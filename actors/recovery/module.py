@@ -21,8 +21,8 @@ from typing import Any, ClassVar
 
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import (
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import (
     RecoveryCommand,
     RecoveryPhase,
     RecoveryReport,

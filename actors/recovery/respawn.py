@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import Heartbeat, ProcessEvent, RecoveryCommand, RespawnRequest
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import ProcessEvent, RecoveryCommand, RespawnRequest
 from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.recovery.respawn_core import RespawnCore
 from rampart.actors.runtime.actor import Context, Header, on
@@ -38,7 +40,7 @@ class Respawn(RecoveryModule):
         cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]
     ) -> tuple[str, ...] | None:
         """Hear the heartbeats of its nodes."""
-        if topic is topics.HEARTBEAT:
+        if topic is bus_topics.HEARTBEAT:
             return own_nodes(parameters)
         return super().names(topic, name, parameters)
 
@@ -73,7 +75,7 @@ class Respawn(RecoveryModule):
         self._core.peer(node, incarnation, alive, self.clock.now())
         self._settle()
 
-    @on(topics.HEARTBEAT)
+    @on(bus_topics.HEARTBEAT)
     def heartbeat(self, _message: Heartbeat, header: Header) -> None:
         """Hear that a node works."""
         self._core.beat(header.source, header.incarnation, header.stamp, self.clock.now())

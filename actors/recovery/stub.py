@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rampart.actors.osmosis.messages import RecoveryCommand, RecoveryPhase
+from rampart.actors.ftm.messages import RecoveryCommand, RecoveryPhase
 from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.parameters import amount

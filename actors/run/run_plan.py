@@ -15,8 +15,9 @@ import msgspec
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.zenoh_bus import endpoint
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import AdaptedSystem, NamedFault
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import AdaptedSystem
+from rampart.actors.osmosis.messages import NamedFault
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.wiring import Member, load_class, partners
 from rampart.actors.supervision.kill_node import signal_node

@@ -24,7 +24,7 @@ from rampart.actors.bus import run_folder
 from rampart.actors.bus.tap import Tap
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
-from rampart.actors.osmosis.messages import NodeTable
+from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.actors.supervision.descriptors import needed_descriptors, raise_descriptor_limit

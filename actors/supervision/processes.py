@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
-from rampart.actors.osmosis.messages import AdaptedSystem
+from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.supervision.patience import Usage, usage
 from rampart.actors.supervision.process_title import find_processes, is_stopped
 from rampart.actors.supervision.spawner_client import (

@@ -27,7 +27,7 @@ import msgspec
 
 from rampart.actors.bus.run_folder import issue, issued, remove, socket_path
 from rampart.actors.bus.unix_peer import is_same_user
-from rampart.actors.osmosis.messages import AdaptedSystem
+from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.run.run_plan import (
     Layout,
     RunPlan,

@@ -27,7 +27,7 @@ import time
 import msgspec
 
 from rampart.actors.bus.unix_peer import is_same_user, peer, receive_signed
-from rampart.actors.osmosis.messages import AdaptedSystem
+from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.supervision.process_title import find_process
 from rampart.actors.supervision.spawner import (
     MAX_DATAGRAM,

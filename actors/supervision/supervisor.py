@@ -27,16 +27,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.limits import RateLimit
+from rampart.actors.bus.messages import Diagnostic, Heartbeat, Injection, InjectionReport
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import (
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import (
     AdaptedSystem,
-    Diagnostic,
-    Heartbeat,
-    Injection,
-    InjectionReport,
     ManagerStatus,
     NodeInfo,
     NodeState,
@@ -119,8 +117,8 @@ class _Process:
 class Supervisor(Actor):
     """Keeps the processes of the run alive. Parameters: `nodes`, the names it watches."""
 
-    outputs = (topics.NODES, topics.PROCESS_EVENT, topics.ERROR_REPORT, topics.INJECT,
-               topics.INJECTION_RESULT)
+    outputs = (topics.NODES, topics.PROCESS_EVENT, topics.ERROR_REPORT, bus_topics.INJECT,
+               bus_topics.INJECTION_RESULT)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -150,7 +148,7 @@ class Supervisor(Actor):
         cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
     ) -> tuple[str, ...] | None:
         """Hear the heartbeats of the nodes that it starts."""
-        return tuple(parameters.get("nodes", ())) if topic is topics.HEARTBEAT else None
+        return tuple(parameters.get("nodes", ())) if topic is bus_topics.HEARTBEAT else None
 
     # -- start and stop -------------------------------------------------------------------------
 
@@ -181,7 +179,7 @@ class Supervisor(Actor):
 
     # -- what it hears --------------------------------------------------------------------------
 
-    @on(topics.HEARTBEAT)
+    @on(bus_topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
         """Note that a node's loop turns; adopt a process that was not known, if the kernel does."""
         unit = self._layout.unit_of.get(header.source)
@@ -215,23 +213,23 @@ class Supervisor(Actor):
         process.heard_s[_STATUS] = max(
             process.heard_s.get(_STATUS, -math.inf), self._loop.time() - age_s)
 
-    @on(topics.DIAGNOSTIC)
+    @on(bus_topics.DIAGNOSTIC)
     def diagnostic(self, message: Diagnostic, _header: Header) -> None:
         """Pass a node's error report on to whoever shows it, unless there are too many."""
         if self._passed_on.allows(self.clock.now()):
             self.publish(topics.ERROR_REPORT, message)
 
-    @on(topics.INJECTION_REQUEST)
+    @on(bus_topics.INJECTION_REQUEST)
     def inject(self, message: Injection, _header: Header) -> None:
         """Order a fault for the operator's page; whoever publishes the topic hears it."""
         if self._passed_on.allows(self.clock.now()):
-            self.publish(topics.INJECT, message)
+            self.publish(bus_topics.INJECT, message)
 
-    @on(topics.INJECTION_REPORT)
+    @on(bus_topics.INJECTION_REPORT)
     def injected(self, message: InjectionReport, _header: Header) -> None:
         """Pass on what came of a fault."""
         if self._passed_on.allows(self.clock.now()):
-            self.publish(topics.INJECTION_RESULT, message)
+            self.publish(bus_topics.INJECTION_RESULT, message)
 
     @on(topics.ADAPTED_SYSTEM)
     def adapted(self, message: AdaptedSystem, header: Header) -> None:

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
 from rampart.cli import systems
 from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say
 from rampart.cli.session import connect

@@ -8,7 +8,9 @@ import contextlib
 from pathlib import Path
 from typing import Any, Protocol
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.airport.model import Airport
@@ -31,8 +33,8 @@ RERUN_SCHEMES = ("rerun+http://", "rerun+https://", "rerun://")
 
 SHOWN: tuple[Topic[Any], ...] = (
     topics.POSE, topics.ODOMETRY, topics.SCAN, topics.UPPER_SCAN, topics.OBSTACLES, topics.ROUTE,
-    topics.LIGHT_MEASURED, topics.MISSION_STATUS, topics.DECISION, topics.PROCESS_EVENT,
-    topics.DIAGNOSTIC, topics.DETECTION, topics.INJECTION_REPORT, topics.MISSION_ORDER,
+    topics.LIGHT_MEASURED, topics.MISSION_STATUS, ftm_topics.DECISION, ftm_topics.PROCESS_EVENT,
+    bus_topics.DIAGNOSTIC, ftm_topics.DETECTION, bus_topics.INJECTION_REPORT, topics.MISSION_ORDER,
     topics.MISSION_ORDER_ANSWER)
 """What `rampart.actors.recording.views` translates."""
 

@@ -19,6 +19,8 @@ from prometheus_client.core import (
     StateSetMetricFamily,
 )
 
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.run.run_info import RunInfo
@@ -79,11 +81,11 @@ def _counter(name: str, doc: str, labels: tuple[str, ...], rows: Iterable[Row]) 
 
 
 def _nodes(now: Exposition) -> Iterator[Metric]:
-    table: m.NodeTable | None = now.picture.latest(topics.NODES)
+    table: fm.NodeTable | None = now.picture.latest(ftm_topics.NODES)
     nodes = table.nodes if table else ()
     beats = sorted(now.picture.beats.items())
     yield _gauge("node_up", "Whether a node runs, as the supervisor sees it.", ("node", "kind"), [
-        ((n.name, n.kind), float(n.state is m.NodeState.RUNNING)) for n in nodes])
+        ((n.name, n.kind), float(n.state is fm.NodeState.RUNNING)) for n in nodes])
     yield _gauge("node_incarnation", "Which life of a node this is.", ("node",), [
         ((n.name,), n.incarnation) for n in nodes])
     yield _counter("node_restarts", "How often a node was restarted in this run.", ("node",), [
@@ -103,13 +105,13 @@ def _nodes(now: Exposition) -> Iterator[Metric]:
 def _mechanisms(picture: RunPicture) -> Iterator[Metric]:
     detections = sorted(picture.detections.items())
     recoveries = sorted(picture.recoveries.items())
-    manager: m.ManagerStatus | None = picture.latest(topics.MANAGER_STATUS)
+    manager: fm.ManagerStatus | None = picture.latest(ftm_topics.MANAGER_STATUS)
     yield _gauge("detection_active", "Whether a module detects.", ("module",), [
-        ((name,), float(report.state is m.DetectionState.ACTIVE)) for name, report in detections])
+        ((name,), float(report.state is fm.DetectionState.ACTIVE)) for name, report in detections])
     yield _counter("detections", "How often a module began to detect.", ("module",), [
         ((name,), picture.detections_total[name]) for name, _ in detections])
     yield _gauge("recovery_activated", "Whether a recovery is in force.", ("module",), [
-        ((name,), float(report.state is m.RecoveryState.ACTIVATED))
+        ((name,), float(report.state is fm.RecoveryState.ACTIVATED))
         for name, report in recoveries])
     yield _counter("recoveries", "How often a recovery was activated.", ("module",), [
         ((name,), picture.recoveries_total[name]) for name, _ in recoveries])

@@ -16,8 +16,8 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
+from rampart.actors.ftm import topics
 from rampart.actors.operator.processes import ProcessObserver
-from rampart.actors.osmosis import topics
 from rampart.actors.supervision.process_usage import read_count
 from rampart.actors.web.server import WebServer
 from rampart.cli.following import LOOK_S, draw, is_over, sessions, stopped_by_signals

@@ -14,8 +14,8 @@ from typing import Any
 from rich.console import Console, Group
 from rich.live import Live
 
+from rampart.actors.ftm import topics
 from rampart.actors.operator.processes import ProcessObserver
-from rampart.actors.osmosis import topics
 from rampart.cli.following import LOOK_S, draw, is_over, sessions, stopped_by_signals
 from rampart.cli.look import top_view
 from rampart.cli.output import print_json, say

@@ -14,6 +14,8 @@ from typing import Any
 from rich.cells import cell_len, set_cell_size
 from rich.text import Text
 
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.cli.run_picture import RunPicture
@@ -77,7 +79,7 @@ def picture_json(frame: Frame) -> dict[str, Any]:
         "pose": picture.latest(topics.POSE),
         "control": picture.latest(topics.CONTROL_STATUS),
         "pilot": picture.latest(topics.PILOT_STATUS),
-        "manager": picture.latest(topics.MANAGER_STATUS),
+        "manager": picture.latest(ftm_topics.MANAGER_STATUS),
         "safety": _safety(picture.latest(topics.TRUTH)) or None,
         "detections": dict(sorted(picture.detections.items())),
         "recoveries": dict(sorted(picture.recoveries.items())),
@@ -110,7 +112,7 @@ def _title(frame: Frame, width: int) -> Text:
 def _state(frame: Frame, width: int) -> list[Text]:
     picture, now_s = frame.picture, frame.time_s
     mission = picture.latest(topics.MISSION_STATUS)
-    manager = picture.latest(topics.MANAGER_STATUS)
+    manager = picture.latest(ftm_topics.MANAGER_STATUS)
     safety = _safety(picture.latest(topics.TRUTH))
     rows: list[tuple[str, str, str, Any]] = [
         ("mission", _mission(mission, width), "", topics.MISSION_STATUS),
@@ -118,7 +120,7 @@ def _state(frame: Frame, width: int) -> list[Text]:
         ("pilot", *_pilot(picture.latest(topics.PILOT_STATUS)), topics.PILOT_STATUS),
         ("safety", safety or "not known: nobody tells the ground truth",
          "bold red" if "UNSAFE" in safety else "", topics.TRUTH),
-        ("manager", *_manager(manager), topics.MANAGER_STATUS),
+        ("manager", *_manager(manager), ftm_topics.MANAGER_STATUS),
         ("detection", *_detections(picture), None),
     ]
     shown = []
@@ -167,25 +169,25 @@ def _safety(truth: m.GroundTruth | None) -> str:
     return f"UNSAFE: {', '.join(harm)}; {near}" if harm else f"safe so far; {near}"
 
 
-def _manager(status: m.ManagerStatus | None) -> tuple[str, str]:
+def _manager(status: fm.ManagerStatus | None) -> tuple[str, str]:
     busy = status is not None and (status.active or status.activated)
     return manager_in_words(status), "yellow" if busy else ""
 
 
 def _detections(picture: RunPicture) -> tuple[str, str]:
     found = sorted(picture.detections.items())
-    manager: m.ManagerStatus | None = picture.latest(topics.MANAGER_STATUS)
+    manager: fm.ManagerStatus | None = picture.latest(ftm_topics.MANAGER_STATUS)
     silent = manager.silent if manager else ()
     active = [f"{name} silent" for name in silent]
     active += [f"{name} {report.reason}" for name, report in found
-               if report.state is m.DetectionState.ACTIVE and name not in silent]
+               if report.state is fm.DetectionState.ACTIVE and name not in silent]
     if active:
         modules = len({*silent, *picture.detections})
         return f"{len(active)} of {modules}: {'; '.join(active)}", "yellow"
     return (f"none of {len(found)} modules detects anything" if found else "no module heard", "")
 
 
-def _words(record: m.DecisionRecord) -> str:
+def _words(record: fm.DecisionRecord) -> str:
     return decision_in_words(record.active, record.rule, record.recoveries, record.strategy)
 
 
@@ -201,7 +203,7 @@ def _decisions(frame: Frame, count: int) -> list[Text]:
 
 def _rows(frame: Frame) -> list[dict[str, Any]]:
     """Return a row for each process: those in trouble first, then as asked for."""
-    table: m.NodeTable | None = frame.picture.latest(topics.NODES)
+    table: fm.NodeTable | None = frame.picture.latest(ftm_topics.NODES)
     rows = [{"name": n.name, "kind": n.kind, "pid": n.pid, "state": n.state.value,
              "incarnation": n.incarnation, "restarts": n.restarts}
             for n in (table.nodes if table else ())]
@@ -209,7 +211,7 @@ def _rows(frame: Frame) -> list[dict[str, Any]]:
 
     def place(row: Mapping[str, Any]) -> tuple[bool, float]:
         busy = frame.usage.get(row["name"], {}).get("cpu", 0.0) if frame.by_cpu else 0.0
-        return row["state"] == m.NodeState.RUNNING.value, -busy
+        return row["state"] == fm.NodeState.RUNNING.value, -busy
 
     return sorted(rows, key=place)
 
@@ -242,7 +244,7 @@ def _processes(frame: Frame, width: int, height: int) -> list[Text]:
         name = set_cell_size(printable(row["name"]), 18)
         text = (f"{name} {row['state']:<8} {row['incarnation']:>4} {row['restarts']:>5} "
                 f"{figures}")
-        trouble = row["state"] != m.NodeState.RUNNING.value
+        trouble = row["state"] != fm.NodeState.RUNNING.value
         shown.append(Text(set_cell_size(text, width), style="bold red" if trouble else ""))
     if not rows:
         shown.append(Text(set_cell_size("the supervisor has not told yet", width)))

@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.envelope import Header
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
 from rampart.cli.output import NoEffectError, UsageError, print_json, say
 from rampart.cli.session import connect
 from rampart.files import toml

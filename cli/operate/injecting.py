@@ -9,11 +9,12 @@ import uuid
 
 import msgspec
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
+from rampart.actors.bus.messages import Injection, InjectionReport
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import Injection, InjectionReport
 from rampart.actors.run.system_topics import find_topic
 from rampart.cli.output import NoEffectError, print_json, say, unknown
 from rampart.cli.session import Session, connect
@@ -97,7 +98,7 @@ async def run_fault(fault: Fault, duration_s: float | None, port: int | None, *,
             if all(watch.settled for watch in watches):
                 settled.set()
 
-        session.listen(topics.INJECTION_REPORT, topics.INJECTION_REPORT.at(), hear)
+        session.listen(bus_topics.INJECTION_REPORT, bus_topics.INJECTION_REPORT.at(), hear)
         try:
             for watch in watches:
                 await _take_hold(session, watch)
@@ -124,7 +125,7 @@ async def run_fault(fault: Fault, duration_s: float | None, port: int | None, *,
 
 
 async def _take_hold(session: Session, watch: _Watch) -> None:
-    if not await session.command(topics.INJECT, watch.order, lambda: watch.taken, _TAKE_HOLD_S):
+    if not await session.command(bus_topics.INJECT, watch.order, lambda: watch.taken, _TAKE_HOLD_S):
         raise NoEffectError(f"no effect: no node publishes {watch.order.topic} in this run")
     if watch.refused and watch.affected == 0:
         raise NoEffectError(f"no effect: refused by {watch.refused}")
@@ -134,7 +135,7 @@ async def _end(session: Session, watches: list[_Watch]) -> None:
     """End the injections now: an order of the same id with no duration."""
     for watch in watches:
         over = msgspec.structs.replace(watch.order, duration_s=0.0)
-        await session.command(topics.INJECT, over, lambda w=watch: w.finished, 0.5)  # type: ignore[misc]
+        await session.command(bus_topics.INJECT, over, lambda w=watch: w.finished, 0.5)  # type: ignore[misc]
 
 
 def _judge(watch: _Watch) -> None:

@@ -8,6 +8,8 @@ import contextlib
 import sys
 from typing import Any
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -126,7 +128,7 @@ class _Drive:
         self._pilot: m.PilotStatus | None = None
         session.listen(topics.PILOT_STATUS, topics.PILOT_STATUS.at(), self._hear_pilot)
         session.listen(topics.TELEOP_COMMAND, topics.TELEOP_COMMAND.at(), self._hear_command)
-        session.listen(topics.DIAGNOSTIC, topics.DIAGNOSTIC.pattern, self._hear_diagnostic)
+        session.listen(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.pattern, self._hear_diagnostic)
 
     @property
     def unanswered(self) -> bool:
@@ -207,7 +209,7 @@ class _Drive:
     def _hear_command(self, _key: str, _header: Header, _twist: m.Twist) -> None:
         self.answered = self.answered or self._held_since_s is not None
 
-    def _hear_diagnostic(self, _key: str, _header: Header, report: m.Diagnostic) -> None:
+    def _hear_diagnostic(self, _key: str, _header: Header, report: bm.Diagnostic) -> None:
         if report.offender == self._session.name:
             self.answered = True
             sys.stdout.write("\r")

@@ -6,6 +6,8 @@ import argparse
 import asyncio
 from typing import Any
 
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.cli.holdings import Holdings
@@ -13,7 +15,7 @@ from rampart.cli.output import NoEffectError, print_json, print_table, say
 from rampart.cli.session import Session, connect
 from rampart.cli.state_words import manager_in_words, mission_in_words, pilot_in_words
 
-_STATUS = (topics.MISSION_STATUS, topics.PILOT_STATUS, topics.MANAGER_STATUS, topics.NODES)
+_STATUS = (topics.MISSION_STATUS, topics.PILOT_STATUS, ftm_topics.MANAGER_STATUS, ftm_topics.NODES)
 _WAIT_S = 1.5
 """Simulated seconds to collect states; the rarest comes twice a second."""
 
@@ -45,10 +47,10 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
 async def node_list(options: argparse.Namespace) -> int:
     """Print the supervisor's table."""
     async with connect(options.port) as session:
-        found = await session.latest((topics.NODES,), session.real_s(_WAIT_S) + 1.0)
+        found = await session.latest((ftm_topics.NODES,), session.real_s(_WAIT_S) + 1.0)
     if not found:
         raise NoEffectError("the supervisor does not answer; it may just be restarting, try again")
-    table: m.NodeTable = found[topics.NODES.key]
+    table: fm.NodeTable = found[ftm_topics.NODES.key]
     if options.json:
         print_json([
             {"name": n.name, "kind": n.kind, "pid": n.pid, "state": n.state,
@@ -69,8 +71,8 @@ async def status(options: argparse.Namespace) -> int:
         time_s = session.clock.now()
     mission: m.MissionStatus | None = found.get(topics.MISSION_STATUS.key)
     pilot: m.PilotStatus | None = found.get(topics.PILOT_STATUS.key)
-    manager: m.ManagerStatus | None = found.get(topics.MANAGER_STATUS.key)
-    nodes: m.NodeTable | None = found.get(topics.NODES.key)
+    manager: fm.ManagerStatus | None = found.get(ftm_topics.MANAGER_STATUS.key)
+    nodes: fm.NodeTable | None = found.get(ftm_topics.NODES.key)
     if options.json:
         run = session.run
         print_json({
@@ -101,10 +103,10 @@ def _print_run(session: Session, time_s: float) -> None:
     say(f"time      {time_s:.1f} s at rate {run.rate:g}{page}")
 
 
-def _nodes(table: m.NodeTable | None) -> str:
+def _nodes(table: fm.NodeTable | None) -> str:
     if table is None:
         return "silent (supervisor)"
-    bad = [f"{n.name} {n.state.value}" for n in table.nodes if n.state is not m.NodeState.RUNNING]
+    bad = [f"{n.name} {n.state.value}" for n in table.nodes if n.state is not fm.NodeState.RUNNING]
     restarts = sum(n.restarts for n in table.nodes)
     text = f"{len(table.nodes) - len(bad)} of {len(table.nodes)} running, {restarts} restarts"
     return f"{text}; {', '.join(bad)}" if bad else text

@@ -9,7 +9,11 @@ import math
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.cli import systems
@@ -87,8 +91,8 @@ async def reset(options: argparse.Namespace) -> int:
         known = [r.name for r in systems.load(session.run.system_file).recoveries]
         if options.recovery not in known:
             return await _let_go(session, options.recovery, known)
-        latched = _Latest[m.ManagerStatus]()
-        session.listen(topics.MANAGER_STATUS, topics.MANAGER_STATUS.at(), latched.keep)
+        latched = _Latest[fm.ManagerStatus]()
+        session.listen(ftm_topics.MANAGER_STATUS, ftm_topics.MANAGER_STATUS.at(), latched.keep)
         status = await latched.first(session.real_s(1.0))
         if status is None:
             raise NoEffectError("the FTM Manager does not answer; try again when it is back")
@@ -96,7 +100,7 @@ async def reset(options: argparse.Namespace) -> int:
             waiting = ", ".join(status.latched) or "none"
             raise NoEffectError(f"no effect: {options.recovery} is not latched; latched: {waiting}")
         released = await session.command(
-            topics.RESET, m.Reset(options.recovery, session.name),
+            ftm_topics.RESET, fm.Reset(options.recovery, session.name),
             lambda: latched.value is not None and options.recovery not in latched.value.latched,
             session.real_s(_RESET_WAIT_S))
     if not released:
@@ -117,7 +121,7 @@ async def _let_go(session: Session, name: str, known: list[str]) -> int:
     what = held.by(name)
     if not what:
         raise unknown("recovery", name, [*known, *held.holders])
-    if not await session.command(topics.RESET, m.Reset(name, session.name),
+    if not await session.command(ftm_topics.RESET, fm.Reset(name, session.name),
                                  lambda: not held.by(name), session.real_s(_RESET_WAIT_S)):
         raise NoEffectError(f"{name} was not made to let go of {' and '.join(held.by(name))}; it "
                             "orders it again and again")
@@ -134,23 +138,24 @@ async def trigger(options: argparse.Namespace) -> int:
         stubs = [d.name for d in spec.detections if d.actor == STUB_DETECTION]
         if options.module not in stubs:
             raise unknown("stand-in detection module", options.module, stubs)
-        heard = _Latest[m.DetectionReport]()
-        session.listen(topics.DETECTION, topics.DETECTION.at(options.module), heard.keep)
+        heard = _Latest[fm.DetectionReport]()
+        session.listen(ftm_topics.DETECTION, ftm_topics.DETECTION.at(options.module), heard.keep)
 
-        async def bring(state: m.DetectionState) -> bool:
-            active = state is m.DetectionState.ACTIVE
+        async def bring(state: fm.DetectionState) -> bool:
+            active = state is fm.DetectionState.ACTIVE
             return await session.command(
-                topics.STUB_TRIGGER, m.StubTrigger(options.module, active, "triggered by hand"),
+                ftm_topics.STUB_TRIGGER,
+                fm.StubTrigger(options.module, active, "triggered by hand"),
                 lambda: heard.value is not None and heard.value.state is state,
                 session.real_s(1.0))
 
-        if not await bring(m.DetectionState.ACTIVE):
+        if not await bring(fm.DetectionState.ACTIVE):
             raise NoEffectError(f"no effect: {options.module} does not answer")
         say(f"{options.module} detects")
         stop = asyncio.Event()
         with stopped_by_signals(stop), contextlib.suppress(TimeoutError):
             await asyncio.wait_for(stop.wait(), options.duration / session.clock.rate)
-        if not await bring(m.DetectionState.IDLE):
+        if not await bring(fm.DetectionState.IDLE):
             raise NoEffectError(f"{options.module} did not become idle again")
     say(f"{options.module} is idle again")
     return 0
@@ -231,9 +236,9 @@ class _World:
         self._listed = _Latest[m.ObstacleList]()
         self._complaint = ""
         session.listen(topics.OBSTACLES, topics.OBSTACLES.at(), self._listed.keep)
-        session.listen(topics.DIAGNOSTIC, topics.DIAGNOSTIC.pattern, self._diagnostic)
+        session.listen(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.pattern, self._diagnostic)
 
-    def _diagnostic(self, _key: str, _header: Header, report: m.Diagnostic) -> None:
+    def _diagnostic(self, _key: str, _header: Header, report: bm.Diagnostic) -> None:
         if report.offender == self._session.name:
             self._complaint = report.reason
 

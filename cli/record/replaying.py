@@ -19,7 +19,7 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.bus import run_folder
+from rampart.actors.bus import run_folder, topics
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.messages import Message
@@ -28,7 +28,6 @@ from rampart.actors.bus.tap import Tap
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
-from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.message_form import form_of, header_of, renumbered

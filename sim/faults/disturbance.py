@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from rampart.actors.osmosis.messages import Injection
+from rampart.actors.bus.messages import Injection
 
 
 class UnknownFaultError(ValueError):

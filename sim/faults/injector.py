@@ -11,12 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.limits import Remembered
+from rampart.actors.bus.messages import InjectionReport
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import (
     GroundTruth,
-    InjectionReport,
     MissionPhase,
     MissionStatus,
     ObstacleCommand,
@@ -94,7 +95,7 @@ class Injector(Actor):
         ScenarioError: a planned fault makes no sense in this system.
     """
 
-    outputs = (topics.INJECT, topics.ACTUATOR_FAULT, topics.OBSTACLE)
+    outputs = (bus_topics.INJECT, topics.ACTUATOR_FAULT, topics.OBSTACLE)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -132,7 +133,7 @@ class Injector(Actor):
         """Note where the robot is."""
         self._pose = truth.pose
 
-    @on(topics.INJECTION_REPORT)
+    @on(bus_topics.INJECTION_REPORT)
     def report(self, report: InjectionReport, header: Header) -> None:
         """Note what an injection has changed; a node that was restarted counts anew."""
         for fault in self._planned:
@@ -160,7 +161,7 @@ class Injector(Actor):
         if isinstance(action, OnTopics):
             fault.ids = tuple(order.injection for order in action.orders)
             for order in action.orders:
-                self.publish(topics.INJECT, order)
+                self.publish(bus_topics.INJECT, order)
         elif isinstance(action, OnActuators):
             fault.ids = (action.order.injection,)
             self.publish(topics.ACTUATOR_FAULT, action.order)

@@ -20,9 +20,10 @@ from typing import Any
 
 import msgspec
 
+from rampart.actors.bus.messages import Injection
 from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import ActuatorFault, ActuatorFaultKind, Injection
+from rampart.actors.osmosis.messages import ActuatorFault, ActuatorFaultKind
 from rampart.sim.faults.disturbance import Fault
 from rampart.sim.faults.faults import find_fault
 from rampart.sim.osmosis.robot import WHEEL_NAMES

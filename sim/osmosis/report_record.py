@@ -8,8 +8,12 @@ from typing import Any, Literal
 
 import msgspec
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
@@ -207,14 +211,14 @@ class RunRecorder:
             topics.MISSION_STATUS.key: self._mission_status,
             topics.LIGHT_MEASURED.key: self._light,
             topics.OBSTACLES.key: self._obstacle_list,
-            topics.DETECTION.key: self._detection,
-            topics.MANAGER_STATUS.key: self._manager,
-            topics.DECISION.key: self._decision,
-            topics.SHADOW.key: self._shadow,
+            ftm_topics.DETECTION.key: self._detection,
+            ftm_topics.MANAGER_STATUS.key: self._manager,
+            ftm_topics.DECISION.key: self._decision,
+            ftm_topics.SHADOW.key: self._shadow,
             topics.PILOT_STATUS.key: self._pilot,
-            topics.PROCESS_EVENT.key: self._process_event,
-            topics.INJECT.key: self._injection,
-            topics.INJECTION_REPORT.key: self._injection_report,
+            ftm_topics.PROCESS_EVENT.key: self._process_event,
+            bus_topics.INJECT.key: self._injection,
+            bus_topics.INJECTION_REPORT.key: self._injection_report,
         }
 
     @property
@@ -300,28 +304,28 @@ class RunRecorder:
             if o.present:
                 self._obstacles[o.name] = ObstacleSeen(o.name, o.x_m, o.y_m, o.radius_m)
 
-    def _detection(self, report: m.DetectionReport, header: Header) -> None:
-        active = report.state is m.DetectionState.ACTIVE
+    def _detection(self, report: fm.DetectionReport, header: Header) -> None:
+        active = report.state is fm.DetectionState.ACTIVE
         name = header.source
         if self._turn("detection", name, active, header.stamp, report.reason):
             text = f"{name} detects: {report.reason}" if active else f"{name} is idle again"
             self._note(header.stamp, "fault" if active else "clear", text)
 
-    def _manager(self, status: m.ManagerStatus, header: Header) -> None:
+    def _manager(self, status: fm.ManagerStatus, header: Header) -> None:
         for name in status.activated:
             self._turn("recovery", name, True, header.stamp)
         for lane, name in list(self._open):
             if lane == "recovery" and name not in status.activated:
                 self._turn(lane, name, False, header.stamp)
 
-    def _decision(self, record: m.DecisionRecord, header: Header) -> None:
+    def _decision(self, record: fm.DecisionRecord, header: Header) -> None:
         self._decisions[header.incarnation, record.decision] = DecisionLine(
             header.stamp, record.decision, record.strategy, record.active, record.rule,
             record.recoveries,
             decision_in_words(record.active, record.rule, record.recoveries, record.strategy),
             record.path, record.rejected, record.detected_s)
 
-    def _shadow(self, record: m.ShadowRecord, header: Header) -> None:
+    def _shadow(self, record: fm.ShadowRecord, header: Header) -> None:
         key = header.incarnation, record.decision
         if key in self._decisions:  # it is told right after the decision, on the same way
             self._decisions[key] = msgspec.structs.replace(
@@ -331,7 +335,7 @@ class RunRecorder:
     def _pilot(self, status: m.PilotStatus, header: Header) -> None:
         self._turn("stop", "Safety Pilot", status.stopped, header.stamp, status.reason)
 
-    def _process_event(self, event: m.ProcessEvent, header: Header) -> None:
+    def _process_event(self, event: fm.ProcessEvent, header: Header) -> None:
         if event.detail == "already":  # the answer to a request that came twice
             return
         detail = f": {event.detail}" if event.detail else ""
@@ -348,10 +352,10 @@ class RunRecorder:
                 self._lives[life] = None
                 self._restarts[event.node] = self._restarts.get(event.node, 0) + 1
 
-    def _injection(self, order: m.Injection, _header: Header) -> None:
+    def _injection(self, order: bm.Injection, _header: Header) -> None:
         self._injections[order.injection] = f"{order.mode} {order.topic}"
 
-    def _injection_report(self, report: m.InjectionReport, header: Header) -> None:
+    def _injection_report(self, report: bm.InjectionReport, header: Header) -> None:
         what = self._injections.get(report.injection, report.injection)
         if self._turn("injection", report.injection, not report.finished, header.stamp, what):
             if report.finished:

@@ -12,8 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.holders import Holders
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -47,7 +51,7 @@ class Simulator(Actor):
         airport's file if absent.
     """
 
-    outputs = (*_JOBS, topics.HOLDS)
+    outputs = (*_JOBS, ftm_topics.HOLDS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -125,8 +129,8 @@ class Simulator(Actor):
             self._brakes.let_go(header.source)
         self._braked(unknown)
 
-    @on(topics.RESET)
-    def reset(self, message: m.Reset, _header: Header) -> None:
+    @on(ftm_topics.RESET)
+    def reset(self, message: fm.Reset, _header: Header) -> None:
         """Let go of the brake in the place of a holder that is no recovery module."""
         self._advance()
         unknown = self._brakes.unknown
@@ -141,11 +145,11 @@ class Simulator(Actor):
     def _tell_holds(self) -> None:
         """Tell who holds the brake and should not, again and again as long as somebody does."""
         unknown = self._brakes.unknown
-        self.publish(topics.HOLDS, m.Holds("brake", unknown))
+        self.publish(ftm_topics.HOLDS, fm.Holds("brake", unknown))
         if self._holds_timer is not None:
             self._holds_timer.cancel()
         self._holds_timer = self.call_later(
-            1.0 / topics.HOLDS.rate_hz, self._tell_holds) if unknown else None
+            1.0 / ftm_topics.HOLDS.rate_hz, self._tell_holds) if unknown else None
 
     @on(topics.OBSTACLE)
     def obstacle(self, message: m.ObstacleCommand, header: Header) -> None:
@@ -203,8 +207,8 @@ class Simulator(Actor):
     def _report_fault(
         self, injection: str, affected: int, *, finished: bool, reason: str = ""
     ) -> None:
-        report = m.InjectionReport(injection, self.name, affected, finished, clip(reason))
-        self.publish(topics.INJECTION_REPORT, report)
+        report = bm.InjectionReport(injection, self.name, affected, finished, clip(reason))
+        self.publish(bus_topics.INJECTION_REPORT, report)
 
     def _measure_speed(self, now_s: float) -> None:
         """Over each second, the share of the clock's time that was simulated and not skipped."""

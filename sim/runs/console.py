@@ -10,21 +10,23 @@ from typing import Any, TextIO
 
 from rampart.actors.bus.bounds import MANY, MOST, clip
 from rampart.actors.bus.limits import RateLimit, Remembered
+from rampart.actors.bus.messages import Diagnostic
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis.airport.model import Mission
-from rampart.actors.osmosis.messages import (
+from rampart.actors.ftm.messages import (
     DecisionRecord,
     DetectionReport,
     DetectionState,
-    Diagnostic,
+    ManagerStatus,
+    ProcessEvent,
+    ShadowRecord,
+)
+from rampart.actors.osmosis.airport.model import Mission
+from rampart.actors.osmosis.messages import (
     GroundTruth,
     LightVerdict,
-    ManagerStatus,
     MissionPhase,
     MissionStatus,
     PilotStatus,
-    ProcessEvent,
-    ShadowRecord,
 )
 from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import Header

@@ -11,9 +11,10 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import ProcessEvent
 from rampart.actors.osmosis.airport.model import Airport, Mission
-from rampart.actors.osmosis.messages import ControlStatus, GroundTruth, MissionStatus, ProcessEvent
+from rampart.actors.osmosis.messages import ControlStatus, GroundTruth, MissionStatus
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock

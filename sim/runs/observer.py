@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import GroundTruth, MissionPhase, MissionStatus
 from rampart.actors.runtime.actor import BASE_INPUTS, Actor, Context, Header, on
@@ -32,15 +34,15 @@ class Observer(Actor):
     @on(topics.LIGHT_MEASURED)
     @on(topics.POSE)
     @on(topics.PILOT_STATUS)
-    @on(topics.DETECTION)
-    @on(topics.RECOVERY)
-    @on(topics.DECISION)
-    @on(topics.SHADOW)
-    @on(topics.MANAGER_STATUS)
-    @on(topics.NODES)
-    @on(topics.PROCESS_EVENT)
-    @on(topics.INJECTION_REPORT)
-    @on(topics.DIAGNOSTIC)
+    @on(ftm_topics.DETECTION)
+    @on(ftm_topics.RECOVERY)
+    @on(ftm_topics.DECISION)
+    @on(ftm_topics.SHADOW)
+    @on(ftm_topics.MANAGER_STATUS)
+    @on(ftm_topics.NODES)
+    @on(ftm_topics.PROCESS_EVENT)
+    @on(bus_topics.INJECTION_REPORT)
+    @on(bus_topics.DIAGNOSTIC)
     @on(topics.TRUTH)
     @on(topics.OBSTACLES)
     def heard(self, message: Any, header: Header) -> None:

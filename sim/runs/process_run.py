@@ -9,7 +9,7 @@ from typing import Any
 from rampart.actors.bus.run_folder import register_of
 from rampart.actors.bus.shared_bus import SharedBus
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis.messages import NodeTable
+from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.run.system_topics import system_topics
 from rampart.actors.runtime.actor import Actor, Context, Header

@@ -20,7 +20,7 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis.messages import NodeTable
+from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run.run_plan import OBSERVER, Layout, RunPlan, load_shared
 from rampart.actors.run.system_topics import system_topics
 from rampart.actors.runtime.actor import Actor, Context, Header

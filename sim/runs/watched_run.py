@@ -15,8 +15,8 @@ from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.run_folder import register_of
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import DecisionRecord, NodeTable, ProcessEvent
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import DecisionRecord, NodeTable, ProcessEvent
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.clock import Clock

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Any
 
-from rampart.actors.osmosis.messages import AdaptedSystem, NodeTable
+from rampart.actors.ftm.messages import AdaptedSystem, NodeTable
 from rampart.actors.run.run_plan import SUPERVISOR, Layout, adapted_system
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import (

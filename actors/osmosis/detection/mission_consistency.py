@@ -7,6 +7,7 @@ contradicts the others, so that it can be respawned.
 
 from __future__ import annotations
 
+from rampart.actors.bus import messages as bm
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -64,7 +65,7 @@ class MissionConsistency(DetectionModule):
         self.monitor.pose(message.x_m, message.y_m, self.clock.now())
         self.follow(self.monitor)
 
-    def _hear(self, message: m.Message, header: Header) -> None:
+    def _hear(self, message: bm.Message, header: Header) -> None:
         self.monitor.heard(message, header.source, header.incarnation, header.stamp,
                            self.clock.now())
         self.follow(self.monitor)

@@ -10,6 +10,7 @@ send the run's first mission at all.
 
 from __future__ import annotations
 
+from rampart.actors.ftm import messages as fm
 from rampart.actors.osmosis import messages as m
 
 RESPAWN_WINDOW_S = 8.0
@@ -33,12 +34,12 @@ class BusyError(ValueError):
     """A mission cannot be started now; the text says why."""
 
 
-def system_is_up(table: m.NodeTable | None, now_s: float) -> bool:
+def system_is_up(table: fm.NodeTable | None, now_s: float) -> bool:
     """Whether a mission may be sent: simulated time has begun, and all known nodes run."""
     if now_s < 0 or table is None:
         return now_s >= 0
     return now_s > START_ANYWAY_S or all(
-        row.state is m.NodeState.RUNNING for row in table.nodes)
+        row.state is fm.NodeState.RUNNING for row in table.nodes)
 
 
 class Submission:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from rampart.actors.ftm.messages import RecoveryCommand
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import BaseStatus, BrakeCommand, RecoveryCommand
+from rampart.actors.osmosis.messages import BaseStatus, BrakeCommand
 from rampart.actors.recovery.holding import HoldingRecovery
 from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context, Header, on

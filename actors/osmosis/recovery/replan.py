@@ -7,15 +7,9 @@ and who orders the Graph Planner; the answer is the route itself.
 
 from __future__ import annotations
 
+from rampart.actors.ftm.messages import RecoveryCommand, RecoveryPhase
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import (
-    MissionAction,
-    MissionOrder,
-    MissionOrderAnswer,
-    RecoveryCommand,
-    RecoveryPhase,
-    Route,
-)
+from rampart.actors.osmosis.messages import MissionAction, MissionOrder, MissionOrderAnswer, Route
 from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context, Header, on
 

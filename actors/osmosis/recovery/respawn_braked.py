@@ -10,8 +10,9 @@ the brake and let go of it: the base brakes as long as anybody holds it (`topics
 
 from __future__ import annotations
 
+from rampart.actors.ftm.messages import RecoveryCommand, RecoveryPhase
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import BrakeCommand, RecoveryCommand, RecoveryPhase
+from rampart.actors.osmosis.messages import BrakeCommand
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import Context
 

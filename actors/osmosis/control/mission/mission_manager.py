@@ -7,6 +7,8 @@ import math
 import msgspec
 
 from rampart.actors.bus.bounds import clip
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ftm.messages import ManagerStatus
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.control.mission import mission_state
@@ -16,7 +18,6 @@ from rampart.actors.osmosis.messages import (
     ControlStatus,
     Goal,
     LightMeasurement,
-    ManagerStatus,
     MissionOrder,
     MissionRequest,
     Route,
@@ -65,7 +66,7 @@ class MissionManager(Actor):
         self._become(state)
         self.publish(topics.MISSION_ORDER_ANSWER, answer)
 
-    @on(topics.MANAGER_STATUS)
+    @on(ftm_topics.MANAGER_STATUS)
     def manager(self, message: ManagerStatus, _header: Header) -> None:
         """Pause while a recovery holds the robot, and go on when it is released."""
         if self._held_by:

@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 
 from rampart.actors.bus.bounds import clip
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ftm.messages import Holds, ManagerStatus, Reset
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair
 from rampart.actors.osmosis.control.pilot.safety_gate import GateOutput, SafetyGate, Stamped
 from rampart.actors.osmosis.control.settings import checks_of, gate_of, reach_of
 from rampart.actors.osmosis.messages import (
     BaseCommand,
-    Holds,
     LaserScan,
-    ManagerStatus,
     PilotMode,
     PilotOrder,
     PilotStatus,
-    Reset,
     Twist,
 )
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
@@ -32,7 +31,7 @@ class SafetyPilot(Actor):
     dead man is fed and everything that expires does.
     """
 
-    outputs = (topics.BASE_COMMAND, topics.PILOT_STATUS, topics.HOLDS)
+    outputs = (topics.BASE_COMMAND, topics.PILOT_STATUS, ftm_topics.HOLDS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -88,7 +87,7 @@ class SafetyPilot(Actor):
                                    "of this system; rampart reset ends it", header.source)
         self._follow(before)
 
-    @on(topics.RESET)
+    @on(ftm_topics.RESET)
     def reset(self, message: Reset, _header: Header) -> None:
         """End the order of one that is no recovery module of the system."""
         before = self._orders_in_force()
@@ -107,9 +106,9 @@ class SafetyPilot(Actor):
 
     def _tell_holds(self) -> None:
         """Tell who orders something and should not."""
-        self.publish(topics.HOLDS, Holds("pilot", self._gate.unknown))
+        self.publish(ftm_topics.HOLDS, Holds("pilot", self._gate.unknown))
 
-    @on(topics.MANAGER_STATUS)
+    @on(ftm_topics.MANAGER_STATUS)
     def manager(self, _message: ManagerStatus, header: Header) -> None:
         """Hear that the manager lived when it said so: old news is as good as none."""
         self._gate.manager_alive(min(header.stamp, self.clock.now()))

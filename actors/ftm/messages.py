@@ -1,0 +1,235 @@
+"""The contract of fault tolerance: what detection, recovery, manager and supervision say.
+
+One struct for each message, SI units; times are simulated seconds. Header data (source,
+incarnation, sequence, stamp) is not in these structs: the bus puts it round them
+(`rampart.actors.bus.envelope`). Every field is bounded by the types of `rampart.actors.bus.bounds`:
+a payload beyond the bounds never reaches an actor.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import msgspec
+
+from rampart.actors.bus.bounds import (
+    MANY,
+    Count,
+    Document,
+    Explained,
+    Incarnation,
+    Name,
+    Names,
+    Pid,
+    Seconds,
+    Text,
+    Texts,
+)
+from rampart.actors.bus.messages import Message
+
+
+class Holds(Message, frozen=True):
+    """Who holds the brake, or an order to the pilot, and is no recovery module of the system.
+
+    `what` is held; `holders` are obeyed until they let go, or an operator does for them.
+    """
+
+    what: Name
+    holders: Names
+
+
+class DetectionState(StrEnum):
+    """State of a detection module (paper, figure 4)."""
+
+    IDLE = "idle"
+    ACTIVE = "active"
+
+
+class DetectionReport(Message, frozen=True):
+    """State of one detection module; `nodes` names the failed nodes where that is the subject."""
+
+    state: DetectionState
+    reason: Text
+    nodes: Names
+    since_s: Seconds
+
+
+class RecoveryState(StrEnum):
+    """State of a recovery module (paper, figure 4)."""
+
+    IDLE = "idle"
+    ACTIVATED = "activated"
+
+
+class RecoveryPhase(StrEnum):
+    """How far an activated recovery is: only `ACTING` must not be cut off."""
+
+    IDLE = "idle"
+    ACTING = "acting"
+    DONE = "done"
+    DEGRADED = "degraded"
+    FAILED = "failed"
+
+
+class RecoveryCommand(Message, frozen=True):
+    """The manager's wish for one recovery module, repeated until it is reported fulfilled."""
+
+    activate: bool
+    decision: Count
+    nodes: Names
+    reason: Text
+
+
+class RecoveryReport(Message, frozen=True):
+    """State of one recovery module, for the decision it last obeyed."""
+
+    state: RecoveryState
+    phase: RecoveryPhase
+    decision: Count
+    reason: Text
+
+
+class DecisionRecord(Message, frozen=True):
+    """A decision with its certificate: rule is the block 1 to 4 of safety-first, 0 for no fault."""
+
+    decision: Count
+    strategy: Name
+    active: Names
+    rule: Count
+    recoveries: Names
+    path: Texts
+    rejected: Explained
+    detected_s: Seconds
+
+
+class AdaptationRequest(Message, frozen=True):
+    """Asks the manager to change a mechanism while running (`manager.spec.adaptation.Change`).
+
+    `values` is a JSON object. The answer carries the same `request`.
+    """
+
+    request: Name
+    action: Name
+    name: Name
+    values: Document
+    by: Name
+
+
+class AdaptationAnswer(Message, frozen=True):
+    """Whether a change was made, and why not; `version` counts the changes made in this run."""
+
+    request: Name
+    accepted: bool
+    reason: Text
+    version: Count
+
+
+class AdaptedSystem(Message, frozen=True):
+    """The system as it was changed; `document` is its whole spec as a JSON object."""
+
+    version: Count
+    change: Text
+    by: Name
+    document: Document
+
+
+class StubTrigger(Message, frozen=True):
+    """Makes the stand-in for detection module `name` active or idle."""
+
+    name: Name
+    active: bool
+    reason: Text
+
+
+class ShadowRecord(Message, frozen=True):
+    """A decision that the strategy in shadow would have taken instead of decision `decision`."""
+
+    decision: Count
+    strategy: Name
+    active: Names
+    rule: Count
+    recoveries: Names
+    taken: Names
+
+
+class DetectionView(Message, frozen=True):
+    """What the manager believes about a detection module (it holds a flapping one active)."""
+
+    name: Name
+    active: bool
+    reason: Text
+    nodes: Names
+
+
+_Views = Annotated[tuple[DetectionView, ...], msgspec.Meta(max_length=MANY)]
+
+
+class ManagerStatus(Message, frozen=True):
+    """The manager's view, and by its regularity the proof that it lives."""
+
+    active: Names
+    silent: Names
+    activated: Names
+    latched: Names
+    strategy: Name
+    decision: Count
+    detections: _Views = ()
+
+
+class Reset(Message, frozen=True):
+    """Operator's word to release a latched recovery, e.g. the emergency stop."""
+
+    recovery: Name
+    by: Name
+
+
+class NodeState(StrEnum):
+    """State of a node's process as the supervisor sees it."""
+
+    STARTING = "starting"
+    RUNNING = "running"
+    CRASHED = "crashed"
+    STOPPED = "stopped"
+    WEDGED = "wedged"
+    GIVEN_UP = "given up"
+
+
+class NodeInfo(Message, frozen=True):
+    """One row of the supervisor's table."""
+
+    name: Name
+    kind: Name
+    pid: Pid
+    state: NodeState
+    incarnation: Incarnation
+    restarts: Count
+
+
+_Rows = Annotated[tuple[NodeInfo, ...], msgspec.Meta(max_length=MANY)]
+
+
+class NodeTable(Message, frozen=True):
+    """All nodes of the system."""
+
+    nodes: _Rows
+
+
+class RespawnRequest(Message, frozen=True):
+    """A wish of a recovery module or the manager: kill a process, if it lives, and restart it."""
+
+    request: Count
+    node: Name
+    failed_incarnation: Incarnation
+    by: Name
+
+
+class ProcessEvent(Message, frozen=True):
+    """Something happened to a process: crashed, stopped, wedged, respawned, refused, given up."""
+
+    node: Name
+    event: Name
+    pid: Pid
+    incarnation: Incarnation
+    by: Name
+    detail: Text

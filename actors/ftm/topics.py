@@ -1,0 +1,51 @@
+"""The keys that every system has, declared once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rampart.actors.bus import messages as bus_messages
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.ftm import messages as m
+
+# Detection, recovery, manager.
+HOLDS = Topic("holds/{name}", m.Holds, Qos.STATE, 5, "",
+              "Who makes {name} stand and is no recovery module of the system; silent while "
+              "nobody does. `rampart reset` lets go in its place.")
+DETECTION = Topic("detection/{name}", m.DetectionReport, Qos.STATE, 5, "",
+                  "State of detection module {name}.")
+RECOVERY_COMMAND = Topic("recovery/{name}/command", m.RecoveryCommand, Qos.STATE, 5, "",
+                         "The manager's wish for recovery module {name}.")
+RECOVERY = Topic("recovery/{name}/state", m.RecoveryReport, Qos.STATE, 5, "",
+                 "State of recovery module {name}.")
+DECISION = Topic("manager/decision", m.DecisionRecord, Qos.COMMAND, 0, "",
+                 "Each decision of the FTM Manager with its certificate.")
+SHADOW = Topic("manager/shadow", m.ShadowRecord, Qos.COMMAND, 0, "",
+               "What the strategy in shadow would have decided, where it differs.")
+ADAPT = Topic("manager/adapt", m.AdaptationRequest, Qos.COMMAND, 0, "",
+              "Change a module, a mechanism or the strategy while running.")
+ADAPTATION = Topic("manager/adaptation", m.AdaptationAnswer, Qos.COMMAND, 0, "",
+                   "Whether a change was made, and why not.")
+ADAPTED_SYSTEM = Topic("manager/system", m.AdaptedSystem, Qos.STATE, 1, "",
+                       "The changed system, whole; silent while nothing was changed.")
+MANAGER_STATUS = Topic("manager/status", m.ManagerStatus, Qos.STATE, 10, "",
+                       "The FTM Manager's view; its silence stops the robot.")
+RESET = Topic("manager/reset", m.Reset, Qos.COMMAND, 0, "", "Release a latched recovery.")
+
+# Runtime and supervision.
+NODES = Topic("supervisor/nodes", m.NodeTable, Qos.STATE, 2, "", "The supervisor's node table.")
+RESPAWN = Topic("supervisor/respawn", m.RespawnRequest, Qos.COMMAND, 0, "",
+                "Ask for a node to be respawned.")
+ERROR_REPORT = Topic("supervisor/error", bus_messages.Diagnostic, Qos.COMMAND, 0, "",
+                     "Diagnostics of all nodes, passed on: who shows them needs one link only.")
+PROCESS_EVENT = Topic("supervisor/event", m.ProcessEvent, Qos.COMMAND, 0, "",
+                      "What happened to processes.")
+
+# Stand-ins for modules that are not written yet.
+STUB_TRIGGER = Topic("stub/trigger", m.StubTrigger, Qos.COMMAND, 0, "",
+                     "Make the stand-in of a detection module active or idle.")
+
+ALL: tuple[Topic[Any], ...] = (
+    *bus_topics.ALL, *(v for v in globals().values() if isinstance(v, Topic)))
+"""Those of the bus as well."""
