@@ -7,6 +7,8 @@ import json
 import socket
 from contextlib import asynccontextmanager
 
+from virtual_loop import run_context
+
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm
@@ -86,7 +88,7 @@ class World:
 
     def context(self, name: str, incarnation: int, **shared: object) -> Context:
         return Context(name, incarnation, self.clock, VirtualBus(self.hub, name, incarnation),
-                       {}, {"airport": AIRPORT, "run_id": "r1", **shared})
+                       run=run_context(**{"airport": AIRPORT, "run_id": "r1", **shared}))
 
     @asynccontextmanager
     async def running(self, actor: Actor):

@@ -6,8 +6,6 @@ import asyncio
 from collections.abc import Mapping
 from typing import Any
 
-from virtual_loop import System
-
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
@@ -118,7 +116,6 @@ class Supervisor(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.system: System = context.shared["world"]
         self.answer = "respawned"
         self.delay_s = 0.05
         self.requests: list[tuple[float, fm.RespawnRequest]] = []
@@ -127,8 +124,8 @@ class Supervisor(Actor):
     @on(ftm_topics.RESPAWN)
     def respawn(self, message: fm.RespawnRequest, _header: Header) -> None:
         self.requests.append((self.clock.now(), message))
-        life = self.system.incarnations.get(message.node, 0)
-        alive = message.node in self.system.tasks
+        life = self.around.incarnations.get(message.node, 0)
+        alive = message.node in self.around.tasks
         if self.answer == "nothing":
             return
         if self.answer != "respawned":
@@ -140,11 +137,11 @@ class Supervisor(Actor):
 
     async def _replace(self, message: fm.RespawnRequest, alive: bool) -> None:
         if alive:
-            await self.system.kill(message.node)
+            await self.around.kill(message.node)
         await asyncio.sleep(self.delay_s)
-        if message.node not in self.system.tasks:
-            self.system.start(message.node, Node)
-        self._say(message, "respawned", self.system.incarnations[message.node])
+        if message.node not in self.around.tasks:
+            self.around.start(message.node, Node)
+        self._say(message, "respawned", self.around.incarnations[message.node])
 
     def _say(self, message: fm.RespawnRequest, event: str, incarnation: int) -> None:
         self.publish(ftm_topics.PROCESS_EVENT, fm.ProcessEvent(

@@ -13,13 +13,13 @@ from laser_sweeps import full_sweep
 from localization_drive import Reading, Truth, disturbed
 from virtual_loop import System, run, shipped_system
 
+from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.following.bridged_control import BridgedControl, BridgedStandby
 from rampart.actors.osmosis.control.following.dead_reckoning import AFTER_S, DeadReckoning
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.runtime.actor import Actor, Context, Header, on
-from rampart.actors.runtime.wiring import Member, heard
 
 PERIOD_S = 0.02
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from shapely.geometry import box
 from virtual_loop import System, run, shipped_system
 
+from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
@@ -26,7 +27,6 @@ from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea
 from rampart.actors.osmosis.detection.bounds import Bounds
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Actor
-from rampart.actors.runtime.wiring import Member, heard
 
 LIMITS = FenceLimits(half_diagonal_m=0.473, reaction_s=0.3, braking_mps2=2.0)
 ACCURACY_M = 0.05

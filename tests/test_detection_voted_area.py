@@ -20,6 +20,7 @@ from localization_drive import (
 from shapely.geometry import box
 from virtual_loop import System, run, shipped_system
 
+from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
@@ -27,7 +28,6 @@ from rampart.actors.osmosis.detection.area.geofence import Fix
 from rampart.actors.osmosis.detection.area.position_vote import GPS, WHEELS, PositionVote
 from rampart.actors.osmosis.detection.area.voted_area import VotedArea, VotedPosition
 from rampart.actors.runtime.actor import Actor
-from rampart.actors.runtime.wiring import Member, heard
 from rampart.sim.faults.faults import SENSOR_FAULTS
 
 END_S = sum(leg[0] for leg in LEGS)

@@ -7,12 +7,13 @@ import pkgutil
 from collections.abc import Iterator
 from typing import Any
 
-import actors.stub
 import pytest
-from virtual_loop import System, run, shipped_system
+from virtual_loop import System, run, run_context, shipped_system
 
-import actors.detection
-import actors.recovery
+import rampart.actors.detection
+import rampart.actors.osmosis.detection
+import rampart.actors.osmosis.recovery
+import rampart.actors.recovery
 from rampart.actors.bus import topics
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis.airport.formats import load_airport
@@ -54,9 +55,10 @@ class Read(dict[str, Any]):
 
 
 def shipped() -> Iterator[type[Any]]:
-    for package in (actors.detection, actors.recovery, actors.stub):
-        for found in pkgutil.iter_modules(package.__path__):
-            module = importlib.import_module(f"{package.__name__}.{found.name}")
+    for package in (rampart.actors.detection, rampart.actors.recovery,
+                    rampart.actors.osmosis.detection, rampart.actors.osmosis.recovery):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            module = importlib.import_module(found.name)
             for cls in vars(module).values():
                 if isinstance(cls, type) and issubclass(cls, DetectionModule | RecoveryModule) \
                         and cls.__module__ == module.__name__ and cls.__name__ not in BASES \
@@ -76,7 +78,7 @@ def start(path: str, **values: Any) -> set[str]:
     async def scenario() -> None:
         system = System()
         cls(Context("X", 1, system.clock, VirtualBus(system.hub, "X", 1), parameters,
-                    {"system": shipped_system(), "airport": load_airport("vallombre")}))
+                    run_context(system=shipped_system(), airport=load_airport("vallombre"))))
         cls.names(topics.HEARTBEAT, "X", parameters)
         cls.watches("X", parameters)
 

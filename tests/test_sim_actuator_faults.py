@@ -8,6 +8,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from virtual_loop import run_context
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import messages as m
@@ -479,7 +480,7 @@ class Bench:
         self.now_s = 10.0
         clock = Clock(0.0, 1.0, lambda: self.now_s)
         self.actor = Simulator(Context(
-            "simulator", 1, clock, VirtualBus(Hub(), "simulator"), {}, {"airport": FIELD}))
+            "simulator", 1, clock, VirtualBus(Hub(), "simulator"), run=run_context(airport=FIELD)))
         self.reports, self.complaints = [], []
         self.actor.publish = lambda topic, body, **_: (
             self.reports.append((body.injection, body.affected, body.finished, body.reason))

@@ -6,6 +6,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from virtual_loop import run_context
 
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
@@ -27,7 +28,7 @@ class Bench:
         self.now_s = 100.0
         clock = Clock(0.0, 1.0, lambda: self.now_s)
         context = Context("simulator", 1, clock, VirtualBus(Hub(), "simulator"), parameters,
-                          {"airport": AIRPORT})  # fmt: skip
+                          run_context(airport=AIRPORT))
         self.actor = Simulator(context)
         self.sent = []
         self.actor.has_readers = lambda topic: True

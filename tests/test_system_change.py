@@ -11,10 +11,11 @@ import pytest
 from stub_actors import ROOT
 
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.run.run_plan import Layout, RunPlan, adapted_system, load_system
+from rampart.actors.layout.layout import Layout, adapted_system
+from rampart.actors.run.run_plan import RunPlan, load_system
 
 FILE = ROOT / "systems" / "paper.toml"
-PLAN = RunPlan("r", 20000, 1.0, 1, str(FILE), "", "", "", 0, ftm=True, hmi_port=0)
+PLAN = RunPlan("r", 20000, system_file=str(FILE))
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from stub_actors import ROOT
 
 from rampart.files import working_folder
 
-LOOK = ("from rampart.actors.runtime import wiring\n"
+LOOK = ("from rampart.actors.layout import wiring\n"
         "from rampart.files import working_folder\n"
         "working_folder.admit()\n"
         "wiring.load_class('intruder:Node')\n")
