@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
 import pkgutil
 from collections.abc import Iterator
+from importlib import import_module, resources
 from typing import Any
 
-import actors.stub
 import pytest
 from virtual_loop import System, run, shipped_system
 
-import actors.detection
-import actors.recovery
 from rampart.actors.bus import topics
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis.airport.formats import load_airport
@@ -54,9 +51,10 @@ class Read(dict[str, Any]):
 
 
 def shipped() -> Iterator[type[Any]]:
-    for package in (actors.detection, actors.recovery, actors.stub):
-        for found in pkgutil.iter_modules(package.__path__):
-            module = importlib.import_module(f"{package.__name__}.{found.name}")
+    for room in ("detection", "recovery", "osmosis.detection", "osmosis.recovery"):
+        package = f"rampart.actors.{room}"
+        for found in pkgutil.walk_packages([str(resources.files(package))], package + "."):
+            module = import_module(found.name)
             for cls in vars(module).values():
                 if isinstance(cls, type) and issubclass(cls, DetectionModule | RecoveryModule) \
                         and cls.__module__ == module.__name__ and cls.__name__ not in BASES \

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from porter_actors import write_porter_system
 
-import systems as shipped
+from rampart import systems as shipped
 from rampart.actors.bus import messages as bm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m

@@ -75,7 +75,7 @@ def test_an_unsafe_run_is_unsafe_though_its_reader_has_seen_enough(tmp_path):
 
 STUCK = """
 import sys
-from actors.runtime import streams
+from rampart.files import streams
 streams.PATIENCE_S = 0.05
 streams.secure()
 for number in range(20_000):
@@ -97,7 +97,7 @@ def test_who_does_not_read_stderr_stops_nobody():
 
 CLOSED = """
 import os, sys
-from actors.runtime import streams
+from rampart.files import streams
 streams.secure()
 opened = os.open("/dev/null", os.O_RDONLY)
 print("to nobody", file=sys.stderr)
