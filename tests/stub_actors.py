@@ -68,8 +68,7 @@ def free_base_port() -> int:
 
 def stub_plan(system: Path, **changes: object) -> RunPlan:
     """Return a plan that runs the stub system."""
-    plan = RunPlan("stub", free_base_port(), 1.0, 1, str(system), "", "vallombre", "AB", 0,
-                   ftm=True, hmi_port=0)
+    plan = RunPlan("stub", free_base_port(), system_file=str(system))
     return msgspec.structs.replace(plan, **changes)
 
 

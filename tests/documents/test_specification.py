@@ -13,9 +13,9 @@ import msgspec
 import pytest
 
 from rampart.actors.ftm.messages import DetectionState
+from rampart.actors.layout.system_topics import system_topics
+from rampart.actors.layout.wiring import load_class
 from rampart.actors.osmosis import topics
-from rampart.actors.run.system_topics import system_topics
-from rampart.actors.runtime.wiring import load_class
 from rampart.manager.model.gates import GateError, detection_gate
 from rampart.manager.spec.schema import (
     DetectionSpec,
@@ -127,7 +127,8 @@ def test_the_worked_example_is_a_sound_system(tmp_path):
 def test_the_modules_of_one_s_own_that_it_shows_work(tmp_path, monkeypatch):
     (tmp_path / "tank_actors.py").write_text(MODULES, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
-    text = EXAMPLE.replace("rampart.actors.ftm.stub_node:StubNode", "tank_actors:Gauge").replace(
+    text = EXAMPLE.replace(
+        "rampart.actors.runtime.stub_node:StubNode", "tank_actors:Gauge").replace(
         "rampart.actors.detection.stub:StubDetection", "tank_actors:LevelTooHigh")
     spec = parse_specification(text, "tank.toml")
     assert [topic.key for topic in system_topics(spec)][len(topics.ALL):] == ["tank/level"]

@@ -6,9 +6,9 @@ import dataclasses
 
 import pytest
 
+from rampart.actors.layout.system_topics import own_topics, published_keys, system_topics
+from rampart.actors.layout.wiring import load_class
 from rampart.actors.osmosis import topics
-from rampart.actors.run.system_topics import own_topics, published_keys, system_topics
-from rampart.actors.runtime.wiring import load_class
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import markdown, uses
 from tests import ROOT, porter_actors
@@ -41,7 +41,7 @@ def test_the_shipped_systems_have_the_common_topics_and_no_other(name):
 
 def test_who_asks_only_for_a_robot_s_own_topics_loads_no_actor_that_ships(tmp_path, monkeypatch):
     loaded = []
-    monkeypatch.setattr("rampart.actors.run.system_topics.load_class",
+    monkeypatch.setattr("rampart.actors.layout.system_topics.load_class",
                         lambda path: loaded.append(path) or load_class(path))
     assert [own_topics(systems.load(name)) for name in ("paper", "osmosis", "cell")] == [()] * 3
     assert loaded == []

@@ -11,7 +11,7 @@ import pytest
 from rampart.files import working_folder
 from tests import ROOT
 
-LOOK = ("from rampart.actors.runtime import wiring\n"
+LOOK = ("from rampart.actors.layout import wiring\n"
         "from rampart.files import working_folder\n"
         "working_folder.admit()\n"
         "wiring.load_class('intruder:Node')\n")

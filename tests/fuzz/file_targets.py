@@ -61,7 +61,7 @@ actor = "rampart.manager.actor:FtmManager"
 kind = "manager"
 [[node]]
 name = "lamp"
-actor = "rampart.actors.ftm.stub_node:StubNode"
+actor = "rampart.actors.runtime.stub_node:StubNode"
 kind = "control"
 respawn = "RM1"
 [[detection]]

@@ -32,9 +32,12 @@ from msgspec import inspect
 from rampart import systems as shipped
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode
 from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.layout.layout import Layout, load_run
+from rampart.actors.layout.system_topics import find_topic
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.recording.views import Views
-from rampart.actors.run.run_plan import Layout, RunPlan, load_shared
-from rampart.actors.run.system_topics import find_topic
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor, Context
 from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Shelf
 from rampart.actors.supervision.patience import AT_LEISURE, Usage
@@ -88,7 +91,7 @@ class System:
     spec: SystemSpec
     plan: RunPlan
     layout: Layout
-    shared: dict[str, Any]
+    run: RunContext
     words: tuple[str, ...]
 
 
@@ -96,20 +99,19 @@ class System:
 def system(name: str) -> System:
     """Return a shipped system by its name."""
     spec = systems.load(name)
-    airport, mission = ("", "") if name == "cell" else ("vallombre", "AB")
-    plan = RunPlan("fuzz", 7450, rate=1.0, seed=1, system_file=str(shipped.find(name)), strategy="",
-                   airport=airport, mission=mission, obstacles=1, ftm=True, hmi_port=0,
-                   launcher_pid=1)
-    layout = Layout(plan, spec)
-    shared = {**load_shared(plan, spec), "joystick": None, "known_incarnations": {}}
-    lights = [light.name for light in shared["airport"].lights[:2]] if airport else []
+    plan = RunPlan("fuzz", system_file=str(shipped.find(name)), launcher_pid=1,
+                   options={} if name == "cell" else {"obstacles": 1})
+    run = load_run(plan, spec)
+    layout = Layout(plan, spec, run.application)
+    lights = [light.name for light in run.application.airport.lights[:2]] \
+        if name != "cell" else []
     words = (*layout.members, *(m.name for m in spec.mechanisms), *lights, "fuzz/first", "x",
              "crate", "front left", "FTM1", "control/command", "localization/pose", "heartbeat/DM1",
              "drop", "delay", "corrupt", "freeze", "stuck", "duplicate", "restamp", "x_m",
              "nodes", "enable", "disable", "retune", "set", "strategy", "order",
              "safety-first", "guarded-repair", '{"value": "safety-first"}', '{"deadline_s": 1.0}',
-             msgspec.json.encode(shared["document"]).decode())
-    return System(spec, plan, layout, shared, words)
+             msgspec.json.encode(run.document).decode())
+    return System(spec, plan, layout, run, words)
 
 
 class Machine:
@@ -221,10 +223,10 @@ async def _live(of: System, name: str, incarnation: int, shelf: Shelf, stranger:
     loop = asyncio.get_running_loop()
     hub, member = Hub(), of.layout.members[name]
     clock = VirtualClock(loop, loop.time() + 1.0)  # type: ignore[arg-type]
-    shared = {**of.shared, "processes": Machine(), "sinks": _sinks(of, clock)}
+    more = {SUPERVISOR: [Machine()], OBSERVER: [_sinks(of, clock)]}.get(name, [])
     actor = member.actor(Context(
-        name, incarnation, clock, VirtualBus(hub, name, incarnation), member.parameters, shared,
-        pid=100, checkpoints=MemoryCheckpoints(shelf, incarnation)))
+        name, incarnation, clock, VirtualBus(hub, name, incarnation), member.parameters, of.run,
+        pid=100, checkpoints=MemoryCheckpoints(shelf, incarnation)), *more)
     problems: list[str] = []
 
     def overheard(_now_s: float, source: str, key: str, payload: bytes) -> None:
@@ -281,9 +283,9 @@ def _flaw(actor: Actor, key: str, payload: bytes) -> Iterator[str]:
 
 def _sinks(of: System, clock: VirtualClock) -> list[Any]:
     """Return what the launcher has the observer tell the run's story to."""
-    if not of.plan.airport:
+    if not isinstance(of.run.application, Osmosis):
         return [Console(io.StringIO()).take]
-    run = MissionRun(of.plan, of.shared["airport"], of.shared["mission"], strategy="x",
+    run = MissionRun(of.plan, of.run.application.airport, of.run.application.mission, strategy="x",
                      patience_s=60.0, console=Console(io.StringIO()))
 
     def conclude(_topic: Any, _message: Any, _header: Header) -> None:
@@ -298,7 +300,7 @@ def fuzz_tools(seed: int) -> Finding | None:
     of = system("osmosis")
     stranger = Stranger(f"tools {seed}", of)
     picture = RunPicture()
-    views = Views(of.shared["airport"], (0.7, 0.6))
+    views = Views(of.run.application.airport, (0.7, 0.6))
     run = _Run()
     try:
         with _patience():

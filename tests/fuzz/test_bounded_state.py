@@ -101,8 +101,8 @@ def flooded(of, name):
         clock = VirtualClock(loop, 0.0)
         actor = member.actor(Context(
             name, 1, clock, VirtualBus(hub, name), member.parameters,
-            {**of.shared, "processes": Machine(), "sinks": ()}, pid=1,
-            checkpoints=MemoryCheckpoints(Shelf(), 1), members=frozenset(of.layout.members)))
+            of.run, pid=1, checkpoints=MemoryCheckpoints(Shelf(), 1),
+            members=frozenset(of.layout.members)), *([Machine()] if name == SUPERVISOR else []))
         task = asyncio.create_task(actor.run())
         stranger = VirtualBus(hub, "stranger")
         await stranger.open()
@@ -167,7 +167,7 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
     monkeypatch.setattr(rampart.sim.runs.console, "MANY", 500)
     monkeypatch.setattr(rampart.sim.runs.console, "MOST", 500)
     of = system("osmosis")
-    run = MissionRun(of.plan, of.shared["airport"], of.shared["mission"], strategy="x",
+    run = MissionRun(of.plan, of.run.application.airport, of.run.application.mission, strategy="x",
                      patience_s=60.0, console=Console(io.StringIO()))
     picture, views = RunPicture(), Views()
     clock = type("Clock", (), {"now": staticmethod(lambda: 0.0)})()
@@ -339,7 +339,7 @@ def test_the_supervisor_passes_on_a_bounded_number_of_reports_and_says_what_it_l
         member = of.layout.members[SUPERVISOR]
         actor = member.actor(Context(
             SUPERVISOR, 1, VirtualClock(loop, 0.0), VirtualBus(hub, SUPERVISOR), member.parameters,
-            {**of.shared, "processes": Machine()}, pid=1))
+            of.run, pid=1), Machine())
         task = asyncio.create_task(actor.run())
         stranger = VirtualBus(hub, "stranger")
         await stranger.open()

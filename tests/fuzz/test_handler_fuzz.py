@@ -9,8 +9,9 @@ import pytest
 from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.layout.layout import adapted_system
 from rampart.actors.osmosis import topics
-from rampart.actors.run.run_plan import SUPERVISOR, adapted_system
+from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, on
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
@@ -71,7 +72,7 @@ def heard_by_the_supervisor(*bodies):
         member = of.layout.members[SUPERVISOR]
         actor = member.actor(Context(
             SUPERVISOR, 1, VirtualClock(loop, 0.0), VirtualBus(hub, SUPERVISOR), member.parameters,
-            {**of.shared, "processes": handler_fuzz.Machine()}, pid=1))
+            of.run, pid=1), handler_fuzz.Machine())
         actor.report_diagnostic = lambda *report: reports.append(report)
         task = asyncio.create_task(actor.run())
         stranger = VirtualBus(hub, "stranger")

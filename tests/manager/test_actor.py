@@ -18,6 +18,7 @@ from rampart.actors.detection.module import DetectionModule
 from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.layout.wiring import Member, heard, published
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
@@ -30,7 +31,6 @@ from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
 from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.actors.runtime.wiring import Member, heard, published
 from rampart.manager.actor import DECISIONS_PER_LIFE, FtmManager
 from tests.actors.osmosis.recovery.world import Base, Node, Pilot, Supervisor, hang
 from tests.virtual_loop import System, VirtualLoop, run, shipped_system
@@ -120,7 +120,6 @@ class Whole(System):
         airport = Airport("field", {"a": (0.0, 0.0), "b": (1.0, 0.0)}, (("a", "b"),),
                           box(-50.0, -2.5, 50.0, 2.5), StartPose(0.0, 0.0, 0.0))
         super().__init__(system=shipped_system(), airport=airport)
-        self.shared["world"] = self
         timing = shipped_system().timing
         self.actors: dict[str, Actor] = {}
         self.modules: dict[str, tuple[type[Actor], dict[str, Any]]] = {
@@ -358,7 +357,7 @@ def test_a_detection_module_that_stays_away_counts_as_active():
 def test_a_detection_module_that_lives_and_is_not_heard_is_replaced_once_before_it_counts():
     async def scenario(system: Whole) -> None:
         system.supervisor.answer = "nothing"
-        timeout_s = system.shared["system"].timing.detection_silence_timeout_s
+        timeout_s = system.run.system.timing.detection_silence_timeout_s
         hung_s = system.clock.now()
         hang(system.actors["DM3"])
         await asyncio.sleep(3.0)

@@ -11,8 +11,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rampart.actors.bus import messages as bm
+from rampart.actors.layout.layout import load_run
 from rampart.actors.osmosis import messages as m
-from rampart.actors.run.run_plan import RunPlan, load_shared, load_system
+from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.checkpoint import Shelf
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.runs.mission_run import MissionRun
@@ -85,15 +86,16 @@ def fly(mission: str, faults: Sequence[str], *, seed: int = 1, system: Path | No
     """Run a mission with faults; the paper's system with checkpoints if none is named."""
     with TemporaryDirectory() as directory, spying_on_machines() as machines:
         file = system or with_checkpoints(Path(directory))
-        plan = RunPlan("checkpoints", 1024, 1.0, seed, str(file), "", "vallombre", mission, 0,
-                       ftm=True, hmi_port=0)
+        plan = RunPlan("checkpoints", 1024, seed=seed, system_file=str(file),
+                       options={"mission": mission})
         spec = load_system(plan)
-        shared = load_shared(plan, spec)
-        run = _Mission(plan, shared["airport"], shared["mission"], strategy=spec.strategy,
+        loaded = load_run(plan, spec)
+        known = loaded.application
+        run = _Mission(plan, known.airport, known.mission, strategy=spec.strategy,
                        patience_s=60.0)
         run.watch()
         result = VirtualRun(plan, spec, run, scenario=tuple(map(parse_fault, faults)),
-                            shared=shared).run()
+                            run=loaded).run()
     of_mission = [s for s in run.statuses if s.mission_id]
     return Watched(result, of_mission[-1], run.measured, [s.step for s in of_mission],
                    run.diagnostics, machines[0].shelves)

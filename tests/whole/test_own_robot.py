@@ -27,9 +27,14 @@ def changed(text: str, *changes: tuple[str, str]) -> str:
     return text
 
 
+def application_of(text: str) -> str:
+    """Return the table `[application]` of a spec."""
+    return text[text.index("[application]"):text.index("\n\n", text.index("[application]"))]
+
+
 TANK = (ROOT / "docs" / "specification.md").read_text(
     encoding="utf-8").split("```toml\n")[1].split("```")[0]
-PORTER = changed(PAPER, ('mission = "AB"\n', ""), ('airport = "vallombre"\n', ""), (WORLD, ""))
+PORTER = changed(PAPER, (application_of(PAPER), ""), (WORLD, ""))
 
 
 def launched(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -95,7 +100,7 @@ def test_a_module_of_one_s_own_that_cannot_be_imported_is_one_line_with_file_pat
 
 OWN_ACTOR = '''
 from rampart.actors.runtime.actor import every
-from rampart.actors.ftm.stub_node import StubNode
+from rampart.actors.runtime.stub_node import StubNode
 
 class Own(StubNode):
     @every(0.5)
@@ -120,7 +125,7 @@ def test_actors_beside_the_caller_are_found_in_virtual_time_and_tell_where_they_
 def test_actors_beside_the_caller_are_found_by_the_toolbox(tmp_path):
     (tmp_path / "own.py").write_text(OWN_ACTOR)
     (tmp_path / "own.toml").write_text(
-        changed(TANK, ("rampart.actors.ftm.stub_node:StubNode", "own:Own")))
+        changed(TANK, ("rampart.actors.runtime.stub_node:StubNode", "own:Own")))
     done = subprocess.run(
         [str(Path(sys.executable).with_name("rampart")), "topic", "list", "--system",
          "own.toml"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -132,7 +137,7 @@ def test_actors_beside_the_caller_are_found_by_the_toolbox(tmp_path):
 def test_a_run_without_a_mission_tells_where_its_tracebacks_are(tmp_path):
     (tmp_path / "own.py").write_text(OWN_ACTOR)
     (tmp_path / "own.toml").write_text(
-        changed(TANK, ("rampart.actors.ftm.stub_node:StubNode", "own:Own")))
+        changed(TANK, ("rampart.actors.runtime.stub_node:StubNode", "own:Own")))
     report = tmp_path / "report"
     done = launched(tmp_path, "--system", "own.toml", "--duration", "2", "--port",
                     str(free_base_port()), "--report", str(report))
@@ -141,16 +146,21 @@ def test_a_run_without_a_mission_tells_where_its_tracebacks_are(tmp_path):
     assert f'File "{tmp_path}/own.py", line 8, in fail' in (report / "errors.log").read_text()
 
 
+NO_OPTION = ("{}: no option of the launcher or of tank; --system tank.toml --help shows those "
+             "there are")
 REFUSED = [
-    (["--virtual"], "--virtual: tank has no [robot] and drives nowhere"),
+    (["--virtual"],
+     "--virtual: tank has no mission: its [application] names no class with one"),
     (["--fault", "kill:pump_controller"],
-     "--fault kill:pump_controller: tank has no [robot] and drives nowhere"),
-    (["--patience", "7"], "--patience 7: tank has no [robot] and drives nowhere"),
-    (["--obstacles", "1"], "--obstacles 1: tank has no [robot] and drives nowhere"),
+     "--fault kill:pump_controller: tank has no mission: its [application] names no class with "
+     "one"),
+    (["--patience", "7"],
+     "--patience 7: tank has no mission: its [application] names no class with one"),
+    (["--obstacles", "1"], NO_OPTION.format("--obstacles")),
     (["--wait"], "--wait: no node of tank serves an operator's page"),
     (["--hmi-port", "9000"], "--hmi-port 9000: no node of tank serves an operator's page"),
     (["--hmi-host", "0.0.0.0"], "--hmi-host 0.0.0.0: no node of tank serves an operator's page"),
-    (["--joystick"], "--joystick auto: no node of tank reads it"),
+    (["--joystick"], NO_OPTION.format("--joystick")),
 ]
 
 
@@ -161,15 +171,18 @@ def test_an_option_that_would_have_no_effect_is_refused(tmp_path, arguments, lin
     assert (done.returncode, done.stderr) == (2, f"launch.py: {line}\n")
 
 
+OSMOSIS = '[application]\nclass = "rampart.actors.osmosis.application:Osmosis"\n'
 HALF = [
-    ([], "--virtual: paper has no mission; --airport and --mission give it one"),
-    (["--mission", "A"], "--airport: missing; paper names none"),
-    (["--airport", "vallombre"], "--mission: missing; paper names none"),
+    ("", [], "--virtual: paper has no mission: its [application] names no class with one"),
+    (OSMOSIS, ["--mission", "A"], "{file}: $.application: Object missing required field `airport`"),
+    (OSMOSIS, ["--airport", "vallombre"],
+     "{file}: $.application: Object missing required field `mission`"),
 ]
 
 
-@pytest.mark.parametrize(("arguments", "line"), HALF)
-def test_half_a_mission_is_none(tmp_path, arguments, line):
-    (tmp_path / "porter.toml").write_text(PORTER)
+@pytest.mark.parametrize(("application", "arguments", "line"), HALF)
+def test_half_a_mission_is_none(tmp_path, application, arguments, line):
+    (tmp_path / "porter.toml").write_text(PORTER + application)
+    line = line.format(file=tmp_path / "porter.toml")
     done = launched(tmp_path, "--system", "porter.toml", "--virtual", *arguments)
     assert (done.returncode, done.stderr) == (2, f"launch.py: {line}\n")

@@ -99,8 +99,9 @@ def test_no_name_of_the_first_system_is_in_the_engine_s_code(room):
      "R_RETRACT both claim arm; they cannot run together"),
     ('title = "Pick and place behind a light curtain"\n',
      'title = "x"\nairport = "vallombre"\n',
-     "cell.toml: $.airport = 'vallombre': without [robot] there is nobody to drive there; leave "
-     "it out"),
+     "cell.toml: $.airport = 'vallombre': unknown field; known: name, title, application, robot, "
+     "strategy, shadow, order, timing, layers, node, detection, recovery, mechanism, event, "
+     "orders; what an application is told stands in [application]"),
     ('shadow', 'shadow', None),
 ])
 def test_refused(old, new, message):

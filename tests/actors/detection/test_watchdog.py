@@ -10,8 +10,8 @@ import pytest
 from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.detection.watchdog_core import WatchdogCore
 from rampart.actors.ftm import messages as m
+from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.runtime.actor import Actor
-from rampart.actors.runtime.wiring import Member, heard
 from tests.detection_timeline import Ear, play, table
 from tests.virtual_loop import System, run
 

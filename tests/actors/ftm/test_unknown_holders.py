@@ -67,7 +67,7 @@ def during(name, script):
         hub, clock = Hub(), VirtualClock(loop, 0.0)
         member = of.layout.members[name]
         actor = member.actor(Context(name, 1, clock, VirtualBus(hub, name), member.parameters,
-                                     of.shared, pid=1, members=frozenset(of.layout.members),
+                                     of.run, pid=1, members=frozenset(of.layout.members),
                                      register=dict.fromkeys(of.layout.members, 1).get))
         world = World(hub, clock, actor)
         task = asyncio.create_task(actor.run())

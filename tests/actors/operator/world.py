@@ -18,6 +18,7 @@ from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from tests.virtual_loop import run_context
 
 AIRPORT = load_airport("vallombre")
 RATE = 20.0
@@ -86,7 +87,7 @@ class World:
 
     def context(self, name: str, incarnation: int, **shared: object) -> Context:
         return Context(name, incarnation, self.clock, VirtualBus(self.hub, name, incarnation),
-                       {}, {"airport": AIRPORT, "run_id": "r1", **shared})
+                       run=run_context(**{"airport": AIRPORT, "run_id": "r1", **shared}))
 
     @asynccontextmanager
     async def running(self, actor: Actor):

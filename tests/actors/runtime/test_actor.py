@@ -21,18 +21,13 @@ from rampart.actors.bus.envelope import ArrivalGuard, encode
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.layout.layout import OBSERVER_CLASS, SUPERVISOR_CLASS, Layout
+from rampart.actors.layout.wiring import load_class
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.run.run_plan import (
-    OBSERVER_CLASS,
-    SUPERVISOR_CLASS,
-    Layout,
-    RunPlan,
-    load_system,
-)
+from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.clock import Clock
-from rampart.actors.runtime.wiring import load_class
 from rampart.actors.supervision.node_process import make_actor
 from rampart.cli import systems
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
@@ -320,8 +315,8 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
     ("rampart.actors.operator.hmi:Hmi", "rampart.actors.operator.himi:Hmi",
      "$.node[4].actor = 'rampart.actors.operator.himi:Hmi': No module named "
      "'rampart.actors.operator.himi'"),
-    ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.ftm.stub_node:StubNode",
-     "$.detection[2].actor = 'rampart.actors.ftm.stub_node:StubNode': it does not publish "
+    ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.runtime.stub_node:StubNode",
+     "$.detection[2].actor = 'rampart.actors.runtime.stub_node:StubNode': it does not publish "
      "detection/{name}, as "
      "the modules of this table do"),
     ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.recovery.stub:StubRecovery",
@@ -336,7 +331,7 @@ def test_a_class_that_is_not_there_or_of_another_table_is_named_with_its_place(
         tmp_path, old, new, message):
     file = tmp_path / "other.toml"
     file.write_text((SHIPPED / "paper.toml").read_text().replace(old, new))
-    plan = RunPlan("run", 7450, 1.0, 1, str(file), "", "vallombre", "A", 0, ftm=True, hmi_port=0)
+    plan = RunPlan("run", system_file=str(file))
     with pytest.raises(ValueError, match=re.escape(f"{file}: {message}")):
         Layout(plan, load_system(plan))
 
@@ -356,7 +351,7 @@ async def test_the_heart_beats_at_the_period_that_the_system_states():
 
 def test_a_process_is_given_the_heartbeat_period_of_the_spec():
     file = SHIPPED / "paper.toml"
-    plan = RunPlan("run", 7450, 1.0, 1, str(file), "", "vallombre", "A", 0, ftm=True, hmi_port=0)
+    plan = RunPlan("run", system_file=str(file))
     spec = load_system(plan)
     timing = msgspec.structs.replace(spec.timing, heartbeat_period_s=0.123)
     layout = Layout(plan, msgspec.structs.replace(spec, timing=timing))

@@ -23,9 +23,10 @@ from rampart.actors.bus.messages import Diagnostic
 from rampart.actors.bus.run_folder import socket_path
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeTable, ProcessEvent, RespawnRequest
+from rampart.actors.layout.layout import Layout
 from rampart.actors.run import run_info
 from rampart.actors.run.run_info import find_runs
-from rampart.actors.run.run_plan import Layout, load_system
+from rampart.actors.run.run_plan import load_system
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision import node_process
@@ -46,9 +47,9 @@ class Witness(Actor):
 
     outputs = (topics.RESPAWN,)
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, launcher: Launcher) -> None:
         super().__init__(context)
-        self.launcher: Launcher = context.shared["launcher"]
+        self.launcher = launcher
         self.events: list[ProcessEvent] = []
         self.errors: list[Diagnostic] = []
         self.table = NodeTable(())
@@ -82,7 +83,7 @@ async def running(tmp_path, **changes) -> AsyncIterator[tuple[Launcher, Witness]
     async with launched(stub_plan(write_stub_system(tmp_path), **changes)) as launcher:
         bus = launcher.observers_bus()
         clock = Clock(launcher.plan.origin_s)
-        witness = Witness(Context("observer", 1, clock, bus, {}, {"launcher": launcher}))
+        witness = Witness(Context("observer", 1, clock, bus), launcher)
         task = asyncio.create_task(witness.run())
         try:
             await eventually(lambda: len(witness.table.nodes) == 22 and all(

@@ -18,13 +18,8 @@ from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem, ManagerStatus, NodeState, RespawnRequest
-from rampart.actors.run.run_plan import (
-    SUPERVISOR,
-    Layout,
-    RunPlan,
-    load_document,
-    load_system,
-)
+from rampart.actors.layout.layout import Layout
+from rampart.actors.run.run_plan import SUPERVISOR, RunPlan, load_document, load_system
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.patience import Usage
@@ -34,8 +29,7 @@ from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from tests import ROOT
 from tests.virtual_loop import run, turns, until
 
-PLAN = RunPlan("r", 20000, 1.0, 1, str(ROOT / "systems" / "paper.toml"), "", "", "", 0,
-               ftm=True, hmi_port=0)
+PLAN = RunPlan("r", 20000, system_file=str(ROOT / "systems" / "paper.toml"))
 EXIT_S = 0.005
 """From a SIGKILL to the moment when the last thread has let go of the port."""
 

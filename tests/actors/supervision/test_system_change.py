@@ -10,11 +10,12 @@ import msgspec
 import pytest
 
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.run.run_plan import Layout, RunPlan, adapted_system, load_system
+from rampart.actors.layout.layout import Layout, adapted_system
+from rampart.actors.run.run_plan import RunPlan, load_system
 from tests import ROOT
 
 FILE = ROOT / "systems" / "paper.toml"
-PLAN = RunPlan("r", 20000, 1.0, 1, str(FILE), "", "", "", 0, ftm=True, hmi_port=0)
+PLAN = RunPlan("r", 20000, system_file=str(FILE))
 
 
 @pytest.fixture

@@ -113,9 +113,9 @@ WHY = "the launcher's observer failed: RuntimeError: no room for tables"
 @pytest.mark.processes
 async def test_a_run_whose_observer_fails_ends_in_order_and_says_why(tmp_path, monkeypatch):
     plan = stub_plan(write_stub_system(tmp_path))
-    airport = load_airport(plan.airport)
+    airport = load_airport("vallombre")
     stream = io.StringIO()
-    mission = MissionRun(plan, airport, load_mission(plan.mission, airport), strategy="",
+    mission = MissionRun(plan, airport, load_mission("AB", airport), strategy="",
                          patience_s=60, console=Console(stream))
     usual = mission.sinks
     monkeypatch.setattr(mission, "sinks", lambda clock: [*usual(clock), broken_sink])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import copy
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -207,7 +208,7 @@ class Engineer(Actor):
 def in_adaptable_system(scenario: Any) -> None:
     async def begin() -> None:
         async with Whole() as system:
-            system.shared["document"] = copy.deepcopy(DOCUMENT)
+            system.run = replace(system.run, document=copy.deepcopy(DOCUMENT))
             await system.begin()
             engineer = system.start("engineer", Engineer)
             await asyncio.sleep(0.1)

@@ -16,7 +16,7 @@ from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context
 from rampart.manager.spec.parameters import NEEDS, TAKES, find_wrong
 from rampart.sim.virtual.virtual_bus import VirtualBus
-from tests.virtual_loop import System, run, shipped_system
+from tests.virtual_loop import System, run, run_context, shipped_system
 
 BASES = {"Freshness", "HoldingRecovery", "PilotRecovery"}
 NODES = ("osmosis_control", "standby_control", "safety_pilot")
@@ -74,7 +74,7 @@ def start(path: str, **values: Any) -> set[str]:
     async def scenario() -> None:
         system = System()
         cls(Context("X", 1, system.clock, VirtualBus(system.hub, "X", 1), parameters,
-                    {"system": shipped_system(), "airport": load_airport("vallombre")}))
+                    run_context(system=shipped_system(), airport=load_airport("vallombre"))))
         cls.names(topics.HEARTBEAT, "X", parameters)
         cls.watches("X", parameters)
 

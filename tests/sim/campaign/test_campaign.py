@@ -545,9 +545,10 @@ def test_bad_usage_is_one_line_and_exit_code_2(capsys, arguments, words):
 def test_a_campaign_takes_a_mission(tmp_path, capsys):
     text = (SHIPPED / "paper.toml").read_text(encoding="utf-8")
     robot = tmp_path / "robot.toml"
-    robot.write_text(text.replace('airport = "vallombre"\nmission = "AB"\n', ""))
+    robot.write_text(text.replace('airport = "vallombre"\n', ""))
     assert rampart(["campaign", "--system", str(robot), "--fault", "none"]) == 2
-    assert capsys.readouterr().err == "rampart: --airport: missing; paper names none\n"
+    assert capsys.readouterr().err == (
+        f"rampart: {robot}: $.application: Object missing required field `airport`\n")
 
 
 def test_a_run_is_replayed_by_its_key_and_recognised(tmp_path, capsys):

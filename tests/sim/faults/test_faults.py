@@ -13,9 +13,9 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.envelope import Header, decode, encode
 from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.layout.system_topics import published_keys
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.run.system_topics import published_keys
 from rampart.actors.runtime.injection import MODES, FaultGate, flaw
 from rampart.cli.look.topic_catalogue import resolve, uses
 from rampart.sim.faults.faults import (

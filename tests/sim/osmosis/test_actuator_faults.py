@@ -21,6 +21,7 @@ from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.simulator import Simulator
 from rampart.sim.osmosis.world import World
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from tests.virtual_loop import run_context
 
 STUCK = m.ActuatorFaultKind.STUCK_WHEEL
 WEAK = m.ActuatorFaultKind.WEAK_WHEEL
@@ -479,7 +480,7 @@ class Bench:
         self.now_s = 10.0
         clock = Clock(0.0, 1.0, lambda: self.now_s)
         self.actor = Simulator(Context(
-            "simulator", 1, clock, VirtualBus(Hub(), "simulator"), {}, {"airport": FIELD}))
+            "simulator", 1, clock, VirtualBus(Hub(), "simulator"), run=run_context(airport=FIELD)))
         self.reports, self.complaints = [], []
         self.actor.publish = lambda topic, body, **_: (
             self.reports.append((body.injection, body.affected, body.finished, body.reason))

@@ -16,6 +16,7 @@ from rampart.actors.runtime.clock import Clock
 from rampart.sim.osmosis.schedule import Schedule
 from rampart.sim.osmosis.simulator import Simulator
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from tests.virtual_loop import run_context
 
 AIRPORT = load_airport("vallombre")
 
@@ -27,7 +28,7 @@ class Bench:
         self.now_s = 100.0
         clock = Clock(0.0, 1.0, lambda: self.now_s)
         context = Context("simulator", 1, clock, VirtualBus(Hub(), "simulator"), parameters,
-                          {"airport": AIRPORT})  # fmt: skip
+                          run_context(airport=AIRPORT))
         self.actor = Simulator(context)
         self.sent = []
         self.actor.has_readers = lambda topic: True

@@ -16,7 +16,7 @@ from rampart.manager.spec.specification import parse_specification
 from rampart.sim.runs.console import Console
 from tests import ROOT
 
-PLAN = RunPlan("r", 7450, 1.0, 1, "", "", "", "", 0, ftm=True, hmi_port=0)
+PLAN = RunPlan("r")
 MISSION = load_airport("vallombre").mission("AB")
 CALM = m.ManagerStatus((), (), (), (), "guarded-repair", 0)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.teleoperation.joystick_device import JoystickDevice, mapping_of
 from rampart.actors.osmosis.control.teleoperation.stick_arbitration import (
     TIMEOUT_S,
@@ -61,7 +62,7 @@ class Teleoperation(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        robot = context.shared["system"].robot
+        robot = context.run.system.robot
         self._linear_mps = float(context.parameters.get("linear_mps", robot.top_speed_mps))
         self._angular_radps = float(
             context.parameters.get("angular_radps", robot.top_turn_rate_radps))
@@ -72,7 +73,7 @@ class Teleoperation(Actor):
 
     def on_start(self) -> None:
         """Open the joystick, if there is to be one."""
-        asked = self.context.shared.get("joystick", "")
+        asked = Osmosis.of(self.context).joystick
         name = asked or self.parameters.get("device", "")
         if not name or asked is None:
             return

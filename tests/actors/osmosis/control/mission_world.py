@@ -78,7 +78,7 @@ class FullHouse(House):
         self.lives[name] = self.lives.get(name, 0) + 1
         bus = VirtualBus(self.hub, name, self.lives[name])
         context = Context(name, self.lives[name], self.clock, bus, PARAMETERS.get(name, {}),
-                          self.shared)
+                          self.run)
         self.actors[name] = {**NODES, "base": Operator}[name](context)
         self.tasks[name] = asyncio.create_task(self.actors[name].run())
 

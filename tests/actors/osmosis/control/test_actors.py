@@ -27,6 +27,7 @@ from rampart.manager.spec.specification import Layers, Robot, SystemSpec, Timing
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from tests.actors.osmosis.control.world import Circle, World
+from tests.virtual_loop import run_context
 
 AIRPORT = load_airport("vallombre")
 BROKEN = {"A03": 0.0, "A06": 0.35, "A10": 0.0}
@@ -110,7 +111,7 @@ class House:
     def __init__(self, world: World, spec: SystemSpec) -> None:
         self.hub = Hub()
         self.clock = Clock(0.0, 1.0, asyncio.get_running_loop().time)
-        self.shared = {"airport": AIRPORT, "system": spec}
+        self.run = run_context(airport=AIRPORT, system=spec)
         self.lives: dict[str, int] = {}
         self.actors: dict[str, Actor] = {}
         self.tasks: dict[str, asyncio.Task] = {}
@@ -122,7 +123,7 @@ class House:
     def start(self, name):
         self.lives[name] = self.lives.get(name, 0) + 1
         bus = VirtualBus(self.hub, name, self.lives[name])
-        context = Context(name, self.lives[name], self.clock, bus, {}, self.shared)
+        context = Context(name, self.lives[name], self.clock, bus, {}, self.run)
         self.actors[name] = NODES[name](context)
         self.tasks[name] = asyncio.create_task(self.actors[name].run())
 

@@ -7,6 +7,7 @@ import math
 
 import pytest
 
+from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.area.estimation_error import (
@@ -15,7 +16,6 @@ from rampart.actors.osmosis.detection.area.estimation_error import (
 )
 from rampart.actors.osmosis.detection.area.geofence import Fix
 from rampart.actors.runtime.actor import Actor
-from rampart.actors.runtime.wiring import Member, heard
 from rampart.sim.faults.faults import SENSOR_FAULTS
 from tests.actors.osmosis.control.localization_drive import (
     LEGS,

@@ -10,12 +10,12 @@ import pytest
 from rampart.actors.detection.module import EXCUSE_S, DetectionModule, IllegalTransitionError
 from rampart.actors.detection.stub import StubDetection
 from rampart.actors.ftm import messages as fm
+from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.freshness import CommandFreshness, LocalizationFreshness
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Header, on
-from rampart.actors.runtime.wiring import Member, heard
 from tests.detection_timeline import Ear, Source, play, table
 from tests.virtual_loop import System, VirtualLoop, run
 

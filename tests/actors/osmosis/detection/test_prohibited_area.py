@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shapely.geometry import box
 
+from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
@@ -24,7 +25,6 @@ from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea
 from rampart.actors.osmosis.detection.bounds import Bounds
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Actor
-from rampart.actors.runtime.wiring import Member, heard
 from tests.detection_timeline import Ear, Source, play, table
 from tests.virtual_loop import System, run, shipped_system
 

@@ -31,7 +31,6 @@ class BoundedPilot(Pilot):
 
 
 async def braking(system: System) -> tuple[Boss, Base, Supervisor]:
-    system.shared["world"] = system
     boss, base = system.start("boss", Boss), system.start("base", Base)
     supervisor = system.start("supervisor", Supervisor)
     system.start("safety_pilot", Node)

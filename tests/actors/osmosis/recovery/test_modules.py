@@ -7,6 +7,7 @@ import asyncio
 import pytest
 
 from rampart.actors.ftm import messages as fm
+from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import PilotMode
@@ -15,7 +16,6 @@ from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
 from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
 from rampart.actors.recovery.module import TRANSITIONS, IllegalTransitionError, RecoveryModule
 from rampart.actors.recovery.respawn import Respawn
-from rampart.actors.runtime.wiring import Member, heard
 from tests.actors.osmosis.recovery.world import Base, Boss, Node, Pilot, Supervisor, hang
 from tests.virtual_loop import System, run
 
@@ -336,7 +336,6 @@ def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_reports_failu
 
 
 async def respawning(system: System) -> tuple[Boss, Supervisor]:
-    system.shared["world"] = system
     boss, supervisor = system.start("boss", Boss), system.start("supervisor", Supervisor)
     for name in ("a", "b"):
         system.start(name, Node)

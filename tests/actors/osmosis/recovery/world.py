@@ -12,7 +12,6 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from tests.virtual_loop import System
 
 
 class Boss(Actor):
@@ -117,7 +116,6 @@ class Supervisor(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.system: System = context.shared["world"]
         self.answer = "respawned"
         self.delay_s = 0.05
         self.requests: list[tuple[float, fm.RespawnRequest]] = []
@@ -126,8 +124,8 @@ class Supervisor(Actor):
     @on(ftm_topics.RESPAWN)
     def respawn(self, message: fm.RespawnRequest, _header: Header) -> None:
         self.requests.append((self.clock.now(), message))
-        life = self.system.incarnations.get(message.node, 0)
-        alive = message.node in self.system.tasks
+        life = self.around.incarnations.get(message.node, 0)
+        alive = message.node in self.around.tasks
         if self.answer == "nothing":
             return
         if self.answer != "respawned":
@@ -139,11 +137,11 @@ class Supervisor(Actor):
 
     async def _replace(self, message: fm.RespawnRequest, alive: bool) -> None:
         if alive:
-            await self.system.kill(message.node)
+            await self.around.kill(message.node)
         await asyncio.sleep(self.delay_s)
-        if message.node not in self.system.tasks:
-            self.system.start(message.node, Node)
-        self._say(message, "respawned", self.system.incarnations[message.node])
+        if message.node not in self.around.tasks:
+            self.around.start(message.node, Node)
+        self._say(message, "respawned", self.around.incarnations[message.node])
 
     def _say(self, message: fm.RespawnRequest, event: str, incarnation: int) -> None:
         self.publish(ftm_topics.PROCESS_EVENT, fm.ProcessEvent(

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.following.bridged_control import BridgedControl, BridgedStandby
 from rampart.actors.osmosis.control.following.dead_reckoning import AFTER_S, DeadReckoning
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.runtime.actor import Actor, Context, Header, on
-from rampart.actors.runtime.wiring import Member, heard
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
 from tests.actors.osmosis.control.localization_drive import Reading, Truth, disturbed
 from tests.actors.osmosis.control.world import World

@@ -11,11 +11,17 @@ import importlib
 import traceback
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
+import rampart
 from rampart.actors.bus.topic import Topic
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from rampart.files import working_folder
+
+T = TypeVar("T")
+
+_ROOMS_OF_0_6 = ("actors", "manager", "sim")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,25 +94,48 @@ def load_class(path: str, reports_on: Topic[Any] | None = None) -> type[Actor]:
         ValueError: there is no such class, it is no actor, or one of another kind, or its module
             cannot be imported.
     """
+    found = import_class(path, Actor, "actor")
+    if reports_on is not None and reports_on not in found.outputs:
+        raise ValueError(f"actor = {path!r}: it does not publish {reports_on.key}, as the modules "
+                         "of this table do")
+    return found
+
+
+def import_class(path: str, base: type[T], field: str) -> type[T]:
+    """Return the class named `module:Class`, which has to be derived from `base`.
+
+    Raises:
+        ValueError: there is no such class, or its module cannot be imported; `field` and `path`
+            are named.
+    """
     module, _, name = path.partition(":")
     try:
         imported = importlib.import_module(module)
     except ImportError as error:
         hidden = working_folder.why_not()
-        hint = f"; nothing is imported from the working folder: {hidden}" if hidden else ""
-        raise ValueError(f"actor = {path!r}: {error}{hint}") from None
+        hint = _moved(module, name) or (
+            f"; nothing is imported from the working folder: {hidden}" if hidden else "")
+        raise ValueError(f"{field} = {path!r}: {error}{hint}") from None
     except Exception as error:  # a module of the user's own may raise anything
         at = traceback.extract_tb(error.__traceback__)[-1]
         where = "" if isinstance(error, SyntaxError) else f" ({at.filename}, line {at.lineno})"
-        raise ValueError(f"actor = {path!r}: {module} cannot be imported: "
+        raise ValueError(f"{field} = {path!r}: {module} cannot be imported: "
                          f"{type(error).__name__}: {error}{where}") from None
     found = getattr(imported, name, None)
-    if not (isinstance(found, type) and issubclass(found, Actor)):
+    if not (isinstance(found, type) and issubclass(found, base)):
         known = [key for key, value in vars(imported).items() if isinstance(value, type)
-                 and issubclass(value, Actor) and value.__module__ == module]
-        raise ValueError(f"actor = {path!r}: no such actor class; known: "
+                 and issubclass(value, base) and value.__module__ == module]
+        raise ValueError(f"{field} = {path!r}: no such {base.__name__.lower()} class; known: "
                          f"{', '.join(known) or 'none'}")
-    if reports_on is not None and reports_on not in found.outputs:
-        raise ValueError(f"actor = {path!r}: it does not publish {reports_on.key}, as the modules "
-                         "of this table do")
     return found
+
+
+def _moved(module: str, name: str) -> str:
+    """Return where a class of Rampart 0.6 is now, for a message; "" if it is none."""
+    if module.partition(".")[0] not in _ROOMS_OF_0_6:
+        return ""
+    root = Path(rampart.__file__).parent
+    now = [file.relative_to(root).with_suffix("")
+           for room in ("actors", "manager", "sim") for file in (root / room).rglob("*.py")
+           if f"class {name}(" in file.read_text(encoding="utf-8")]
+    return f"; since 0.7 it is rampart.{'.'.join(now[0].parts)}:{name}" if len(now) == 1 else ""

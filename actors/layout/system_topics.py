@@ -8,43 +8,52 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.actors.run.run_plan import DEFAULT_PORT, OBSERVER, Layout, RunPlan
-from rampart.actors.runtime.wiring import heard, load_class, published, topics_of
+from rampart.actors.ftm import topics
+from rampart.actors.layout.layout import Layout, application_class
+from rampart.actors.layout.wiring import heard, load_class, published, topics_of
+from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.manager.spec.specification import SystemSpec
 
-_ANY_RUN = RunPlan("", DEFAULT_PORT, rate=1.0, seed=0, system_file="", strategy="", airport="",
-                   mission="", obstacles=0, ftm=True, hmi_port=0)
+_ANY_RUN = RunPlan()
 """Which keys a system publishes follows from its spec; nothing in the plan of a run matters."""
 
 _SHIPPED = "rampart."
-"""Where the actors that ship are; that their topics are common is a test's business."""
+"""Where the actors that ship are; that their topics are declared is a test's business."""
+
+
+def declared_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return the topics of the engine and of the system's application.
+
+    Raises:
+        ValueError: the application's class does not exist.
+    """
+    return (*topics.ALL, *application_class(spec).topics)
 
 
 def system_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
-    """Return every topic of a system once: the common ones first, then the robot's own.
+    """Return every topic of a system once: the declared ones, then what its actors have besides.
 
-    The own ones are in the order of the spec. A key of `actors/osmosis/topics.py` keeps its
-    contract.
+    The latter are in the order of the spec. A key that is declared keeps its contract.
 
     Raises:
         ValueError: the spec names an actor class that does not exist, or one of them declares a
             topic that makes no sense.
     """
-    return (*topics.ALL, *_beyond_the_common(_actors(spec)))
+    known = declared_topics(spec)
+    return (*known, *_beyond(known, _actors(spec)))
 
 
 def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
-    """Return the topics that a system has beyond the common ones.
+    """Return the topics that a system has beyond the declared ones.
 
-    Only actors that do not ship are loaded, for those that do declare common topics only: a tool
+    Only actors that do not ship are loaded, for those that do have declared topics only: a tool
     that looks at a run need not wait for controller and simulator to be imported.
 
     Raises:
         ValueError: as `system_topics`, of the actors that do not ship.
     """
-    return _beyond_the_common(
-        path for path in _actors(spec) if not path.startswith(_SHIPPED))
+    return _beyond(declared_topics(spec), (
+        path for path in _actors(spec) if not path.startswith(_SHIPPED)))
 
 
 def published_keys(spec: SystemSpec) -> tuple[str, ...]:
@@ -89,9 +98,9 @@ def _actors(spec: SystemSpec) -> Iterator[str]:
             yield one.actor
 
 
-def _beyond_the_common(paths: Iterable[str]) -> tuple[Topic[Any], ...]:
-    """Return what actors declare that is not in `actors/osmosis/topics.py`, each key once."""
-    common = {topic.key for topic in topics.ALL}
+def _beyond(known: Iterable[Topic[Any]], paths: Iterable[str]) -> tuple[Topic[Any], ...]:
+    """Return what actors have that is not known, each key once."""
+    common = {topic.key for topic in known}
     found: dict[str, Topic[Any]] = {}
     for path in dict.fromkeys(paths):
         inputs, outputs = topics_of(load_class(path))
