@@ -6,7 +6,7 @@ until the victim has gone and another has taken its place, so that hits come in 
 Three processes are special:
 
 * The launcher is what a run *is*: its end ends the run. That it leaves nothing behind is
-  `whole/test_launch.py`'s subject.
+  `tests/whole/test_launch.py`'s subject.
 * The world is only stopped for a moment. It stands for the real one, ground truth included: with
   its process the place of the robot is gone, and nobody can bring that back; the supervisor does
   not try. A wedged loop never turns again, so that would be its death too.
