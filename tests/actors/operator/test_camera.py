@@ -21,8 +21,9 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, Building, StartPose, Surface
 from rampart.sim.osmosis.camera import MARGIN_M, MAX_PIXELS, View, ground_image
+from rampart.testing import free_port
 from tests.actors.operator.browser import CHROMIUM, browser
-from tests.actors.operator.world import AIRPORT, World, free_port, served
+from tests.actors.operator.world import AIRPORT, World, served
 
 ECHO = """
 import struct, sys

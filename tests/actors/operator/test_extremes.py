@@ -24,11 +24,12 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Light, Mission
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
 from rampart.actors.osmosis.page.map import MAX_GRAPH, MAX_PATHS_BYTES, page_map
+from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import CHROMIUM, browser
 from tests.actors.operator.extremes import DOCUMENTS, LONG, MARKUP, messages
 from tests.actors.operator.page import LIVE, SPEC
 from tests.actors.operator.test_operating import open_page
-from tests.actors.operator.world import AIRPORT, eventually, free_port, hear, served
+from tests.actors.operator.world import AIRPORT, hear, served
 
 FRAME_BYTES = 512_000
 HANDLED = [(kind, topic, method) for kind in (Hmi, Teleoperation)

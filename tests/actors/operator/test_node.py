@@ -18,16 +18,9 @@ from rampart.actors.operator.requests import OrderWish
 from rampart.actors.operator.server import MAX_MESSAGE_BYTES, Visitor
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import CHROMIUM, browser
-from tests.actors.operator.world import (
-    AIRPORT,
-    RATE,
-    eventually,
-    free_port,
-    hear,
-    repeated,
-    served,
-)
+from tests.actors.operator.world import AIRPORT, RATE, hear, repeated, served
 
 
 async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world):
