@@ -10,11 +10,11 @@ import pytest
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
 from rampart.testing import free_port
-from tests.actors.operator.browser import CHROMIUM, browser
+from tests.actors.operator.browser import browser
 from tests.actors.operator.page import LIVE, SPEC, events, page, speaking_world
 from tests.actors.operator.world import repeated, served
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+pytestmark = pytest.mark.page
 
 
 @pytest.fixture

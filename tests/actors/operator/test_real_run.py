@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun, free_base_port
 from tests import ROOT
-from tests.actors.operator.browser import CHROMIUM, browser
+from tests.actors.operator.browser import browser
 
 pytestmark = pytest.mark.processes
 TOKEN = "secret-of-the-hangar-7"
@@ -28,7 +28,7 @@ ROW = "document.querySelector('tr[data-node=localization]')"
 STATE = f"(({ROW}) || document.createElement('p')).textContent"
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.page
 async def test_a_mission_is_started_from_the_page_disturbed_from_it_and_followed_to_its_report(
         tmp_path):
     port = free_base_port()
