@@ -21,7 +21,7 @@ from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.faults.offered_faults import offered_faults
 from rampart.testing import eventually, free_port
 from tests.actors.operator.world import hear, repeated, served
-from tests.virtual_loop import shipped_system
+from tests.osmosis_system import shipped_system
 
 TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
