@@ -25,6 +25,7 @@ ROOMS = (
     "actors.supervision", "actors.recording", "actors.operator",
     "sim.virtual", "sim.faults", "sim.runs", "sim.campaign",
     "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.main", "cli.run",
+    "testing",
 )
 """The rooms of the engine, from the bottom to the top: each may import those before it."""
 
@@ -64,8 +65,9 @@ def modules() -> dict[str, Path]:
     """Return the files of the package by the name of their module, without `rampart.`."""
     files = [f for top in sorted((ROOT / "rampart").iterdir()) if top.is_dir()
              for f in sorted(top.resolve().rglob("*.py"))]
-    return {".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): f
-            for f in files if f.name != "__pycache__"}
+    names = {f: ".".join(f.relative_to(ROOT).with_suffix("").parts) for f in files}
+    return {name.removeprefix("rampart.").removesuffix(".__init__"): file
+            for file, name in names.items()}
 
 
 MODULES = modules()
@@ -152,7 +154,7 @@ def the_map() -> str:
 
 def named(text: str) -> list[str]:
     """Return the rooms that a text names as folders and files, as names of modules."""
-    return [name.removesuffix(".py").replace("/", ".")
+    return [name.removeprefix("rampart/").removesuffix(".py").replace("/", ".")
             for name in re.findall(r"[a-z]+(?:/[a-z]+)*(?:\.py)?", text)]
 
 
