@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from control_world import DT_S, Circle, World, drive
 
-from rampart.actors.osmosis.airport.photometry import illuminance_lux, sensor_position
+from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
 from rampart.actors.osmosis.control.following.light_inspection import (
     LightInspection,
     RowLight,
@@ -36,8 +36,8 @@ def inspect(lights, factors, *, seed=0, pose_delay_s=0.0, noise=0.03, blind=(), 
                         world.yaw_rad)
         if not (blind and blind[0] < world.x_m < blind[1]):
             sensor = sensor_position(world.x_m, world.y_m, world.yaw_rad)
-            lux = sum(illuminance_lux(factors[li.name] * li.nominal_cd,
-                                      math.dist(sensor, (li.x_m, li.y_m))) for li in lights)
+            lux = sum(factors[li.name] * li.nominal_cd * illuminance_per_candela(
+                math.dist(sensor, (li.x_m, li.y_m))) for li in lights)
             inspection.sample(now, lux * (1 + rng.normal(0, noise)) + rng.normal(0, 5.0))
         found += inspection.take(ended=motion.arrived)
         if motion.arrived:

@@ -20,8 +20,6 @@ from rampart.actors.osmosis.airport.world import WorldTruth
 SHIPPED = Path(__file__).resolve().parents[3] / "systems" / "airports"
 """Folder of the shipped airports."""
 
-DEFAULT_AIRPORT = "vallombre"
-
 
 def shipped_airports() -> tuple[str, ...]:
     """Return the names of the shipped airports."""

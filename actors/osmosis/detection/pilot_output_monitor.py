@@ -19,7 +19,7 @@ from collections import deque
 from dataclasses import dataclass
 from itertools import chain, takewhile
 
-from rampart.actors.detection.plausible import is_possible
+from rampart.actors.bus.plausible import is_possible
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from rampart.actors.osmosis.airport.photometry import SENSOR_HEIGHT_M, sensor_position
+from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
 from rampart.actors.osmosis.control.polyline import Array, Point
 
 DIM_BELOW = 0.5
@@ -228,7 +228,7 @@ class LightInspection:
         for shift_m in np.linspace(-limits.shift_m, limits.shift_m, 31):
             moved = places + shift_m * along
             offsets = moved[:, None, :] - self._places[None, columns, :]
-            kernel = _per_candela(np.hypot(offsets[:, :, 0], offsets[:, :, 1]))
+            kernel = illuminance_per_candela(np.hypot(offsets[:, :, 0], offsets[:, :, 1]))
             # Neighbours farther off than the fit's radius hardly show: damping keeps them sane.
             normal = kernel.T @ kernel + np.diag([0.0] + [1e-4] * (len(columns) - 1))
             solution = np.linalg.solve(normal, kernel.T @ lux)
@@ -244,9 +244,3 @@ class LightInspection:
         _, _, axes = np.linalg.svd(centred, full_matrices=False)
         along: Array = axes[0]
         return along if (places[-1] - places[0]) @ along >= 0 else -along
-
-
-def _per_candela(distance_m: Array) -> Array:
-    """Illuminance per candela, as `photometry.illuminance_per_candela`, on arrays."""
-    square = distance_m**2 + SENSOR_HEIGHT_M**2
-    return np.asarray(SENSOR_HEIGHT_M / (square * np.sqrt(square)))

@@ -146,10 +146,6 @@ class LightRow:
                               replace(self._limits, pass_after_s=math.inf))
         self._back._ramp = self._ramp  # it is the same robot
 
-    def go_on(self) -> None:
-        """Go back no further."""
-        self._back = None
-
     @property
     def is_passing(self) -> bool:
         """Whether it drives round an obstacle."""

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from rampart.actors.bus.bounds import clip
+from rampart.actors.bus.plausible import is_sane
 from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport
@@ -30,7 +31,6 @@ from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimi
 from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
 from rampart.actors.osmosis.control.following.path_follower import Motion, PathFollower
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair
-from rampart.actors.osmosis.control.plausible import is_sane
 from rampart.actors.osmosis.control.polyline import Array, Polyline
 from rampart.actors.osmosis.control.settings import hull_of, motion_of, reach_of
 from rampart.actors.osmosis.messages import (

@@ -17,8 +17,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from rampart.actors.bus.plausible import is_possible, is_sane
 from rampart.actors.osmosis.control.localization.planar_ekf import wrap
-from rampart.actors.osmosis.control.plausible import is_possible, is_sane
 
 BACK_AFTER_S = 1.0
 """How long a device must have been without a flaw to be believed again."""

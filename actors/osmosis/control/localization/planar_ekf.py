@@ -55,12 +55,6 @@ class PlanarEkf:
         """Standard deviation of the heading, rad."""
         return math.sqrt(self._ww)
 
-    @property
-    def covariance(self) -> tuple[tuple[float, float, float], ...]:
-        """The covariance of (x, y, yaw)."""
-        return ((self._xx, self._xy, self._xw), (self._xy, self._yy, self._yw),
-                (self._xw, self._yw, self._ww))
-
     def predict(self, forward_m: float, turn_rad: float, variance_m2: float,
                 variance_rad2: float) -> tuple[float, float]:
         """Move by a measured way; return it in `map`.

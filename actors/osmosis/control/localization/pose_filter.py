@@ -26,10 +26,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from rampart.actors.bus.envelope import AHEAD_S
+from rampart.actors.bus.plausible import is_sane
 from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck, Trust
 from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf, wrap
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits, PositionSource
-from rampart.actors.osmosis.control.plausible import AHEAD_S, is_sane
 
 ABSOLUTE_POSE, GPS, ODOMETRY, IMU = "absolute pose", "GPS", "odometry", "IMU"
 

@@ -21,11 +21,11 @@ from typing import NamedTuple
 
 import msgspec
 
+from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.ftm.holders import Holders
 from rampart.actors.osmosis.control.pilot.command_pair import CommandPair, PairLimits
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
-from rampart.actors.osmosis.control.plausible import AHEAD_S
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Array
 from rampart.actors.osmosis.messages import PilotMode
 

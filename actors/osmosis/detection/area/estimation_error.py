@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import math
 
+from rampart.actors.bus.plausible import is_sane
 from rampart.actors.detection.module import DetectionModule
-from rampart.actors.detection.plausible import is_sane
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.area.geofence import Fix

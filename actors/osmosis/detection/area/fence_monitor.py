@@ -6,7 +6,7 @@ number counts the same: after the timeout the monitor is active.
 
 from __future__ import annotations
 
-from rampart.actors.detection.plausible import is_possible
+from rampart.actors.bus.plausible import is_possible
 from rampart.actors.osmosis.detection.area.geofence import (
     DistanceBound,
     FenceLimits,

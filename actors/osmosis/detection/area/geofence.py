@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from rampart.actors.detection.plausible import is_sane
+from rampart.actors.bus.plausible import is_sane
 
 ProhibitedDistance = Callable[[float, float], float]
 """Signed distance (m) from a point in `map` to the prohibited area, negative inside it."""

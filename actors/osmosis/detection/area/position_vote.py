@@ -21,7 +21,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from rampart.actors.detection.plausible import AHEAD_S, is_possible, is_sane
+from rampart.actors.bus.envelope import AHEAD_S
+from rampart.actors.bus.plausible import is_possible, is_sane
 from rampart.actors.osmosis.detection.area.geofence import Fix
 
 GPS = "GPS"
