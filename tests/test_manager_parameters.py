@@ -22,7 +22,7 @@ from rampart.actors.runtime.actor import Context
 from rampart.manager.spec.parameters import NEEDS, TAKES, find_wrong
 from rampart.sim.virtual.virtual_bus import VirtualBus
 
-BASES = {"Freshness", "HoldingRecovery", "PilotRecovery"}
+BASES = {"Freshness", "PilotRecovery"}
 NODES = ("osmosis_control", "standby_control", "safety_pilot")
 STARTABLE = {"watch": ["osmosis_control"], "nodes": ["osmosis_control"]}
 FOR_THE_ANALYSES = {"rampart.actors.detection.stub:StubDetection":
