@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from control_world import DT_S, Circle, World, drive
 
+from rampart.actors.osmosis.airport.model import Light
 from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
 from rampart.actors.osmosis.control.following.light_inspection import (
     LightInspection,
-    RowLight,
     verdict,
 )
 from rampart.actors.osmosis.control.following.light_row import LightRow
@@ -16,7 +16,7 @@ ROW = ((0.0, 0.0), (20.0, 0.0))
 
 
 def light_row(count=6, spacing_m=3.0):
-    return [RowLight(f"L{i}", 2.0 + spacing_m * i, 0.0, 200.0) for i in range(count)]
+    return [Light(f"L{i}", "L", 2.0 + spacing_m * i, 0.0, 200.0) for i in range(count)]
 
 
 def inspect(lights, factors, *, seed=0, pose_delay_s=0.0, noise=0.03, blind=(), start_m=0.0,

@@ -16,7 +16,7 @@ from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.plausible import is_sane
 from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.airport.model import Airport, Light
 from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.following.blockage import BlockageWatch
@@ -25,7 +25,7 @@ from rampart.actors.osmosis.control.following.control_checkpoint import (
     ControlKept,
     whole_row,
 )
-from rampart.actors.osmosis.control.following.light_inspection import LightInspection, RowLight
+from rampart.actors.osmosis.control.following.light_inspection import LightInspection
 from rampart.actors.osmosis.control.following.light_ledger import LightLedger
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
 from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
@@ -39,9 +39,7 @@ from rampart.actors.osmosis.messages import (
     ControlStatus,
     GoalOrder,
     LaserScan,
-    LightMeasurement,
     LightSample,
-    LightVerdict,
     MissionStatus,
     Mode,
     Pose,
@@ -84,7 +82,7 @@ class OsmosisControl(Actor):
         system, airport = context.run.system, Osmosis.of(context).airport
         self._hull = hull_of(system)
         self._motion = motion_of(system)
-        self._lights = row_lights(airport)
+        self._lights = airport.lights
         self._inspection = LightInspection(self._lights)
         self._pose: Pose | None = None
         self._points: Array | None = None
@@ -292,12 +290,9 @@ class OsmosisControl(Actor):
         self._is_incomplete = False
         if motion is None or not isinstance(self._follower, LightRow):
             return
-        measured = [
-            LightMeasurement(
-                found.light, found.intensity_cd, found.ratio, LightVerdict(found.verdict))
-            for found in self._inspection.take(ended=motion.arrived)]
         now = self.clock.now()
-        fresh = [light for light in measured if self._ledger.add(light, now)]
+        fresh = [light for light in self._inspection.take(ended=motion.arrived)
+                 if self._ledger.add(light, now)]
         if fresh:
             self._remember()
         for light in fresh:
@@ -360,8 +355,8 @@ class OsmosisControl(Actor):
 
 
 def lights_along(
-    lights: tuple[RowLight, ...], waypoints: tuple[tuple[float, float], ...]
-) -> tuple[RowLight, ...]:
+    lights: tuple[Light, ...], waypoints: tuple[tuple[float, float], ...]
+) -> tuple[Light, ...]:
     """Return the lights that a robot passes over which follows the waypoints."""
     line = Polyline(waypoints)
     feet = [(light, line.project(light.x_m, light.y_m)) for light in lights]
@@ -371,10 +366,3 @@ def lights_along(
 
 def _same_goal(one: Route, other: Route) -> bool:
     return (one.mission_id, one.step, one.mode) == (other.mission_id, other.step, other.mode)
-
-
-def row_lights(airport: Airport) -> tuple[RowLight, ...]:
-    """Return the airport's lights as the inspection wants them."""
-    return tuple(
-        RowLight(light.name, light.x_m, light.y_m, light.nominal_cd) for light in airport.lights
-    )
