@@ -24,9 +24,9 @@ from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimi
 from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
 from rampart.actors.osmosis.control.following.path_follower import Motion, PathFollower, Pose2
 from rampart.actors.osmosis.control.following.row_inspection import RowInspection
+from rampart.actors.osmosis.control.limits_from_spec import hull_of, motion_of, reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LaserPair
 from rampart.actors.osmosis.control.polyline import Array
-from rampart.actors.osmosis.control.settings import hull_of, motion_of, reach_of
 from rampart.actors.osmosis.messages import (
     Blockage,
     ControlPhase,
