@@ -103,12 +103,8 @@ class EstimationError(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.monitor = EstimationMonitor(
-            known=self.first_life, wait_until_s=self.clock.now() + self.grace_s(1.0))
-
-    def on_start(self) -> None:
-        """Start waiting for something to compare."""
-        self.follow(self.monitor)
+        self.monitor = self.judged_by(EstimationMonitor(
+            known=self.first_life, wait_until_s=self.clock.now() + self.grace_s(1.0)))
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
@@ -128,11 +124,11 @@ class EstimationError(DetectionModule):
         self.monitor.gps(
             Fix(message.x_m, message.y_m, message.velocity_x_mps, message.velocity_y_mps,
                 message.accuracy_m), header.stamp, self.clock.now())
-        self.follow(self.monitor)
+        self.follow()
 
     @on(topics.POSE)
     def pose(self, message: m.Pose, header: Header) -> None:
         """Hear the pose under test."""
         self.monitor.pose(message, header.stamp, self.clock.now(),
                           f"{header.source}#{header.incarnation}")
-        self.follow(self.monitor)
+        self.follow()

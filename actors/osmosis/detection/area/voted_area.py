@@ -100,23 +100,19 @@ class VotedArea(DetectionModule):
         self._where = VotedPosition(robot.gps_accuracy_m,
                                     amount(self.parameters, "blind_s", 10.0),
                                     amount(self.parameters, "blind_m", 5.0))
-        self.monitor = FenceMonitor(
+        self.monitor = self.judged_by(FenceMonitor(
             airport.prohibited_distance_m,
             FenceLimits(half_diagonal_m(robot), self._reaction_s(system, robot),
                         robot.braking_mps2),
             FreshnessMonitor("position that two sources agree on", timeout_s, 2 * GPS_PERIOD_S,
                              self.clock.now(), self.grace_s(timeout_s), known=self.first_life),
-            amount(self.parameters, "hold_s", 0.5))
+            amount(self.parameters, "hold_s", 0.5)))
 
     def _reaction_s(self, system: SystemSpec, robot: Robot) -> float:
         needed_s = GPS_PERIOD_S + system.timing.arbitration_s + system.timing.actuation_s
         if "margin_m" not in self.parameters:
             return needed_s
         return max(needed_s, time_to_intrusion_s(robot, amount(self.parameters, "margin_m", 0.0)))
-
-    def on_start(self) -> None:
-        """Start waiting for the first position."""
-        self.follow(self.monitor)
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
@@ -152,4 +148,4 @@ class VotedArea(DetectionModule):
         found = self._where.look(now_s)
         if found is not None:
             self.monitor.fix(*found, now_s)
-        self.follow(self.monitor)
+        self.follow()
