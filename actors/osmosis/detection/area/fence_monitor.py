@@ -10,12 +10,13 @@ from rampart.actors.bus.plausible import is_possible
 from rampart.actors.osmosis.detection.area.geofence import (
     DistanceBound,
     FenceLimits,
-    Fix,
     ProhibitedDistance,
     intrusion,
+    is_usable,
     reach_m,
 )
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.osmosis.messages import GpsFix
 
 
 class FenceMonitor:
@@ -64,9 +65,9 @@ class FenceMonitor:
         """Conclude from the time without a fix."""
         self._freshness.expire(now_s)
 
-    def fix(self, fix: Fix, stamp_s: float, now_s: float) -> None:
+    def fix(self, fix: GpsFix, stamp_s: float, now_s: float) -> None:
         """Take note of a fix in `map`, measured at `stamp_s`."""
-        if not fix.is_usable or not is_possible(stamp_s, now_s):
+        if not is_usable(fix) or not is_possible(stamp_s, now_s):
             return
         self._freshness.heard(stamp_s, now_s)
         extra_m = self._limits.hysteresis_m if self._intrusion else 0.0

@@ -13,7 +13,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
-from rampart.actors.osmosis.detection.area.geofence import FenceLimits, Fix
+from rampart.actors.osmosis.detection.area.geofence import FenceLimits
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import amount
@@ -56,9 +56,7 @@ class ProhibitedArea(DetectionModule):
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:
         """Look where the robot is and where it is going."""
-        self.monitor.fix(
-            Fix(message.x_m, message.y_m, message.velocity_x_mps, message.velocity_y_mps,
-                message.accuracy_m), header.stamp, self.clock.now())
+        self.monitor.fix(message, header.stamp, self.clock.now())
         self.follow()
 
 
