@@ -22,6 +22,7 @@ from rampart.actors.osmosis.control.polyline import (
     Hull,
     Point,
     Polyline,
+    Pose2,
     Projection,
     to_map,
     wrap_angle,
@@ -74,9 +75,6 @@ class Motion(msgspec.Struct, frozen=True, gc=False):
     waypoint: int
     distance_to_go_m: float
 
-
-Pose2 = tuple[float, float, float]
-"""Planar pose (x, y, yaw) in `map`."""
 
 _ASTRAY_M = 1.0
 

@@ -22,11 +22,11 @@ from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckonin
 from rampart.actors.osmosis.control.following.light_ledger import LightsKept
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
 from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
-from rampart.actors.osmosis.control.following.path_follower import Motion, PathFollower, Pose2
+from rampart.actors.osmosis.control.following.path_follower import Motion, PathFollower
 from rampart.actors.osmosis.control.following.row_inspection import RowInspection
 from rampart.actors.osmosis.control.limits_from_spec import hull_of, motion_of, reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LaserPair
-from rampart.actors.osmosis.control.polyline import Array
+from rampart.actors.osmosis.control.polyline import Array, Pose2
 from rampart.actors.osmosis.messages import (
     Blockage,
     ControlPhase,

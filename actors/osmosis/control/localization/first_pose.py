@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck
-from rampart.actors.osmosis.control.localization.planar_ekf import wrap
 from rampart.actors.osmosis.control.localization.position_source import PositionSource
+from rampart.actors.osmosis.control.polyline import wrap_angle
 
 GPS_VELOCITY_SD_MPS, SIDESLIP_RAD = 0.03, 0.03
 COURSE_FROM_MPS = 0.4
@@ -60,7 +60,7 @@ def find_first(pose: PositionSource, gps: PositionSource, wheels: OdometryCheck,
     if by_pose:
         return FirstPose(pose, pose.reading[2])
     if gyro.usable(now_s):
-        return FirstPose(gps, wrap(gyro.yaw_rad), _IMU_SD_RAD)
+        return FirstPose(gps, wrap_angle(gyro.yaw_rad), _IMU_SD_RAD)
     vx, vy = gps.velocity
     speed_mps = math.hypot(vx, vy)
     if speed_mps > COURSE_FROM_MPS and wheels.speed_mps > 0:

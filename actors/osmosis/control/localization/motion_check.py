@@ -18,7 +18,7 @@ import math
 from dataclasses import dataclass, field
 
 from rampart.actors.bus.plausible import is_possible, is_sane
-from rampart.actors.osmosis.control.localization.planar_ekf import wrap
+from rampart.actors.osmosis.control.polyline import wrap_angle
 
 BACK_AFTER_S = 1.0
 """How long a device must have been without a flaw to be believed again."""
@@ -146,7 +146,7 @@ class OdometryCheck(Source):
         if dt_s > LONGEST_STEP_S:
             return None
         limits = ODOMETRY_PARITY
-        turn = wrap(yaw_rad - was[2])
+        turn = wrap_angle(yaw_rad - was[2])
         middle = was[2] + turn / 2
         cos, sin = math.cos(middle), math.sin(middle)
         dx, dy = x_m - was[0], y_m - was[1]
@@ -197,7 +197,7 @@ class ImuCheck(Source):
         if dt_s > LONGEST_STEP_S:
             return
         limits = IMU_PARITY
-        off = wrap(yaw_rad - then_yaw - rate_radps * dt_s)
+        off = wrap_angle(yaw_rad - then_yaw - rate_radps * dt_s)
         self._sum = self._sum * max(0.0, 1.0 - dt_s / limits.forget_s) + off
         if abs(rate_radps) > limits.fastest or not -limits.step < off < limits.step:
             self._sum = 0.0

@@ -35,8 +35,9 @@ from rampart.actors.osmosis.control.localization.first_pose import (
     find_first,
 )
 from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck, Trust
-from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf, wrap
+from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits, PositionSource
+from rampart.actors.osmosis.control.polyline import wrap_angle
 from rampart.actors.osmosis.messages import LocalizationStatus
 
 _MAX_AGE_S = 0.3
@@ -144,7 +145,7 @@ class PoseFilter:
         if self._gyro.usable(stamp_s):
             heading = self._gyro.heading_at(stamp_s)
             before = self._gyro_used
-            turn = turn_rad or 0.0 if before is None else wrap(heading - before)
+            turn = turn_rad or 0.0 if before is None else wrap_angle(heading - before)
             self._gyro_used = heading
             turn_variance = _GYRO_RAD2_PER_S * dt_s
         else:
@@ -338,7 +339,7 @@ class PoseFilter:
     def _believe_both(self, ekf: PlanarEkf, stamp_s: float) -> None:
         """Neither position fits the filter, and they agree: it was the prediction that failed."""
         pose, gps = self._pose, self._gps
-        if abs(wrap(pose.reading[2] - ekf.yaw_rad)) > _GYRO_ASTRAY_RAD:
+        if abs(wrap_angle(pose.reading[2] - ekf.yaw_rad)) > _GYRO_ASTRAY_RAD:
             self._gyro.trust.flaw("its turns do not fit the positions", stamp_s)
             self._gyro_used = None
         else:
@@ -357,8 +358,8 @@ class PoseFilter:
         """Keep an excluded gyro excluded while it turns otherwise than the robot."""
         trust = self._gyro.trust
         if trust.reason:
-            off = wrap(self._gyro.yaw_rad - ekf.yaw_rad)
-            if abs(wrap(off - self._gyro_off)) > _GYRO_ASTRAY_RAD:
+            off = wrap_angle(self._gyro.yaw_rad - ekf.yaw_rad)
+            if abs(wrap_angle(off - self._gyro_off)) > _GYRO_ASTRAY_RAD:
                 self._gyro_off = off
                 trust.flaw(trust.reason, stamp_s)
 
@@ -388,11 +389,8 @@ _GYRO_RAD2_PER_S = 1e-6
 _WHEEL_TURN_SHARE, _WHEEL_RAD2_PER_S = 0.15, 1e-5
 _UNKNOWN_TURN_RADPS, _UNKNOWN_SPEED_MPS = 1.0, 0.3
 _CREEP_MPS, _TOP_SPEED_MPS, _FASTEST_MPS = 0.05, 1.0, 100.0
-_GPS_REPEATS = 2
-_STRAIGHT_RADPS = 0.1
-_APART_GAIN = 0.3
-_MORE_THAN_CHANCE = 3
-_CLEARLY = 2.0
+_GPS_REPEATS, _STRAIGHT_RADPS = 2, 0.1
+_APART_GAIN, _CLEARLY, _MORE_THAN_CHANCE = 0.3, 2.0, 3
 _WHEELS_ASTRAY_M, _GYRO_ASTRAY_RAD = 0.25, 0.1
 
 
