@@ -34,8 +34,9 @@ from rampart.manager.spec.specification import (
     read_document,
 )
 from rampart.manager.strategies.registry import STRATEGIES
+from rampart.testing import run
 from tests import ROOT
-from tests.virtual_loop import System, run
+from tests.osmosis_system import System
 
 DOCUMENT = (ROOT / "docs" / "specification.md").read_text(encoding="utf-8")
 EXAMPLE = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)[0]

@@ -18,10 +18,11 @@ from rampart.actors.osmosis.page import stick as hmi_stick
 from rampart.actors.osmosis.page.stick import Grip
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.faults.offered_faults import offered_faults
-from tests.actors.operator.browser import CHROMIUM, browser
-from tests.actors.operator.world import World, eventually, free_port, hear, repeated, served
+from rampart.testing import eventually, free_port
+from tests.actors.operator.browser import browser
+from tests.actors.operator.world import World, hear, repeated, served
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+pytestmark = pytest.mark.page
 
 TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)

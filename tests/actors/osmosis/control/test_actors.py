@@ -27,7 +27,7 @@ from rampart.manager.spec.specification import Layers, Robot, SystemSpec, Timing
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from tests.actors.osmosis.control.world import Circle, World
-from tests.virtual_loop import run_context
+from tests.osmosis_system import run_context
 
 AIRPORT = load_airport("vallombre")
 BROKEN = {"A03": 0.0, "A06": 0.35, "A10": 0.0}
