@@ -243,7 +243,7 @@ def test_a_real_unsafe_run_is_unsafe_though_its_folder_is_gone_and_nobody_listen
 @pytest.mark.processes
 @pytest.mark.timeout(180)
 def test_a_real_mission_succeeds_though_its_folder_goes_and_its_recording_stops(tmp_path):
-    with RealRun(tmp_path, "paper", "--system", str(with_checkpoints(tmp_path)), "--mission",
+    with RealRun(tmp_path, with_checkpoints(tmp_path), "--mission",
                  str(write_short_mission(tmp_path)), "--rate", "2", "--record", "/dev/full",
                  "--overwrite") as run:
         run.sleep_until(8.0)
