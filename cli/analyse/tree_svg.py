@@ -156,22 +156,18 @@ def _stem(diagram: Diagram) -> float:
 def _body(diagram: Diagram, placing: Placing) -> Iterator[str]:
     looks = _looks(diagram)
     tall = _tall(looks)
-    arriving: dict[str, list[float]] = {}
     leaving: dict[str, list[str]] = {}
-    for (upper, lower), line in zip(diagram.edges, placing.lines, strict=True):
-        arriving.setdefault(lower, []).append(line[-1][0])
+    for (upper, _), line in zip(diagram.edges, placing.lines, strict=True):
         leaving.setdefault(upper, []).append("M" + "L".join(f"{x:g} {y:g}" for x, y in line))
     for lines in leaving.values():  # one path, for what is painted twice looks thicker
         yield f'<path class="line" d="{"".join(lines)}"/>'
-    for at, several in ((placing.places[name], xs) for name, xs in arriving.items()):
-        if min(several) < max(several):  # they are all inputs of the same box
-            yield _line(min(several), at.top, max(several), at.top)
+    lowers = {lower for _, lower in diagram.edges}
     for box in diagram.boxes:
         at = placing.places[box.name]
         classes = " ".join(["node", *["active"] * box.active, *["decided"] * box.decided])
         yield f'<g class="{classes}"><title>{escape(_tooltip(box, diagram))}</title>'
         if diagram.what == "fault-tree":
-            if box.name in arriving or box.mechanism:
+            if box.name in lowers or box.mechanism:
                 yield _line(at.x, at.top, at.x, at.top + _stem(diagram))
             yield from _barrier(looks[box.name], at, _stem(diagram))
             yield from _symbol(box, at.x, at.bottom - SYMBOL)
