@@ -26,21 +26,25 @@ from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.actors.runtime.wiring import load_class
-from rampart.manager.arbitration.arbiter import (
+from rampart.manager.arbitration.arbiter import build_arbiter
+from rampart.manager.arbitration.arbiter_memory import (
+    Memory,
+    objection,
+    recall,
+    remember,
+    take_over,
+)
+from rampart.manager.arbitration.arbiter_state import (
     DecisionMade,
-    DetectionHeard,
     Input,
-    RecoveryHeard,
     ResetAnswered,
     ResetAsked,
     ShadowDiffered,
     State,
     Tick,
-    build_arbiter,
 )
-from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
-from rampart.manager.arbitration.detection_track import overdue
-from rampart.manager.arbitration.recovery_track import Command, Phase
+from rampart.manager.arbitration.detection_track import DetectionHeard, overdue
+from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard
 from rampart.manager.spec.adaptation import Action, Change, Document, adapt, describe
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.specification import check_modules
@@ -113,7 +117,7 @@ class FtmManager(Actor):
     def recovery(self, message: m.RecoveryReport, header: Header) -> None:
         """Hear a recovery module."""
         self._step(RecoveryHeard(
-            header.source, message.state is m.RecoveryState.ACTIVATED, Phase(message.phase.value),
+            header.source, message.state is m.RecoveryState.ACTIVATED, message.phase,
             message.decision, message.reason))
 
     @on(topics.RESET)
@@ -181,7 +185,7 @@ class FtmManager(Actor):
         for recovery in system.recoveries:
             load_class(recovery.actor, topics.RECOVERY)
         arbiter = build_arbiter(system)
-        self.arbiter_state = arbiter.take_over(self.arbiter_state, self.clock.now())
+        self.arbiter_state = take_over(arbiter, self.arbiter_state, self.clock.now())
         self._arbiter, self._document, self._system = arbiter, document, system
         self._strategy = system.strategy
         self._adapted = m.AdaptedSystem(

@@ -4,7 +4,9 @@ import msgspec
 import pytest
 from manager_bench import DMS, Bench, commands, edited
 
-from rampart.manager.arbitration.arbiter import Command, Phase, State, Tick
+from rampart.manager.arbitration.arbiter_state import State, Tick
+from rampart.manager.arbitration.recovery_track import Command
+from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 
 ACTING, DONE, IDLE, DEGRADED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.DEGRADED
 

@@ -2,8 +2,9 @@
 
 from manager_bench import DMS, RMS, Bench, commands, edited, paper
 
-from rampart.manager.arbitration.arbiter import Phase, build_arbiter
+from rampart.manager.arbitration.arbiter import build_arbiter
 from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
+from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 
 ACTING, DONE, IDLE, FAILED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.FAILED
 

@@ -4,7 +4,8 @@ import msgspec
 import pytest
 from manager_bench import Bench, commands, paper
 
-from rampart.manager.arbitration.arbiter import Phase, ShadowDiffered
+from rampart.manager.arbitration.arbiter_state import ShadowDiffered
+from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 
 ACTING, DONE, IDLE, FAILED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.FAILED
 

@@ -27,6 +27,7 @@ from rampart.actors.bus.bounds import (
     Texts,
 )
 from rampart.actors.bus.messages import Message
+from rampart.manager.model.mechanisms import RecoveryPhase
 
 
 class Holds(Message, frozen=True):
@@ -60,16 +61,6 @@ class RecoveryState(StrEnum):
 
     IDLE = "idle"
     ACTIVATED = "activated"
-
-
-class RecoveryPhase(StrEnum):
-    """How far an activated recovery is: only `ACTING` must not be cut off."""
-
-    IDLE = "idle"
-    ACTING = "acting"
-    DONE = "done"
-    DEGRADED = "degraded"
-    FAILED = "failed"
 
 
 class RecoveryCommand(Message, frozen=True):
