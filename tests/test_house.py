@@ -54,8 +54,8 @@ STILL_ROBOTIC = {
 STILL_TOO_LONG = {
     "actors.osmosis.control.localization.pose_filter", "actors.osmosis.messages",
     "actors.runtime.actor", "actors.supervision.supervisor", "cli.analyse.campaigning", "cli.run",
-    "manager.analysis.cut_sets", "manager.spec.checks",
-    "manager.spec.schema", "sim.osmosis.report_record", "sim.osmosis.world"}
+    "manager.analysis.cut_sets",
+    "sim.osmosis.report_record", "sim.osmosis.world"}
 
 STILL_CIRCULAR = {("actors.runtime.injection_desk", "actors.runtime.actor")}
 

@@ -15,8 +15,9 @@ from real_run import RealRun
 from stub_actors import ROOT
 
 from rampart.manager.model.gates import detection_gate
-from rampart.manager.spec.schema import SpecificationError, Within
+from rampart.manager.spec.schema import Within
 from rampart.manager.spec.specification import parse_specification
+from rampart.manager.spec.tables import SpecificationError
 from rampart.manager.strategies.registry import decide
 
 TEXT = (ROOT / "systems" / "cell.toml").read_text(encoding="utf-8")

@@ -4,9 +4,9 @@ Reading happens in three steps, each with its own kind of error, and every error
 names file, path, value, and what would be right (`SpecificationError`):
 
 1. syntax, sizes and types: `rampart.files.toml`, then `msgspec`, strict, unknown fields forbidden;
-2. timing values left out are derived from the robot (`rampart.manager.spec.budget`), and parameters
-   that name a timing value are replaced by it; 3. sense: names, cycles, the tree, the order, the
-   time budget (`rampart.manager.spec.checks`).
+2. timing values left out are derived from the robot (`rampart.manager.spec.mobile_robot`), and
+   parameters that name a timing value are replaced by it;
+3. sense: names, cycles, the tree, the order, the time budget (`rampart.manager.spec.checks`).
 
 There is no file I/O here: the caller hands over the text, and the name to use in messages.
 """
@@ -24,26 +24,21 @@ import msgspec
 from rampart.files import toml
 from rampart.files.reading import FileError
 from rampart.manager.model.mechanisms import RecoveryKind
-from rampart.manager.spec.budget import derive_timeouts
 from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
+from rampart.manager.spec.mobile_robot import Hazard, Robot, derive_timeouts
 from rampart.manager.spec.schema import (
     NODE_KINDS,
     AtLeast,
     DetectionSpec,
     EventSpec,
-    Hazard,
     Kind,
-    Layers,
     MechanismSpec,
     NodeSpec,
     RecoverySpec,
-    Robot,
-    SpecificationError,
     SystemSpec,
-    Table,
-    Timing,
     Within,
 )
+from rampart.manager.spec.tables import Layers, SpecificationError, Table, Timing
 
 __all__ = [
     "AtLeast", "DetectionSpec", "EventSpec", "Hazard", "Kind", "Layers", "MechanismSpec",
