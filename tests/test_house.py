@@ -54,7 +54,6 @@ STILL_ROBOTIC = {
 STILL_TOO_LONG = {
     "actors.osmosis.control.localization.pose_filter", "actors.osmosis.messages",
     "actors.runtime.actor", "actors.supervision.supervisor", "cli.analyse.campaigning", "cli.run",
-    "manager.analysis.cut_sets",
     "sim.osmosis.report_record", "sim.osmosis.world"}
 
 STILL_CIRCULAR = {("actors.runtime.injection_desk", "actors.runtime.actor")}

@@ -213,9 +213,10 @@ class Arbiter:
             for track in state.detections)
         believed = {track.name: track for track in detections}
         active = self._active(detections)
+        contracts, users = self.mechanisms.contracts, self.mechanisms.users
         recoveries = tuple(
-            recovery_track.judge(track, self.mechanisms.contracts[track.name],
-                                 self.mechanisms.users[track.name], believed, active, now)
+            recovery_track.judge(track, contracts[track.name], users[track.name], believed,
+                                 active, now)
             for track in state.recoveries)
         oriented = state.oriented or (
             all(t.ever_heard or t.silent for t in detections) and (

@@ -96,13 +96,13 @@ def find_contradictions(spec: SystemSpec) -> Iterator[Finding]:
 
 def find_wrong_compounds(spec: SystemSpec) -> Iterator[Finding]:
     """Recoveries that one mechanism runs together must be able to run together."""
-    contracts = spec.build_mechanisms().contracts
+    recoveries = {recovery.name: recovery for recovery in spec.recoveries}
     for index, mechanism in enumerate(spec.mechanisms):
         ways = recovery_gate(mechanism.recover).alternatives()
         together = dict.fromkeys(chain.from_iterable(permutations(way, 2) for way in ways))
         for one, other in together:
-            shared = contracts[one].claims & contracts[other].claims
-            harmed = contracts[one].disables & contracts[other].needs
+            shared = recoveries[one].claims & recoveries[other].claims
+            harmed = recoveries[one].disables & recoveries[other].needs
             if shared or harmed:
                 yield Finding(f"$.mechanism[{index}].recover", (
                     f"{one} and {other} both claim {', '.join(sorted(shared))}" if shared else
@@ -142,12 +142,12 @@ def find_wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
 
 def _undelayed(spec: SystemSpec, order: PartialOrder, last_resort: str) -> Iterator[Finding]:
     """A recovery of the FTMTree's root is a last resort: nothing may make it wait."""
-    contracts = spec.build_mechanisms().contracts
-    names = [recovery.name for recovery in spec.recoveries]
+    recoveries = {r.name: (index, r.claims) for index, r in enumerate(spec.recoveries)}
     for name in order.names:
-        shared = contracts[name].claims & contracts[last_resort].claims
+        index, claims = recoveries[name]
+        shared = claims & recoveries[last_resort][1]
         if name != last_resort and shared:
-            yield Finding(f"$.recovery[{names.index(name)}].claims",
+            yield Finding(f"$.recovery[{index}].claims",
                           f"{last_resort}, the last resort, would have to wait for {name}, which "
                           f"claims {', '.join(sorted(shared))} as well",
-                          (sorted(contracts[name].claims),))
+                          (sorted(claims),))
