@@ -144,7 +144,7 @@ def test_in_the_end_there_is_one_decision_and_it_is_carried_out(actions, remaini
     state = walk.bench.state
     assert {dm for name in state.active for dm in MECHANISMS.detect[name]} == remaining
     assert list(state.activated) == list(state.decision.recoveries)
-    assert state.draining == ()
+    assert not any(track.draining for track in state.recoveries)
     assert bool(state.activated) == bool(remaining or state.latched)
     for rm in RMS:
         assert (walk.modules.phase[rm] in FINISHED) == (rm in state.activated)

@@ -239,9 +239,10 @@ class Arbiter:
             failures = {**self._unmet(state), **failures}
         if failures:
             decision = escalate(decision, failures, self.arrangement)
+        kept = [t for t in state.recoveries if t.latched or t.adopted]
         return chosen, decision, latching.keep(
-            decision, [t for t in state.recoveries if t.latched or t.adopted], self.arrangement,
-            exclusive=self.decider.strategy.exclusive)
+            decision, kept, self.arrangement,
+            exclusive=self.decider.strategy.exclusive) if kept else decision
 
     def _unmet(self, state: State) -> dict[str, str]:
         """Return why recoveries are of no use now: a node that they need is reported failed."""

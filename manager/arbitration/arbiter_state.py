@@ -117,11 +117,6 @@ class State(msgspec.Struct, frozen=True):
                      if track.wanted or track.letting_go or track.latched)
 
     @property
-    def draining(self) -> tuple[str, ...]:
-        """Names of the recovery modules that are superseded and finishing their action."""
-        return tuple(track.name for track in self.recoveries if track.draining)
-
-    @property
     def latched(self) -> tuple[str, ...]:
         """Names of the recovery modules that stay until they are reset."""
         return tuple(track.name for track in self.recoveries if track.latched)

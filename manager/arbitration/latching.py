@@ -41,12 +41,11 @@ def keep(decision: Decision, kept: Sequence[RecoveryTrack], arrangement: Arrange
 
     Args:
         decision: Without regard to what is kept.
-        kept: Latched and adopted recoveries. Several are only if one drains under another.
+        kept: Latched and adopted recoveries, at least one. Several are only if one drains under
+            another.
         arrangement: Of the system.
         exclusive: No repairs run beneath.
     """
-    if not kept:
-        return decision
     order, contracts = arrangement.order, arrangement.mechanisms.contracts
     safest = min(kept, key=lambda track: order.number[track.name])
     base = tuple(name for name in decision.recoveries
