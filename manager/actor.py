@@ -51,7 +51,7 @@ from rampart.manager.spec.specification import check_modules
 
 MANAGER_STATE = StateFormat(Memory, version=1, objection=objection)
 
-DECISIONS_PER_LIFE = 10_000
+DECISIONS_PER_INCARNATION = 10_000
 """Each incarnation numbers its decisions from a multiple of this."""
 
 ABSENCE_S = 0.3
@@ -70,10 +70,10 @@ class FtmManager(Actor):
         self._document: Document = context.shared.get("document", {})
         self._adapted: m.AdaptedSystem | None = context.shared.get("adapted")
         self._strategy = self._system.strategy
-        self._arbiter = build_arbiter(self._system, first_life=context.incarnation == 1)
+        self._arbiter = build_arbiter(self._system, first_start=context.incarnation == 1)
         now_s = self.clock.now()
         self.arbiter_state = self._arbiter.initial(
-            now_s, (context.incarnation - 1) * DECISIONS_PER_LIFE)
+            now_s, (context.incarnation - 1) * DECISIONS_PER_INCARNATION)
         self._ran_s = now_s
         self._shown: m.ManagerStatus | None = None
         self._remembered: tuple[int, tuple[str, ...]] | None = None
@@ -140,7 +140,7 @@ class FtmManager(Actor):
 
     @every(1.0)
     def repeat_system(self) -> None:
-        """Repeat the changed system for whoever joined late."""
+        """Repeat the changed system for those that joined late."""
         if self._adapted is not None:
             self.publish(topics.ADAPTED_SYSTEM, self._adapted)
 
@@ -224,13 +224,13 @@ class FtmManager(Actor):
             self.remember()
 
     def _replace_the_overdue(self) -> None:
-        """Ask for a new life of a detection module that is not heard, once for each life."""
+        """Ask for a restart of a detection module that is not heard, once for each incarnation."""
         silent = overdue(self.arbiter_state.detections, self._arbiter.rules, self.clock.now())
-        if silent is not None and self._replaced.get(silent.name) != silent.life:
-            self._replaced[silent.name] = silent.life
+        if silent is not None and self._replaced.get(silent.name) != silent.incarnation:
+            self._replaced[silent.name] = silent.incarnation
             self._request += 1
             self.publish(topics.RESPAWN, m.RespawnRequest(
-                self._request, silent.name, silent.life, self.name))
+                self._request, silent.name, silent.incarnation, self.name))
 
     def _command(self, command: Command) -> None:
         self.publish(topics.RECOVERY_COMMAND, m.RecoveryCommand(

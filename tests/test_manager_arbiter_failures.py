@@ -285,7 +285,7 @@ def test_the_wait_for_orientation_ends_with_the_grace():
 def respawned() -> Bench:
     """The arbiter of a manager that was respawned: modules run already."""
     bench = Bench(oriented=False)
-    bench.arbiter = build_arbiter(paper(), first_life=False)
+    bench.arbiter = build_arbiter(paper(), first_start=False)
     return bench
 
 

@@ -64,7 +64,7 @@ class RecoveryState(StrEnum):
 
 
 class RecoveryCommand(Message, frozen=True):
-    """The manager's wish for one recovery module, repeated until it is reported fulfilled."""
+    """What the manager orders one recovery module to do, repeated until it is reported done."""
 
     activate: bool
     decision: Count
@@ -207,7 +207,7 @@ class NodeTable(Message, frozen=True):
 
 
 class RespawnRequest(Message, frozen=True):
-    """A wish of a recovery module or the manager: kill a process, if it lives, and restart it."""
+    """A request of a recovery module or the manager: kill a process, if it runs, and restart it."""
 
     request: Count
     node: Name

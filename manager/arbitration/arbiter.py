@@ -57,8 +57,8 @@ from rampart.manager.strategies.escalation import escalate
 from rampart.manager.strategies.registry import Decider, find_strategy
 
 LARGEST_NUMBER = 1 << 52
-"""A decision number beyond it was never given, whoever reports or remembers it. What may follow
-still fits into a message (`rampart.actors.bus.bounds.Count`)."""
+"""A decision number beyond it was never given, although it be reported or remembered. What may
+follow still fits into a message (`rampart.actors.bus.bounds.Count`)."""
 
 _is_at_rest = attrgetter("is_at_rest")
 
@@ -334,9 +334,9 @@ class Arbiter:
         if track.wanted:
             if not self._has_new_cause(state, track):
                 return replace(track, draining=False)
-            if not track.acknowledged or not self._is_news(state, track, _without_life):
-                # It has been deaf since then; or its detection has not cleared and blames one life
-                # of a node after the other: it has not ended the error.
+            if not track.acknowledged or not self._is_news(state, track, _without_incarnation):
+                # It has been deaf since then; or its detection has not cleared and blames one
+                # incarnation of a node after the other: it has not ended the error.
                 ordered_s = track.ordered_s
         elif any(self._blocks(other, track.name, state.decision.recoveries)
                  for other in state.recoveries):
@@ -363,29 +363,29 @@ class Arbiter:
         return not self.order.is_above(name, other.name)
 
 
-def _without_life(node: str) -> str:
-    """Return the name of a node that is blamed by its life, NODE#INCARNATION, or as it is."""
+def _without_incarnation(node: str) -> str:
+    """Return the name of a node that is blamed as NODE#INCARNATION, or as it is."""
     return node.partition("#")[0]
 
 
-def build_arbiter(spec: SystemSpec, strategy: str = "", *, first_life: bool = True) -> Arbiter:
+def build_arbiter(spec: SystemSpec, strategy: str = "", *, first_start: bool = True) -> Arbiter:
     """Build the arbiter of a system.
 
     Args:
         spec: The system.
         strategy: Name of a strategy; "" for the one that the spec names.
-        first_life: Whether modules may be starting as well, and are waited for accordingly; those
+        first_start: Whether modules may be starting as well, and are waited for accordingly; those
             of an arbiter that was respawned run already.
 
     Raises:
         UnknownStrategyError: No such strategy.
     """
     timing = spec.timing
+    silence_s = timing.detection_silence_timeout_s
     arrangement = arrange(
         spec.build_mechanisms(patience_s(spec)), spec.build_ftm_tree(), spec.build_order())
     return Arbiter(
         arrangement, find_strategy(strategy or spec.strategy),
-        DetectionRules(timing.detection_silence_timeout_s,
-                       timing.startup_grace_s if first_life else timing.detection_silence_timeout_s,
+        DetectionRules(silence_s, timing.startup_grace_s if first_start else silence_s,
                        timing.release_hold_s, timing.release_hold_max_s),
         find_strategy(spec.shadow) if spec.shadow else None)

@@ -44,7 +44,7 @@ class DetectionHeard(msgspec.Struct, frozen=True, tag=True):
         nodes: Failed nodes that it names.
         since_s: When it took that state.
         stamp_s: When the report was true; infinite for now.
-        life: Its incarnation.
+        incarnation: Its own.
     """
 
     detection: str
@@ -53,7 +53,7 @@ class DetectionHeard(msgspec.Struct, frozen=True, tag=True):
     nodes: tuple[str, ...] = ()
     since_s: float = 0.0
     stamp_s: float = math.inf
-    life: int = 0
+    incarnation: int = 0
 
 
 class DetectionRules(msgspec.Struct, frozen=True):
@@ -71,7 +71,7 @@ class DetectionTrack(msgspec.Struct, frozen=True):
     Attributes:
         name: Of the module.
         heard_s: When its newest report was true, or else when its time to report began to run.
-        life: Its incarnation, as last heard; 0 before.
+        incarnation: Its own, as last heard; 0 before.
         ever_heard: Whether it was heard at all since the arbiter started.
         reported: What it last said: active or not.
         silent: Not heard for too long.
@@ -98,7 +98,7 @@ class DetectionTrack(msgspec.Struct, frozen=True):
     bucket_at_s: float = 0.0
     nodes: tuple[str, ...] = ()
     reason: str = ""
-    life: int = 0
+    incarnation: int = 0
 
     @property
     def asserted(self) -> bool:
@@ -112,7 +112,7 @@ class DetectionTrack(msgspec.Struct, frozen=True):
 
 OVERDUE_SHARE = 0.6
 """Of the silence timeout: older news of a module, and it is overdue; half of that is late. Three
-reports fit in before, and a new life has time to be heard after."""
+reports fit in before, and its successor has time to be heard after."""
 
 
 def overdue(tracks: tuple[DetectionTrack, ...], rules: DetectionRules, now: float
@@ -135,7 +135,8 @@ def hear(track: DetectionTrack, report: DetectionHeard, rules: DetectionRules, n
     """Take in a report that arrives at `now`; it was true then at the latest."""
     heard_s = max(track.heard_s, min(report.stamp_s, now))
     heard = replace(
-        track, heard_s=heard_s, ever_heard=True, reported=report.active, life=report.life,
+        track, heard_s=heard_s, ever_heard=True, reported=report.active,
+        incarnation=report.incarnation,
         silent=track.silent and now - heard_s > rules.silence_timeout_s)
     if report.active:
         heard = replace(heard, nodes=report.nodes, reason=report.reason)

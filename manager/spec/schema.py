@@ -110,7 +110,7 @@ class DetectionSpec(Table, frozen=True):
 
     @property
     def soonest_s(self) -> float:
-        """The shorter of the two, for whoever has to be faster than this module."""
+        """The shorter of the two, for what has to be faster than this module."""
         return min(self._times_s)
 
     @property

@@ -46,7 +46,10 @@ Late = frozenset[str]
 
 
 class Strategy(Protocol):
-    """A policy, pure. It can be replaced without touching any detection or recovery module."""
+    """A policy without a state, so its answers can be remembered.
+
+    It can be replaced without touching any detection or recovery module.
+    """
 
     name: str
     patient: bool

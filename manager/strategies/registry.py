@@ -62,7 +62,7 @@ def find_strategy(name: str) -> Strategy:
 
 
 class Decider:
-    """A strategy applied to an arrangement; pure, so the answer to a known question is known."""
+    """A strategy applied to an arrangement, which remembers its answers."""
 
     def __init__(self, strategy: Strategy, arrangement: Arrangement) -> None:
         self.strategy = strategy
