@@ -55,8 +55,7 @@ STILL_ROBOTIC = {
 STILL_TOO_LONG = {
     "actors.osmosis.messages",
     "actors.runtime.actor", "actors.supervision.supervisor", "cli.analyse.campaigning", "cli.run",
-    "manager.analysis.cut_sets", "manager.arbitration.arbiter", "manager.spec.checks",
-    "manager.spec.schema", "sim.osmosis.report_record", "sim.osmosis.world"}
+    "sim.osmosis.report_record", "sim.osmosis.world"}
 
 STILL_CIRCULAR = {("actors.runtime.injection_desk", "actors.runtime.actor")}
 

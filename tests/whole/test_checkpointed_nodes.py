@@ -25,16 +25,12 @@ from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_ST
 from rampart.actors.osmosis.control.mission.mission_state import MissionState
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Polyline
 from rampart.actors.runtime.checkpoint import Loaded, MemoryCheckpoints, Record, StateError
-from rampart.manager.arbitration.arbiter import (
-    DetectionHeard,
-    Phase,
-    RecoveryHeard,
-    ResetAsked,
-    Tick,
-    build_arbiter,
-)
+from rampart.manager.arbitration.arbiter import build_arbiter
 from rampart.manager.arbitration.arbiter_memory import Latch, Memory, objection, recall, remember
-from rampart.manager.arbitration.recovery_track import Command
+from rampart.manager.arbitration.arbiter_state import ResetAsked, Tick
+from rampart.manager.arbitration.detection_track import DetectionHeard
+from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard
+from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import RealRun
 from tests import ROOT

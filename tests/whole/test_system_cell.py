@@ -13,8 +13,9 @@ import time
 import pytest
 
 from rampart.manager.model.gates import detection_gate
-from rampart.manager.spec.schema import SpecificationError, Within
+from rampart.manager.spec.schema import Within
 from rampart.manager.spec.specification import parse_specification
+from rampart.manager.spec.tables import SpecificationError
 from rampart.manager.strategies.registry import decide
 from rampart.testing import RealRun
 from tests import ROOT

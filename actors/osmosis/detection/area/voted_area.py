@@ -22,8 +22,8 @@ from rampart.actors.osmosis.detection.area.prohibited_area import GPS_PERIOD_S, 
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import amount
-from rampart.manager.spec.budget import time_to_intrusion_s
-from rampart.manager.spec.schema import Robot, SystemSpec
+from rampart.manager.spec.mobile_robot import Robot, time_to_intrusion_s
+from rampart.manager.spec.schema import SystemSpec
 
 _ABSOLUTE = "absolute pose"
 _ERROR_PER_M = 0.06
