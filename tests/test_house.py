@@ -53,10 +53,9 @@ STILL_ROBOTIC = {
     "sim.runs.process_run", "sim.runs.run_end", "sim.runs.virtual_run"}
 
 STILL_TOO_LONG = {
-    "actors.osmosis.control.localization.pose_filter", "actors.osmosis.messages",
+    "actors.osmosis.messages",
     "actors.runtime.actor", "actors.supervision.supervisor", "cli.analyse.campaigning", "cli.run",
-    "manager.analysis.cut_sets", "manager.arbitration.arbiter", "manager.spec.checks",
-    "manager.spec.schema", "sim.osmosis.report_record", "sim.osmosis.world"}
+    "sim.osmosis.report_record", "sim.osmosis.world"}
 
 STILL_CIRCULAR = {("actors.runtime.injection_desk", "actors.runtime.actor")}
 
