@@ -30,7 +30,7 @@ import msgspec
 from message_extremes import Drawer, all_topics
 from msgspec import inspect
 
-import systems as shipped
+from rampart import systems as shipped
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording.views import Views

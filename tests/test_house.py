@@ -53,11 +53,11 @@ STILL_ROBOTIC = {
 
 STILL_TOO_LONG = {
     "actors.osmosis.control.localization.pose_filter", "actors.osmosis.messages",
-    "actors.runtime.actor", "actors.supervision.supervisor", "cli.analyse.campaigning", "cli.run",
+    "actors.supervision.supervisor", "cli.analyse.campaigning", "cli.run",
     "manager.analysis.cut_sets", "manager.arbitration.arbiter", "manager.spec.checks",
     "manager.spec.schema", "sim.osmosis.report_record", "sim.osmosis.world"}
 
-STILL_CIRCULAR = {("actors.runtime.injection_desk", "actors.runtime.actor")}
+STILL_CIRCULAR: set[tuple[str, str]] = set()
 
 
 def modules() -> dict[str, Path]:

@@ -169,7 +169,7 @@ class Supervisor(Actor):
         """
         handles = []
         for process in reversed(self._processes.values()):
-            if not self._stopping:
+            if not self._dispatcher.stopping:
                 self._unwatch(process)
             elif process.handle is not None and process.state is not NodeState.CRASHED:
                 process.handle.ignore()
@@ -472,7 +472,7 @@ class Supervisor(Actor):
         if process.pid != pid:  # it was replaced while this waited
             return
         try:
-            process.handle = self._machine.hold(pid, lambda: self._mailbox.put_latest(
+            process.handle = self._machine.hold(pid, lambda: self._dispatcher.put(
                 f"exit {pid}", lambda: self._exited(process, pid)))
         except ProcessLookupError:
             self._process_ended(process, "it ended before it could be watched")
