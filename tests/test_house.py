@@ -53,7 +53,7 @@ STILL_ROBOTIC = {
 
 STILL_TOO_LONG = {
     "actors.osmosis.control.localization.pose_filter", "actors.osmosis.messages",
-    "actors.supervision.supervisor", "cli.analyse.campaigning", "cli.run",
+    "cli.analyse.campaigning", "cli.run",
     "manager.analysis.cut_sets", "manager.arbitration.arbiter", "manager.spec.checks",
     "manager.spec.schema", "sim.osmosis.report_record", "sim.osmosis.world"}
 

@@ -320,7 +320,8 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
     ("rampart.actors.operator.hmi:Hmi", "rampart.actors.operator.hmi:Hm",
      "$.node[4].actor = 'rampart.actors.operator.hmi:Hm': no such actor class; known: Hmi"),
     ("rampart.actors.operator.hmi:Hmi", "rampart.actors.operator.himi:Hmi",
-     "$.node[4].actor = 'rampart.actors.operator.himi:Hmi': No module named 'rampart.actors.operator.himi'"),
+     "$.node[4].actor = 'rampart.actors.operator.himi:Hmi': No module named "
+     "'rampart.actors.operator.himi'"),
     ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.ftm.stub_node:StubNode",
      "$.detection[2].actor = 'rampart.actors.ftm.stub_node:StubNode': it does not publish "
      "detection/{name}, as "

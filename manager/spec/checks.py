@@ -442,6 +442,15 @@ def _timing(spec: SystemSpec) -> Iterator[Finding]:
         yield Finding(path, problem, (value,))
 
 
+def _supervision(spec: SystemSpec) -> Iterator[Finding]:
+    for first in ("backoff", "attempt"):
+        first_s = getattr(spec.supervision, f"{first}_s")
+        most_s = getattr(spec.supervision, f"{first}_max_s")
+        if most_s < first_s:
+            yield Finding(f"$.supervision.{first}_max_s",
+                          f"must be no less than {first}_s = {first_s:g}", (most_s,))
+
+
 def _room(robot: Robot) -> Iterator[Finding]:
     braking_m = braking_distance_m(robot, robot.top_speed_mps)
     for field in ("corridor_clearance_m", "stop_distance_m"):
@@ -489,6 +498,6 @@ def _budget(spec: SystemSpec) -> Iterator[Finding]:
 
 
 VALIDATORS: tuple[Callable[[SystemSpec], Iterator[Finding]], ...] = (
-    _timing, _names, _nodes, _detections, _recoveries, _disabling, _processes, _mechanisms,
-    _reachability, _fault_tree, _policy, _orders, _criteria, _compounds, _order_against_tree,
-    _budget)
+    _timing, _supervision, _names, _nodes, _detections, _recoveries, _disabling, _processes,
+    _mechanisms, _reachability, _fault_tree, _policy, _orders, _criteria, _compounds,
+    _order_against_tree, _budget)

@@ -39,6 +39,7 @@ from rampart.manager.spec.schema import (
     RecoverySpec,
     Robot,
     SpecificationError,
+    Supervision,
     SystemSpec,
     Table,
     Timing,
@@ -47,14 +48,15 @@ from rampart.manager.spec.schema import (
 
 __all__ = [
     "AtLeast", "DetectionSpec", "EventSpec", "Hazard", "Kind", "Layers", "MechanismSpec",
-    "NodeSpec", "RecoverySpec", "Robot", "SpecificationError", "SystemSpec", "Timing",
-    "check_document", "check_modules", "parse_specification", "read_document",
+    "NodeSpec", "RecoverySpec", "Robot", "SpecificationError", "Supervision", "SystemSpec",
+    "Timing", "check_document", "check_modules", "parse_specification", "read_document",
 ]
 
 TABLES: dict[str, type[Table]] = {
-    "": SystemSpec, "robot": Robot, "timing": Timing, "layers": Layers, "node": NodeSpec,
-    "detection": DetectionSpec, "recovery": RecoverySpec, "mechanism": MechanismSpec,
-    "event": EventSpec, "gate": AtLeast, "against": Within,
+    "": SystemSpec, "robot": Robot, "timing": Timing, "layers": Layers,
+    "supervision": Supervision, "node": NodeSpec, "detection": DetectionSpec,
+    "recovery": RecoverySpec, "mechanism": MechanismSpec, "event": EventSpec, "gate": AtLeast,
+    "against": Within,
 }
 
 ENUMS: dict[tuple[str, str], Iterable[Enum]] = {
