@@ -8,7 +8,7 @@ from typing import Any
 
 from rampart import systems
 from rampart.actors.bus.topic import Topic
-from rampart.actors.run.system_topics import own_topics, system_topics
+from rampart.actors.layout.system_topics import own_topics, system_topics
 from rampart.cli.output import UsageError
 from rampart.files import toml
 from rampart.files.reading import FileError, read_text

@@ -23,9 +23,9 @@ from rampart.actors.bus.bounds import DOCUMENT_CHARS, clip
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
+from rampart.actors.layout.wiring import load_class
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
-from rampart.actors.runtime.wiring import load_class
 from rampart.manager.arbitration.arbiter import (
     DecisionMade,
     DetectionHeard,
@@ -62,9 +62,9 @@ class FtmManager(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._system: SystemSpec = context.shared["system"]
-        self._document: Document = context.shared.get("document", {})
-        self._adapted: m.AdaptedSystem | None = context.shared.get("adapted")
+        self._system: SystemSpec = context.run.system
+        self._document: Document = dict(context.run.document)
+        self._adapted: m.AdaptedSystem | None = context.run.adapted
         self._strategy = self._system.strategy
         self._arbiter = build_arbiter(self._system, first_life=context.incarnation == 1)
         now_s = self.clock.now()

@@ -104,8 +104,7 @@ class DetectionModule(Actor):
         """Return how long the first input may take, s."""
         if not self.first_life:
             return timeout_s
-        system = self.context.shared.get("system")
-        startup_s = DEFAULT_GRACE_S if system is None else system.timing.startup_grace_s
+        startup_s = self.context.run.system.timing.startup_grace_s
         return max(timeout_s, amount(self.parameters, "startup_grace_s", startup_s))
 
     # -- the state machine ----------------------------------------------------------------------

@@ -9,6 +9,7 @@ from typing import Any
 
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.run_folder import Register
+from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.clock import Clock
 
@@ -23,7 +24,7 @@ class Context:
         clock: simulated time.
         bus: this actor's access to the bus, not yet open.
         parameters: the node's parameters from the system spec.
-        shared: read-only objects loaded once for the whole run ("system", "airport", ...).
+        run: what all actors of the run have in common, loaded once.
         pid: number of the process that it runs in.
         checkpoints: where this node's state is kept.
         heartbeat_period_s: simulated seconds between two heartbeats.
@@ -37,7 +38,7 @@ class Context:
     clock: Clock
     bus: Bus
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    shared: Mapping[str, Any] = field(default_factory=dict)
+    run: RunContext = field(default_factory=RunContext)
     pid: int = field(default_factory=os.getpid)
     checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
     heartbeat_period_s: float = 0.1

@@ -21,7 +21,7 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from rampart.actors.ftm.messages import NodeState
-from rampart.actors.run.run_plan import Unit
+from rampart.actors.layout.layout import Unit
 from rampart.actors.supervision.patience import Patience, Usage
 from rampart.manager.spec.schema import Supervision
 

@@ -34,7 +34,7 @@ from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
-from rampart.actors.run.run_plan import Layout, RunPlan, adapted_system
+from rampart.actors.layout.layout import Layout, adapted_system
 from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
 from rampart.actors.supervision.patience import Patience
@@ -56,7 +56,7 @@ from rampart.actors.supervision.supervised_process import (
     SupervisedProcess,
 )
 from rampart.manager.spec.adaptation import changed_actors
-from rampart.manager.spec.specification import Kind, SystemSpec
+from rampart.manager.spec.specification import Kind
 
 STOP_GRACE_S = 0.5
 """Wall seconds between SIGTERM and SIGKILL at the end of a run."""
@@ -101,25 +101,24 @@ class Supervisor(Relay):
 
     outputs = (topics.NODES, topics.PROCESS_EVENT, *Relay.outputs)
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, processes: Processes | None = None) -> None:
         super().__init__(context)
-        self._plan: RunPlan = context.shared["plan"]
-        self._spec: SystemSpec = context.shared["system"]
+        run = context.run
+        self._plan, self._spec = run.plan, run.system
         self._layout = Layout(self._plan, self._spec)
-        self._machine: Processes = context.shared.get("processes") or OsProcesses(
+        self._machine: Processes = processes or OsProcesses(
             self._plan.base_port, self._plan.launcher_pid, self._plan.folder)
         self._processes = {
             u.name: _Process(u, RestartPolicy(self._spec.supervision),
                              Patience(2 * _CHECK_S / self._plan.rate))
             for u in self._layout.units.values()}
-        for node, incarnation in context.shared.get("known_incarnations", {}).items():
+        for node, incarnation in run.known_incarnations.items():
             process = self._process_of(node)
             if process is not None:
                 process.incarnation = process.highest = incarnation
-        adapted: fm.AdaptedSystem | None = context.shared.get("adapted")
-        self._version = (0, adapted.version if adapted else 0)
-        if adapted is not None:
-            self._machine.adapt(adapted)
+        self._version = (0, run.adapted.version if run.adapted else 0)
+        if run.adapted is not None:
+            self._machine.adapt(run.adapted)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
         self._loop = asyncio.get_running_loop()
         self._checked_s = self._loop.time()
@@ -200,7 +199,7 @@ class Supervisor(Relay):
             return
         self._version = version
         try:
-            layout, _ = adapted_system(self._layout, {}, message)
+            layout, _ = adapted_system(self._layout, self.context.run, message)
         except ValueError as error:
             self.report_diagnostic("adaptation", " ".join(str(error).split()), message.change)
             return

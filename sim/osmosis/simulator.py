@@ -21,11 +21,10 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.holders import Holders
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.formats import load_world
-from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
-from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.schedule import Schedule
 from rampart.sim.osmosis.sensors import LaserSpec
@@ -47,8 +46,6 @@ class Simulator(Actor):
     Parameters (all optional): `seed`; `obstacles`, number of presets that take part;
     `dead_man`, False switches it off; `dead_man_timeout_s`; `laser_range_m`; `laser_rays`;
     `upper_laser`, True for a robot with a second one.
-    Shared: `airport`; `world` (`rampart.actors.osmosis.airport.world.WorldTruth`), read from the
-        airport's file if absent.
     """
 
     outputs = (*_JOBS, ftm_topics.HOLDS)
@@ -56,7 +53,7 @@ class Simulator(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         parameters = self.parameters
-        self._airport: Airport = context.shared["airport"]
+        self._airport = Osmosis.of(context).airport
         self._laser = LaserSpec(
             rays=int(parameters.get("laser_rays", 181)),
             range_max_m=float(parameters.get("laser_range_m", 8.0)),
@@ -65,20 +62,17 @@ class Simulator(Actor):
         self._dead_man_s = timeout_s if parameters.get("dead_man", True) else None
         self._asked_s = self._skipped_s = 0.0
         self._real_time_factor = 1.0
-        system: SystemSpec | None = context.shared.get("system")
         self._brakes: Holders[bool] = Holders(
-            [recovery.name for recovery in system.recoveries] if system else None, True)
+            None if context.run.system is NO_SYSTEM
+            else [recovery.name for recovery in context.run.system.recoveries], True)
         self._holds_timer: Timer | None = None
 
     def on_start(self) -> None:
         """Build the world at the present time."""
         now_s = self.clock.now()
-        truth = self.context.shared.get("world")
-        if truth is None and self._airport.source:
-            truth = load_world(self._airport.source)
         self._world = World(
             self._airport,
-            truth,
+            Osmosis.of(self.context).world,
             seed=int(self.parameters.get("seed", 0)),
             obstacles=int(self.parameters.get("obstacles", 0)),
             dead_man_timeout_s=self._dead_man_s,

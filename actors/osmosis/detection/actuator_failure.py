@@ -10,7 +10,6 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.actuator_failure_monitor import ActuatorMonitor, MotionLimits
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import amount
-from rampart.manager.spec.schema import SystemSpec
 
 _FIRST_STATUS_S = 0.3
 """A respawned module waits this long for a first status of the base before it says idle."""
@@ -26,7 +25,7 @@ class ActuatorFailure(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system: SystemSpec = context.shared["system"]
+        system = context.run.system
         usual = MotionLimits()
         self.monitor = ActuatorMonitor(
             MotionLimits(

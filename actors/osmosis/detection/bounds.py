@@ -12,7 +12,6 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.bounds_check import BoundsCheck
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import amount
-from rampart.manager.spec.schema import SystemSpec
 
 _FIRST_COMMAND_S = 0.2
 """A respawned module waits this long for a first command, four periods, before it says idle."""
@@ -31,7 +30,7 @@ class Bounds(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system: SystemSpec = context.shared["system"]
+        system = context.run.system
         self._suspects = suspects_of(self.parameters)
         self.monitor = BoundsCheck(
             system.robot.top_speed_mps, system.robot.top_turn_rate_radps,

@@ -10,7 +10,6 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.pilot_output_monitor import PilotLimits, PilotOutputMonitor
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import amount
-from rampart.manager.spec.schema import SystemSpec
 
 
 class PilotOutput(DetectionModule):
@@ -28,7 +27,7 @@ class PilotOutput(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system: SystemSpec = context.shared["system"]
+        system = context.run.system
         usual = PilotLimits()
         limits = PilotLimits(
             # As the Safety Pilot has it: without its checks it goes on for ever.

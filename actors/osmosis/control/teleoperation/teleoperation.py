@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.teleoperation.joystick_device import JoystickDevice, mapping_of
 from rampart.actors.osmosis.control.teleoperation.stick_arbitration import (
     TIMEOUT_S,
@@ -52,16 +53,13 @@ class Teleoperation(Actor):
     `device`: path of a joystick or "auto" for the first one; "" for none. `forward_axis`,
     `left_axis`, `forward_sign`, `left_sign`, `dead_man_button`, `dead_zone`: see
     `joystick_device.StickMapping`.
-
-    Shared objects: "joystick" (device that has precedence over the parameter, or ""; None: devices
-    are not to be opened).
     """
 
     outputs = (topics.TELEOP_COMMAND,)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        robot = context.shared["system"].robot
+        robot = context.run.system.robot
         self._linear_mps = float(context.parameters.get("linear_mps", robot.top_speed_mps))
         self._angular_radps = float(
             context.parameters.get("angular_radps", robot.top_turn_rate_radps))
@@ -72,9 +70,8 @@ class Teleoperation(Actor):
 
     def on_start(self) -> None:
         """Open the joystick, if there is to be one."""
-        asked = self.context.shared.get("joystick", "")
-        name = asked or self.parameters.get("device", "")
-        if not name or asked is None:
+        name = Osmosis.of(self.context).joystick or self.parameters.get("device", "")
+        if not name or self.context.run.plan.virtual:
             return
         try:
             mapping = mapping_of(self.parameters)

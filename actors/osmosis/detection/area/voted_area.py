@@ -14,7 +14,7 @@ import math
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
 from rampart.actors.osmosis.detection.area.geofence import FenceLimits, Fix
 from rampart.actors.osmosis.detection.area.position_vote import GPS, PositionVote
@@ -92,8 +92,8 @@ class VotedArea(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system: SystemSpec = context.shared["system"]
-        airport: Airport = context.shared["airport"]
+        system = context.run.system
+        airport = Osmosis.of(context).airport
         robot = system.robot
         timeout_s = amount(self.parameters, "unknown_s", 5 * GPS_PERIOD_S)
         self._looked_s = -math.inf
