@@ -54,10 +54,10 @@ STILL_ROBOTIC = {
 
 STILL_TOO_LONG = {
     "actors.osmosis.messages",
-    "actors.runtime.actor", "actors.supervision.supervisor", "cli.analyse.campaigning", "cli.run",
+    "cli.analyse.campaigning", "cli.run",
     "sim.osmosis.report_record", "sim.osmosis.world"}
 
-STILL_CIRCULAR = {("actors.runtime.injection_desk", "actors.runtime.actor")}
+STILL_CIRCULAR: set[tuple[str, str]] = set()
 
 
 def modules() -> dict[str, Path]:
