@@ -53,9 +53,8 @@ STILL_ROBOTIC = {
     "sim.runs.process_run", "sim.runs.run_end", "sim.runs.virtual_run"}
 
 STILL_TOO_LONG = {
-    "actors.osmosis.messages",
-    "cli.analyse.campaigning", "cli.run",
-    "sim.osmosis.report_record", "sim.osmosis.world"}
+    "actors.osmosis.messages", "cli.analyse.campaigning", "cli.run", "sim.osmosis.report_record",
+    "sim.osmosis.world"}
 
 STILL_CIRCULAR: set[tuple[str, str]] = set()
 
