@@ -154,7 +154,7 @@ def test_it_runs_its_dead_nodes_come_back_and_what_is_triggered_is_recovered_fro
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    (["--system", "cell", "--mission", "A"], "--mission A: cell has no [robot] and drives nowhere"),
+    (["--system", "cell", "--mission", "A"], "--mission: no option of the launcher or of cell"),
     (["--system", "cell", "--duration", "-1"], "--duration -1: must be above 0"),
     (["--duration", "5"], "--duration 5: a mission ends by itself"),
     (["--shadow", "bold"], "--shadow bold: unknown strategy; known: safety-first"),

@@ -25,6 +25,7 @@ from rampart.actors.layout.layout import OBSERVER_CLASS, SUPERVISOR_CLASS, Layou
 from rampart.actors.layout.wiring import load_class
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.clock import Clock
@@ -350,6 +351,6 @@ def test_a_process_is_given_the_heartbeat_period_of_the_spec():
     timing = msgspec.structs.replace(spec.timing, heartbeat_period_s=0.123)
     layout = Layout(plan, msgspec.structs.replace(spec, timing=timing))
     loop = asyncio.new_event_loop()
-    node = make_actor(layout, "DM2", 1, {"system": layout.spec}, loop)
+    node = make_actor(layout, "DM2", 1, RunContext(plan, layout.spec), loop)
     loop.close()
     assert node.context.heartbeat_period_s == 0.123
