@@ -60,7 +60,7 @@ def build_parser() -> argparse.ArgumentParser:
     operator_verbs.add(verbs, formatter, common)
     mission_verb.add(verbs, formatter, common)
     joystick_verb.add(verbs, formatter, common)
-    live_verb.add(verbs, formatter, common)
+    live_verb.add(verbs, formatter)
     metrics_verb.add(verbs, formatter)
     adapt_verb.add(verbs, formatter, common)
     record_verbs.add(verbs, formatter, common)

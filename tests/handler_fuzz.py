@@ -36,7 +36,7 @@ from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.layout.layout import Layout, load_run
 from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.recording.views import Views
+from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor, Context
@@ -300,7 +300,7 @@ def fuzz_tools(seed: int) -> Finding | None:
     of = system("osmosis")
     stranger = Stranger(f"tools {seed}", of)
     picture = RunPicture()
-    views = Views(of.run.application.airport, (0.7, 0.6))
+    views = OsmosisViews(of.run.application, of.run.system)
     run = _Run()
     try:
         with _patience():

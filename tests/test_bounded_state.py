@@ -24,7 +24,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.recording.views import Views
+from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, on
 from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Shelf
@@ -169,7 +169,7 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
     of = system("osmosis")
     run = MissionRun(of.plan, of.run.application.airport, of.run.application.mission, strategy="x",
                      patience_s=60.0, console=Console(io.StringIO()))
-    picture, views = RunPicture(), Views()
+    picture, views = RunPicture(), OsmosisViews()
     clock = type("Clock", (), {"now": staticmethod(lambda: 0.0)})()
     for topic in all_topics():
         kind = inspect.type_info(topic.type)

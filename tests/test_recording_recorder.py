@@ -27,13 +27,16 @@ from stub_actors import ROOT, free_base_port
 
 from rampart.actors.bus import tap as taps
 from rampart.actors.bus.tap import Tap, frame, parse_frame
+from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.bag_writer import BagError
-from rampart.actors.recording.message_form import form_of, header_of
+from rampart.actors.recording.message_form import Forms, header_of
 from rampart.actors.recording.process import Order, RecorderProcess
 from rampart.actors.recording.recorder import FLUSH_S, PERIOD_S, Recorder
 from rampart.actors.run.run_info import RunInfo
 from rampart.cli.main import main
+
+form_of = Forms(topics.ALL).of
 
 
 def until(condition, what, timeout_s=15.0):

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from rampart.actors.osmosis.airport.model import Airport, Mission
     from rampart.actors.osmosis.airport.world import WorldTruth
 
+_AIRPORT = "airport"
+"""Folder of a recording with the airport's files."""
+
 _TELEOPERATION = "rampart.actors.osmosis.control.teleoperation.teleoperation:Teleoperation"
 
 
@@ -47,6 +50,8 @@ class Osmosis(Application):
             extra={"metavar": "DEVICE", "alone": "auto"})] = ""
 
     topics = topics.ROBOT
+    views = "rampart.actors.osmosis.recording.views:OsmosisViews"
+    lines = "rampart.cli.osmosis.lines:OsmosisLines"
     options: Options
 
     def __init__(self, options: Options) -> None:
@@ -81,6 +86,31 @@ class Osmosis(Application):
         found.airport, found.world = airport, world or WorldTruth()
         found.mission = mission or Mission("", ())
         return found
+
+    def documents(self) -> list[tuple[str, Path]]:
+        """Return the airport's files, and the mission's if it has one."""
+        from rampart.actors.osmosis.airport.formats import files_of  # noqa: PLC0415 as above
+
+        found = [(f"{_AIRPORT}/{path.name}", path) for path in files_of(Path(self.airport.source))]
+        mission = Path(self.options.mission)
+        if mission.suffix in (".miss", ".toml") and mission.is_file():
+            found.append((f"mission/{mission.name}", mission))
+        return found
+
+    @classmethod
+    def restored(cls, directory: Path) -> Application:
+        """Return the application on the airport of a recording, without a mission.
+
+        Raises:
+            OSError, ValueError: it has none, or it is unsound.
+        """
+        from rampart.actors.osmosis.airport.formats import load_airport  # noqa: PLC0415 as above
+
+        found = sorted((directory / _AIRPORT).glob("*.toml")) or sorted(
+            (directory / _AIRPORT).glob("*.graph"))
+        if not found:
+            raise ValueError("no airport in the recording")
+        return cls.on_map(load_airport(found[0]))
 
     def check(self, spec: SystemSpec, *, virtual: bool) -> str:
         """Refuse a joystick that nobody can drive with; one that is not plugged in is waited for.
