@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _AIRPORT = "airport"
 """Folder of a recording with the airport's files."""
 
-_TELEOPERATION = "rampart.actors.osmosis.control.teleoperation.teleoperation:Teleoperation"
+TELEOPERATION = "rampart.actors.osmosis.control.teleoperation.teleoperation:Teleoperation"
 
 
 class Osmosis(Application):
@@ -123,7 +123,7 @@ class Osmosis(Application):
             return ""
         if virtual:
             raise ValueError(f"--joystick {name}: not with --virtual, nobody can drive that fast")
-        if all(node.actor != _TELEOPERATION for node in spec.nodes):
+        if all(node.actor != TELEOPERATION for node in spec.nodes):
             raise ValueError(f"--joystick {name}: no node of {spec.name} reads it")
         device = Path(name)
         if device.is_file() or device.is_dir():

@@ -45,6 +45,7 @@ from rampart.cli import systems
 from rampart.cli.look import top_view
 from rampart.cli.look.metrics_families import families
 from rampart.cli.look.topic_verbs import in_line
+from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.runs.console import Console
@@ -299,7 +300,7 @@ def fuzz_tools(seed: int) -> Finding | None:
     """Tell what the tools show of a run whatever the types allow; return what went wrong."""
     of = system("osmosis")
     stranger = Stranger(f"tools {seed}", of)
-    picture = RunPicture()
+    picture = RunPicture(OsmosisLines())
     views = OsmosisViews(of.run.application, of.run.system)
     run = _Run()
     try:
@@ -309,7 +310,7 @@ def fuzz_tools(seed: int) -> Finding | None:
                 header = stranger.header(1.0, wild=0.6)
                 found, body = decode(topic, stranger.payload(topic, header))
                 now_s = stranger.dice.choice((0.0, 1.0, 1.0 + number, 1e12))
-                if topic in DECODED:
+                if topic in (*DECODED, *OsmosisLines.read):
                     picture.heard(topic, found, body, now_s)
                 picture.sample(now_s)
                 in_line(body)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 
 import pytest
 import websockets
@@ -12,6 +13,7 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.operator import operating as operating_module
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.page import stick as hmi_stick
@@ -20,6 +22,7 @@ from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.faults.offered_faults import offered_faults
 from tests.actors.operator.browser import CHROMIUM, browser
 from tests.actors.operator.world import World, eventually, free_port, hear, repeated, served
+from tests.virtual_loop import shipped_system
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 
@@ -292,12 +295,13 @@ async def test_the_second_operator_sees_who_drives(world):
     assert {s.forward for s in world.others.stick} == {0.25, 0.0, -0.5}
 
 
-async def test_a_node_is_signalled_from_its_row_after_a_second_press(world):
+async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, monkeypatch):
     sent = []
 
-    def signal_node(node: str, name: str) -> RunProcess:
+    def signal_node(node: str, name: str, _port: int) -> RunProcess:
         sent.append((node, name))
         return RunProcess(77, 7450, 1, (node,), 1)
+    monkeypatch.setattr(operating_module, "signal_node", signal_node)
 
     def table(state: fm.NodeState, restarts: int) -> None:
         world.others.publish(ftm_topics.NODES, fm.NodeTable(tuple(
@@ -306,7 +310,7 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world):
 
     row = "document.querySelector('tr[data-node=osmosis_control]')"
     async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), signal_node=signal_node) as hmi):
+                world.hmi(hmi_port=free_port(), launcher_pid=os.getpid()) as hmi):
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until(LIVE)
         async with repeated(lambda: table(fm.NodeState.RUNNING, 0)):
@@ -329,7 +333,8 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world):
 
 async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world):
     async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), faults=offered_faults()) as hmi):
+                world.hmi(hmi_port=free_port(), faults=offered_faults(),
+                          system=shipped_system()) as hmi):
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until("!document.getElementById('strategy-set').disabled")
         assert await tab.value("document.getElementById('strategy-name').value") == "safety-first"
