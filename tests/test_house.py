@@ -24,6 +24,7 @@ ROOMS = (
     "actors.supervision", "actors.recording", "actors.operator",
     "sim.virtual", "sim.faults", "sim.runs", "sim.campaign",
     "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.main", "cli.run",
+    "testing",
 )
 """The rooms of the engine, from the bottom to the top: each may import those before it."""
 
@@ -55,8 +56,9 @@ def modules() -> dict[str, Path]:
     """Return the files of the package by the name of their module, without `rampart.`."""
     files = [f for top in sorted((ROOT / "rampart").iterdir()) if top.is_dir()
              for f in sorted(top.resolve().rglob("*.py"))]
-    return {".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): f
-            for f in files if f.name != "__pycache__"}
+    names = {f: ".".join(f.relative_to(ROOT).with_suffix("").parts) for f in files}
+    return {name.removeprefix("rampart.").removesuffix(".__init__"): file
+            for file, name in names.items()}
 
 
 MODULES = modules()

@@ -32,8 +32,10 @@ from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleopera
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.manager.actor import DECISIONS_PER_LIFE, FtmManager
+from rampart.sim.virtual.virtual_loop import VirtualLoop
+from rampart.testing import run
 from tests.actors.osmosis.recovery.world import Base, Node, Pilot, Supervisor, hang
-from tests.virtual_loop import System, VirtualLoop, run, shipped_system
+from tests.osmosis_system import System, shipped_system
 
 CONTROL = ("mission_manager", "graph_planner", "osmosis_control")
 OTHERS = ("hmi", "teleoperation")

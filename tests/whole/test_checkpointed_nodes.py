@@ -36,9 +36,9 @@ from rampart.manager.arbitration.arbiter import (
 from rampart.manager.arbitration.arbiter_memory import Latch, Memory, objection, recall, remember
 from rampart.manager.arbitration.recovery_track import Command
 from rampart.manager.spec.specification import parse_specification
+from rampart.testing import RealRun
 from tests import ROOT
 from tests.actors.osmosis.control.world import World, drive
-from tests.real_run import RealRun
 from tests.whole.checkpoint_runs import (
     CONTROL,
     SHORT_LIGHTS,
@@ -391,7 +391,7 @@ def test_real_nodes_come_back_on_damaged_checkpoints_and_keep_new_ones(tmp_path)
     files = tmp_path / "report" / "checkpoints"
     nodes = {"mission_manager": nulls, "graph_planner": fifo, "osmosis_control": noise,
              "ftm_manager": nulls}
-    with RealRun(tmp_path, "--system", str(with_checkpoints(tmp_path)), "--mission",
+    with RealRun(tmp_path, "paper", "--system", str(with_checkpoints(tmp_path)), "--mission",
                  str(write_short_mission(tmp_path)), "--rate", "2") as run:
         for index, (node, damage) in enumerate(nodes.items()):
             run.sleep_until(10.0 + 5 * index)
@@ -413,7 +413,7 @@ def test_real_nodes_come_back_on_damaged_checkpoints_and_keep_new_ones(tmp_path)
 def test_real_control_nodes_are_killed_and_nothing_is_lost_or_doubled(tmp_path):
     dice = random.Random(os.getpid())
     moments = sorted(dice.uniform(2, 50) for _ in range(6))
-    with RealRun(tmp_path, "--system", str(with_checkpoints(tmp_path)), "--mission",
+    with RealRun(tmp_path, "paper", "--system", str(with_checkpoints(tmp_path)), "--mission",
                  str(write_short_mission(tmp_path)), "--rate", "2") as run:
         for index, moment in enumerate(moments):
             run.sleep_until(moment)

@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.adaptation import GIVE_UP_S, StrategyChoice
@@ -50,6 +51,7 @@ def test_a_fault_is_sent_until_its_publisher_reports_and_its_effect_is_told_once
     faults = injections()
     ordered = faults.order("localization-not-updated", 0.0, None, 5.0)
     (order,) = faults.due(5.0)
+    assert order.topic is bus_topics.INJECTION_REQUEST
     assert (order.message.topic, order.message.mode, order.message.duration_s) == (
         "localization/pose", "freeze", 10.0)
     assert faults.due(5.5) == [order]
@@ -108,7 +110,7 @@ def test_a_planned_fault_waits_for_its_time_and_can_be_withdrawn():
     with pytest.raises(FaultError, match=r"no fault .* is under way"):
         faults.end(withdrawn.injection, 7.0)
     (order,) = faults.due(25.0)
-    assert order.message.topic == "summit_xl/gps"
+    assert order.place == "summit_xl/gps"
     assert order.injection.startswith(ordered.injection)
 
 
@@ -151,6 +153,7 @@ def test_a_fault_of_the_base_counts_its_ticks():
     faults = injections()
     faults.order("stuck-wheel:rear-left", 0.0, 4.0, 0.0)
     (order,) = faults.due(0.0)
+    assert order.topic is topics.ACTUATOR_FAULT
     assert isinstance(order.message, m.ActuatorFault)
     assert (order.message.wheel, order.message.duration_s) == ("rear left", 4.0)
     told = faults.hear(report(order, 400, finished=True, node="simulator"))
@@ -214,7 +217,8 @@ def test_every_mode_that_is_offered_can_be_ordered_as_it_stands():
     faults = injections()
     for mode in faults.choice()["modes"]:
         (order,) = faults.order(f"{mode}:localization/pose", 0.0, None, 0.0).orders
-        assert (order.message.mode, order.message.delay_s > 0, order.message.stamp_s > AHEAD_S) == (
+        sent = order.message
+        assert (sent.mode, sent.delay_s > 0, sent.stamp_s > AHEAD_S) == (
             mode, mode == "delay", mode == "restamp")
 
 

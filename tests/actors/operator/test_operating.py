@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import os
 
 import httpx
 import pytest
@@ -15,14 +14,14 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.operator import operating as operating_module
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.supervision.kill_node import SignalError
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.faults.offered_faults import offered_faults
-from tests.actors.operator.world import eventually, free_port, hear, repeated, served
-from tests.virtual_loop import shipped_system
+from rampart.testing import eventually, free_port
+from tests.actors.operator.world import hear, repeated, served
+from tests.osmosis_system import shipped_system
 
 TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
@@ -219,9 +218,10 @@ async def test_a_signal_is_sent_to_a_node_and_to_the_hmi_itself_after_its_answer
             raise SignalError(f"unknown node {node!r}")
         sent.append((node, name))
         return RunProcess(77, 7450, 1, (node,), 1)
-    monkeypatch.setattr(operating_module, "signal_node", signal_node)
 
-    async with world.hmi(hmi_port=free_port(), launcher_pid=os.getpid()) as hmi:
+    monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
+
+    async with world.hmi(hmi_port=free_port(), launcher_pid=1) as hmi:
         async with open_page(await served(hmi)) as page:
             told = await ask(page, type="signal", node="localization", signal="KILL")
             assert told == {"type": "done", "text": "localization (pid 77): KILL"}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 
 import pytest
 import websockets
@@ -13,18 +12,18 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.operator import operating as operating_module
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.page import stick as hmi_stick
 from rampart.actors.osmosis.page.stick import Grip
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.faults.offered_faults import offered_faults
-from tests.actors.operator.browser import CHROMIUM, browser
-from tests.actors.operator.world import World, eventually, free_port, hear, repeated, served
-from tests.virtual_loop import shipped_system
+from rampart.testing import eventually, free_port
+from tests.actors.operator.browser import browser
+from tests.actors.operator.world import World, hear, repeated, served
+from tests.osmosis_system import shipped_system
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+pytestmark = pytest.mark.page
 
 TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
@@ -301,7 +300,8 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, monk
     def signal_node(node: str, name: str, _port: int) -> RunProcess:
         sent.append((node, name))
         return RunProcess(77, 7450, 1, (node,), 1)
-    monkeypatch.setattr(operating_module, "signal_node", signal_node)
+
+    monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
 
     def table(state: fm.NodeState, restarts: int) -> None:
         world.others.publish(ftm_topics.NODES, fm.NodeTable(tuple(
@@ -310,7 +310,7 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, monk
 
     row = "document.querySelector('tr[data-node=osmosis_control]')"
     async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), launcher_pid=os.getpid()) as hmi):
+                world.hmi(hmi_port=free_port(), launcher_pid=1) as hmi):
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until(LIVE)
         async with repeated(lambda: table(fm.NodeState.RUNNING, 0)):

@@ -38,10 +38,9 @@ from rampart.cli.output import UsageError
 from rampart.cli.record import replaying
 from rampart.cli.record.replaying import Replay
 from rampart.cli.session import connect
+from rampart.testing import HEEDS_SIGNALS, free_base_port
 from tests import ROOT as HERE
 from tests.actors.recording.samples import AnsweringLauncher, documents, pose, sample, write
-from tests.real_run import HEEDS_SIGNALS
-from tests.stub_actors import free_base_port
 
 form_of = Forms(topics.ALL).of
 

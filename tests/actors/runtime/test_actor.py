@@ -32,6 +32,7 @@ from rampart.actors.supervision.node_process import make_actor
 from rampart.cli import systems
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.systems import SHIPPED
+from rampart.testing import eventually
 
 
 class Talker(Actor):
@@ -98,13 +99,6 @@ async def running(cls: type[Actor], name: str, make_bus: MakeBus, incarnation: i
     finally:
         actor.stop()
         await asyncio.wait_for(asyncio.gather(task, return_exceptions=True), 5)
-
-
-async def eventually(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    deadline = asyncio.get_running_loop().time() + timeout_s
-    while not condition():
-        assert asyncio.get_running_loop().time() < deadline, "it did not happen in time"
-        await asyncio.sleep(0.005)
 
 
 async def test_a_message_arrives_with_its_header(make_bus):

@@ -15,6 +15,7 @@ from rampart.actors.supervision import supervisor
 from rampart.actors.supervision.restart_policy import RestartPolicy
 from rampart.sim.campaign.job import Job, run_virtually
 from rampart.sim.faults.scenario import parse_fault
+from rampart.testing import eventually, run
 from tests.actors.supervision.sick_actors import (
     ACTORS,
     SICK_S,
@@ -23,9 +24,8 @@ from tests.actors.supervision.sick_actors import (
     write_sick_stubs,
     write_sick_system,
 )
-from tests.actors.supervision.test_supervision import eventually, running
+from tests.actors.supervision.test_supervision import running
 from tests.actors.supervision.test_supervisor import running as played
-from tests.virtual_loop import run, until
 
 
 def lives(policy: RestartPolicy, until_s: float, lasts_s: float = 0.0) -> list[tuple[float, bool]]:
@@ -86,7 +86,7 @@ def test_a_process_that_fails_at_its_start_is_given_up_tried_again_and_comes_bac
             world.kill(name)
             await asyncio.sleep(0.02)
             world.respawn(name, 1)  # of RM3's node; once: the module may have been released since
-            await until(lambda: world.row(name)[0] == "given up", 20)
+            await eventually(lambda: world.row(name)[0] == "given up", 20)
             await asyncio.sleep(0.01)
             forks = len(world.machine.forks)
             assert forks == 8
@@ -100,13 +100,13 @@ def test_a_process_that_fails_at_its_start_is_given_up_tried_again_and_comes_bac
             assert 13 <= attempts <= 17  # 5 s, 2 s, and then one in four seconds
             assert world.row(name)[0] == "given up"
             well.append(True)
-            await until(lambda: world.row(name)[0] == "running", 10)
+            await eventually(lambda: world.row(name)[0] == "running", 10)
             assert len(world.machine.of(name)) == 1
             await asyncio.sleep(10)
             world.kill(name)  # it is like any other again
             await asyncio.sleep(0.02)
             world.respawn(name, world.row(name)[1])
-            await until(lambda: world.row(name)[0] == "running", 0.2)
+            await eventually(lambda: world.row(name)[0] == "running", 0.2)
 
     run(scenario)
 
@@ -120,10 +120,10 @@ def test_a_node_that_is_adapted_is_not_held_to_what_it_was_given_up_for(monkeypa
             for _ in range(20):
                 process.policy.restarted(asyncio.get_running_loop().time())
             world.kill("DM2")
-            await until(lambda: world.row("DM2")[0] == "given up")
+            await eventually(lambda: world.row("DM2")[0] == "given up")
             world.supervisor._anew(process)
             world.supervisor._respawn(process, "supervisor")
-            await until(lambda: world.row("DM2")[0] == "running", 0.3)
+            await eventually(lambda: world.row("DM2")[0] == "running", 0.3)
 
     run(scenario)
 

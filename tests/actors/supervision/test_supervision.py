@@ -11,8 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -36,6 +35,7 @@ from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.restart_policy import RestartPolicy
 from rampart.actors.supervision.spawner import address
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+from rampart.testing import eventually
 from tests import ROOT
 from tests.stub_actors import launched, stub_plan, write_stub_system
 
@@ -92,13 +92,6 @@ async def running(tmp_path, **changes) -> AsyncIterator[tuple[Launcher, Witness]
         finally:
             witness.stop()
             await task
-
-
-async def eventually(condition: Callable[[], bool], timeout_s: float = 10) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        await asyncio.sleep(0.01)
 
 
 def process(port: int, name: str) -> int | None:

@@ -20,8 +20,9 @@ from rampart.sim.runs.console import Console
 from rampart.sim.runs.mission_run import MissionRun
 from rampart.sim.runs.process_run import ProcessRun
 from rampart.sim.runs.watched_run import WatchedRun
+from rampart.testing import free_base_port
 from tests import ROOT
-from tests.stub_actors import Idler, free_base_port, launched, stub_plan, write_stub_system
+from tests.stub_actors import Idler, launched, stub_plan, write_stub_system
 
 
 class Stumbler(Idler):

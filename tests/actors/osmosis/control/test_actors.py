@@ -27,7 +27,7 @@ from rampart.manager.spec.specification import Layers, Robot, SystemSpec, Timing
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from tests.actors.osmosis.control.world import Circle, World
-from tests.virtual_loop import run_context
+from tests.osmosis_system import run_context
 
 AIRPORT = load_airport("vallombre")
 BROKEN = {"A03": 0.0, "A06": 0.35, "A10": 0.0}
@@ -40,7 +40,7 @@ def system(**layers: bool) -> SystemSpec:
         lateral_distance_m=0.3, sensing_range_m=5.0, gps_accuracy_m=0.05,
         corridor_clearance_m=1.5)
     timing = Timing(command_timeout_s=0.9, manager_timeout_s=0.9, scan_timeout_s=0.5)
-    return SystemSpec("test", "test", "vallombre", "AB", robot, timing=timing,
+    return SystemSpec("test", "test", mobile=robot, timing=timing,
                       layers=Layers(**layers))
 
 

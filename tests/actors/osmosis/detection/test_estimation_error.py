@@ -17,6 +17,7 @@ from rampart.actors.osmosis.detection.area.estimation_error import (
 from rampart.actors.osmosis.detection.area.geofence import Fix
 from rampart.actors.runtime.actor import Actor
 from rampart.sim.faults.faults import SENSOR_FAULTS
+from rampart.testing import Ear, run
 from tests.actors.osmosis.control.localization_drive import (
     LEGS,
     WRONG_STAMPS,
@@ -27,8 +28,7 @@ from tests.actors.osmosis.control.localization_drive import (
     fault,
     mis_stamped,
 )
-from tests.detection_timeline import Ear
-from tests.virtual_loop import System, run, shipped_system
+from tests.osmosis_system import System, shipped_system
 
 END_S = sum(leg[0] for leg in LEGS)
 FROM_S = 4.0

@@ -25,8 +25,9 @@ from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea
 from rampart.actors.osmosis.detection.bounds import Bounds
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Actor
-from tests.detection_timeline import Ear, Source, play, table
-from tests.virtual_loop import System, run, shipped_system
+from rampart.testing import Ear, play, run, table
+from tests.actors.osmosis.detection.sources import Source
+from tests.osmosis_system import System, shipped_system
 
 LIMITS = FenceLimits(half_diagonal_m=0.473, reaction_s=0.3, braking_mps2=2.0)
 ACCURACY_M = 0.05

@@ -16,10 +16,11 @@ from rampart.actors.osmosis.control.following.bridged_control import BridgedCont
 from rampart.actors.osmosis.control.following.dead_reckoning import AFTER_S, DeadReckoning
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.testing import run
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
 from tests.actors.osmosis.control.localization_drive import Reading, Truth, disturbed
 from tests.actors.osmosis.control.world import World
-from tests.virtual_loop import System, run, shipped_system
+from tests.osmosis_system import System, shipped_system
 
 PERIOD_S = 0.02
 

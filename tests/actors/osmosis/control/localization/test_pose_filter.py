@@ -17,6 +17,7 @@ from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
 from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits
 from rampart.sim.faults.faults import SENSOR_FAULTS
+from rampart.testing import table
 from tests.actors.osmosis.control.localization_drive import (
     LEGS,
     START_RAD,
@@ -28,7 +29,6 @@ from tests.actors.osmosis.control.localization_drive import (
     fault,
     mis_stamped,
 )
-from tests.detection_timeline import table
 
 END_S = sum(leg[0] for leg in LEGS)
 FOR_EVER = math.inf

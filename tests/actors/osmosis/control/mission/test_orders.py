@@ -14,11 +14,12 @@ from rampart.actors.osmosis.messages import MissionAction, MissionPhase, Mode, P
 from rampart.actors.osmosis.recovery.replan import Replan
 from rampart.actors.runtime.actor import Actor, on
 from rampart.sim.virtual.virtual_loop import VirtualLoop
+from rampart.testing import run
 from tests.actors.osmosis.control.mission_world import full_house
 from tests.actors.osmosis.control.test_actors import AIRPORT
 from tests.actors.osmosis.control.world import World
 from tests.actors.osmosis.recovery.world import Boss
-from tests.virtual_loop import System, run
+from tests.osmosis_system import System
 
 START = (AIRPORT.start.x_m, AIRPORT.start.y_m, AIRPORT.start.yaw_rad)
 DOWN = m.Goal(-29.5, -3.0, Mode.TAXI)
@@ -207,7 +208,7 @@ class Planner(Actor):
 
 def replanning(scenario, *, mission=True):
     async def scene():
-        async with System() as system:
+        async with System(airport=AIRPORT) as system:
             boss, planner = system.start("boss", Boss), system.start("planner", Planner)
             manager = system.start("mission_manager", MissionManager)
             system.start("RM6", Replan)
