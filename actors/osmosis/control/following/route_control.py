@@ -150,7 +150,7 @@ class RouteControl:
         """Take the goal, to check the route's end by; a route refused for it is looked at again.
 
         Returns:
-            Whether that one is followed now.
+            As `route`.
         """
         if order == self._goal:
             return False
@@ -161,7 +161,7 @@ class RouteControl:
         """Take a route; the follower finds its place on it by itself.
 
         Returns:
-            Whether it is another one than before, and followed now.
+            Whether it takes the place of the one before; a refused one may, and the robot stands.
         """
         previous = self._route
         if route == previous:
