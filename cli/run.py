@@ -41,8 +41,8 @@ from rampart.files import streams, working_folder
 from rampart.files.plain_text import one_line
 from rampart.manager.spec.specification import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
+from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
-from rampart.sim.faults.offered_faults import offered_faults
 from rampart.sim.faults.scenario import action_of, parse_fault
 from rampart.sim.osmosis.report import in_words, try_report
 from rampart.sim.osmosis.report_record import RunRecord
@@ -178,7 +178,7 @@ class Run:
             Layout(plan, spec)  # names file and path of an actor that cannot be had
             known = system_topics(spec)
         for i, planned in enumerate(self._scenario):
-            action_of(planned, f"f{i}", can_be_hit(spec), known)  # refused now, not in mid-run
+            action_of(planned, f"f{i}", can_be_hit(spec), known, faults_of(spec))  # not in mid-run
             if planned.goal > len(mission.goals):
                 raise UsageError(f"--fault {planned.text()}: mission {mission.name} has "
                                  f"{len(mission.goals)} goals")
@@ -399,8 +399,10 @@ def _plan(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPlan
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
         hmi_host=options.hmi_host, hmi_token=token,
         hmi_token_is_new=token_is_new,
-        faults=() if options.no_hmi else offered_faults(), waits=options.wait)
+        waits=options.wait)
     spec = load_system(plan)
+    if not options.no_hmi:
+        plan = msgspec.structs.replace(plan, faults=faults_of(spec).offered())
     return _fitting(options, plan, spec), spec
 
 

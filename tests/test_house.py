@@ -45,10 +45,8 @@ STILL_ROBOTIC = {
     "cli.operate.keyboard_stick", "cli.operate.mission_verb", "cli.operate.node_verbs",
     "cli.operate.operator_verbs", "cli.record.record_verbs", "cli.record.replaying", "cli.run",
     "cli.run_picture", "cli.state_words", "sim.campaign.distributions", "sim.campaign.job",
-    "sim.campaign.plan", "sim.campaign.report", "sim.campaign.wording", "sim.campaign.worst_runs",
-    "sim.faults.faults", "sim.faults.injector", "sim.faults.offered_faults", "sim.faults.scenario",
-    "sim.faults.topic_faults", "sim.runs.console", "sim.runs.mission_run", "sim.runs.observer",
-    "sim.runs.process_run", "sim.runs.run_end", "sim.runs.virtual_run"}
+    "sim.campaign.report", "sim.campaign.wording", "sim.campaign.worst_runs", "sim.runs.console",
+    "sim.runs.mission_run", "sim.runs.observer", "sim.runs.process_run", "sim.runs.run_end", "sim.runs.virtual_run"}
 
 STILL_TOO_LONG = {
     "actors.osmosis.control.localization.pose_filter", "actors.osmosis.messages",

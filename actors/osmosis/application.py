@@ -47,6 +47,7 @@ class Osmosis(Application):
             extra={"metavar": "DEVICE", "alone": "auto"})] = ""
 
     topics = topics.ROBOT
+    faults = "rampart.sim.osmosis.faults:OsmosisFaults"
     options: Options
 
     def __init__(self, options: Options) -> None:

@@ -34,6 +34,7 @@ class Application:
 
     Class attributes:
         topics: what its actors publish and hear besides the engine's topics.
+        faults: class path of its `Faults`; "" if it has none of its own.
 
     Attributes:
         options: what was chosen for this run.
@@ -46,6 +47,7 @@ class Application:
         """What a run can be told; fields are options of the command line, with their help."""
 
     topics: ClassVar[tuple[Topic[Any], ...]] = ()
+    faults: ClassVar[str] = ""
 
     def __init__(self, options: Any = None) -> None:
         self.options = options or self.Options()

@@ -46,6 +46,7 @@ from rampart.sim.campaign.report import Campaign, worth_showing, write_campaign_
 from rampart.sim.campaign.statistics import Rate, Row, Spread, as_json, table, total
 from rampart.sim.campaign.store import Run, Store, StoreError
 from rampart.sim.faults.disturbance import UnknownFaultError
+from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import PlannedFault, ScenarioError, action_of, parse_fault
 from rampart.sim.osmosis.report import in_words, write_report
@@ -66,7 +67,7 @@ def campaign(options: argparse.Namespace) -> int:
         return _replay(options)
     _check(options)
     if options.search is not None:
-        return hunt(options, _groups(options, spec), _base_jobs(options))
+        return hunt(options, _groups(options, spec), _base_jobs(options), faults_of(spec))
     name, jobs = _choose(options, spec)
     directory = _directory(options, name)
     try:
@@ -160,7 +161,8 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
         groups = _groups(options, spec)
         together = f"-{options.together}" if options.together > 1 else ""
         return f"sample{together}", sample(
-            jobs, groups, options.runs, seed=options.seed, together=options.together)
+            jobs, groups, options.runs, seed=options.seed, faults=faults_of(spec),
+            together=options.together)
     faults = list(_planned(options.fault, spec, _all_groups(spec)))
     return "faults", cross(jobs, faults, range(options.seed, options.seed + options.seeds))
 
@@ -187,7 +189,7 @@ def _all_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
 def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str, ...]]
              ) -> Iterable[PlannedFault | None]:
     every = [name for names in groups.values() for name in names]
-    nodes, known = can_be_hit(spec), systems.topics_of(spec)
+    nodes, known, faults = can_be_hit(spec), systems.topics_of(spec), faults_of(spec)
     for text in texts:
         if text == "none":
             yield None
@@ -196,7 +198,7 @@ def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str
             planned = parse_fault(text)
             found = fnmatch.filter(every, planned.fault)
             if not found:
-                action_of(planned, "f1", nodes, known)
+                action_of(planned, "f1", nodes, known, faults)
                 found = [planned.fault]
         except (ScenarioError, UnknownFaultError) as error:
             raise UsageError(f"--fault {text}: {error}") from None

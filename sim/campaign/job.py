@@ -24,6 +24,7 @@ from rampart.files.reading import read_text
 from rampart.manager.spec.adaptation import Action, Change, adapt
 from rampart.manager.spec.specification import check_document, read_document
 from rampart.sim.campaign.defaults import PATIENCE_S
+from rampart.sim.faults.faults import Faults, faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.report_record import RunRecord
@@ -229,6 +230,17 @@ def _document(system: str) -> tuple[str, dict[str, Any]]:
     """Return path and document of a system spec."""
     file = systems.find(system)
     return str(file), read_document(read_text(file, toml.MAX_SIZE), str(file))
+
+
+@lru_cache(maxsize=8)
+def faults_of_system(system: str) -> Faults:
+    """Return the faults of the robot of a system, given as in `Job`.
+
+    Raises:
+        ValueError: there is no such system, or it is unsound.
+    """
+    file, document = _document(system)
+    return faults_of(check_document(document, file))
 
 
 @lru_cache(maxsize=8)

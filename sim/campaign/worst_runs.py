@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from rampart.sim.campaign.grouping import KINDS, kind_of
+from rampart.sim.campaign.grouping import kind_of
 from rampart.sim.campaign.statistics import badness
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.wording import metres
@@ -59,7 +59,7 @@ def track(run: Run, record: RunRecord) -> dict[str, Any]:
                       _CLOSE_UP_M, _CLOSE_UP_M))
     return {
         "key": run.job.key, "fault": run.job.text(), "run": run,
-        "kind": KINDS[kind_of(run.job)], "marks": marks, "views": views,
+        "kind": kind_of(run.job), "marks": marks, "views": views,
         "line": points(record.track), "obstacles": record.obstacles, "goals": record.steps,
         "margin": metres(result.margin_m),
         "moments": sorted([*((at_s, kind, name) for kind, name, at_s, *_ in marks),

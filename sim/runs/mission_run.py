@@ -19,6 +19,7 @@ from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
 from rampart.sim.faults.scenario import FaultOutcome
+from rampart.sim.osmosis.injector import OsmosisInjector
 from rampart.sim.osmosis.judge import Judge, Verdict
 from rampart.sim.osmosis.report_record import RunRecord, RunRecorder, Safety
 from rampart.sim.runs.console import Console
@@ -41,6 +42,8 @@ class MissionRun:
         patience_s: Simulated seconds without progress after which it is over.
         console: For the story; None keeps quiet.
     """
+
+    injector = OsmosisInjector
 
     def __init__(self, plan: RunPlan, airport: Airport, mission: Mission, *, strategy: str,
                  patience_s: float, console: Console | None = None) -> None:

@@ -17,7 +17,8 @@ from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.unseen import watch
 from rampart.manager.spec.schema import SystemSpec
-from rampart.sim.faults.injector import INJECTOR, Injector, can_be_hit
+from rampart.sim.faults.faults import faults_of
+from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.process_hand import ProcessHand
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.osmosis.report_record import RunRecord
@@ -83,9 +84,10 @@ class ProcessRun:
         actors: list[Actor] = [Observer(Context(OBSERVER, 1, clock, bus, **of_the_run), sinks)]
         injector = None
         if self._scenario:
-            injector = Injector(
+            injector = mission.injector(
                 Context(INJECTOR, 1, clock, SharedBus(bus), **of_the_run), self._scenario,
-                ProcessHand(plan.base_port), can_be_hit(self._spec), system_topics(self._spec))
+                ProcessHand(plan.base_port), nodes=can_be_hit(self._spec),
+                known=system_topics(self._spec), faults=faults_of(self._spec))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         for task, actor in zip(tasks, actors, strict=True):

@@ -27,7 +27,8 @@ from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.manager.spec.schema import SystemSpec
-from rampart.sim.faults.injector import INJECTOR, Injector, can_be_hit
+from rampart.sim.faults.faults import faults_of
+from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.osmosis.judge import Verdict
 from rampart.sim.osmosis.report_record import RunRecord
@@ -184,10 +185,11 @@ class VirtualRun:
         actors: list[Actor] = [observer]
         injector = None
         if self._scenario:
-            injector = Injector(
+            injector = self.mission.injector(
                 Context(INJECTOR, 1, clock, VirtualBus(hub, INJECTOR), pid=1,
                         members=frozenset(self._layout.members)),
-                self._scenario, machine, self._nodes, system_topics(self._layout.spec))
+                self._scenario, machine, nodes=self._nodes, known=system_topics(self._layout.spec),
+                faults=faults_of(self._layout.spec))
             actors.append(injector)
         watching = [asyncio.create_task(actor.run()) for actor in actors]
         machine.start()

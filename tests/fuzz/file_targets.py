@@ -14,6 +14,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from PIL import Image
 
+from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.errors import AirportError
 from rampart.actors.osmosis.airport.formats import load_airport, load_mission
 from rampart.actors.osmosis.airport.mask import allowed_area
@@ -33,8 +34,9 @@ from rampart.manager.spec.schema import SpecificationError
 from rampart.manager.spec.specification import check_document, parse_specification, read_document
 from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.store import _NO_RUN, _run
-from rampart.sim.faults.faults import UnknownFaultError
+from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.scenario import ScenarioError, action_of, parse_fault
+from rampart.sim.osmosis.faults import OsmosisFaults
 from tests import ROOT
 from tests.actors.osmosis.airport.test_formats import GRAPH, SCALE, TOML
 from tests.actors.recording.samples import documents, pose
@@ -268,7 +270,7 @@ def open_psa(data: bytes) -> None:
 def fault(data: bytes) -> None:
     planned = parse_fault(data.decode(errors="replace"))
     planned.text()
-    action_of(planned, "f1", ("osmosis_control", "hmi"))
+    action_of(planned, "f1", ("osmosis_control", "hmi"), topics.ALL, OsmosisFaults())
 
 
 # -- recordings, results ---------------------------------------------------------------------------
