@@ -44,10 +44,10 @@ from rampart.manager.strategies.registry import STRATEGIES
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import action_of, parse_fault
-from rampart.sim.osmosis.report import in_words, try_report
-from rampart.sim.osmosis.report_record import RunRecord
+from rampart.sim.osmosis.trial.mission_trial import MissionRun, summary
+from rampart.sim.osmosis.trial.record import RunRecord
+from rampart.sim.osmosis.trial.report import in_words, try_report
 from rampart.sim.runs.console import Console
-from rampart.sim.runs.mission_run import MissionRun, summary
 from rampart.sim.runs.process_run import ProcessRun
 from rampart.sim.runs.virtual_run import LEAD_S, VirtualRun
 from rampart.sim.runs.watched_run import WatchedRun

@@ -47,7 +47,7 @@ class Osmosis(Application):
             extra={"metavar": "DEVICE", "alone": "auto"})] = ""
 
     topics = topics.ROBOT
-    faults = "rampart.sim.osmosis.faults:OsmosisFaults"
+    faults = "rampart.sim.osmosis.trial.faults:OsmosisFaults"
     options: Options
 
     def __init__(self, options: Options) -> None:

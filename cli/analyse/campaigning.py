@@ -32,15 +32,6 @@ from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
 from rampart.sim.campaign.execute import BackendError, JobError, execute
 from rampart.sim.campaign.job import Job, RunResult, run_virtually
-from rampart.sim.campaign.paper_tables import (
-    FULL_SYSTEM,
-    PAPER_SYSTEM,
-    Cell,
-    cells,
-    full_jobs,
-    paper_jobs,
-    table_iii,
-)
 from rampart.sim.campaign.plan import cross, fault_groups, sample
 from rampart.sim.campaign.report import Campaign, worth_showing, write_campaign_report
 from rampart.sim.campaign.statistics import Rate, Row, Spread, as_json, table, total
@@ -49,8 +40,17 @@ from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import PlannedFault, ScenarioError, action_of, parse_fault
-from rampart.sim.osmosis.report import in_words, write_report
-from rampart.sim.osmosis.report_record import RunRecord
+from rampart.sim.osmosis.trial.paper_tables import (
+    FULL_SYSTEM,
+    PAPER_SYSTEM,
+    Cell,
+    cells,
+    full_jobs,
+    paper_jobs,
+    table_iii,
+)
+from rampart.sim.osmosis.trial.record import RunRecord
+from rampart.sim.osmosis.trial.report import in_words, write_report
 from rampart.sim.virtual.network import NETWORKS
 
 

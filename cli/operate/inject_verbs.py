@@ -21,7 +21,7 @@ from rampart.cli.output import UsageError, print_json, print_table, say
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.topic_faults import modes_of, systematic_faults
-from rampart.sim.osmosis.faults import PAPER_FAULTS, SENSOR_FAULTS, OsmosisFaults
+from rampart.sim.osmosis.trial.faults import PAPER_FAULTS, SENSOR_FAULTS, OsmosisFaults
 
 _DEFAULT_DURATION_S = 5.0
 

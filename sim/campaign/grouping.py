@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import msgspec
 
 from rampart.sim.campaign.job import Job, faults_of_system
-from rampart.sim.campaign.paper_tables import AS_THE_PAPER
 from rampart.sim.campaign.store import Run
+from rampart.sim.osmosis.trial.paper_tables import AS_THE_PAPER
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from rampart.sim.campaign.defaults import PATIENCE_S
 from rampart.sim.faults.faults import Faults, faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
-from rampart.sim.osmosis.report_record import RunRecord
-from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.osmosis.trial.mission_trial import MissionRun
+from rampart.sim.osmosis.trial.record import RunRecord
 from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun
 from rampart.sim.virtual.network import find_network
 

@@ -17,17 +17,17 @@ from typing import Any
 from markupsafe import Markup
 
 from rampart.actors.osmosis.airport.drawing import AirportDrawing
-from rampart.sim.campaign import paper_tables
 from rampart.sim.campaign.distributions import distributions
 from rampart.sim.campaign.grouping import Condition, by_kind, conditions, in_common
-from rampart.sim.campaign.paper_tables import CONDITIONS, FAULTS, FULL, GOOD, Cell, Decided
 from rampart.sim.campaign.statistics import Row, Spread, rate, table, total
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.wording import NONE, count, interval, metres, percent, seconds
 from rampart.sim.campaign.worst_runs import track, worth_showing
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
-from rampart.sim.osmosis.report import environment, write_atomically
-from rampart.sim.osmosis.report_record import RunRecord
+from rampart.sim.osmosis.trial import paper_tables
+from rampart.sim.osmosis.trial.paper_tables import CONDITIONS, FAULTS, FULL, GOOD, Cell, Decided
+from rampart.sim.osmosis.trial.record import RunRecord
+from rampart.sim.osmosis.trial.report import environment, write_atomically
 
 __all__ = ["Campaign", "headline", "render", "worth_showing", "write_campaign_report"]
 

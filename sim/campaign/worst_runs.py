@@ -10,8 +10,8 @@ from rampart.sim.campaign.grouping import kind_of
 from rampart.sim.campaign.statistics import badness
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.wording import metres
-from rampart.sim.osmosis.report import points
-from rampart.sim.osmosis.report_record import RunRecord
+from rampart.sim.osmosis.trial.record import RunRecord
+from rampart.sim.osmosis.trial.report import points
 
 _DECISIONS = 8
 _CLOSE_UP_M = 9.0

@@ -32,8 +32,8 @@ from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.files.plain_text import LINE_CHARS, printable
 from rampart.manager.spec.schema import SystemSpec
-from rampart.sim.osmosis.report import headline
-from rampart.sim.osmosis.report_record import RunRecord
+from rampart.sim.osmosis.trial.record import RunRecord
+from rampart.sim.osmosis.trial.report import headline
 
 _EXAMPLE = "osmosis_control"
 """Of a node to kill; a system that has it not offers its first that a recovery brings back."""

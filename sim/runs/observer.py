@@ -15,7 +15,7 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import GroundTruth, MissionPhase, MissionStatus
 from rampart.actors.runtime.actor import BASE_INPUTS, Actor, Context, Header, on
-from rampart.sim.osmosis.judge import Judge, Sample
+from rampart.sim.osmosis.trial.judge import Judge, Sample
 
 Sink = Callable[[Topic[Any], Any, Header], None]
 

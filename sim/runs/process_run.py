@@ -21,8 +21,8 @@ from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.process_hand import ProcessHand
 from rampart.sim.faults.scenario import PlannedFault
-from rampart.sim.osmosis.report_record import RunRecord
-from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.osmosis.trial.mission_trial import MissionRun
+from rampart.sim.osmosis.trial.record import RunRecord
 from rampart.sim.runs.observer import Observer, Sink
 
 _LOOK_S = 0.05

@@ -30,9 +30,9 @@ from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
-from rampart.sim.osmosis.judge import Verdict
-from rampart.sim.osmosis.report_record import RunRecord
-from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.osmosis.trial.judge import Verdict
+from rampart.sim.osmosis.trial.mission_trial import MissionRun
+from rampart.sim.osmosis.trial.record import RunRecord
 from rampart.sim.runs.observer import Observer, Sink
 from rampart.sim.virtual.network import NETWORKS, NetworkModel, SeededNetwork
 from rampart.sim.virtual.virtual_bus import Hub, Tap, VirtualBus

@@ -22,7 +22,7 @@ from rampart.cli.main import build_parser, main
 from rampart.cli.operate.inject_verbs import choose
 from rampart.cli.output import UsageError
 from rampart.sim.campaign.job import _document
-from rampart.sim.osmosis.faults import SENSOR_FAULTS
+from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
 from tests.porter_actors import write_porter_system
 
 

@@ -36,7 +36,7 @@ from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.store import _NO_RUN, _run
 from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.scenario import ScenarioError, action_of, parse_fault
-from rampart.sim.osmosis.faults import OsmosisFaults
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests import ROOT
 from tests.actors.osmosis.airport.test_formats import GRAPH, SCALE, TOML
 from tests.actors.recording.samples import documents, pose

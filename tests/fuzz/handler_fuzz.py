@@ -47,8 +47,8 @@ from rampart.cli.look.metrics_families import families
 from rampart.cli.look.topic_verbs import in_line
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.manager.spec.specification import SystemSpec
+from rampart.sim.osmosis.trial.mission_trial import MissionRun
 from rampart.sim.runs.console import Console
-from rampart.sim.runs.mission_run import MissionRun
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
 from tests.fuzz.message_extremes import Drawer, all_topics

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from msgspec import inspect
 
-import rampart.sim.osmosis.report_record
+import rampart.sim.osmosis.trial.record
 import rampart.sim.runs.console
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
@@ -31,8 +31,8 @@ from rampart.actors.runtime.mailbox import Mailbox
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, Motor
 from rampart.sim.osmosis.scene import WorldError
+from rampart.sim.osmosis.trial.mission_trial import MissionRun
 from rampart.sim.runs.console import Console
-from rampart.sim.runs.mission_run import MissionRun
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
 from tests.fuzz.handler_fuzz import Machine, cases, system
@@ -162,8 +162,8 @@ def test_what_remembers_without_bound_is_found(monkeypatch):
 
 
 def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkeypatch):
-    monkeypatch.setattr(rampart.sim.osmosis.report_record, "KEPT", 500)
-    monkeypatch.setattr(rampart.sim.osmosis.report_record, "TRACK_KEPT", 500)
+    monkeypatch.setattr(rampart.sim.osmosis.trial.record, "KEPT", 500)
+    monkeypatch.setattr(rampart.sim.osmosis.trial.record, "TRACK_KEPT", 500)
     monkeypatch.setattr(rampart.sim.runs.console, "MANY", 500)
     monkeypatch.setattr(rampart.sim.runs.console, "MOST", 500)
     of = system("osmosis")

@@ -16,7 +16,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.checkpoint import Shelf
 from rampart.sim.faults.scenario import parse_fault
-from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.osmosis.trial.mission_trial import MissionRun
 from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun
 from rampart.sim.virtual.virtual_processes import VirtualMachine
 from tests import ROOT

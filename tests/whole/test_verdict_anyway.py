@@ -16,11 +16,11 @@ from pathlib import Path
 import jinja2
 import pytest
 
-import rampart.sim.osmosis.report
+import rampart.sim.osmosis.trial.report
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.recording.virtual import VirtualRecording
 from rampart.cli import run as launch
-from rampart.sim.osmosis.report import RunRecorder, try_report
+from rampart.sim.osmosis.trial.report import RunRecorder, try_report
 from tests import ROOT
 from tests.actors.recording.samples import pose
 from tests.real_run import HEEDS_SIGNALS, RealRun
@@ -177,7 +177,7 @@ def test_a_page_that_cannot_be_made_costs_neither_record_nor_verdict(
     def broken(_run):
         raise error
 
-    monkeypatch.setattr(rampart.sim.osmosis.report, "render", broken)
+    monkeypatch.setattr(rampart.sim.osmosis.trial.report, "render", broken)
     assert launch.main(unsafe(tmp_path)[2:]) == UNSAFE
     told = capsys.readouterr()
     result = result_of(told.out)

@@ -28,7 +28,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.cli import systems
 from rampart.sim.faults.topic_faults import modes_of
-from rampart.sim.osmosis.faults import OsmosisFaults
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests.porter_actors import write_porter_system
 
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])

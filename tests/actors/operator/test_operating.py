@@ -18,7 +18,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.supervision.kill_node import SignalError
 from rampart.actors.supervision.process_title import RunProcess
-from rampart.sim.osmosis.faults import OsmosisFaults
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests.actors.operator.world import eventually, free_port, hear, repeated, served
 
 TOKEN = "abcdefghijklmnop"

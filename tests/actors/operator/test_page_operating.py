@@ -17,7 +17,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.page import stick as hmi_stick
 from rampart.actors.osmosis.page.stick import Grip
 from rampart.actors.supervision.process_title import RunProcess
-from rampart.sim.osmosis.faults import OsmosisFaults
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests.actors.operator.browser import CHROMIUM, browser
 from tests.actors.operator.world import World, eventually, free_port, hear, repeated, served
 

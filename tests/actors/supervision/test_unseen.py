@@ -16,8 +16,8 @@ from rampart.actors.supervision.descriptors import needed_descriptors
 from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
+from rampart.sim.osmosis.trial.mission_trial import MissionRun
 from rampart.sim.runs.console import Console
-from rampart.sim.runs.mission_run import MissionRun
 from rampart.sim.runs.process_run import ProcessRun
 from rampart.sim.runs.watched_run import WatchedRun
 from tests import ROOT

@@ -26,7 +26,13 @@ from rampart.cli.main import main as rampart
 from rampart.sim.campaign import execute as execution
 from rampart.sim.campaign.execute import BackendError, JobError, execute
 from rampart.sim.campaign.job import Job, RunResult, run_job
-from rampart.sim.campaign.paper_tables import (
+from rampart.sim.campaign.plan import cross, fault_groups, sample
+from rampart.sim.campaign.search import Space, margin, search, shrink
+from rampart.sim.campaign.statistics import badness, rate, spread, table, total, worst
+from rampart.sim.campaign.store import Run, Store, StoreError
+from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
+from rampart.sim.osmosis.trial.paper_tables import (
     AS_THE_PAPER,
     CONDITIONS,
     FAULTS,
@@ -38,12 +44,6 @@ from rampart.sim.campaign.paper_tables import (
     paper_jobs,
     table_iii,
 )
-from rampart.sim.campaign.plan import cross, fault_groups, sample
-from rampart.sim.campaign.search import Space, margin, search, shrink
-from rampart.sim.campaign.statistics import badness, rate, spread, table, total, worst
-from rampart.sim.campaign.store import Run, Store, StoreError
-from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
-from rampart.sim.osmosis.faults import OsmosisFaults
 from rampart.systems import SHIPPED
 from tests import ROOT
 from tests.porter_actors import write_porter_system

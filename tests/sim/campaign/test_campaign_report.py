@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 
 from rampart.actors.osmosis.airport.drawing import draw
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.sim.campaign import charts, paper_tables
+from rampart.sim.campaign import charts
 from rampart.sim.campaign.grouping import by_kind, conditions, in_common, kind_of
 from rampart.sim.campaign.job import DecisionTaken, Job, RunResult
-from rampart.sim.campaign.paper_tables import Decided
 from rampart.sim.campaign.report import (
     Campaign,
     headline,
@@ -30,8 +29,10 @@ from rampart.sim.campaign.statistics import badness, rate
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.wording import interval, metres, percent, seconds
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
-from rampart.sim.osmosis.faults import OsmosisFaults
-from rampart.sim.osmosis.report_record import ObstacleSeen, RunRecord, StepResult
+from rampart.sim.osmosis.trial import paper_tables
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
+from rampart.sim.osmosis.trial.paper_tables import Decided
+from rampart.sim.osmosis.trial.record import ObstacleSeen, RunRecord, StepResult
 
 ABOUT = Campaign("A campaign", "rampart campaign --runs 3", 7)
 OUT = Path("out/my campaign")

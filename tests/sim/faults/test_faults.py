@@ -21,9 +21,9 @@ from rampart.cli.look.topic_catalogue import resolve, uses
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.topic_faults import DELAY_S, modes_of, systematic_faults
 from rampart.sim.faults.topic_faults import topic_fault as topic_fault_of
-from rampart.sim.osmosis.faults import PAPER_FAULTS, SENSOR_FAULTS, OsmosisFaults
-from rampart.sim.osmosis.sensor_faults import LEFT_OUT, SENSORS
 from rampart.sim.osmosis.sensors import Gps
+from rampart.sim.osmosis.trial.faults import PAPER_FAULTS, SENSOR_FAULTS, OsmosisFaults
+from rampart.sim.osmosis.trial.sensor_faults import LEFT_OUT, SENSORS
 from tests.porter_actors import AXLE, LOAD
 from tests.virtual_loop import shipped_system
 

@@ -16,7 +16,7 @@ from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import OnProcess, PlannedFault, ScenarioError, parse_fault
 from rampart.sim.faults.scenario import action_of as action_in
-from rampart.sim.osmosis.faults import OsmosisFaults, SuddenObstacle
+from rampart.sim.osmosis.trial.faults import OsmosisFaults, SuddenObstacle
 
 SYSTEM = systems.load(None)
 NODES = can_be_hit(SYSTEM)

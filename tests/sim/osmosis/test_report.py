@@ -17,7 +17,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.runtime.actor import Header
-from rampart.sim.osmosis.report import (
+from rampart.sim.osmosis.trial.report import (
     RunRecord,
     RunRecorder,
     clearance,

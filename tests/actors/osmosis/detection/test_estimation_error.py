@@ -16,7 +16,7 @@ from rampart.actors.osmosis.detection.area.estimation_error import (
 )
 from rampart.actors.osmosis.detection.area.geofence import Fix
 from rampart.actors.runtime.actor import Actor
-from rampart.sim.osmosis.faults import SENSOR_FAULTS
+from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
 from tests.actors.osmosis.control.localization_drive import (
     LEGS,
     WRONG_STAMPS,

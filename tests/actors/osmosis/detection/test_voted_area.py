@@ -16,7 +16,7 @@ from rampart.actors.osmosis.detection.area.geofence import Fix
 from rampart.actors.osmosis.detection.area.position_vote import GPS, WHEELS, PositionVote
 from rampart.actors.osmosis.detection.area.voted_area import VotedArea, VotedPosition
 from rampart.actors.runtime.actor import Actor
-from rampart.sim.osmosis.faults import SENSOR_FAULTS
+from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
 from tests.actors.osmosis.control.localization_drive import (
     LEGS,
     WRONG_STAMPS,

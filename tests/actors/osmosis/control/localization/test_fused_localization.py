@@ -15,8 +15,8 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.localization.fused_localization import FusedLocalization
 from rampart.actors.osmosis.control.localization.localization import Localization
 from rampart.actors.runtime.actor import Actor, Context, Header, on
-from rampart.sim.osmosis.faults import OsmosisFaults
 from rampart.sim.osmosis.simulator import Simulator
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests.actors.osmosis.control.localization_drive import field_airport
 from tests.virtual_loop import System, run, shipped_system
 

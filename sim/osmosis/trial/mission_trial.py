@@ -19,12 +19,12 @@ from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
 from rampart.sim.faults.scenario import FaultOutcome
-from rampart.sim.osmosis.injector import OsmosisInjector
-from rampart.sim.osmosis.judge import Judge, Verdict
-from rampart.sim.osmosis.report_record import RunRecord, RunRecorder, Safety
+from rampart.sim.osmosis.trial.injector import OsmosisInjector
+from rampart.sim.osmosis.trial.judge import Judge, Verdict
+from rampart.sim.osmosis.trial.record import RunRecord, RunRecorder, Safety
+from rampart.sim.osmosis.trial.run_end import RunEnd
 from rampart.sim.runs.console import Console
 from rampart.sim.runs.observer import JudgeSink, Sink
-from rampart.sim.runs.run_end import RunEnd
 
 LAUNCHER = "launch.py"
 

@@ -13,7 +13,7 @@ from rampart.sim.faults.disturbance import Disturbance, Fault
 from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.scenario import ScenarioError, number
 from rampart.sim.osmosis.robot import WHEEL_NAMES
-from rampart.sim.osmosis.sensor_faults import LEFT_OUT, sensor_faults
+from rampart.sim.osmosis.trial.sensor_faults import LEFT_OUT, sensor_faults
 
 OBSTACLE = "obstacle-ahead"
 

@@ -16,7 +16,7 @@ from rampart.actors.osmosis.messages import (
 )
 from rampart.actors.runtime.actor import Header, on
 from rampart.sim.faults.injector import Injector, PlannedAction
-from rampart.sim.osmosis.faults import SuddenObstacle
+from rampart.sim.osmosis.trial.faults import SuddenObstacle
 
 
 class OsmosisInjector(Injector):
