@@ -43,18 +43,15 @@ STILL_ROBOTIC = {
     "cli.look.top_view", "cli.look.topic_catalogue", "cli.look.topic_verbs",
     "cli.operate.inject_verbs", "cli.operate.injecting", "cli.operate.joystick_verb",
     "cli.operate.keyboard_stick", "cli.operate.mission_verb", "cli.operate.node_verbs",
-    "cli.operate.operator_verbs", "cli.record.record_verbs", "cli.record.replaying", "cli.run",
-    "cli.run_picture", "cli.state_words", "sim.campaign.distributions",
-    "sim.campaign.grouping", "sim.campaign.job", "sim.campaign.report", "sim.campaign.wording",
-    "sim.campaign.worst_runs", "sim.runs.console", "sim.runs.observer", "sim.runs.process_run",
-    "sim.runs.virtual_run"}
+    "cli.operate.operator_verbs", "cli.record.record_verbs", "cli.record.replaying",
+    "cli.run_picture", "cli.state_words", "sim.campaign.grouping", "sim.campaign.report",
+    "sim.campaign.worst_runs"}
 
 STILL_TOO_LONG = {
     "actors.osmosis.control.localization.pose_filter", "actors.osmosis.messages",
     "actors.runtime.actor", "actors.supervision.supervisor", "cli.analyse.campaigning",
     "cli.run", "manager.analysis.cut_sets", "manager.arbitration.arbiter",
-    "manager.spec.checks", "manager.spec.schema", "sim.osmosis.trial.record",
-    "sim.osmosis.world"}
+    "manager.spec.checks", "manager.spec.schema", "sim.osmosis.world"}
 
 STILL_CIRCULAR = {("actors.runtime.injection_desk", "actors.runtime.actor")}
 

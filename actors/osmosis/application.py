@@ -48,6 +48,8 @@ class Osmosis(Application):
 
     topics = topics.ROBOT
     faults = "rampart.sim.osmosis.trial.faults:OsmosisFaults"
+    observer = "rampart.sim.osmosis.trial.observer:OsmosisObserver"
+    trial = "rampart.sim.osmosis.trial.mission_trial:MissionTrial"
     options: Options
 
     def __init__(self, options: Options) -> None:

@@ -49,8 +49,9 @@ from rampart.sim.osmosis.trial.paper_tables import (
     paper_jobs,
     table_iii,
 )
-from rampart.sim.osmosis.trial.record import RunRecord
-from rampart.sim.osmosis.trial.report import in_words, write_report
+from rampart.sim.osmosis.trial.record import MissionRecord
+from rampart.sim.osmosis.trial.report import render
+from rampart.sim.runs.report import in_words, try_report
 from rampart.sim.virtual.network import NETWORKS
 
 
@@ -297,7 +298,9 @@ def _replay(options: argparse.Namespace) -> int:
     except ValueError as error:
         raise UsageError(f"--replay {options.replay}: {' '.join(str(error).split())}") from None
     same = again.trace == found.result.trace
-    html, data = write_report(again.record, directory / "replays")
+    html, data, problem = try_report(again.record, render, directory / "replays")
+    if problem:
+        raise UsageError(f"report: {problem}")
     if options.json:
         print_json({"run": found.job.key, "job": found.job, "same_trace": same,
                     "report": str(html), "record": str(data)})
@@ -424,11 +427,18 @@ def _list(spec: SystemSpec, *, as_json: bool) -> int:
 
 def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path,
                   runs: Sequence[Run]) -> Path:
-    worst: dict[str, RunRecord] = {
-        run.job.key: run_virtually(run.job).record for run in worth_showing(runs)}
+    worst: dict[str, MissionRecord] = {
+        run.job.key: _record_of(run) for run in worth_showing(runs)}
     title = "Fault-injection campaign"
     if options.paper:
         title = "The paper's rows on the full system" if options.full else "The paper's tables"
     about = Campaign(title=title, command=f"rampart {shlex.join(sys.argv[1:])}", seed=options.seed)
     decided = table_iii(spec) if options.paper and not options.full else ()
     return write_campaign_report(directory, about, runs, decided, worst)
+
+
+def _record_of(run: Run) -> MissionRecord:
+    found = run_virtually(run.job).record
+    if not isinstance(found, MissionRecord):
+        raise TypeError(f"{run.job.system}: no track to show")
+    return found

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rampart.sim.campaign import charts
+from rampart.sim.campaign.defaults import EXACT_BELOW_M
 from rampart.sim.campaign.grouping import by_kind
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.wording import count
-from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 
 
 def distributions(runs: Sequence[Run]) -> list[charts.Chart]:

@@ -16,7 +16,7 @@ import msgspec
 
 from rampart import systems
 from rampart.actors.layout.layout import load_application
-from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system, tailor
 from rampart.files import toml
@@ -27,8 +27,8 @@ from rampart.sim.campaign.defaults import PATIENCE_S
 from rampart.sim.faults.faults import Faults, faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
-from rampart.sim.osmosis.trial.mission_trial import MissionRun
-from rampart.sim.osmosis.trial.record import RunRecord
+from rampart.sim.runs.record import RunRecord
+from rampart.sim.runs.trial import trial_class
 from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun
 from rampart.sim.virtual.network import find_network
 
@@ -162,16 +162,13 @@ def run_job(job: Job) -> RunResult:
     """Run a job in virtual time and return what is kept of it."""
     begun_s = time.perf_counter()
     result, injected_s = run_virtually(job), None
-    record, verdict = result.record, result.verdict
+    record = result.record
     effective = [o.injected_s for o in record.faults if o.effective and o.injected_s is not None]
     if effective:
         injected_s = min(effective)
     return RunResult(
-        success=verdict.success, safe=bool(verdict.safe), reasons=record.reasons,
-        duration_s=round(record.duration_s, 2), collisions=record.collisions,
-        prohibited_s=round(record.prohibited_s, 3),
-        obstacle_m=_metres(verdict.closest_obstacle_m),
-        prohibited_m=_metres(verdict.closest_prohibited_m), unsafe_s=verdict.first_unsafe_s,
+        success=record.mission == "success", safe=record.safety == "safe", reasons=record.reasons,
+        duration_s=round(record.duration_s, 2), **result.figures,
         injected_s=injected_s, **latencies(record, injected_s),
         decisions=tuple(DecisionTaken(round(d.t_s, 3), d.active, d.recoveries)
                         for d in record.decisions),
@@ -196,11 +193,11 @@ def run_virtually(job: Job) -> VirtualResult:
         options=job.options)
     nodes, spec = can_be_hit(spec), tailor(plan, spec)
     application = _application(msgspec.json.encode(plan.options), file)
-    mission = MissionRun(plan, application.airport, application.mission, strategy=spec.strategy,
-                         patience_s=job.patience_s)
-    return VirtualRun(
-        plan, spec, mission, network=find_network(job.network), scenario=job.faults, nodes=nodes,
-        run=RunContext(plan, spec, document, application)).run()
+    trial = trial_class(spec)(RunContext(plan, spec, document, application), job.patience_s)
+    if not trial.judges:
+        raise ValueError(f"{file}: nobody judges its runs")
+    return VirtualRun(trial, network=find_network(job.network), scenario=job.faults,
+                      nodes=nodes).run()
 
 
 def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
@@ -219,10 +216,6 @@ def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
         "detected_after_s": round(after[0] - injected_s, 4) if after else None,
         "recovered_after_s": round(calm - injected_s, 3) if calm is not None else None,
         "false_alarms": sum(t < injected_s for t in detections)}
-
-
-def _metres(value: float) -> float | None:
-    return round(value, 4) if math.isfinite(value) else None
 
 
 @lru_cache(maxsize=8)
@@ -244,10 +237,7 @@ def faults_of_system(system: str) -> Faults:
 
 
 @lru_cache(maxsize=8)
-def _application(options: bytes, file: str) -> Osmosis:
+def _application(options: bytes, file: str) -> Application:
     """Load what actors have in common; the map of an airport is large, and read-only."""
     plan = RunPlan(system_file=file, options=msgspec.json.decode(options))
-    found = load_application(plan, load_system(plan))
-    if not isinstance(found, Osmosis):
-        raise ValueError(f"{file}: no system with an airport and a mission")
-    return found
+    return load_application(plan, load_system(plan))

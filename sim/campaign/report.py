@@ -17,17 +17,17 @@ from typing import Any
 from markupsafe import Markup
 
 from rampart.actors.osmosis.airport.drawing import AirportDrawing
+from rampart.sim.campaign.defaults import EXACT_BELOW_M
 from rampart.sim.campaign.distributions import distributions
 from rampart.sim.campaign.grouping import Condition, by_kind, conditions, in_common
 from rampart.sim.campaign.statistics import Row, Spread, rate, table, total
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.wording import NONE, count, interval, metres, percent, seconds
 from rampart.sim.campaign.worst_runs import track, worth_showing
-from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial import paper_tables
 from rampart.sim.osmosis.trial.paper_tables import CONDITIONS, FAULTS, FULL, GOOD, Cell, Decided
-from rampart.sim.osmosis.trial.record import RunRecord
-from rampart.sim.osmosis.trial.report import environment, write_atomically
+from rampart.sim.osmosis.trial.record import MissionRecord
+from rampart.sim.runs.report import environment, write_atomically
 
 __all__ = ["Campaign", "headline", "render", "worth_showing", "write_campaign_report"]
 
@@ -56,7 +56,7 @@ class Campaign:
 
 def write_campaign_report(directory: Path, about: Campaign, runs: Sequence[Run],
                           decided: Sequence[Decided] = (),
-                          worst_tracks: Mapping[str, RunRecord] = {}) -> Path:
+                          worst_tracks: Mapping[str, MissionRecord] = {}) -> Path:
     """Write `report.html` into the campaign's directory; it appears complete or not at all.
 
     Args:
@@ -79,7 +79,7 @@ def write_campaign_report(directory: Path, about: Campaign, runs: Sequence[Run],
 
 
 def render(directory: Path, about: Campaign, runs: Sequence[Run], decided: Sequence[Decided] = (),
-           worst_tracks: Mapping[str, RunRecord] = {}) -> str:
+           worst_tracks: Mapping[str, MissionRecord] = {}) -> str:
     """Return the HTML page; arguments as for `write_campaign_report`."""
     found = conditions(runs)
     cells = paper_tables.cells(runs) if are_the_papers(runs) else []

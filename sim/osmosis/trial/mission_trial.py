@@ -1,62 +1,54 @@
-"""What makes a run a mission: judge, end, record and console, whether it is real or virtual.
-
-Whoever runs the robot makes a `MissionRun`, gives its sinks to the observer, asks it now and then
-whether the run is over, and has it conclude.
-"""
+"""A run of Osmosis: a mission on an airport, judged by ground truth."""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from pathlib import Path
+from typing import Any, TextIO
 
 import msgspec
 
 from rampart.actors.bus.topic import Topic
-from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import ProcessEvent
-from rampart.actors.osmosis.airport.model import Airport, Mission
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.messages import ControlStatus, GroundTruth, MissionStatus
-from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
 from rampart.sim.faults.scenario import FaultOutcome
+from rampart.sim.osmosis.trial.console import MissionConsole
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
-from rampart.sim.osmosis.trial.judge import Judge, Verdict
-from rampart.sim.osmosis.trial.record import RunRecord, RunRecorder, Safety
+from rampart.sim.osmosis.trial.judge import Judge, JudgeSink
+from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
+from rampart.sim.osmosis.trial.report import render
 from rampart.sim.osmosis.trial.run_end import RunEnd
-from rampart.sim.runs.console import Console
-from rampart.sim.runs.observer import JudgeSink, Sink
+from rampart.sim.runs.observer import Sink
+from rampart.sim.runs.record import RunRecord, Safety
+from rampart.sim.runs.report import Written, try_report
+from rampart.sim.runs.trial import Trial
 
-LAUNCHER = "launch.py"
-
+_PATIENCE_S = 60.0
 _SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not known"}
 
 
-class MissionRun:
-    """One mission on one airport.
+class MissionTrial(Trial):
+    """One mission on one airport; it is over when nothing progresses for `limit_s`."""
 
-    Args:
-        plan: What is run.
-        airport: Where.
-        mission: What is to be done.
-        strategy: Of the manager, empty without FTMs.
-        patience_s: Simulated seconds without progress after which it is over.
-        console: For the story; None keeps quiet.
-    """
-
+    judges = True
     injector = OsmosisInjector
+    tells = MissionConsole
+    campaign = {"mission": ("A",), "obstacles": (0, 2)}
 
-    def __init__(self, plan: RunPlan, airport: Airport, mission: Mission, *, strategy: str,
-                 patience_s: float, console: Console | None = None) -> None:
-        self.plan = plan
-        self.airport = airport
-        self.mission = mission
-        self.judge = Judge(mission.goals)
-        self.console = console
-        self.strategy = strategy if plan.ftm else ""
-        self._end = RunEnd(patience_s, plan.waits)
-        self._recorder = RunRecorder(
-            plan.run_id, airport, mission, seed=plan.seed, rate=plan.rate, strategy=self.strategy)
-        self._brought_back = 0
+    def __init__(self, run: RunContext, limit_s: float | None = None,
+                 stream: TextIO | None = None) -> None:
+        super().__init__(run, limit_s, stream)
+        known = Osmosis.of_run(run)
+        self.name = known.mission.name
+        self.goals = len(known.mission.goals)
+        self.title = f"{self.name} on {known.airport.name}"
+        self.about = f"mission {self.name} ({self.goals} goals) on {known.airport.name}"
+        self.judge = Judge(known.mission.goals)
+        self._end = RunEnd(_PATIENCE_S if limit_s is None else limit_s, run.plan.waits)
+        self.recorder = MissionRecorder(run.plan, self.strategy, known.airport, known.mission)
 
     def sinks(self, clock: Clock) -> list[Sink]:
         """Return what wants to hear the run's messages."""
@@ -69,18 +61,7 @@ class MissionRun:
             elif isinstance(message, GroundTruth):
                 self._end.truth(message.twist, clock.now())
 
-        sinks: list[Sink] = [to_end, JudgeSink(self.judge), self._recorder.feed]
-        return [*sinks, self.console.take] if self.console else sinks
-
-    def brought_back(self, name: str, now_s: float) -> None:
-        """Note that the launcher has brought somebody back."""
-        self._brought_back += 1
-        if self.console:
-            self.console.line(now_s, f"{name} brought back")
-        self._recorder.feed(
-            topics.PROCESS_EVENT,
-            ProcessEvent(name, "respawned", 0, self._brought_back, LAUNCHER, ""),
-            Header(LAUNCHER, 1, self._brought_back, now_s))
+        return [to_end, JudgeSink(self.judge), *super().sinks(clock)]
 
     def excuse(self, stall_s: float) -> None:
         """Do not count simulated seconds in which the launcher heard nothing, being stopped."""
@@ -91,29 +72,40 @@ class MissionRun:
         return self._end.ended(now_s)
 
     def conclude(self, now_s: float, why: str, faults: tuple[FaultOutcome, ...] = ()
-                 ) -> RunRecord:
+                 ) -> MissionRecord:
         """Return the record of the run with the judge's verdict, and what became of faults."""
-        verdict = self.verdict()
-        reasons = () if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}")
-        record = self._recorder.record(
-            "success" if verdict.success else "fail", _SAFETY[verdict.safe],
-            reasons, now_s)
-        return msgspec.structs.replace(record, faults=faults)
+        verdict = self.judge.verdict()
+        found = self.recorder.record(
+            now_s, faults=faults, mission="success" if verdict.success else "fail",
+            safety=_SAFETY[verdict.safe],
+            reasons=() if verdict.success and verdict.safe else (
+                *verdict.reasons, f"ended: {why}"))
+        return _mission(found)
 
-    def verdict(self) -> Verdict:
-        """Return the judge's verdict on what was seen so far."""
-        return self.judge.verdict()
+    def summary(self, record: RunRecord) -> dict[str, Any]:
+        """Return what scripts rely on, the lights too."""
+        return {**super().summary(record),
+                "lights": [msgspec.to_builtins(light) for light in _mission(record).lights]}
+
+    def figures(self, record: RunRecord) -> dict[str, Any]:
+        """Return what ground truth shows: collisions, clearances, and when it became unsafe."""
+        verdict, found = self.judge.verdict(), _mission(record)
+        return {
+            "collisions": found.collisions, "prohibited_s": round(found.prohibited_s, 3),
+            "obstacle_m": _metres(verdict.closest_obstacle_m),
+            "prohibited_m": _metres(verdict.closest_prohibited_m),
+            "unsafe_s": verdict.first_unsafe_s}
+
+    def report(self, record: RunRecord, directory: Path) -> Written:
+        """Write as much of the inspection report as can be written."""
+        return try_report(record, render, directory)
 
 
-def summary(record: RunRecord, /, **more: str | None) -> dict[str, Any]:
-    """Return what scripts rely on: the last line of stdout with --json."""
-    return {
-        "mission": record.mission, "safety": record.safety, "reasons": list(record.reasons),
-        "duration_s": round(record.duration_s, 2),
-        "lights": [msgspec.to_builtins(light) for light in record.lights],
-        "decisions": [msgspec.to_builtins(decision) for decision in record.decisions],
-        "restarts": record.restarts,
-        "faults": [{**msgspec.to_builtins(fault), "effective": fault.effective}
-                   for fault in record.faults],
-        **more,
-    }
+def _mission(record: RunRecord) -> MissionRecord:
+    if not isinstance(record, MissionRecord):
+        raise TypeError(f"{type(record).__name__}: no record of a mission")
+    return record
+
+
+def _metres(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None

@@ -32,7 +32,7 @@ from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.trial import paper_tables
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.sim.osmosis.trial.paper_tables import Decided
-from rampart.sim.osmosis.trial.record import ObstacleSeen, RunRecord, StepResult
+from rampart.sim.osmosis.trial.record import MissionRecord, ObstacleSeen, StepResult
 
 ABOUT = Campaign("A campaign", "rampart campaign --runs 3", 7)
 OUT = Path("out/my campaign")
@@ -54,7 +54,7 @@ def run(fault: str = "gps-bias", *, row: str = "", affected: int = 1, ftm: bool 
     return Run(job, RunResult(**fields))
 
 
-def record_of(made: Run, **more) -> RunRecord:
+def record_of(made: Run, **more) -> MissionRecord:
     fields = {
         "run_id": made.job.key, "airport": DRAWING, "mission_name": "A", "mission": "success",
         "safety": "safe", "reasons": (), "duration_s": 90.0, "distance_m": 9.0,
@@ -64,7 +64,7 @@ def record_of(made: Run, **more) -> RunRecord:
         "decisions": (), "restarts": {}, "collisions": 0, "prohibited_s": 0.0,
         "obstacle_clearance_m": None, "prohibited_clearance_m": 0.8, "strategy": "", "seed": 1,
         "rate": 1.0} | more
-    return RunRecord(**fields)
+    return MissionRecord(**fields)
 
 
 class Tables(HTMLParser):
