@@ -19,8 +19,7 @@ from rampart.actors.operator.bounds import MAX_NAME, SHOWN, Bounds, clip
 from rampart.actors.operator.picture import Picture
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.page.laser import thin
-from rampart.manager.model.words import decision_in_words
-from rampart.manager.strategies.registry import STRATEGIES
+from rampart.manager.strategies.decision_words import decision_in_words
 
 TRACK_STEP_M = 0.25
 """A track point is kept when the robot has moved this far."""
@@ -150,8 +149,6 @@ class HmiState:
 
     def decision(self, record: fm.DecisionRecord, now_s: float) -> None:
         """Add a decision of the manager to the decision log."""
-        strategy = STRATEGIES.get(record.strategy)
-        rules = strategy.rules if strategy else {}
         self.picture.add("decisions", {
             "t": round(now_s, 2),
             "number": record.decision,
@@ -160,8 +157,7 @@ class HmiState:
             "strategy": record.strategy,
             "recoveries": record.recoveries,
             "words": decision_in_words(
-                record.active, record.rule, record.recoveries, record.strategy,
-                rules.get(record.rule, "")),
+                record.active, record.rule, record.recoveries, record.strategy),
             "rule": f"{record.rule} of {record.strategy}",
             "path": record.path,
             "rejected": [f"{name}: {why}" for name, why in record.rejected],

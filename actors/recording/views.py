@@ -27,7 +27,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording import scene
-from rampart.manager.model.words import decision_in_words
+from rampart.manager.strategies.decision_words import decision_in_words
 
 View = tuple[str, fg.Record]
 """Channel and what is to be seen on it."""

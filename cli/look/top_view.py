@@ -21,7 +21,7 @@ from rampart.actors.osmosis import topics
 from rampart.cli.run_picture import RunPicture
 from rampart.cli.state_words import manager_in_words, mission_in_words, pilot_in_words
 from rampart.files.plain_text import printable
-from rampart.manager.model.words import decision_in_words
+from rampart.manager.strategies.decision_words import decision_in_words
 
 _LABEL = 10
 _PROCESS_WIDTH = 57

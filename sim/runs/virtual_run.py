@@ -130,7 +130,7 @@ class VirtualRun:
         # Nothing that differs from run to run may get into a message.
         self.plan = msgspec.structs.replace(
             trial.run.plan, run_id=f"virtual-{trial.run.plan.seed}", rate=1.0, hmi_port=0,
-            launcher_pid=1)
+            launcher_pid=1, virtual=True)
         self.trial = trial
         self.interrupted: str | None = None
         self._context = replace(trial.run, plan=self.plan)

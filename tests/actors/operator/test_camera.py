@@ -21,8 +21,9 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, Building, StartPose, Surface
 from rampart.sim.osmosis.camera import MARGIN_M, MAX_PIXELS, View, ground_image
-from tests.actors.operator.browser import CHROMIUM, browser
-from tests.actors.operator.world import AIRPORT, World, free_port, served
+from rampart.testing import free_port
+from tests.actors.operator.browser import browser
+from tests.actors.operator.world import AIRPORT, World, served
 
 ECHO = """
 import struct, sys
@@ -197,7 +198,7 @@ async def test_a_pose_and_an_obstacle_that_are_no_numbers_end_no_renderer(monkey
     assert hmi._camera._process is renderer_before
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.page
 async def test_the_renderer_starts_when_somebody_looks_and_the_page_says_what_is_wrong_with_it():
     world = World()
     async with (world.running(world.others), browser() as tab,

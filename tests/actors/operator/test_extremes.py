@@ -24,11 +24,12 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Light, Mission
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
 from rampart.actors.osmosis.page.map import MAX_GRAPH, MAX_PATHS_BYTES, page_map
-from tests.actors.operator.browser import CHROMIUM, browser
+from rampart.testing import eventually, free_port
+from tests.actors.operator.browser import browser
 from tests.actors.operator.extremes import DOCUMENTS, LONG, MARKUP, messages
 from tests.actors.operator.page import LIVE, SPEC
 from tests.actors.operator.test_operating import open_page
-from tests.actors.operator.world import AIRPORT, eventually, free_port, hear, served
+from tests.actors.operator.world import AIRPORT, hear, served
 
 FRAME_BYTES = 512_000
 HANDLED = [(kind, topic, method) for kind in (Hmi, Teleoperation)
@@ -57,7 +58,7 @@ async def test_a_handler_of_the_operators_nodes_survives_every_extreme(world, ki
             actor._state.grow_old(1e9)
             assert len(actor._server._feed.frame(0)) < FRAME_BYTES
         await asyncio.sleep(0.05)
-        assert not actor._ended.done()
+        assert not actor._dispatcher._ended.done()
     diagnosed = {d.context for d in world.others.diagnostics}
     assert "handler failed" not in diagnosed
 
@@ -119,7 +120,7 @@ async def test_with_3000_lights_a_frame_is_bounded_and_a_light_costs_what_a_ligh
             assert len(text) < 1000
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.page
 async def test_the_page_draws_so_many_lights_and_says_how_many_it_leaves_out(world):
     lights = "document.querySelectorAll('#map .light')"
     async with browser() as tab:
@@ -307,7 +308,7 @@ def test_random_bytes_in_an_open_websocket_raise_nothing(chunks):
 # ---- text is text -----------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.page
 async def test_markup_in_every_text_of_the_bus_and_of_the_airport_is_inert(world):
     airport = dataclasses.replace(
         AIRPORT, name=MARKUP, nodes={f"{MARKUP}{n}"[:90]: at for n, at in AIRPORT.nodes.items()},

@@ -18,16 +18,9 @@ from rampart.actors.operator.requests import OrderWish
 from rampart.actors.operator.server import MAX_MESSAGE_BYTES, Visitor
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from tests.actors.operator.browser import CHROMIUM, browser
-from tests.actors.operator.world import (
-    AIRPORT,
-    RATE,
-    eventually,
-    free_port,
-    hear,
-    repeated,
-    served,
-)
+from rampart.testing import eventually, free_port
+from tests.actors.operator.browser import browser
+from tests.actors.operator.world import AIRPORT, RATE, hear, repeated, served
 
 
 async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world):
@@ -233,7 +226,7 @@ async def test_a_successor_takes_the_page_over_at_once(world):
     await page.close()
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.page
 async def test_chromium_shows_the_system_resets_the_stop_and_reconnects_by_itself(world):
     port = free_port()
     async with browser() as tab:
@@ -263,7 +256,7 @@ async def press(tab, key: str) -> None:
                        windowsVirtualKeyCode=13, text="\r" if kind == "char" else "")
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.page
 async def test_in_chromium_the_orders_that_make_sense_are_buttons_for_mouse_and_keyboard(world):
     p, a = m.MissionPhase, m.MissionAction
     async with world.hmi(hmi_port=free_port()) as hmi, browser() as tab:

@@ -18,10 +18,12 @@ from rampart.actors.osmosis.page import stick as hmi_stick
 from rampart.actors.osmosis.page.stick import Grip
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
-from tests.actors.operator.browser import CHROMIUM, browser
-from tests.actors.operator.world import World, eventually, free_port, hear, repeated, served
+from rampart.testing import eventually, free_port
+from tests.actors.operator.browser import browser
+from tests.actors.operator.world import World, hear, repeated, served
+from tests.osmosis_system import shipped_system
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+pytestmark = pytest.mark.page
 
 TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
@@ -292,12 +294,14 @@ async def test_the_second_operator_sees_who_drives(world):
     assert {s.forward for s in world.others.stick} == {0.25, 0.0, -0.5}
 
 
-async def test_a_node_is_signalled_from_its_row_after_a_second_press(world):
+async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, monkeypatch):
     sent = []
 
-    def signal_node(node: str, name: str) -> RunProcess:
+    def signal_node(node: str, name: str, _port: int) -> RunProcess:
         sent.append((node, name))
         return RunProcess(77, 7450, 1, (node,), 1)
+
+    monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
 
     def table(state: fm.NodeState, restarts: int) -> None:
         world.others.publish(ftm_topics.NODES, fm.NodeTable(tuple(
@@ -306,7 +310,7 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world):
 
     row = "document.querySelector('tr[data-node=osmosis_control]')"
     async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), signal_node=signal_node) as hmi):
+                world.hmi(hmi_port=free_port(), launcher_pid=1) as hmi):
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until(LIVE)
         async with repeated(lambda: table(fm.NodeState.RUNNING, 0)):
@@ -329,7 +333,8 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world):
 
 async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world):
     async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), faults=OsmosisFaults().offered()) as hmi):
+                world.hmi(hmi_port=free_port(), faults=OsmosisFaults().offered(),
+                          system=shipped_system()) as hmi):
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until("!document.getElementById('strategy-set').disabled")
         assert await tab.value("document.getElementById('strategy-name').value") == "safety-first"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 from contextlib import asynccontextmanager
 
 from rampart.actors.bus import messages as bm
@@ -18,7 +17,8 @@ from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from tests.virtual_loop import run_context
+from rampart.testing import eventually
+from tests.osmosis_system import run_context
 
 AIRPORT = load_airport("vallombre")
 RATE = 20.0
@@ -117,19 +117,6 @@ class World:
     def say_latched(self, *names: str) -> None:
         self.others.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus(
             (), (), names, names, "safety-first", 1))
-
-
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
-
-
-async def eventually(condition, timeout_s: float = 5.0) -> None:
-    deadline = asyncio.get_running_loop().time() + timeout_s
-    while not condition():
-        assert asyncio.get_running_loop().time() < deadline, "it did not happen in time"
-        await asyncio.sleep(0.005)
 
 
 @asynccontextmanager

@@ -14,14 +14,15 @@ from rampart.actors.layout.layout import load_run
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import load_system
-from rampart.actors.supervision.descriptors import needed_descriptors
+from rampart.actors.supervision.launcher import needed_descriptors
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.process_run import ProcessRun
 from rampart.sim.runs.trial import Trial
+from rampart.testing import free_base_port
 from tests import ROOT
-from tests.stub_actors import Idler, free_base_port, launched, stub_plan, write_stub_system
+from tests.stub_actors import Idler, launched, stub_plan, write_stub_system
 
 
 class Stumbler(Idler):

@@ -14,6 +14,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.control.mission import mission_state
 from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
 from rampart.actors.osmosis.control.mission.mission_state import MissionState, obey, status
@@ -24,6 +25,7 @@ from rampart.actors.runtime.clock import Clock
 from rampart.cli import systems
 from rampart.cli.main import main
 from tests.cli.test_verbs_live import RATE, Run
+from tests.osmosis_system import run_context
 
 GOALS = (m.Goal(1.0, 2.0, m.Mode.TAXI), m.Goal(3.0, 4.0, m.Mode.TAXI))
 REQUEST = m.MissionRequest("r1/first", "AB", GOALS)
@@ -47,7 +49,8 @@ async def run(monkeypatch, sockets):
     for name, cls in (("mission_manager", MissionManager), ("planner", Planner)):
         bus = ZenohBus(name, 1, endpoint(sockets, name),
                        [endpoint(sockets, n) for n in names if n != name])
-        node = cls(Context(name, 1, clock, bus, {"held_by": ["RM2"]}))
+        node = cls(Context(name, 1, clock, bus, {"held_by": ["RM2"]},
+                           run_context(airport=load_airport("vallombre"))))
         tasks.append(asyncio.create_task(node.run()))
         nodes.append((node, bus))
     await asyncio.sleep(0.1)

@@ -16,9 +16,10 @@ from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context
 from rampart.manager.spec.parameters import NEEDS, TAKES, find_wrong
 from rampart.sim.virtual.virtual_bus import VirtualBus
-from tests.virtual_loop import System, run, run_context, shipped_system
+from rampart.testing import run
+from tests.osmosis_system import System, run_context, shipped_system
 
-BASES = {"Freshness", "HoldingRecovery", "PilotRecovery"}
+BASES = {"Freshness", "PilotRecovery"}
 NODES = ("osmosis_control", "standby_control", "safety_pilot")
 STARTABLE = {"watch": ["osmosis_control"], "nodes": ["osmosis_control"]}
 FOR_THE_ANALYSES = {"rampart.actors.detection.stub:StubDetection":

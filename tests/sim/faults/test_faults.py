@@ -24,8 +24,8 @@ from rampart.sim.faults.topic_faults import topic_fault as topic_fault_of
 from rampart.sim.osmosis.sensors import Gps
 from rampart.sim.osmosis.trial.faults import PAPER_FAULTS, SENSOR_FAULTS, OsmosisFaults
 from rampart.sim.osmosis.trial.sensor_faults import LEFT_OUT, SENSORS
+from tests.osmosis_system import shipped_system
 from tests.porter_actors import AXLE, LOAD
-from tests.virtual_loop import shipped_system
 
 KEYS = published_keys(shipped_system())
 CATALOGUE = OsmosisFaults.named

@@ -53,9 +53,6 @@ class Teleoperation(Actor):
     `device`: path of a joystick or "auto" for the first one; "" for none. `forward_axis`,
     `left_axis`, `forward_sign`, `left_sign`, `dead_man_button`, `dead_zone`: see
     `joystick_device.StickMapping`.
-
-    Shared objects: "joystick" (device that has precedence over the parameter, or ""; None: devices
-    are not to be opened).
     """
 
     outputs = (topics.TELEOP_COMMAND,)
@@ -73,9 +70,8 @@ class Teleoperation(Actor):
 
     def on_start(self) -> None:
         """Open the joystick, if there is to be one."""
-        asked = Osmosis.of(self.context).joystick
-        name = asked or self.parameters.get("device", "")
-        if not name or asked is None:
+        name = Osmosis.of(self.context).joystick or self.parameters.get("device", "")
+        if not name or self.context.run.plan.virtual:
             return
         try:
             mapping = mapping_of(self.parameters)
