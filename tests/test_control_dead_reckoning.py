@@ -239,7 +239,7 @@ def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
 
 def test_the_papers_control_does_not_make_the_base_publish_odometry():
     key = topics.ODOMETRY.key
-    assert key not in heard(Member("osmosis_control", OsmosisControl, {}))
-    assert key in heard(Member("osmosis_control", BridgedControl, {}))
-    assert key in heard(Member("standby", BridgedStandby, {}))
+    assert key not in heard(Member("osmosis_control", OsmosisControl, OsmosisControl.Parameters()))
+    assert key in heard(Member("osmosis_control", BridgedControl, BridgedControl.Parameters()))
+    assert key in heard(Member("standby", BridgedStandby, BridgedStandby.Parameters()))
     assert BridgedStandby.outputs == (topics.STANDBY_COMMAND,)

@@ -24,7 +24,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DetectionReport, DetectionState
 from rampart.actors.runtime.actor import Actor, Context, every
-from rampart.actors.runtime.parameters import amount
+from rampart.manager.spec.schema import NonNegative
 
 TRANSITIONS = {
     DetectionState.IDLE: frozenset({DetectionState.ACTIVE}),
@@ -78,6 +78,17 @@ class Monitor(Protocol):
         """Draw the conclusions from the time that has passed without an event."""
 
 
+class Waiting(Actor.Parameters, frozen=True):
+    """Parameters of a module that waits for its first input.
+
+    Attributes:
+        startup_grace_s: how long that may take while the system starts; None: the spec's. A
+            respawned module joins a running system: for it the timeout itself is the grace.
+    """
+
+    startup_grace_s: NonNegative | None = None
+
+
 class DetectionModule(Actor):
     """Base of DM1 to DM7.
 
@@ -106,7 +117,8 @@ class DetectionModule(Actor):
             return timeout_s
         system = self.context.shared.get("system")
         startup_s = DEFAULT_GRACE_S if system is None else system.timing.startup_grace_s
-        return max(timeout_s, amount(self.parameters, "startup_grace_s", startup_s))
+        said_s = getattr(self.parameters, "startup_grace_s", None)
+        return max(timeout_s, startup_s if said_s is None else said_s)
 
     # -- the state machine ----------------------------------------------------------------------
 

@@ -59,20 +59,28 @@ class Hmi(Actor):
 
     Shared objects: "run_id" (text, required for a mission), "mission" (the mission the run starts
     with, or None), "waits" (True: that mission alone, and not before the operator wants it),
-    "airport" (for the map and its missions), "hmi_port" (0 or None: no page; the parameter `port`
-    has precedence), "hmi_host" and "hmi_token" (see `PageServer`), and those of
-    `Operating`.
-    Parameters: `camera`, the module that renders the picture of the robot
-        (`rampart.sim.osmosis.camera`), if any.
+    "airport" (for the map and its missions), "hmi_port" (0 or None: no page), "hmi_host" and
+    "hmi_token" (see `PageServer`), and those of `Operating`.
     """
 
+    class Parameters(Actor.Parameters, frozen=True):
+        """What it serves.
+
+        Attributes:
+            camera: module that renders the picture of the robot (`rampart.sim.osmosis.camera`);
+                "" for none.
+        """
+
+        camera: str = ""
+
+    parameters: Parameters
     outputs = (topics.MISSION_REQUEST, topics.MISSION_ORDER, ftm_topics.RESET, *OUTPUTS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         shared = context.shared
         self._airport: Airport | None = shared.get("airport")
-        self._port: int = self.parameters.get("port", shared.get("hmi_port")) or 0
+        self._port: int = shared.get("hmi_port") or 0
         mission: Mission | None = shared.get("mission")
         run_id = str(shared.get("run_id", "run"))
         waits = bool(shared.get("waits"))
@@ -214,7 +222,7 @@ class Hmi(Actor):
         }
 
     def _make_camera(self) -> CameraEye | None:
-        module = str(self.parameters.get("camera", ""))
+        module = self.parameters.camera
         if not (module and self._port and self._airport and self._airport.source):
             return None
         return CameraEye(renderer(module), {"airport": self._airport.source}, self._camera_view)

@@ -13,13 +13,11 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.zenoh_bus import endpoint
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.osmosis.messages import NamedFault
-from rampart.actors.runtime.actor import Actor
-from rampart.actors.runtime.wiring import Member, load_class, partners
+from rampart.actors.runtime.wiring import Member, load_class, load_member, partners
 from rampart.actors.supervision.kill_node import signal_node
 from rampart.actors.web.access import page_url
 from rampart.files import toml
@@ -167,46 +165,26 @@ def tailor(plan: RunPlan, spec: SystemSpec) -> SystemSpec:
     return spec
 
 
-def actor_parameters(plan: RunPlan, spec: SystemSpec, node: NodeSpec) -> dict[str, Any]:
-    """Return a node's parameters: what follows from plan and spec, then what the spec says.
+def member_of(plan: RunPlan, spec: SystemSpec, node: NodeSpec) -> Member:
+    """Return a node with its class and parameters: what follows from the plan, then the spec's.
 
-    A recovery module that respawns gets the nodes that name it; the world gets the run's seed,
-    obstacles, and the dead man of the robot's base.
+    The world gets the run's seed, obstacles, and the dead man of the robot's base.
+
+    Raises:
+        ValueError: as `load_member`.
     """
-    derived: dict[str, Any] = {}
-    if node.kind is Kind.RECOVERY:
-        own = tuple(n.name for n in spec.nodes if n.respawn == node.name)
-        derived = {"nodes": own} if own else {}
-    elif node.kind is Kind.WORLD:
-        derived = {"seed": plan.seed, "obstacles": plan.obstacles,
-                   "dead_man": spec.layers.dead_man,
-                   "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
-    return {**derived, **node.parameters}
-
-
-REPORTS_ON: Mapping[Kind, Topic[Any]] = {
-    Kind.DETECTION: topics.DETECTION, Kind.RECOVERY: topics.RECOVERY}
-"""What modules of the tables `[[detection]]` and `[[recovery]]` publish."""
-
-
-def _class_of(plan: RunPlan, spec: SystemSpec, node: NodeSpec) -> type[Actor]:
-    try:
-        return load_class(node.actor, REPORTS_ON.get(node.kind))
-    except ValueError as error:
-        names = {"node": [n.name for n in spec.nodes],
-                 "detection": [d.name for d in spec.detections],
-                 "recovery": [r.name for r in spec.recoveries]}
-        path = next(f"$.{table}[{among.index(node.name)}]" for table, among in names.items()
-                    if node.name in among)
-        raise ValueError(f"{plan.system_file}: {path}.{error}") from None
+    world = {"seed": plan.seed, "obstacles": plan.obstacles, "dead_man": spec.layers.dead_man,
+             "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
+    return load_member(node, spec, plan.system_file, topics.REPORTS_ON.get(node.kind),
+                       world if node.kind is Kind.WORLD else {})
 
 
 class Layout:
     """Everything derived from plan and spec: units, endpoints, partners.
 
     Raises:
-        ValueError: an actor class named in the spec does not exist, cannot be imported, or belongs
-            into another table.
+        ValueError: an actor class named in the spec does not exist, cannot be imported, belongs
+            into another table, or does not take its parameters.
     """
 
     def __init__(self, plan: RunPlan, spec: SystemSpec) -> None:
@@ -216,14 +194,12 @@ class Layout:
             name: Unit(name, nodes) for name, nodes in spec.processes().items()}
         self.unit_of: dict[str, str] = {
             node.name: unit.name for unit in self.units.values() for node in unit.nodes}
-        own = [
-            Member(SUPERVISOR, load_class(SUPERVISOR_CLASS), {"nodes": tuple(self.unit_of)}),
-            Member(OBSERVER, load_class(OBSERVER_CLASS), {}),
-        ]
+        supervisor, observer = load_class(SUPERVISOR_CLASS), load_class(OBSERVER_CLASS)
+        heard = msgspec.convert({"nodes": tuple(self.unit_of)}, supervisor.Parameters)
+        own = [Member(SUPERVISOR, supervisor, heard),
+               Member(OBSERVER, observer, observer.Parameters())]
         self.members: dict[str, Member] = {
-            m.name: m for m in (*own, *(
-                Member(n.name, _class_of(plan, spec, n), actor_parameters(plan, spec, n))
-                for n in spec.actors()))}
+            m.name: m for m in (*own, *(member_of(plan, spec, n) for n in spec.actors()))}
         self._partners = partners(self.members.values())
 
     def listen(self, node: str) -> str:

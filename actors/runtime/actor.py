@@ -33,6 +33,7 @@ from rampart.actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpo
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.injection_desk import InjectionDesk
 from rampart.actors.runtime.mailbox import Mailbox
+from rampart.actors.runtime.parameters import read_parameters
 from rampart.actors.runtime.timer import Timer
 
 __all__ = ["Actor", "Context", "Header", "every", "on"]
@@ -72,7 +73,7 @@ class Context:
         incarnation: which life of the node this is, counted from 1.
         clock: simulated time.
         bus: this actor's access to the bus, not yet open.
-        parameters: the node's parameters from the system spec.
+        parameters: the node's parameters, as the system spec gives them or read already.
         shared: read-only objects loaded once for the whole run ("system", "airport", ...).
         pid: number of the process that it lives in.
         checkpoints: where this node's state is kept.
@@ -86,7 +87,7 @@ class Context:
     incarnation: int
     clock: Clock
     bus: Bus
-    parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameters: Mapping[str, Any] | msgspec.Struct = field(default_factory=dict)
     shared: Mapping[str, Any] = field(default_factory=dict)
     pid: int = field(default_factory=os.getpid)
     checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
@@ -121,8 +122,14 @@ class Actor:
 
     Class attributes:
         outputs: topics it publishes; publishing another one raises.
+        Parameters: what the system spec may say of it, by field: type, range and default. One that
+            says more derives its own from that of its base class.
     """
 
+    class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+        """None, unless a subclass declares some."""
+
+    parameters: Parameters
     outputs: ClassVar[tuple[Topic[Any], ...]] = ()
     _handlers: ClassVar[tuple[tuple[Topic[Any], str], ...]] = ()
     _periodic: ClassVar[tuple[tuple[float, str], ...]] = ()
@@ -146,7 +153,8 @@ class Actor:
         self.name = context.name
         self._incarnation = context.incarnation
         self.clock = context.clock
-        self.parameters = context.parameters
+        self.parameters = read_parameters(
+            self.Parameters, context.parameters, context.name, "parameters")
         self._bus = context.bus
         self._guard = ArrivalGuard(
             context.clock.now, context.members, self._crowded, context.register)
@@ -182,20 +190,26 @@ class Actor:
 
     @classmethod
     def names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+        cls, topic: Topic[Any], name: str, parameters: Any  # noqa: ARG003
     ) -> tuple[str, ...] | None:
-        """Which members of an input family the node `name` hears; None for all."""
+        """Which members of an input family a node hears, None for all.
+
+        Args:
+            topic: one of its inputs.
+            name: of the node.
+            parameters: of the node, as its class's `Parameters`.
+        """
         return None
 
     @classmethod
     def output_names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+        cls, topic: Topic[Any], name: str, parameters: Any  # noqa: ARG003
     ) -> tuple[str, ...] | None:
-        """Which members of an output family the node `name` publishes; None for any."""
+        """Which members of an output family a node publishes, likewise; None for any."""
         return (name,)
 
     @classmethod
-    def watches(cls, name: str, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003
+    def watches(cls, name: str, parameters: Any) -> tuple[str, ...]:  # noqa: ARG003
         """Nodes whose life and death `on_peer` reports."""
         return ()
 

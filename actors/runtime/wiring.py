@@ -11,11 +11,15 @@ import importlib
 import traceback
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
+from rampart.actors.runtime.parameters import read_parameters
 from rampart.files import working_folder
+from rampart.manager.spec.checks import modules
+from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +28,7 @@ class Member:
 
     name: str
     actor: type[Actor]
-    parameters: Mapping[str, Any]
+    parameters: Actor.Parameters
 
 
 def published(member: Member) -> dict[str, tuple[str, ...] | None]:
@@ -75,6 +79,35 @@ def topics_of(actor: type[Actor]) -> tuple[tuple[Topic[Any], ...], tuple[Topic[A
         tuple(t for t in actor.inputs() if t not in BASE_INPUTS),
         tuple(actor.outputs),
     )
+
+
+def load_member(node: NodeSpec, spec: SystemSpec, file: str, reports_on: Topic[Any] | None = None,
+                derived: Mapping[str, Any] = MappingProxyType({})) -> Member:
+    """Load the class of an actor, and read its parameters as that declares them.
+
+    Args:
+        node: what the spec says of it.
+        spec: the system; to a module that respawns it says which nodes.
+        file: name of the spec, for messages.
+        reports_on: see `load_class`.
+        derived: parameters that it is given besides, if it takes them.
+
+    Raises:
+        ValueError: there is no such class, or it does not take a parameter; the message is one
+            line and names file, path and value.
+    """
+    path = next(path for path, name, *_ in modules(spec) if name == node.name)
+    own = tuple(n.name for n in spec.nodes if n.respawn == node.name)
+    if node.kind is Kind.RECOVERY and own:
+        derived = {"nodes": own, **derived}
+    try:
+        actor = load_class(node.actor, reports_on)
+    except ValueError as error:
+        raise ValueError(f"{file}: {path}.{error}") from None
+    takes = actor.Parameters.__struct_fields__
+    given = {**{name: derived[name] for name in takes if name in derived}, **node.parameters}
+    return Member(node.name, actor, read_parameters(
+        actor.Parameters, given, file, f"{path}.parameters", spec))
 
 
 def load_class(path: str, reports_on: Topic[Any] | None = None) -> type[Actor]:

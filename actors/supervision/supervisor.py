@@ -23,7 +23,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -117,6 +117,12 @@ class _Process:
 class Supervisor(Actor):
     """Keeps the processes of the run alive. Parameters: `nodes`, the names it watches."""
 
+    class Parameters(Actor.Parameters, frozen=True):
+        """Whom it hears: the names of all nodes."""
+
+        nodes: tuple[str, ...] = ()
+
+    parameters: Parameters
     outputs = (topics.NODES, topics.PROCESS_EVENT, topics.ERROR_REPORT, bus_topics.INJECT,
                bus_topics.INJECTION_RESULT)
 
@@ -145,10 +151,10 @@ class Supervisor(Actor):
 
     @classmethod
     def names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+        cls, topic: Topic[Any], name: str, parameters: Parameters  # noqa: ARG003
     ) -> tuple[str, ...] | None:
         """Hear the heartbeats of the nodes that it starts."""
-        return tuple(parameters.get("nodes", ())) if topic is bus_topics.HEARTBEAT else None
+        return parameters.nodes if topic is bus_topics.HEARTBEAT else None
 
     # -- start and stop -------------------------------------------------------------------------
 

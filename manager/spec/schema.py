@@ -247,7 +247,11 @@ class DetectionSpec(Table, frozen=True):
 
 
 class RecoverySpec(Table, frozen=True):
-    """A recovery module; the contract fields are those of `mechanisms.Contract`."""
+    """A recovery module; the contract fields are those of `mechanisms.Contract`.
+
+    A key of `parameters` that means something here too: `nodes`, a list of names of those that it
+    may respawn.
+    """
 
     name: Name
     title: str
@@ -263,6 +267,11 @@ class RecoverySpec(Table, frozen=True):
     process: OptionalName = ""
     parameters: dict[str, Any] = {}
     enabled: bool = True
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Names of the nodes that it may respawn besides those that name it."""
+        return tuple(self.parameters.get("nodes", ()))
 
 
 class Hazard(StrEnum):

@@ -8,8 +8,9 @@ on the way, each message with the stamp of its reading.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 
 from rampart.actors.bus import messages as bm
@@ -25,7 +26,7 @@ from rampart.actors.osmosis.airport.formats import load_world
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
-from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.schema import Positive, SystemSpec
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.schedule import Schedule
 from rampart.sim.osmosis.sensors import LaserSpec
@@ -44,13 +45,32 @@ _JOBS = (
 class Simulator(Actor):
     """Runs the `World` on the actor's clock.
 
-    Parameters (all optional): `seed`; `obstacles`, number of presets that take part;
-    `dead_man`, False switches it off; `dead_man_timeout_s`; `laser_range_m`; `laser_rays`;
-    `upper_laser`, True for a robot with a second one.
     Shared: `airport`; `world` (`rampart.actors.osmosis.airport.world.WorldTruth`), read from the
         airport's file if absent.
     """
 
+    class Parameters(Actor.Parameters, frozen=True):
+        """Robot and world; the run says the first four.
+
+        Attributes:
+            seed: of everything random.
+            obstacles: number of presets that take part.
+            dead_man: whether the base brakes when commands cease.
+            dead_man_timeout_s: after how long.
+            laser_range_m: of each laser.
+            laser_rays: of each laser.
+            upper_laser: whether the robot has a second one.
+        """
+
+        seed: int = 0
+        obstacles: int = 0
+        dead_man: bool = True
+        dead_man_timeout_s: Positive = DEAD_MAN_TIMEOUT_S
+        laser_range_m: Positive = 8.0
+        laser_rays: Annotated[int, msgspec.Meta(ge=2)] = 181
+        upper_laser: bool = False
+
+    parameters: Parameters
     outputs = (*_JOBS, ftm_topics.HOLDS)
 
     def __init__(self, context: Context) -> None:
@@ -58,11 +78,8 @@ class Simulator(Actor):
         parameters = self.parameters
         self._airport: Airport = context.shared["airport"]
         self._laser = LaserSpec(
-            rays=int(parameters.get("laser_rays", 181)),
-            range_max_m=float(parameters.get("laser_range_m", 8.0)),
-        )
-        timeout_s = float(parameters.get("dead_man_timeout_s", DEAD_MAN_TIMEOUT_S))
-        self._dead_man_s = timeout_s if parameters.get("dead_man", True) else None
+            rays=parameters.laser_rays, range_max_m=parameters.laser_range_m)
+        self._dead_man_s = parameters.dead_man_timeout_s if parameters.dead_man else None
         self._asked_s = self._skipped_s = 0.0
         self._real_time_factor = 1.0
         system: SystemSpec | None = context.shared.get("system")
@@ -79,8 +96,8 @@ class Simulator(Actor):
         self._world = World(
             self._airport,
             truth,
-            seed=int(self.parameters.get("seed", 0)),
-            obstacles=int(self.parameters.get("obstacles", 0)),
+            seed=self.parameters.seed,
+            obstacles=self.parameters.obstacles,
             dead_man_timeout_s=self._dead_man_s,
             laser=self._laser,
             start_s=now_s,
@@ -98,7 +115,7 @@ class Simulator(Actor):
             topics.TRUTH: self._truth,
             topics.OBSTACLES: self._obstacles,
         }
-        if self.parameters.get("upper_laser", False):
+        if self.parameters.upper_laser:
             readings[topics.UPPER_SCAN] = lambda: self._scan(1)
         self._readings = {topic.key: (topic, read) for topic, read in readings.items()}
         self._schedule = Schedule(

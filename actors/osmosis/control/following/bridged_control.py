@@ -13,19 +13,26 @@ from rampart.actors.osmosis.control.following.osmosis_control import OsmosisCont
 from rampart.actors.osmosis.control.following.standby_control import StandbyControl
 from rampart.actors.osmosis.messages import Odometry, Pose
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import amount
+from rampart.manager.spec.schema import NonNegative
 
 
 class BridgedControl(OsmosisControl):
-    """Osmosis Control with `DeadReckoning` between localization and itself.
+    """Osmosis Control with `DeadReckoning` between localization and itself."""
 
-    Parameters:
-        bridge_m: how far it drives without a fresh pose, m; 3 by default.
-    """
+    class Parameters(OsmosisControl.Parameters, frozen=True):
+        """As of Osmosis Control, and how it bridges.
+
+        Attributes:
+            bridge_m: how far it drives without a fresh pose, m.
+        """
+
+        bridge_m: NonNegative = 3.0
+
+    parameters: Parameters
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._reckoning = DeadReckoning(amount(self.parameters, "bridge_m", 3.0))
+        self._reckoning = DeadReckoning(self.parameters.bridge_m)
 
     @on(topics.ODOMETRY)
     def odometry(self, message: Odometry, header: Header) -> None:

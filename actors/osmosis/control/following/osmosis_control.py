@@ -48,7 +48,7 @@ from rampart.actors.osmosis.messages import (
     Twist,
 )
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.actors.runtime.parameters import amount, switch
+from rampart.manager.spec.schema import NonNegative
 
 _PERIOD_S = 0.05
 _ASIDE_M = 0.1
@@ -62,18 +62,28 @@ class OsmosisControl(Actor):
 
     Class attributes:
         command_topic: where the command goes; a standby's has a topic of its own.
-
-    Parameters:
-        check_route: whether a route is checked before it is followed. A bad one is refused: the
-            robot stands, or follows the good one that it has for the same goal. Off by default,
-            as in the paper.
-        pass_after_s: how long the robot waits in a row before it drives round an obstacle, s;
-            for ever if 0, as in the paper.
-        has_standby: whether a standby listens, which is told at once where the robot means to be.
-        yaw_loop: whether the turn rate is controlled in a closed loop (`motion_loop`). Off by
-            default: the base is trusted to turn as it is told.
     """
 
+    class Parameters(Actor.Parameters, frozen=True):
+        """What it does beyond the paper's.
+
+        Attributes:
+            check_route: whether a route is checked before it is followed. A bad one is refused:
+                the robot stands, or follows the good one that it has for the same goal.
+            pass_after_s: how long the robot waits in a row before it drives round an obstacle, s;
+                for ever if 0.
+            has_standby: whether a standby listens, which is told at once where the robot means to
+                be.
+            yaw_loop: whether the turn rate is controlled in a closed loop (`motion_loop`); if not,
+                the base is trusted to turn as it is told.
+        """
+
+        check_route: bool = False
+        pass_after_s: NonNegative = 0.0
+        has_standby: bool = False
+        yaw_loop: bool = False
+
+    parameters: Parameters
     command_topic: ClassVar[Topic[Twist]] = topics.COMMAND
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
         topics.COMMAND, topics.CONTROL_STATUS, topics.LIGHT_MEASURED)
@@ -91,15 +101,14 @@ class OsmosisControl(Actor):
         self._route: Route | None = None
         self._follower: PathFollower | LightRow | None = None
         self._status = ControlStatus("", 0, ControlPhase.IDLE, 0, 0.0)
-        self._tells_aside = switch(self.parameters, "has_standby")
+        self._tells_aside = self.parameters.has_standby
         self._loop = MotionLoop(self._motion.max_angular_radps) \
-            if switch(self.parameters, "yaw_loop") else None
+            if self.parameters.yaw_loop else None
         self._ticked_s = context.clock.now()
         self._begun = False
         self._airport: Airport = airport
-        self._check = RouteCheck(airport) if switch(self.parameters, "check_route") else None
-        self._row = RowLimits(
-            pass_after_s=amount(self.parameters, "pass_after_s", 0.0) or math.inf)
+        self._check = RouteCheck(airport) if self.parameters.check_route else None
+        self._row = RowLimits(pass_after_s=self.parameters.pass_after_s or math.inf)
         self._goal: GoalOrder | None = None
         self._refused: Route | None = None
         self._why_refused = ""

@@ -10,7 +10,10 @@ from __future__ import annotations
 import math
 
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.teleoperation.joystick_device import JoystickDevice, mapping_of
+from rampart.actors.osmosis.control.teleoperation.joystick_device import (
+    JoystickDevice,
+    StickMapping,
+)
 from rampart.actors.osmosis.control.teleoperation.stick_arbitration import (
     TIMEOUT_S,
     Ruling,
@@ -19,6 +22,7 @@ from rampart.actors.osmosis.control.teleoperation.stick_arbitration import (
 from rampart.actors.osmosis.messages import Joystick, Twist
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.timer import Timer
+from rampart.manager.spec.schema import NonNegative
 
 _LOOK_S = 0.05
 """Period in which a held stick is repeated and a silent one noticed (simulated seconds)."""
@@ -48,23 +52,33 @@ class Teleoperation(Actor):
     A device tells changes only, so while its dead man is held its position is repeated; messages
     are repeated by whoever sends them. A device that vanishes has let go, and is looked for again.
 
-    Parameters: `linear_mps`, `angular_radps`: velocities at full stick; the robot's if left out.
-    `device`: path of a joystick or "auto" for the first one; "" for none. `forward_axis`,
-    `left_axis`, `forward_sign`, `left_sign`, `dead_man_button`, `dead_zone`: see
-    `joystick_device.StickMapping`.
-
     Shared objects: "joystick" (device that has precedence over the parameter, or ""; None: devices
     are not to be opened).
     """
 
+    class Parameters(Actor.Parameters, StickMapping, frozen=True):
+        """How it is driven; axes and button as of `StickMapping`.
+
+        Attributes:
+            linear_mps: speed at full stick; the robot's if left out.
+            angular_radps: turn rate at full stick; the robot's if left out.
+            device: path of a joystick, or "auto" for the first one; "" for none.
+        """
+
+        linear_mps: NonNegative | None = None
+        angular_radps: NonNegative | None = None
+        device: str = ""
+
+    parameters: Parameters
     outputs = (topics.TELEOP_COMMAND,)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         robot = context.shared["system"].robot
-        self._linear_mps = float(context.parameters.get("linear_mps", robot.top_speed_mps))
-        self._angular_radps = float(
-            context.parameters.get("angular_radps", robot.top_turn_rate_radps))
+        linear_mps, angular_radps = self.parameters.linear_mps, self.parameters.angular_radps
+        self._linear_mps = robot.top_speed_mps if linear_mps is None else linear_mps
+        self._angular_radps = (
+            robot.top_turn_rate_radps if angular_radps is None else angular_radps)
         self._arbiter = StickArbiter(TIMEOUT_S)
         self._look: Timer | None = None
         self._device: JoystickDevice | None = None
@@ -73,15 +87,10 @@ class Teleoperation(Actor):
     def on_start(self) -> None:
         """Open the joystick, if there is to be one."""
         asked = self.context.shared.get("joystick", "")
-        name = asked or self.parameters.get("device", "")
+        name = asked or self.parameters.device
         if not name or asked is None:
             return
-        try:
-            mapping = mapping_of(self.parameters)
-        except ValueError as error:
-            self.report_diagnostic("joystick", f"not used: {error}", str(name))
-            return
-        self._device = JoystickDevice(str(name), mapping, self._moved, self._gone)
+        self._device = JoystickDevice(str(name), self.parameters, self._moved, self._gone)
         self._plug()
 
     def on_stop(self) -> None:
