@@ -39,20 +39,20 @@ bench-respawn: setup
 # Hits every process of the full system in every way, then 200 deaths in ten minutes with a count
 # of what leaks; half an hour. First the same for control nodes over many seeds in virtual time.
 chaos: setup
-	$(BIN)/python tests/checkpoint_runs.py 0 10 6
-	$(BIN)/python tests/chaos_runs.py
+	$(BIN)/python -m tests.whole.checkpoint_runs 0 10 6
+	$(BIN)/python -m tests.whole.chaos_runs
 
 # Hits every pair of processes of the full system, one after the other in long missions; an hour or
 # more. Interrupted, it goes on where it was: reports/chaos-pairs.jsonl says what is done.
 chaos-pairs: setup
-	$(BIN)/python tests/chaos_pair_runs.py
+	$(BIN)/python -m tests.whole.chaos_pair_runs
 
 # 100,000 inputs into each decoder of what others write; half an hour. FUZZ="--runs 1000000" makes
 # more, FUZZ=--help says what else there is. Coverage guides it where `rampart[fuzz]` is installed.
 # Then 100,000 messages, as extreme as their types allow, into the handlers of all actors.
 fuzz: setup
-	PYTHONPATH=tests $(BIN)/python -m fuzz.run $(FUZZ)
-	$(BIN)/python tests/handler_fuzz.py 25
+	$(BIN)/python -m tests.fuzz.run $(FUZZ)
+	$(BIN)/python -m tests.fuzz.handler_fuzz 25
 
 setup: .venv/installed
 

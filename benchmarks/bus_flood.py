@@ -48,7 +48,8 @@ _GRASS = (_POINT.x, _POINT.y)
 
 _FLOOD = """
 import sys, time, zenoh
-from actors import messages as m, topics
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.ftm import messages as fm, topics as ftm_topics
 from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.bus.messages import Hello
 from rampart.actors.bus.zenoh_bus import session_config

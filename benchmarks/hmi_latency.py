@@ -40,11 +40,9 @@ from rampart.actors.run.run_info import RunInfo, find_runs
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.process_usage import read_count
 from rampart.cli.session import Session, connect
+from tests.actors.operator.browser import CHROMIUM, Browser, browser
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
-
-from hmi_browser import CHROMIUM, Browser, browser  # noqa: E402 the browser of the tests
 
 PORT, PAGE_PORT = 8460, 8560
 PAGES = 10

@@ -49,9 +49,9 @@ OUTPUT: dict[str, Topic[Any]] = {
 class Stopwatch(Actor):
     """Notes when things arrive; times are wall seconds of this process."""
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, launcher: Launcher) -> None:
         super().__init__(context)
-        self._launcher: Launcher = context.shared["launcher"]
+        self._launcher = launcher
         self.newest: dict[str, int] = {}
         self.first: dict[tuple[str, int, str], float] = {}
         self.story: deque[str] = deque(maxlen=40)
@@ -132,8 +132,7 @@ class Stopwatch(Actor):
 
 async def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Run the system, kill the nodes, and return one row of milliseconds per node."""
-    plan = RunPlan("bench", options.port, 1.0, 1, options.system, "", "vallombre", "AB", 0,
-                   ftm=True, hmi_port=0)
+    plan = RunPlan("bench", options.port, system_file=options.system)
     launcher = Launcher(plan, "benchmark")
     launcher.begin()
     rows = []
@@ -142,7 +141,7 @@ async def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
         await launcher.start()
         bus = launcher.observers_bus()
         clock = Clock(launcher.plan.origin_s)
-        watch = Stopwatch(Context(OBSERVER, 1, clock, bus, {}, {"launcher": launcher}))
+        watch = Stopwatch(Context(OBSERVER, 1, clock, bus), launcher)
         task = asyncio.create_task(watch.run())
         await asyncio.sleep(4.0)
         for node in options.node or OUTPUT:

@@ -34,9 +34,9 @@ QUANTILES = 21
 class Ear(Actor):
     """Notes when things arrive."""
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, launcher: Launcher) -> None:
         super().__init__(context)
-        self._launcher: Launcher = context.shared["launcher"]
+        self._launcher = launcher
         self.messages: list[float] = []
         self.deaths: dict[tuple[str, int], float] = {}
         self.forks: dict[tuple[str, int], float] = {}
@@ -72,8 +72,7 @@ class Ear(Actor):
 
 async def measure(port: int, kills: int) -> dict[str, list[float]]:
     """Run the system and return samples in seconds."""
-    plan = RunPlan("bench", port, 1.0, 1, "systems/paper.toml", "", "vallombre", "AB", 0,
-                   ftm=True, hmi_port=0)
+    plan = RunPlan("bench", port, system_file="systems/paper.toml")
     launcher = Launcher(plan, "timing")
     launcher.begin()
     found: dict[str, list[float]] = {
@@ -85,7 +84,7 @@ async def measure(port: int, kills: int) -> dict[str, list[float]]:
         launcher.guard.on_restart = lambda _name: back.append(time.monotonic())
         bus = launcher.observers_bus()
         clock = Clock(launcher.plan.origin_s)
-        ear = Ear(Context(OBSERVER, 1, clock, bus, {}, {"launcher": launcher}))
+        ear = Ear(Context(OBSERVER, 1, clock, bus), launcher)
         task = asyncio.create_task(ear.run())
         await asyncio.sleep(6.0)
         quiet = len(ear.messages)

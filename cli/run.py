@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +22,21 @@ import msgspec
 
 from rampart import systems
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis.airport.formats import load_airport, load_mission
+from rampart.actors.layout.layout import Layout, application_class, load_application
+from rampart.actors.layout.system_topics import system_topics
+from rampart.actors.layout.wiring import load_class
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.process import Order, RecorderProcess
 from rampart.actors.recording.virtual import VirtualRecording
-from rampart.actors.run.run_plan import DEFAULT_PORT, Layout, RunPlan, load_system
-from rampart.actors.run.system_topics import system_topics
-from rampart.actors.runtime.wiring import load_class
+from rampart.actors.run.application import Application
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_plan import DEFAULT_PORT, RunPlan, load_document, load_system
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.web.access import Access, AccessError, is_loopback, new_token
 from rampart.actors.web.token_file import SecretError, read_secret
+from rampart.cli import application_options
+from rampart.cli.output import UsageError
 from rampart.files import streams, working_folder
 from rampart.files.plain_text import one_line
 from rampart.manager.spec.specification import SystemSpec
@@ -53,7 +58,6 @@ LAST_PORT = 32_000
 ERROR_LOG = "errors.log"
 TOKEN_VARIABLE = "RAMPART_HMI_TOKEN"  # noqa: S105 the name of one
 HMI = "rampart.actors.operator.hmi:Hmi"
-TELEOPERATION = "rampart.actors.osmosis.control.teleoperation.teleoperation:Teleoperation"
 EXIT_SUCCESS, EXIT_FAILED, EXIT_USAGE, EXIT_UNSAFE, EXIT_NOT_KNOWN = 0, 1, 2, 3, 4
 
 EPILOG = """\
@@ -81,17 +85,19 @@ nobody reads change none of them; with --json, "report_error" says why there is 
 """
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
+def parser(kind: type[Application] = Application, said: Mapping[str, Any] | None = None
+           ) -> argparse.ArgumentParser:
+    """Return the parser of the command line.
+
+    Args:
+        kind: the application of the system that is started, which adds options.
+        said: what the system's spec says of them.
+    """
     p = argparse.ArgumentParser(
         prog="launch.py", description=__doc__, epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--mission", metavar="NAME|FILE", help="mission of the airport, or a file with "
-                   "lines x=…,y=…,taxi=… (default: the system's)")
     p.add_argument("--wait", action="store_true",
                    help="let the operator start the mission from the page")
-    p.add_argument("--airport", metavar="NAME|FILE", help="shipped airport, a .toml, or a .graph "
-                   "with its image beside it (default: the system's)")
     p.add_argument("--system", metavar="FILE", default=str(systems.DEFAULT),
                    help=f"system spec, or name of a shipped one: {systems.names()} "
                    "(default: osmosis)")
@@ -100,8 +106,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--shadow", metavar="NAME", default="",
                    help="a second strategy that decides without effect; where it differs, it says "
                    "so (default: the system's)")
-    p.add_argument("--obstacles", metavar="N", type=int, default=0,
-                   help="how many of the airport's obstacles stand on the way (default: 0)")
     p.add_argument("--no-ftm", action="store_true",
                    help="run the paper's unprotected baseline: last command kept, no dead man, "
                    "no respawn")
@@ -123,9 +127,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--port", metavar="PORT", type=int, default=DEFAULT_PORT,
                    help="number that tells runs on this machine apart; no port is opened "
                    f"(default: {DEFAULT_PORT})")
-    p.add_argument("--joystick", metavar="DEVICE", nargs="?", const="auto", default="",
-                   help="drive with a joystick or gamepad of this machine, e.g. /dev/input/js0 "
-                   "(without DEVICE: the first one); hold its left shoulder button to drive")
     p.add_argument("--patience", metavar="S", type=float, default=60.0,
                    help="simulated seconds without progress after which the mission counts as "
                    "failed (default: 60)")
@@ -151,11 +152,8 @@ def parser() -> argparse.ArgumentParser:
                    "(default: 10), S how long it lasts")
     p.add_argument("--json", action="store_true",
                    help="last line of stdout is one JSON object with the result")
+    application_options.add(p, kind, said or {})
     return p
-
-
-class UsageError(Exception):
-    """One line for the user; exit code 2."""
 
 
 class Run:
@@ -167,16 +165,13 @@ class Run:
         if options.duration is not None:
             raise UsageError(f"--duration {options.duration:g}: a mission ends by itself; "
                              "--patience S ends one that makes no progress")
-        for name in ("airport", "mission"):
-            if not (getattr(options, name) or getattr(spec, name)):
-                raise UsageError(f"--{name}: missing; {spec.name} names none")
-        airport_name = _existing_path(options.airport or spec.airport)
-        mission_name = _existing_path(options.mission or spec.mission)
-        airport = load_airport(airport_name)
-        mission = load_mission(mission_name, airport)
-        if options.obstacles > len(airport.obstacles):
-            raise UsageError(f"--obstacles {options.obstacles}: {airport.name} has places for "
-                             f"{len(airport.obstacles)}")
+        application = load_application(plan, spec)
+        if not isinstance(application, Osmosis):
+            raise UsageError(f"{spec.name} has no mission")
+        mission = application.mission
+        if note := application.check(spec, virtual=options.virtual):
+            _say(note)
+        self._context = RunContext(plan, spec, load_document(plan), application)
         self._scenario = [parse_fault(text) for text in options.fault]
         known: Sequence[Topic[Any]] = ()
         if self._scenario:
@@ -189,12 +184,13 @@ class Run:
                                  f"{len(mission.goals)} goals")
         self._directory = _directory(options, mission.name)
         self._plan = msgspec.structs.replace(
-            plan, airport=airport_name, mission=mission_name,
+            plan,
             error_log=str(self._directory.resolve() / ERROR_LOG),
             checkpoints=str(self._directory.resolve() / "checkpoints"))
         self._console = Console(sys.stderr)
         self._mission = MissionRun(
-            self._plan, airport, mission, strategy=spec.strategy, patience_s=options.patience,
+            self._plan, application.airport, mission, strategy=spec.strategy,
+            patience_s=options.patience,
             console=self._console)
 
     def on_processes(self) -> int:
@@ -227,6 +223,7 @@ class Run:
                 nodes=Layout(self._plan, self._spec).members, lead_s=LEAD_S,
                 overwrite=self._options.overwrite)
         run = VirtualRun(self._plan, self._spec, self._mission, scenario=self._scenario,
+                         run=self._context,
                          network=find_network(self._options.network),
                          taps=[recording.take] if recording else [])
         self._console.virtual_banner(self._mission.airport.name, self._mission.mission,
@@ -363,20 +360,44 @@ def _interruptible_between_bytecodes(run: VirtualRun) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _plan(options: argparse.Namespace) -> tuple[RunPlan, SystemSpec]:
-    """Return the plan that the options ask for, and the system they name."""
-    system_file = systems.find(options.system)
-    if not system_file.is_file():
-        what = "is a directory" if system_file.is_dir() else "no such file"
-        raise UsageError(f"--system {options.system}: {what}; a spec is right, or the name of a "
+def _parse(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, type[Application]]:
+    """Return the options, those of the system's application included, and its class.
+
+    Raises:
+        UsageError: there is no such system, or an option that it does not have.
+        ValueError: the system's spec is unsound.
+    """
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--system", default=str(systems.DEFAULT))
+    system = str(first.parse_known_args(arguments)[0].system)
+    spec = load_system(RunPlan(system_file=str(_system_file(system))))
+    kind = application_class(spec)
+    options, unknown = parser(kind, spec.application).parse_known_args(arguments)
+    if unknown:
+        raise UsageError(f"{unknown[0]}: no option of the launcher or of {spec.name}; --system "
+                         f"{system} --help shows those there are")
+    return options, kind
+
+
+def _system_file(system: str) -> Path:
+    found = systems.find(system)
+    if not found.is_file():
+        what = "is a directory" if found.is_dir() else "no such file"
+        raise UsageError(f"--system {system}: {what}; a spec is right, or the name of a "
                          f"shipped one: {systems.names()}")
+    return found
+
+
+def _plan(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPlan, SystemSpec]:
+    """Return the plan that the options ask for, and the system they name."""
+    system_file = _system_file(options.system)
     token, token_is_new = _token(options)
     plan = RunPlan(
         run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
-        airport="", mission="", obstacles=options.obstacles, ftm=not options.no_ftm,
+        ftm=not options.no_ftm, options=application_options.chosen(options, kind),
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
-        joystick=_joystick(options), hmi_host=options.hmi_host, hmi_token=token,
+        hmi_host=options.hmi_host, hmi_token=token,
         hmi_token_is_new=token_is_new,
         faults=() if options.no_hmi else offered_faults(), waits=options.wait)
     spec = load_system(plan)
@@ -393,8 +414,6 @@ def _fitting(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> Ru
         _refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token_file"),
                 f"no node of {spec.name} serves an operator's page")
         plan = msgspec.structs.replace(plan, hmi_port=0)
-    if options.joystick and not _has_actor(plan, spec, TELEOPERATION):
-        _refuse(options, ("joystick",), f"no node of {spec.name} reads it")
     return plan
 
 
@@ -416,17 +435,10 @@ def _refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None
         raise UsageError(f"--{name.replace('_', '-')}{text}: {why}")
 
 
-def _has_mission(options: argparse.Namespace, spec: SystemSpec) -> bool:
-    """Whether there is something to drive, and somebody who says where or what for."""
-    return spec.mobile is not None and any(
-        (options.airport, options.mission, spec.airport, spec.mission))
-
-
 async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> int:
     """Run a system without a mission, until its time is over or somebody ends it."""
-    _refuse(options, ("mission", "airport", "obstacles", "fault", "virtual", "wait", "patience"),
-            f"{spec.name} has no [robot] and drives nowhere" if spec.mobile is None else
-            f"{spec.name} has no mission; --airport and --mission give it one")
+    _refuse(options, ("fault", "virtual", "wait", "patience"),
+            f"{spec.name} has no mission: its [application] names no class with one")
     directory = _directory(options, spec.name)
     plan = msgspec.structs.replace(
         plan, error_log=str(directory.resolve() / ERROR_LOG),
@@ -451,8 +463,6 @@ def _directory(options: argparse.Namespace, name: str) -> Path:
 def _check(options: argparse.Namespace) -> None:
     if not 0.1 <= options.rate <= 20:
         raise UsageError(f"--rate {options.rate:g}: must be between 0.1 and 20")
-    if options.obstacles < 0:
-        raise UsageError(f"--obstacles {options.obstacles}: must not be negative")
     if options.duration is not None and not 0 < options.duration < 1e9:
         raise UsageError(f"--duration {options.duration:g}: must be above 0")
     if not options.patience > 0:
@@ -512,36 +522,15 @@ def _token(options: argparse.Namespace) -> tuple[str, bool]:
     return token, bool(token) and not own
 
 
-def _joystick(options: argparse.Namespace) -> str:
-    """Return the joystick to use; one that is not plugged in yet is waited for."""
-    name: str = options.joystick
-    if name and options.virtual:
-        raise UsageError(f"--joystick {name}: not with --virtual, nobody can drive that fast")
-    if name in {"", "auto"}:
-        return name
-    device = Path(name)
-    if device.is_file() or device.is_dir():
-        raise UsageError(f"--joystick {name}: neither a device nor a FIFO; joysticks are "
-                         "/dev/input/js0, /dev/input/js1 …")
-    if not device.exists():
-        _say(f"--joystick {name}: not there yet, waiting for it")
-    return str(device.resolve())
-
-
-def _existing_path(name: str) -> str:
-    """Return an existing path made absolute, so that every process finds it; names stay names."""
-    return str(Path(name).resolve()) if Path(name).exists() else name
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line, run, and return the exit code."""
     streams.secure()
-    options = parser().parse_args(arguments)
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
+        options, kind = _parse(arguments)
         _check(options)
-        plan, spec = _plan(options)
-        if not _has_mission(options, spec):
+        plan, spec = _plan(options, kind)
+        if not issubclass(kind, Osmosis):
             return asyncio.run(_watch(options, plan, spec))
         run = Run(options, plan, spec)
         return run.in_virtual_time() if options.virtual else run.on_processes()

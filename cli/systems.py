@@ -9,8 +9,8 @@ from typing import Any
 from rampart import systems
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm.topics import REPORTS_ON
-from rampart.actors.run.system_topics import own_topics, system_topics
-from rampart.actors.runtime.wiring import load_member
+from rampart.actors.layout.system_topics import own_topics, system_topics
+from rampart.actors.layout.wiring import load_member
 from rampart.cli.output import UsageError
 from rampart.files import toml
 from rampart.files.reading import FileError, read_text
@@ -50,7 +50,7 @@ def load(file: str | None) -> SystemSpec:
         spec = parse_specification(read_text(path, toml.MAX_SIZE), str(path))
         for node in spec.actors():
             if node.kind in REPORTS_ON and node.actor.startswith("rampart."):
-                load_member(node, spec, str(path), REPORTS_ON[node.kind])
+                load_member(node, spec, str(path))
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}; a spec is right, or the name of a shipped "
                          f"one: {systems.names()}") from None

@@ -22,9 +22,9 @@ from rampart.actors.bus.bounds import DOCUMENT_CHARS, clip
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
+from rampart.actors.layout.wiring import load_member
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
-from rampart.actors.runtime.wiring import load_member
 from rampart.manager.arbitration.arbiter import (
     DecisionMade,
     DetectionHeard,
@@ -61,9 +61,9 @@ class FtmManager(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._system: SystemSpec = context.shared["system"]
-        self._document: Document = context.shared.get("document", {})
-        self._adapted: m.AdaptedSystem | None = context.shared.get("adapted")
+        self._system: SystemSpec = context.run.system
+        self._document: Document = dict(context.run.document)
+        self._adapted: m.AdaptedSystem | None = context.run.adapted
         self._strategy = self._system.strategy
         self._arbiter = build_arbiter(self._system, first_life=context.incarnation == 1)
         now_s = self.clock.now()
@@ -171,7 +171,7 @@ class FtmManager(Actor):
         check_modules(self._system, system)
         for node in system.actors():
             if node.kind in topics.REPORTS_ON:
-                load_member(node, system, file, topics.REPORTS_ON[node.kind])
+                load_member(node, system, file)
         busy = self.arbiter_state.busy
         if busy:
             return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"

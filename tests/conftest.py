@@ -20,7 +20,7 @@ def sockets():
 @pytest.fixture
 async def world():
     """A small world for an HMI, with nobody else in it but `others`."""
-    from hmi_world import World
+    from tests.actors.operator.world import World
 
     made = World()
     async with made.running(made.others):

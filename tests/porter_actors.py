@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import msgspec
-from stub_actors import ROOT
 
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.runtime.actor import Actor, Header, every, on
+from tests import ROOT
 
 
 class Load(Message, frozen=True):
@@ -55,7 +55,7 @@ def write_porter_system(directory: Path) -> Path:
     """Write the shipped system with two more nodes."""
     text = (ROOT / "systems" / "osmosis.toml").read_text(encoding="utf-8")
     for name, actor in (("platform", "Platform"), ("display", "Display")):
-        text += (f'\n[[node]]\nname = "{name}"\nactor = "porter_actors:{actor}"\n'
+        text += (f'\n[[node]]\nname = "{name}"\nactor = "tests.porter_actors:{actor}"\n'
                  'kind = "non-control"\n')
     file = directory / "porter.toml"
     file.write_text(text, encoding="utf-8")

@@ -12,10 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from stub_actors import ROOT, free_base_port
-
 from rampart.actors.run.run_info import RunInfo, find_runs
 from rampart.actors.supervision.process_title import find_processes
+from tests import ROOT
+from tests.stub_actors import free_base_port
 
 HEEDS_SIGNALS = ("env", "--default-signal=HUP,INT")
 """Before a command: undoes what nohup, and shells with what they start in the background, do."""

@@ -18,8 +18,7 @@ from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.supervision.launcher import Launcher
-
-ROOT = Path(__file__).resolve().parents[1]
+from tests import ROOT
 
 
 def bases() -> Iterator[int]:
@@ -48,7 +47,7 @@ def write_stub_system(directory: Path) -> Path:
     """Write the shipped system with every actor replaced by an `Idler`."""
     text = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
     file = directory / "stub.toml"
-    file.write_text(re.sub(r'^actor = "[^"]+"', 'actor = "stub_actors:Idler"', text,
+    file.write_text(re.sub(r'^actor = "[^"]+"', 'actor = "tests.stub_actors:Idler"', text,
                            flags=re.MULTILINE), encoding="utf-8")
     return file
 
@@ -69,15 +68,14 @@ def free_base_port() -> int:
 
 def stub_plan(system: Path, **changes: object) -> RunPlan:
     """Return a plan that runs the stub system."""
-    plan = RunPlan("stub", free_base_port(), 1.0, 1, str(system), "", "vallombre", "AB", 0,
-                   ftm=True, hmi_port=0)
+    plan = RunPlan("stub", free_base_port(), system_file=str(system))
     return msgspec.structs.replace(plan, **changes)
 
 
 @asynccontextmanager
 async def launched(plan: RunPlan) -> AsyncIterator[Launcher]:
     """Start a run without observer and end it."""
-    os.environ["PYTHONPATH"] = str(ROOT / "tests")
+    os.environ["PYTHONPATH"] = str(ROOT)
     launcher = Launcher(plan, "test")
     launcher.begin()
     try:

@@ -11,6 +11,10 @@ from functools import cache
 from typing import Any, TypeVar
 
 from rampart import systems
+from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.run.application import Application
+from rampart.actors.run.run_context import NO_SYSTEM, RunContext
+from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.clock import Clock
 from rampart.manager.spec.specification import SystemSpec, parse_specification
@@ -33,12 +37,20 @@ def shipped_system() -> SystemSpec:
     return parse_specification(path.read_text(), path.name)
 
 
+def run_context(*, system: SystemSpec = NO_SYSTEM, document: Any = None, adapted: Any = None,
+                airport: Any = None, mission: Any = None, world: Any = None, **plan: Any
+                ) -> RunContext:
+    """Return what actors have in common in a test; `plan` are fields of the `RunPlan`."""
+    application = Osmosis.on_map(airport, mission, world) if airport else Application()
+    return RunContext(RunPlan(**plan), system, document or {}, application, adapted)
+
+
 class System:
     """Actors on one virtual hub, and the means to kill and respawn them."""
 
-    def __init__(self, **shared: Any) -> None:
+    def __init__(self, **known: Any) -> None:
         self.hub = Hub()
-        self.shared = shared
+        self.run = run_context(**known)
         loop = asyncio.get_running_loop()
         self.clock = Clock(loop.time(), source=loop.time)
         self.incarnations: dict[str, int] = {}
@@ -55,7 +67,8 @@ class System:
         """Start an actor, or its next incarnation."""
         life = self.incarnations[name] = self.incarnations.get(name, 0) + 1
         actor = cls(Context(name, life, self.clock, VirtualBus(self.hub, name, life),
-                            parameters, self.shared))
+                            parameters, self.run))
+        actor.around = self  # type: ignore[attr-defined]
         self.tasks[name] = asyncio.create_task(actor.run())
         return actor
 

@@ -3,7 +3,7 @@
 A field is bounded where it is decoded, once, so that no handler has to ask whether a number can be
 added to or a text be shown: whatever is beyond never reaches an actor, and is reported as `payload
 rejected`. The bounds are no contract of the robot's but what a message can mean at all: generous,
-and the same for all systems. `tests/test_message_bounds.py` finds a field that has none.
+and the same for all systems. `tests/actors/bus/test_message_bounds.py` finds a field that has none.
 
 Measurements and commands (poses, velocities, distances, an illuminance) are plain `float` on
 purpose. NaN and infinity are what a broken sensor or controller publishes, and it is the subject of

@@ -115,8 +115,7 @@ class DetectionModule(Actor):
         """Return how long the first input may take, s."""
         if not self.first_life:
             return timeout_s
-        system = self.context.shared.get("system")
-        startup_s = DEFAULT_GRACE_S if system is None else system.timing.startup_grace_s
+        startup_s = self.context.run.system.timing.startup_grace_s
         said_s = getattr(self.parameters, "startup_grace_s", None)
         return max(timeout_s, startup_s if said_s is None else said_s)
 

@@ -19,6 +19,7 @@ from rampart.actors.bus.bounds import (
     Document,
     Explained,
     Incarnation,
+    Lasting,
     Name,
     Names,
     Pid,
@@ -26,7 +27,7 @@ from rampart.actors.bus.bounds import (
     Text,
     Texts,
 )
-from rampart.actors.bus.messages import Message
+from rampart.actors.bus.messages import Injection, Message
 
 
 class Holds(Message, frozen=True):
@@ -233,3 +234,34 @@ class ProcessEvent(Message, frozen=True):
     incarnation: Incarnation
     by: Name
     detail: Text
+
+
+_Injections = Annotated[tuple[Injection, ...], msgspec.Meta(max_length=64)]
+
+
+class FaultOrder(Message, frozen=True):
+    """A fault that is no disturbance of a topic: a message on `topic`, as a JSON object.
+
+    Its type has the fields `injection`, filled in when it is ordered, and `duration_s`, of which 0
+    ends it. The node that carries it out reports on it as on an injection.
+    """
+
+    topic: Name
+    document: Document
+
+
+_FaultOrders = Annotated[tuple[FaultOrder, ...], msgspec.Meta(max_length=64)]
+
+
+class NamedFault(Message, frozen=True):
+    """A fault that can be ordered by its name: what the launcher offers to the operator's page.
+
+    `duration_s` is how long it lasts unless told otherwise, simulated seconds.
+    """
+
+    name: Name
+    title: Text
+    group: Name
+    duration_s: Lasting
+    injections: _Injections = ()
+    orders: _FaultOrders = ()

@@ -32,12 +32,13 @@ from rampart.actors.operator.requests import (
     ResetWish,
     Wish,
 )
-from rampart.actors.operator.server import LOOPBACK, Handlers, PageServer, PortError, Visitor
+from rampart.actors.operator.server import Handlers, PageServer, PortError, Visitor
 from rampart.actors.operator.state import HmiState
 from rampart.actors.operator.system import draw_system
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, Mission
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.page.map import PageMap, lights_shown, page_map
 from rampart.actors.osmosis.page.orders import NoSenseError, Orders
 from rampart.actors.osmosis.page.submission import (
@@ -47,7 +48,7 @@ from rampart.actors.osmosis.page.submission import (
     first_request,
     system_is_up,
 )
-from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.manager.spec.specification import SystemSpec, check_document
 
@@ -55,13 +56,7 @@ __all__ = ["Hmi"]
 
 
 class Hmi(Actor):
-    """The operator's node.
-
-    Shared objects: "run_id" (text, required for a mission), "mission" (the mission the run starts
-    with, or None), "waits" (True: that mission alone, and not before the operator wants it),
-    "airport" (for the map and its missions), "hmi_port" (0 or None: no page), "hmi_host" and
-    "hmi_token" (see `PageServer`), and those of `Operating`.
-    """
+    """The operator's node."""
 
     class Parameters(Actor.Parameters, frozen=True):
         """What it serves.
@@ -78,16 +73,16 @@ class Hmi(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        shared = context.shared
-        self._airport: Airport | None = shared.get("airport")
-        self._port: int = shared.get("hmi_port") or 0
-        mission: Mission | None = shared.get("mission")
-        run_id = str(shared.get("run_id", "run"))
-        waits = bool(shared.get("waits"))
+        run, plan = context.run, context.run.plan
+        known = run.application if isinstance(run.application, Osmosis) else None
+        self._airport: Airport | None = known.airport if known else None
+        self._port: int = plan.hmi_port
+        mission: Mission | None = known.mission if known else None
+        run_id, waits = plan.run_id, plan.waits
         first = (first_request(run_id, mission.name, _goals(mission))
-                 if mission and not waits else None)
+                 if mission and mission.goals and not waits else None)
         self._missions: Mapping[str, Mission] = (
-            {mission.name: mission} if mission and waits
+            {mission.name: mission} if mission and mission.goals and waits
             else self._airport.missions if self._airport else {})
         self._submission = Submission(run_id, context.incarnation, self.clock.now(), first)
         self._orders = Orders(f"{run_id}/{context.name}.{context.incarnation}", "operator")
@@ -96,13 +91,11 @@ class Hmi(Actor):
         self._table: fm.NodeTable | None = None
         self._server: PageServer | None = None
         self._starting: asyncio.Task[None] | None = None
-        plan: RunPlan | None = shared.get("plan")
         self._camera = self._make_camera()
         self._observer = ProcessObserver(
-            plan.base_port if plan else 0, plan.launcher_pid if plan else 0)
+            plan.base_port, plan.launcher_pid)
         self._version = -1
-        adapted: fm.AdaptedSystem | None = shared.get("adapted")
-        self._show_system(shared.get("system"), adapted.version if adapted else 0)
+        self._show_system(run.system, run.adapted.version if run.adapted else 0)
 
     def listens(self, topic: Topic[Any]) -> bool:
         """Without a page, hear only what missions and orders depend on."""
@@ -119,13 +112,13 @@ class Hmi(Actor):
         if not self._port:
             return
         self._operating.start()
-        shared = self.context.shared
+        plan = self.context.run.plan
         try:
             self._server = PageServer(
                 self._port, Feed(self._state, self.clock.now, self._hello, self._look),
                 Handlers(lambda page: self._operating.introduction(page.number), self._fulfil,
                          lambda page: self._operating.left(page.number)),
-                shared.get("hmi_host") or LOOPBACK, shared.get("hmi_token") or "",
+                plan.hmi_host, plan.hmi_token,
                 camera=self._camera)
         except PortError as error:
             self.report_diagnostic("operator's page", str(error), f"port {self._port}")
@@ -211,7 +204,7 @@ class Hmi(Actor):
     def _hello(self) -> dict[str, Any]:
         return {
             "type": "hello",
-            "run_id": str(self.context.shared.get("run_id", "run")),
+            "run_id": self.context.run.plan.run_id,
             "rate": self.clock.rate,
             "map": self._map.encoded if self._map else None,
             "left_out": self._map.left_out if self._map else {},
@@ -236,8 +229,7 @@ class Hmi(Actor):
 
     @property
     def _footprint_m(self) -> tuple[float, float] | None:
-        system: SystemSpec | None = self.context.shared.get("system")
-        robot = system.mobile if system else None
+        robot = self.context.run.system.mobile
         return (robot.length_m, robot.width_m) if robot else None
 
     @cached_property
@@ -247,8 +239,8 @@ class Hmi(Actor):
     def _look(self) -> None:
         self._state.usage(self._observer.look(self._table))
 
-    def _show_system(self, system: SystemSpec | None, version: int) -> None:
-        if self._port and system is not None and version > self._version:
+    def _show_system(self, system: SystemSpec, version: int) -> None:
+        if self._port and system is not NO_SYSTEM and version > self._version:
             self._version = version
             self._state.system(draw_system(system))
 

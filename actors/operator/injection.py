@@ -8,7 +8,7 @@ with the number of messages that it changed. None at all is *no effect*, and is 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,7 +18,7 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
-from rampart.actors.osmosis import messages as m
+from rampart.actors.ftm.messages import NamedFault
 from rampart.actors.runtime.injection import UNTOUCHED, flaw
 
 TAKE_HOLD_S = 3.0
@@ -51,13 +51,35 @@ class FaultError(ValueError):
     """A fault that cannot be injected; one line."""
 
 
+@dataclass(frozen=True, slots=True)
+class Order:
+    """A message to send, and where: a request to disturb a topic, or a fault of another kind."""
+
+    topic: Topic[Any]
+    message: Any
+
+    def with_(self, **changed: Any) -> Order:
+        """Return the order with other fields."""
+        return Order(self.topic, msgspec.structs.replace(self.message, **changed))
+
+    @property
+    def injection(self) -> str:
+        """Its id."""
+        return str(self.message.injection)
+
+    @property
+    def place(self) -> str:
+        """What is disturbed: a topic's key, or that on which another fault is ordered."""
+        return str(getattr(self.message, "topic", self.topic.key))
+
+
 @dataclass(slots=True)
 class Ordered:
     """One fault as ordered, and what is known of it."""
 
     injection: str
     fault: str
-    orders: tuple[bm.Injection | m.ActuatorFault, ...]
+    orders: tuple[Order, ...]
     begins_s: float
     duration_s: float
     affected: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -91,14 +113,16 @@ class Injections:
         prefix: of the ids; another one for each life of the HMI.
         catalogue: faults that have a name.
         places: keys of topics that can be disturbed.
+        robots: topics of the robot, on one of which a fault of the catalogue may be ordered.
         overhead_s: granted for what takes real time, in simulated seconds.
     """
 
-    def __init__(self, prefix: str, catalogue: Iterable[m.NamedFault],
-                 places: Iterable[str], overhead_s: float = 0.0) -> None:
+    def __init__(self, prefix: str, catalogue: Iterable[NamedFault], places: Iterable[str],
+                 robots: Iterable[Topic[Any]] = (), overhead_s: float = 0.0) -> None:
         self._prefix = prefix
+        self._robots = {topic.key: topic for topic in robots}
         self._overhead_s = overhead_s
-        self._catalogue: Mapping[str, m.NamedFault] = {f.name: f for f in catalogue}
+        self._catalogue: Mapping[str, NamedFault] = {f.name: f for f in catalogue}
         self._places = tuple(places)
         self._count = 0
         self._ordered: list[Ordered] = []
@@ -140,7 +164,7 @@ class Injections:
         orders, own_s = self._find(fault, name)
         lasts_s = own_s if duration_s is None else duration_s
         ordered = Ordered(name, fault, tuple(
-            msgspec.structs.replace(o, duration_s=lasts_s) for o in orders),
+            o.with_(duration_s=lasts_s) for o in orders),
             now_s + delay_s, lasts_s)
         self._ordered.append(ordered)
         ended = [o for o in self._ordered if o.outcome]
@@ -148,7 +172,7 @@ class Injections:
             self._ordered.remove(old)
         return ordered
 
-    def end(self, injection: str, now_s: float) -> tuple[bm.Injection | m.ActuatorFault, ...]:
+    def end(self, injection: str, now_s: float) -> tuple[Order, ...]:
         """End a fault now: return the orders that do it.
 
         Raises:
@@ -160,19 +184,16 @@ class Injections:
                     ordered.outcome = "withdrawn before it took hold"
                 ordered.ending = True
                 ordered.duration_s = max(now_s - ordered.begins_s, 0.0)
-                ordered.orders = tuple(
-                    msgspec.structs.replace(o, duration_s=0.0) for o in ordered.orders)
+                ordered.orders = tuple(o.with_(duration_s=0.0) for o in ordered.orders)
                 return ordered.orders
         raise FaultError(f"no fault {injection[:60]!r} is under way")
 
     def _find(self, fault: str, injection: str
-              ) -> tuple[tuple[bm.Injection | m.ActuatorFault, ...], float]:
+              ) -> tuple[tuple[Order, ...], float]:
         named = self._catalogue.get(fault)
         if named is not None:
-            orders: list[bm.Injection | m.ActuatorFault] = [
-                *named.injections, *named.actuator_faults]
-            return tuple(msgspec.structs.replace(o, injection=f"{injection}.{i}")
-                         for i, o in enumerate(orders, start=1)), named.duration_s
+            return tuple(o.with_(injection=f"{injection}.{i}")
+                         for i, o in enumerate(self._orders(named), start=1)), named.duration_s
         mode, colon, key = fault.partition(":")
         if not colon:
             raise FaultError(f"no fault {fault[:60]!r}; choose one of the list, or MODE:TOPIC")
@@ -186,11 +207,18 @@ class Injections:
                             stamp_s=STAMP_S if mode == "restamp" else 0.0)
         if reason := flaw(order):
             raise FaultError(reason)
-        return (order,), OWN_DURATION_S
+        return (Order(bus_topics.INJECTION_REQUEST, order),), OWN_DURATION_S
+
+    def _orders(self, named: NamedFault) -> Iterator[Order]:
+        for injection in named.injections:
+            yield Order(bus_topics.INJECTION_REQUEST, injection)
+        for order in named.orders:
+            topic = self._robots[order.topic]
+            yield Order(topic, msgspec.json.decode(order.document, type=topic.type))
 
     # -- the run --------------------------------------------------------------------------------
 
-    def due(self, now_s: float) -> list[bm.Injection | m.ActuatorFault]:
+    def due(self, now_s: float) -> list[Order]:
         """Return the orders to send now, first or again: those that nobody has answered."""
         begun = [o for o in self._ordered if not o.outcome and now_s >= o.begins_s]
         for ordered in begun:
@@ -226,8 +254,7 @@ class Injections:
                 continue
             missing = [x for x in o.orders if x.injection not in o.affected]
             if missing and now_s > o.begins_s + TAKE_HOLD_S:
-                where = ", ".join(x.topic if isinstance(x, bm.Injection) else "the base"
-                                  for x in missing)
+                where = ", ".join(x.place for x in missing)
                 o.reason = o.reason or f"nobody that publishes {where} answers"
                 told.append(self._conclude(o))
             elif (math.isfinite(o.duration_s)
@@ -243,8 +270,8 @@ class Injections:
     def _conclude(self, o: Ordered) -> str:
         o.effective = o.changed > 0
         unit = "messages changed"
-        if any(isinstance(x, m.ActuatorFault) for x in o.orders):
-            unit = "ticks of the base changed"
+        if any(x.topic is not bus_topics.INJECTION_REQUEST for x in o.orders):
+            unit = "ticks changed"
         if o.effective:
             o.outcome = f"over, {o.changed} {unit}" + (f"; {o.reason}" if o.reason else "")
         else:

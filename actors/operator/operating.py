@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.layout.system_topics import declared_topics, find_topic, published_keys
 from rampart.actors.operator.adaptation import ChoiceError, StrategyChoice
-from rampart.actors.operator.injection import FaultError, Injections, places
+from rampart.actors.operator.injection import FaultError, Injections, Order, places
 from rampart.actors.operator.requests import (
     AdaptWish,
     EndFaultWish,
@@ -28,9 +28,7 @@ from rampart.actors.operator.requests import (
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.page.stick import SILENCE_S, TICKET_S, Grip, StickDesk, effect
-from rampart.actors.run.system_topics import find_topic, published_keys
-from rampart.actors.supervision.kill_node import SIGNALS, SignalError
-from rampart.actors.supervision.process_title import RunProcess
+from rampart.actors.supervision.kill_node import SIGNALS, SignalError, signal_node
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
 
@@ -64,25 +62,22 @@ _DRIVEN_BY = ("teleoperation", "safety_pilot")
 class Operating:
     """The operator's hands.
 
-    Shared objects of the actor: "faults" (`NamedFault`s to offer), "signal_node" (sends a signal by
-    node and name), "system".
-
     Args:
         actor: the HMI.
         state: what its pages are shown; the section "operating" is this one's.
     """
 
     def __init__(self, actor: Actor, state: HmiState) -> None:
-        shared = actor.context.shared
-        prefix = f"{shared.get('run_id', 'run')}/{actor.name}.{actor.context.incarnation}"
+        run = actor.context.run
+        prefix = f"{run.plan.run_id}/{actor.name}.{actor.context.incarnation}"
         self._actor = actor
         self._state = state
         self._desk = StickDesk()
         overhead_s = OVERHEAD_S * actor.clock.rate
         self._choice = StrategyChoice(f"{prefix}.s", "operator", tuple(STRATEGIES), overhead_s)
-        self._injections = Injections(f"{prefix}.f", shared.get("faults", ()),
-                                      places_of(shared.get("system")), overhead_s)
-        self._signal: Callable[[str, str], RunProcess] | None = shared.get("signal_node")
+        self._injections = Injections(f"{prefix}.f", run.plan.faults, places_of(run.system),
+                                      run.application.topics, overhead_s)
+        self._has_processes = run.plan.launcher_pid > 0  # a replay has none
         self._pilot: m.PilotStatus | None = None
         self._pilot_heard_s = -math.inf
         self._brake = False
@@ -103,7 +98,7 @@ class Operating:
     def introduction(self, page: int) -> dict[str, Any]:
         """Return what a page needs to know to offer all this."""
         return {"type": "operating", "page": page, "strategies": list(self._choice.strategies),
-                "signals": list(SIGNALS) if self._signal else [],
+                "signals": list(SIGNALS) if self._has_processes else [],
                 "silence_s": SILENCE_S, "ticket_s": TICKET_S, **self._injections.choice()}
 
     def fulfil(self, wish: OperatingWish, page: int) -> str | dict[str, Any]:
@@ -139,16 +134,17 @@ class Operating:
             self._release("the page that drove was closed")
 
     def _send_signal(self, wish: SignalWish, page: int) -> str:
-        if self._signal is None:
+        if not self._has_processes:
             raise SignalError("the nodes of this run have no processes that could be signalled")
-        signal_node, node, name = self._signal, wish.node, wish.signal
+        node, name, port = wish.node, wish.signal, self._actor.context.run.plan.base_port
         if name not in SIGNALS:
             raise SignalError(f"unknown signal {name[:20]!r}; known: {', '.join(SIGNALS)}")
         if node == self._actor.name:  # whoever asked is to be told first
-            asyncio.get_running_loop().call_later(OWN_DEATH_S, lambda: signal_node(node, name))
+            asyncio.get_running_loop().call_later(
+                OWN_DEATH_S, lambda: signal_node(node, name, port))
             told = f"{node}: {name}; the page will be back"
         else:
-            victim = signal_node(node, name)
+            victim = signal_node(node, name, port)
             told = f"{node} (pid {victim.pid}): {name}"
         self._state.log(self._now(), "note", f"page {page} sent {told}")
         return told
@@ -166,10 +162,8 @@ class Operating:
         for order in self._injections.due(self._now()):
             self._order(order)
 
-    def _order(self, order: bm.Injection | m.ActuatorFault) -> None:
-        topic = (topics.ACTUATOR_FAULT if isinstance(order, m.ActuatorFault)
-                 else bus_topics.INJECTION_REQUEST)
-        self._actor.publish(topic, order)
+    def _order(self, order: Order) -> None:
+        self._actor.publish(order.topic, order.message)
 
     # -- the stick ------------------------------------------------------------------------------
 
@@ -308,11 +302,10 @@ class Operating:
         return self._actor.clock.now()
 
 
-def places_of(system: SystemSpec | None) -> tuple[str, ...]:
+def places_of(system: SystemSpec) -> tuple[str, ...]:
     """Return the keys at which the page offers to inject: the common ones, then the robot's own."""
-    if system is None:
-        return places(topics.ALL, (), (), ())
-    common = places(topics.ALL, [n.name for n in system.nodes],
+    known = declared_topics(system)
+    common = places(known, [n.name for n in system.nodes],
                     [d.name for d in system.detections], [r.name for r in system.recoveries])
-    own = [key for key in published_keys(system) if find_topic(key, topics.ALL) is None]
+    own = [key for key in published_keys(system) if find_topic(key, known) is None]
     return (*common, *own)

@@ -29,7 +29,7 @@ from rampart.actors.bus.bounds import (
     Seconds,
     Text,
 )
-from rampart.actors.bus.messages import Injection, Message
+from rampart.actors.bus.messages import Message
 
 # ---- robot: what a Summit XL driver publishes and takes --------------------------------------
 
@@ -424,25 +424,6 @@ class ActuatorFault(Message, frozen=True):
     wheel: Name
     strength: float
     duration_s: Lasting
-
-
-_ActuatorFaults = Annotated[tuple[ActuatorFault, ...], msgspec.Meta(max_length=64)]
-_Injections = Annotated[tuple[Injection, ...], msgspec.Meta(max_length=64)]
-
-
-class NamedFault(Message, frozen=True):
-    """A fault that can be ordered by its name: what the launcher offers to the operator's page.
-
-    `duration_s` is how long it lasts unless told otherwise, simulated seconds. The ids of the
-    orders are filled in when it is ordered.
-    """
-
-    name: Name
-    title: Text
-    group: Name
-    duration_s: Lasting
-    injections: _Injections = ()
-    actuator_faults: _ActuatorFaults = ()
 
 
 class ObstacleList(Message, frozen=True):

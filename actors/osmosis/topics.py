@@ -68,6 +68,7 @@ ACTUATOR_FAULT = Topic("world/actuator_fault", m.ActuatorFault, Qos.COMMAND, 0, 
 OBSTACLES = Topic("world/obstacles", m.ObstacleList, Qos.STATE, 1, "map",
                   "Obstacles present, for maps shown to people.")
 
-ALL: tuple[Topic[Any], ...] = (
-    *engine.ALL, *(v for v in globals().values() if isinstance(v, Topic)))
+ROBOT: tuple[Topic[Any], ...] = tuple(v for v in globals().values() if isinstance(v, Topic))
+
+ALL: tuple[Topic[Any], ...] = (*engine.ALL, *ROBOT)
 """Those of the engine as well."""

@@ -29,7 +29,6 @@ from rampart.actors.ftm.messages import (
 )
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
-from rampart.manager.spec.schema import SystemSpec
 
 _P = RecoveryPhase
 _ENDS = frozenset({_P.DONE, _P.DEGRADED, _P.FAILED})
@@ -83,8 +82,7 @@ class RecoveryModule(Actor):
         self._told: RecoveryReport | None = None
 
     def _contract_deadline_s(self) -> float:
-        system: SystemSpec | None = self.context.shared.get("system")
-        contracts = system.recoveries if system else ()
+        contracts = self.context.run.system.recoveries
         return next((c.deadline_s for c in contracts if c.name == self.name), DEFAULT_DEADLINE_S)
 
     @classmethod

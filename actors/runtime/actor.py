@@ -29,6 +29,7 @@ from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection
 from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
+from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.injection_desk import InjectionDesk
@@ -74,7 +75,7 @@ class Context:
         clock: simulated time.
         bus: this actor's access to the bus, not yet open.
         parameters: the node's parameters, as the system spec gives them or read already.
-        shared: read-only objects loaded once for the whole run ("system", "airport", ...).
+        run: what all actors of the run have in common, loaded once.
         pid: number of the process that it lives in.
         checkpoints: where this node's state is kept.
         heartbeat_period_s: simulated seconds between two heartbeats.
@@ -88,7 +89,7 @@ class Context:
     clock: Clock
     bus: Bus
     parameters: Mapping[str, Any] | msgspec.Struct = field(default_factory=dict)
-    shared: Mapping[str, Any] = field(default_factory=dict)
+    run: RunContext = field(default_factory=RunContext)
     pid: int = field(default_factory=os.getpid)
     checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
     heartbeat_period_s: float = 0.1

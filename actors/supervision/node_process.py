@@ -13,7 +13,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,8 @@ from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.run_folder import register_of
 from rampart.actors.bus.tap import Tap
 from rampart.actors.bus.zenoh_bus import ZenohBus
-from rampart.actors.run.run_plan import Layout
+from rampart.actors.layout.layout import Layout
+from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
@@ -41,7 +42,7 @@ EXIT_BUS = 3
 
 
 def make_actor(
-    layout: Layout, name: str, incarnation: int, shared: Mapping[str, Any],
+    layout: Layout, name: str, incarnation: int, run: RunContext,
     loop: asyncio.AbstractEventLoop, *, failed: Callable[[Exception], None] = lambda _error: None,
 ) -> Actor:
     """Build one actor of the system with its bus, not yet running; `failed` is told its error."""
@@ -50,7 +51,7 @@ def make_actor(
     bus = ZenohBus(name, incarnation, layout.listen(name), layout.dial(name),
                    Tap(layout.plan.base_port))
     return member.actor(Context(
-        name, incarnation, clock, bus, member.parameters, shared,
+        name, incarnation, clock, bus, member.parameters, run,
         register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
@@ -67,7 +68,7 @@ def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
 
 
 def node_main(
-    layout: Layout, names: tuple[str, ...], incarnation: int, shared: Mapping[str, Any],
+    layout: Layout, names: tuple[str, ...], incarnation: int, run: RunContext,
     lifeline: int, *, born: Callable[[], None] = lambda: None,
 ) -> int:
     """Run the actors of one process to their end and return the exit code.
@@ -76,7 +77,7 @@ def node_main(
         layout: of the run.
         names: of the actors.
         incarnation: of the process.
-        shared: objects that actors share.
+        run: what all actors of the run have in common.
         lifeline: read end of the pipe; see `lifeline`.
         born: called as soon as the process has its title, before it does anything that others see.
     """
@@ -97,7 +98,7 @@ def node_main(
         for number in (signal.SIGINT, signal.SIGHUP):  # ctrl-C is the launcher's to handle
             signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGUSR2, wedge)
-        asyncio.run(_live(layout, names, incarnation, shared, tell))
+        asyncio.run(_live(layout, names, incarnation, run, tell))
     except BusError as error:
         if error not in told:
             _complain(f"{'+'.join(names)}: {error}")
@@ -110,12 +111,12 @@ def node_main(
 
 
 async def _live(
-    layout: Layout, names: tuple[str, ...], incarnation: int, shared: Mapping[str, Any],
+    layout: Layout, names: tuple[str, ...], incarnation: int, run: RunContext,
     failed: Callable[[Exception], None],
 ) -> None:
     loop = asyncio.get_running_loop()
     tell_of_callbacks(loop, lambda line: _complain(f"{'+'.join(names)} #{incarnation}: {line}"))
-    actors = [make_actor(layout, name, incarnation, shared, loop, failed=failed) for name in names]
+    actors = [make_actor(layout, name, incarnation, run, loop, failed=failed) for name in names]
 
     def stop_all() -> None:
         for actor in actors:

@@ -19,22 +19,18 @@ import selectors
 import signal
 import socket
 import sys
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import msgspec
 
 from rampart.actors.bus.run_folder import issue, issued, remove, socket_path
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.run.run_plan import (
-    Layout,
-    RunPlan,
-    adapted_system,
-    load_shared,
-    load_system,
-)
+from rampart.actors.layout.layout import Layout, adapted_system, load_run
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.supervision.lifeline import kill_leftovers
 from rampart.actors.supervision.node_process import node_main, wedge
 from rampart.actors.supervision.process_title import set_title
@@ -89,10 +85,10 @@ def address(folder: str, name: str) -> str:
 class Spawner:
     """The fork server of one run."""
 
-    def __init__(self, name: str, layout: Layout, shared: Mapping[str, Any], lifeline: int) -> None:
+    def __init__(self, name: str, layout: Layout, run: RunContext, lifeline: int) -> None:
         self.name = name
         self._layout = layout
-        self._shared = shared
+        self._run = run
         self._lifeline = lifeline
         self._selector = selectors.DefaultSelector()
         self._listener: socket.socket | None = None
@@ -173,7 +169,7 @@ class Spawner:
                 self._layout.plan, origin_s=request.origin_s)
         elif isinstance(request, Adapt):
             adapted = msgspec.json.decode(request.adapted, type=AdaptedSystem)
-            self._layout, self._shared = adapted_system(self._layout, self._shared, adapted)
+            self._layout, self._run = adapted_system(self._layout, self._run, adapted)
 
     def _fork(self, request: ForkRequest, connection: socket.socket) -> None:
         for name in request.names:
@@ -205,14 +201,14 @@ class Spawner:
             self._selector.close()
             if request.names[0].startswith("spawner_"):
                 name = request.names[0].removeprefix("spawner_")
-                sibling = Spawner(name, self._layout, self._shared, lifeline)
+                sibling = Spawner(name, self._layout, self._run, lifeline)
                 sibling.take_title()
                 born()
                 sibling.open()
                 sibling.serve()
             code = node_main(
                 self._layout, request.names, request.incarnation,
-                {**self._shared, "known_incarnations": issued(folder)}, lifeline, born=born)
+                replace(self._run, known_incarnations=issued(folder)), lifeline, born=born)
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
@@ -263,14 +259,14 @@ def main() -> int:
     plan = msgspec.json.decode(sys.stdin.buffer.read(), type=RunPlan)
     try:
         spec = load_system(plan)
-        layout = Layout(plan, spec)
-        shared = load_shared(plan, spec)
+        run = load_run(plan, spec)
+        layout = Layout(plan, spec, run.application)
     except (ValueError, OSError) as error:
         print("error: " + " ".join(str(error).split()), flush=True)
         return 2
     gc.collect()
     gc.freeze()  # keeps the collector from touching, and so copying, the shared pages
-    spawner = Spawner(name, layout, shared, lifeline)
+    spawner = Spawner(name, layout, run, lifeline)
     try:
         spawner.open()
         print(msgspec.json.encode(tuple(layout.members)).decode(), flush=True)

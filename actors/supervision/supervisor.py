@@ -42,7 +42,7 @@ from rampart.actors.ftm.messages import (
     ProcessEvent,
     RespawnRequest,
 )
-from rampart.actors.run.run_plan import Layout, RunPlan, Unit, adapted_system
+from rampart.actors.layout.layout import Layout, Unit, adapted_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
 from rampart.actors.supervision.patience import AT_LEISURE, Patience
@@ -56,7 +56,7 @@ from rampart.actors.supervision.processes import (
 )
 from rampart.actors.supervision.restart_policy import RestartPolicy
 from rampart.manager.spec.adaptation import changed_actors
-from rampart.manager.spec.specification import Kind, SystemSpec
+from rampart.manager.spec.specification import Kind
 
 STOP_GRACE_S = 0.5
 """Wall seconds between SIGTERM and SIGKILL at the end of a run."""
@@ -126,24 +126,23 @@ class Supervisor(Actor):
     outputs = (topics.NODES, topics.PROCESS_EVENT, topics.ERROR_REPORT, bus_topics.INJECT,
                bus_topics.INJECTION_RESULT)
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, processes: Processes | None = None) -> None:
         super().__init__(context)
-        self._plan: RunPlan = context.shared["plan"]
-        self._spec: SystemSpec = context.shared["system"]
+        run = context.run
+        self._plan, self._spec = run.plan, run.system
         self._layout = Layout(self._plan, self._spec)
-        self._machine: Processes = context.shared.get("processes") or OsProcesses(
+        self._machine: Processes = processes or OsProcesses(
             self._plan.base_port, self._plan.launcher_pid, self._plan.folder)
         self._processes = {
             u.name: _Process(u, RestartPolicy(), Patience(2 * _CHECK_S / self._plan.rate))
             for u in self._layout.units.values()}
-        for node, incarnation in context.shared.get("known_incarnations", {}).items():
+        for node, incarnation in run.known_incarnations.items():
             if node in self._layout.unit_of:
                 process = self._processes[self._layout.unit_of[node]]
                 process.incarnation = process.highest = incarnation
-        adapted: AdaptedSystem | None = context.shared.get("adapted")
-        self._version = (0, adapted.version if adapted else 0)
-        if adapted is not None:
-            self._machine.adapt(adapted)
+        self._version = (0, run.adapted.version if run.adapted else 0)
+        if run.adapted is not None:
+            self._machine.adapt(run.adapted)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
         self._passed_on = RateLimit(PASSED_ON_PER_S)
         self._loop = asyncio.get_running_loop()
@@ -246,7 +245,7 @@ class Supervisor(Actor):
             return
         self._version = version
         try:
-            layout, _ = adapted_system(self._layout, {}, message)
+            layout, _ = adapted_system(self._layout, self.context.run, message)
         except ValueError as error:
             self.report_diagnostic("adaptation", " ".join(str(error).split()), message.change)
             return

@@ -14,6 +14,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from rampart.actors.layout.layout import load_application
+from rampart.actors.run.run_plan import RunPlan
 from rampart.cli import systems
 from rampart.cli.analyse.hunting import hunt
 from rampart.cli.output import (
@@ -139,21 +141,12 @@ def _base_jobs(options: argparse.Namespace) -> list[Job]:
 
 def _try_world(jobs: Sequence[Job]) -> None:
     """Refuse a mission, airport or number of obstacles that does not exist before any run."""
-    from rampart.actors.osmosis.airport.formats import load_airport, load_mission  # noqa: PLC0415 heavy
-    job = jobs[0]
-    spec = systems.load(job.system)
-    for name in ("airport", "mission"):
-        if not (getattr(job, name) or getattr(spec, name)):
-            raise UsageError(f"--{name}: missing; {spec.name} names none")
-    try:
-        airport = load_airport(job.airport or spec.airport)
-        load_mission(job.mission or spec.mission, airport)
-    except ValueError as error:
-        raise UsageError(" ".join(str(error).split())) from None
+    spec = systems.load(jobs[0].system)
     for each in jobs:
-        if not 0 <= each.obstacles <= len(airport.obstacles):
-            raise UsageError(f"--obstacles {each.obstacles}: {airport.name} has places for "
-                             f"{len(airport.obstacles)}")
+        try:
+            load_application(RunPlan(system_file=each.system, options=each.options), spec)
+        except ValueError as error:
+            raise UsageError(" ".join(str(error).split())) from None
 
 
 def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Job]]:

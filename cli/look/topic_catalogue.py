@@ -11,18 +11,13 @@ import msgspec
 
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES
 from rampart.actors.bus.topic import ROOT, Qos, Topic
+from rampart.actors.layout.layout import OBSERVER_CLASS, SUPERVISOR_CLASS
+from rampart.actors.layout.system_topics import find_topic
+from rampart.actors.layout.wiring import load_class, topics_of
 from rampart.actors.osmosis import topics
 from rampart.actors.run.run_info import NoRunError, find_run
-from rampart.actors.run.run_plan import (
-    OBSERVER,
-    OBSERVER_CLASS,
-    SUPERVISOR,
-    SUPERVISOR_CLASS,
-    load_class,
-)
-from rampart.actors.run.system_topics import find_topic
+from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
-from rampart.actors.runtime.wiring import topics_of
 from rampart.cli import systems
 from rampart.cli.output import UsageError, unknown
 from rampart.manager.spec.specification import SystemSpec

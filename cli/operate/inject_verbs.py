@@ -10,8 +10,8 @@ import msgspec
 
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.layout.system_topics import published_keys
 from rampart.actors.osmosis import topics
-from rampart.actors.run.system_topics import published_keys
 from rampart.actors.runtime.corruption import InjectionError, field_type, is_array
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.cli import systems

@@ -14,6 +14,7 @@ import socket
 import tempfile
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,13 @@ from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
 from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.message_form import form_of, header_of, renumbered
 from rampart.actors.recording.run_documents import SYSTEM, restore
 from rampart.actors.run import run_info
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.process_title import find_processes
@@ -251,16 +255,15 @@ class Replay:
     def _page(self, bus: ZenohBus, clock: Clock, folder: Path) -> ReplayPage | None:
         if not self._hmi_port:
             return None
-        shared: dict[str, Any] = {
-            "run_id": f"replay of {self._path.name}", "hmi_port": self._hmi_port}
-        with contextlib.suppress(ValueError, OSError):  # a page without a map shows the rest
-            found = restore(self.summary.files, folder)
-            shared["airport"] = load_airport(found) if found else None
+        run = RunContext(RunPlan(f"replay of {self._path.name}", hmi_port=self._hmi_port))
         with contextlib.suppress(ValueError, OSError):
             text = read_text(folder / SYSTEM, toml.MAX_SIZE)
-            shared["document"] = document = read_document(text, SYSTEM)
-            shared["system"] = check_document(document, SYSTEM)
-        return ReplayPage(Context(NAME, 1, clock, SharedBus(bus), {}, shared))
+            document = read_document(text, SYSTEM)
+            run = replace(run, document=document, system=check_document(document, SYSTEM))
+        with contextlib.suppress(ValueError, OSError):  # a page without a map shows the rest
+            if found := restore(self.summary.files, folder):
+                run = replace(run, application=Osmosis.on_map(load_airport(found)))
+        return ReplayPage(Context(NAME, 1, clock, SharedBus(bus), run=run))
 
 
 def claim_port(port: int) -> None:

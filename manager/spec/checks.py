@@ -404,10 +404,6 @@ def _timing(spec: SystemSpec) -> Iterator[Finding]:
             if math.isnan(value):
                 yield Finding(f"$.timing.{field}", "missing; it is derived from [robot], and this "
                                                    "system has none")
-        if spec.airport or spec.mission:
-            yield Finding("$.airport" if spec.airport else "$.mission",
-                          "without [robot] there is nobody to drive there; leave it out",
-                          (spec.airport or spec.mission,))
     if timing.release_hold_max_s < timing.release_hold_s:
         yield Finding("$.timing.release_hold_max_s", "must be no less than release_hold_s = "
                       f"{timing.release_hold_s}", (timing.release_hold_max_s,))

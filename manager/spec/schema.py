@@ -353,8 +353,7 @@ class SystemSpec(Table, frozen=True):
     """A whole system. In the file the arrays of tables are called by the singular.
 
     Attributes:
-        airport: Where a mobile robot drives; "" if the system is none.
-        mission: What it does there.
+        application: What the system adds to the engine: `class`, and that class's options.
         mobile: Speeds and distances of a mobile robot, `[robot]` in the file.
         strategy: By which the arbiter decides; `rampart.manager.strategies.registry` has them.
         shadow: A strategy that is asked as well, and whose differing decisions are recorded;
@@ -365,8 +364,7 @@ class SystemSpec(Table, frozen=True):
 
     name: Name
     title: str
-    airport: str = ""
-    mission: str = ""
+    application: dict[str, Any] = {}
     mobile: Robot | None = msgspec.field(name="robot", default=None)
     strategy: str = "safety-first"
     shadow: str = ""

@@ -279,4 +279,5 @@ def _known_fields(table: str) -> list[str]:
 
 def _unknown_field(file: str, path: str, table: str, value: object) -> SpecificationError:
     return SpecificationError(
-        file, path, f"unknown field; known: {', '.join(_known_fields(table))}", value)
+        file, path, f"unknown field; known: {', '.join(_known_fields(table))}"
+        + ("" if table else "; what an application is told stands in [application]"), value)

@@ -9,14 +9,16 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
 import msgspec
 
 from rampart import systems
-from rampart.actors.run.run_plan import RunPlan, load_shared, load_system, tailor
+from rampart.actors.layout.layout import load_application
+from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_plan import RunPlan, load_system, tailor
 from rampart.files import toml
 from rampart.files.reading import read_text
 from rampart.manager.spec.adaptation import Action, Change, adapt
@@ -66,6 +68,12 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         """Short name by which the run is known; it does not depend on the row."""
         return hashlib.sha256(msgspec.msgpack.encode(
             msgspec.structs.replace(self, row=""), order="deterministic")).hexdigest()[:12]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What it chooses of the application's options."""
+        chosen = {"airport": self.airport, "mission": self.mission, "obstacles": self.obstacles}
+        return {name: value for name, value in chosen.items() if value}
 
     def text(self) -> str:
         """Return what goes wrong in it, in words."""
@@ -183,16 +191,15 @@ def run_virtually(job: Job) -> VirtualResult:
     chosen = {"strategy": job.strategy} if job.strategy else {}
     spec = check_document({**document, **chosen}, file)
     plan = RunPlan(
-        run_id=job.key, base_port=1024, rate=1.0, seed=job.seed, system_file=file, strategy="",
-        airport=job.airport or spec.airport, mission=job.mission or spec.mission,
-        obstacles=job.obstacles, ftm=job.ftm, hmi_port=0)
+        run_id=job.key, base_port=1024, seed=job.seed, system_file=file, ftm=job.ftm,
+        options=job.options)
     nodes, spec = can_be_hit(spec), tailor(plan, spec)
-    shared = _shared(plan.airport, plan.mission, file)
-    mission = MissionRun(plan, shared["airport"], shared["mission"], strategy=spec.strategy,
+    application = _application(msgspec.json.encode(plan.options), file)
+    mission = MissionRun(plan, application.airport, application.mission, strategy=spec.strategy,
                          patience_s=job.patience_s)
     return VirtualRun(
         plan, spec, mission, network=find_network(job.network), scenario=job.faults, nodes=nodes,
-        shared={**shared, "document": document}).run()
+        run=RunContext(plan, spec, document, application)).run()
 
 
 def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
@@ -225,7 +232,10 @@ def _document(system: str) -> tuple[str, dict[str, Any]]:
 
 
 @lru_cache(maxsize=8)
-def _shared(airport: str, mission: str, file: str) -> Mapping[str, Any]:
-    """Load what actors share; the map of an airport is large, and read-only."""
-    plan = RunPlan("", 1024, 1.0, 1, file, "", airport, mission, 0, ftm=True, hmi_port=0)
-    return load_shared(plan, load_system(plan))
+def _application(options: bytes, file: str) -> Osmosis:
+    """Load what actors have in common; the map of an airport is large, and read-only."""
+    plan = RunPlan(system_file=file, options=msgspec.json.decode(options))
+    found = load_application(plan, load_system(plan))
+    if not isinstance(found, Osmosis):
+        raise ValueError(f"{file}: no system with an airport and a mission")
+    return found

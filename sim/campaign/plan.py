@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from itertools import product
 
 from rampart.actors.bus.topic import ROOT
-from rampart.actors.run.system_topics import published_keys, system_topics
+from rampart.actors.layout.system_topics import published_keys, system_topics
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.campaign.job import Job
 from rampart.sim.faults.faults import PAPER_FAULTS, SENSOR_FAULTS

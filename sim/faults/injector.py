@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.messages import InjectionReport
+from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import (
     GroundTruth,
@@ -86,10 +87,14 @@ class _Planned:
 
 
 class Injector(Actor):
-    """Carries out `context.shared["scenario"]` with the help of `context.shared["hand"]`.
+    """Carries out a scenario of planned faults.
 
-    Shared: `scenario`, planned faults; `hand`, a `Hand`; `nodes`, names that may be hit; `topics`,
-    all of the system.
+    Args:
+        context: of the actor.
+        scenario: what goes wrong, and when.
+        hand: by which processes are hit.
+        nodes: names that may be hit.
+        known: all topics of the system.
 
     Raises:
         ScenarioError: a planned fault makes no sense in this system.
@@ -97,13 +102,12 @@ class Injector(Actor):
 
     outputs = (bus_topics.INJECT, topics.ACTUATOR_FAULT, topics.OBSTACLE)
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, scenario: Sequence[PlannedFault], hand: Hand,
+                 nodes: Sequence[str], known: Sequence[Topic[Any]]) -> None:
         super().__init__(context)
-        self._hand: Hand = context.shared["hand"]
-        scenario: Sequence[PlannedFault] = context.shared["scenario"]
+        self._hand = hand
         self._planned = [
-            _Planned(planned, action_of(planned, f"f{i}", context.shared["nodes"],
-                                        context.shared["topics"]))
+            _Planned(planned, action_of(planned, f"f{i}", nodes, known))
             for i, planned in enumerate(scenario, start=1)]
         self._begun = 0
         self._pose: Pose | None = None

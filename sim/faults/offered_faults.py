@@ -6,7 +6,10 @@ disturbed as MODE:TOPIC, which the page puts together itself.
 
 from __future__ import annotations
 
-from rampart.actors.osmosis.messages import NamedFault
+import msgspec
+
+from rampart.actors.ftm.messages import FaultOrder, NamedFault
+from rampart.actors.osmosis import topics
 from rampart.sim.faults.faults import CATALOGUE
 from rampart.sim.faults.scenario import ACTUATOR_FAULTS, OnActuators, PlannedFault, action_of
 from rampart.sim.osmosis.robot import WHEEL_NAMES
@@ -37,4 +40,6 @@ def _on_actuators(name: str) -> NamedFault:
         raise TypeError(f"{name} is no fault of the actuators")
     kind, _, wheel = name.partition(":")
     return NamedFault(name, _TITLES[kind].format(wheel.replace("-", " ")), "actuator",
-                      action.order.duration_s, actuator_faults=(action.order,))
+                      action.order.duration_s, orders=(FaultOrder(
+                          topics.ACTUATOR_FAULT.key,
+                          msgspec.json.encode(action.order).decode()),))

@@ -25,8 +25,8 @@ import msgspec
 
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.osmosis import topics
-from rampart.actors.run.system_topics import find_topic
 from rampart.actors.runtime.corruption import is_array
 from rampart.actors.runtime.injection import MODES, UNTOUCHED
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError

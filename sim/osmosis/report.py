@@ -115,7 +115,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 def render(run: RunRecord) -> str:
     """Return the HTML page."""
-    template = environment().get_template("report.html")
+    template = environment().get_template("osmosis/report.html")
     x0, y0, x1, y1 = _bounds(run)
     measured = [light for light in run.lights if light.verdict != "not measured"]
     return template.render(
@@ -136,7 +136,7 @@ def render(run: RunRecord) -> str:
 def environment() -> jinja2.Environment:
     """Return what all reports are rendered with: pages of `sim/`, all text escaped."""
     made = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
+        loader=jinja2.FileSystemLoader(Path(__file__).parents[1]), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     made.filters.update(clock=clock, clearance=clearance)
     return made

@@ -22,11 +22,10 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.holders import Holders
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.formats import load_world
-from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
-from rampart.manager.spec.schema import Positive, SystemSpec
+from rampart.manager.spec.schema import Positive
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.schedule import Schedule
 from rampart.sim.osmosis.sensors import LaserSpec
@@ -43,11 +42,7 @@ _JOBS = (
 
 
 class Simulator(Actor):
-    """Runs the `World` on the actor's clock.
-
-    Shared: `airport`; `world` (`rampart.actors.osmosis.airport.world.WorldTruth`), read from the
-        airport's file if absent.
-    """
+    """Runs the `World` on the actor's clock."""
 
     class Parameters(Actor.Parameters, frozen=True):
         """Robot and world; the run says the first four.
@@ -76,26 +71,22 @@ class Simulator(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         parameters = self.parameters
-        self._airport: Airport = context.shared["airport"]
+        self._airport = Osmosis.of(context).airport
         self._laser = LaserSpec(
             rays=parameters.laser_rays, range_max_m=parameters.laser_range_m)
         self._dead_man_s = parameters.dead_man_timeout_s if parameters.dead_man else None
         self._asked_s = self._skipped_s = 0.0
         self._real_time_factor = 1.0
-        system: SystemSpec | None = context.shared.get("system")
         self._brakes: Holders[bool] = Holders(
-            [recovery.name for recovery in system.recoveries] if system else None, True)
+            [recovery.name for recovery in context.run.system.recoveries], True)
         self._holds_timer: Timer | None = None
 
     def on_start(self) -> None:
         """Build the world at the present time."""
         now_s = self.clock.now()
-        truth = self.context.shared.get("world")
-        if truth is None and self._airport.source:
-            truth = load_world(self._airport.source)
         self._world = World(
             self._airport,
-            truth,
+            Osmosis.of(self.context).world,
             seed=self.parameters.seed,
             obstacles=self.parameters.obstacles,
             dead_man_timeout_s=self._dead_man_s,

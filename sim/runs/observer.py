@@ -6,7 +6,7 @@ function of topic, message and header, called on the observer's loop in order of
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
@@ -21,11 +21,11 @@ Sink = Callable[[Topic[Any], Any, Header], None]
 
 
 class Observer(Actor):
-    """Passes everything it hears to `context.shared["sinks"]`, a list of sinks."""
+    """Passes everything it hears to its sinks."""
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, sinks: Sequence[Sink] = ()) -> None:
         super().__init__(context)
-        self._sinks: list[Sink] = list(context.shared.get("sinks", ()))
+        self._sinks = tuple(sinks)
         self._topic_of = {topic.type: topic for topic in self.inputs()
                           if topic not in BASE_INPUTS}
 

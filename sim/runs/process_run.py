@@ -10,8 +10,8 @@ from rampart.actors.bus.run_folder import register_of
 from rampart.actors.bus.shared_bus import SharedBus
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm.messages import NodeTable
+from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.run.run_plan import OBSERVER
-from rampart.actors.run.system_topics import system_topics
 from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.launcher import Launcher
@@ -80,14 +80,12 @@ class ProcessRun:
         sinks: list[Sink] = [to_launcher, *mission.sinks(clock)]
         of_the_run: dict[str, Any] = {
             "register": register_of(plan.folder), "members": frozenset(launcher.names)}
-        actors: list[Actor] = [Observer(Context(
-            OBSERVER, 1, clock, bus, {}, {"sinks": sinks}, **of_the_run))]
+        actors: list[Actor] = [Observer(Context(OBSERVER, 1, clock, bus, **of_the_run), sinks)]
         injector = None
         if self._scenario:
-            shared = {"scenario": self._scenario, "hand": ProcessHand(plan.base_port),
-                      "nodes": can_be_hit(self._spec), "topics": system_topics(self._spec)}
-            injector = Injector(Context(
-                INJECTOR, 1, clock, SharedBus(bus), {}, shared, **of_the_run))
+            injector = Injector(
+                Context(INJECTOR, 1, clock, SharedBus(bus), **of_the_run), self._scenario,
+                ProcessHand(plan.base_port), can_be_hit(self._spec), system_topics(self._spec))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         for task, actor in zip(tasks, actors, strict=True):

@@ -13,16 +13,18 @@ import hashlib
 import struct
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm.messages import NodeTable
-from rampart.actors.run.run_plan import OBSERVER, Layout, RunPlan, load_shared
-from rampart.actors.run.system_topics import system_topics
+from rampart.actors.layout.layout import Layout, load_run
+from rampart.actors.layout.system_topics import system_topics
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.faults.injector import INJECTOR, Injector, can_be_hit
@@ -118,8 +120,7 @@ class VirtualRun:
         scenario: What goes wrong, and when.
         nodes: That faults may name, whether they run or not; those of the spec if None.
         taps: Hear each message as it is sent: simulated time, key, payload.
-        shared: What actors share, as `run_plan.load_shared` gives it, perhaps for another seed or
-            number of obstacles; loaded if None.
+        run: What all actors have in common, perhaps for another seed; loaded if None.
 
     Raises:
         ValueError: an actor class named in the spec cannot be had.
@@ -132,22 +133,18 @@ class VirtualRun:
                  *, network: NetworkModel | None = None, scenario: Sequence[PlannedFault] = (),
                  nodes: Sequence[str] | None = None,
                  taps: Sequence[Callable[[float, str, bytes], None]] = (),
-                 shared: Mapping[str, Any] | None = None) -> None:
+                 run: RunContext | None = None) -> None:
         # Nothing that differs from run to run may get into a message.
         self.plan = msgspec.structs.replace(
             plan, run_id=f"virtual-{plan.seed}", rate=1.0, hmi_port=0, launcher_pid=1)
         self.mission = mission
         self.interrupted: str | None = None
-        self._layout = Layout(self.plan, spec)
+        self._context = replace(run or load_run(self.plan, spec), plan=self.plan, system=spec)
+        self._layout = Layout(self.plan, spec, self._context.application)
         self._network = network or NETWORKS["measured"]
         self._scenario = tuple(scenario)
         self._taps = tuple(taps)
         self._nodes = can_be_hit(spec) if nodes is None else tuple(nodes)
-        loaded = shared if shared is not None else load_shared(self.plan, spec)
-        self._shared = {
-            **loaded, "system": spec, "plan": self.plan, "run_id": self.plan.run_id,
-            "seed": plan.seed, "obstacles": plan.obstacles, "hmi_port": 0,
-            "joystick": None}
 
     def run(self) -> VirtualResult:
         """Run to the end, on a loop of its own."""
@@ -173,7 +170,7 @@ class VirtualRun:
         trace = Trace()
         hub.taps.append(trace)
         hub.taps += [_tap(take, loop.time() + LEAD_S) for take in self._taps]
-        machine = VirtualMachine(self._layout, self._shared, hub, clock, seed=self.plan.seed)
+        machine = VirtualMachine(self._layout, self._context, hub, clock, seed=self.plan.seed)
         machine.on_restart = lambda name: self.mission.brought_back(name, clock.now())
 
         def to_machine(_topic: Topic[Any], message: Any, _header: Header) -> None:
@@ -182,16 +179,15 @@ class VirtualRun:
 
         sinks: list[Sink] = [to_machine, *self.mission.sinks(clock)]
         observer = Observer(Context(
-            OBSERVER, 1, clock, VirtualBus(hub, OBSERVER), {}, {"sinks": sinks}, pid=1,
-            members=frozenset(self._layout.members)))
+            OBSERVER, 1, clock, VirtualBus(hub, OBSERVER), pid=1,
+            members=frozenset(self._layout.members)), sinks)
         actors: list[Actor] = [observer]
         injector = None
         if self._scenario:
-            injector = Injector(Context(
-                INJECTOR, 1, clock, VirtualBus(hub, INJECTOR), {},
-                {"scenario": self._scenario, "hand": machine, "nodes": self._nodes,
-                 "topics": system_topics(self._layout.spec)},
-                pid=1, members=frozenset(self._layout.members)))
+            injector = Injector(
+                Context(INJECTOR, 1, clock, VirtualBus(hub, INJECTOR), pid=1,
+                        members=frozenset(self._layout.members)),
+                self._scenario, machine, self._nodes, system_topics(self._layout.spec))
             actors.append(injector)
         watching = [asyncio.create_task(actor.run()) for actor in actors]
         machine.start()

@@ -80,9 +80,8 @@ class WatchedRun:
             clock.now(), f"{name} brought back")
         self.launcher.guard.report = lambda text: self._console.line(clock.now(), text)
         observer = Observer(Context(
-            OBSERVER, 1, clock, self.launcher.observers_bus(), {},
-            {"sinks": [self._take, self._console.take]},
-            register=register_of(plan.folder), members=frozenset(self.launcher.names)))
+            OBSERVER, 1, clock, self.launcher.observers_bus(), register=register_of(plan.folder),
+            members=frozenset(self.launcher.names)), [self._take, self._console.take])
         task = asyncio.create_task(observer.run())
         watch(task, "the launcher's observer", self.launcher.failed)
         self._console.line(clock.now(), f"{self._spec.title} ({self._spec.name}), "

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from enum import Enum
 from typing import Any
 
 from rampart.actors.ftm.messages import AdaptedSystem, NodeTable
-from rampart.actors.run.run_plan import SUPERVISOR, Layout, adapted_system
+from rampart.actors.layout.layout import Layout, adapted_system
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import (
     CheckpointStore,
@@ -24,7 +27,8 @@ from rampart.actors.runtime.checkpoint import (
 )
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.patience import AT_LEISURE, Usage
-from rampart.actors.supervision.processes import Living, SpawnerUnavailableError
+from rampart.actors.supervision.processes import Living, ProcessHandle, SpawnerUnavailableError
+from rampart.actors.supervision.supervisor import Supervisor
 from rampart.sim.virtual.timing import Timing, draw, measured
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 
@@ -96,7 +100,7 @@ class VirtualMachine:
 
     Args:
         layout: What to run.
-        shared: Objects that actors share.
+        run: What all actors of the run have in common.
         hub: Where their buses meet.
         clock: Simulated time; its source is the loop's time.
         seed: Of the dice for how long things take.
@@ -108,14 +112,14 @@ class VirtualMachine:
         shelves: What the nodes have kept; it outlives their processes.
     """
 
-    def __init__(self, layout: Layout, shared: Mapping[str, Any], hub: Hub, clock: Clock, *,
+    def __init__(self, layout: Layout, run: RunContext, hub: Hub, clock: Clock, *,
                  seed: Any, timing: Timing | None = None) -> None:
         self.failures: list[tuple[str, BaseException]] = []
         self.on_restart: Callable[[str], None] = lambda _name: None
         self.slow_start_s: dict[str, float] = {}
         self.shelves: dict[str, Shelf] = {}
         self._layout = layout
-        self._shared: dict[str, Any] = {**shared, "processes": self}
+        self._run = run
         self._hub = hub
         self._clock = clock
         self._rng = random.Random(f"processes {seed}")  # noqa: S311 no secret
@@ -144,7 +148,7 @@ class VirtualMachine:
 
     def _start_supervisor(self) -> None:
         self._supervisor += 1
-        self._shared["known_incarnations"] = dict(self._known)
+        self._run = replace(self._run, known_incarnations=dict(self._known))
         self.fork((SUPERVISOR,), self._supervisor)
         self._supervisor_heard_s = self._loop.time()
 
@@ -195,9 +199,9 @@ class VirtualMachine:
 
     def adapt(self, adapted: AdaptedSystem) -> None:
         """Start processes by a changed system from now on."""
-        self._layout, self._shared = adapted_system(self._layout, self._shared, adapted)
+        self._layout, self._run = adapted_system(self._layout, self._run, adapted)
 
-    def end(self, handles: Sequence[_Handle], grace_s: float) -> None:  # noqa: ARG002
+    def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:  # noqa: ARG002
         """End processes."""
         for handle in handles:
             handle.kill()
@@ -287,11 +291,13 @@ class VirtualMachine:
             bus = VirtualBus(self._hub, name, process.incarnation)
             process.buses.append(bus)
             try:
-                actor = member.actor(Context(
-                    name, process.incarnation, self._clock, bus, member.parameters, self._shared,
+                context = Context(
+                    name, process.incarnation, self._clock, bus, member.parameters, self._run,
                     process.pid, self._store(name, process.incarnation),
                     self._layout.spec.timing.heartbeat_period_s, register=self._known.get,
-                    members=frozenset(self._layout.members)))
+                    members=frozenset(self._layout.members))
+                actor = (Supervisor(context, self) if name == SUPERVISOR
+                         else member.actor(context))
             except Exception as error:
                 self._failed(process, name, error)
                 return

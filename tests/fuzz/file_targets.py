@@ -13,11 +13,7 @@ import msgspec
 import numpy as np
 from mcap.writer import CompressionType, Writer
 from PIL import Image
-from recording_samples import documents, pose
-from test_airport_formats import GRAPH, SCALE, TOML
 
-from fuzz.samples import sample
-from fuzz.target import ROOT, target
 from rampart.actors.osmosis.airport.errors import AirportError
 from rampart.actors.osmosis.airport.formats import load_airport, load_mission
 from rampart.actors.osmosis.airport.mask import allowed_area
@@ -39,6 +35,11 @@ from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.store import _NO_RUN, _run
 from rampart.sim.faults.faults import UnknownFaultError
 from rampart.sim.faults.scenario import ScenarioError, action_of, parse_fault
+from tests import ROOT
+from tests.actors.osmosis.airport.test_formats import GRAPH, SCALE, TOML
+from tests.actors.recording.samples import documents, pose
+from tests.fuzz.samples import sample
+from tests.fuzz.target import target
 
 SYSTEMS = ROOT / "systems"
 _CELL = (SYSTEMS / "cell.toml").read_text("utf-8")
@@ -60,7 +61,7 @@ actor = "rampart.manager.actor:FtmManager"
 kind = "manager"
 [[node]]
 name = "lamp"
-actor = "rampart.actors.ftm.stub_node:StubNode"
+actor = "rampart.actors.runtime.stub_node:StubNode"
 kind = "control"
 respawn = "RM1"
 [[detection]]

@@ -20,8 +20,8 @@ from typing import Any
 import msgspec
 import tomli_w
 
-from fuzz.target import MAX_INPUT
 from rampart.files import toml
+from tests.fuzz.target import MAX_INPUT
 
 NUMBERS: tuple[Any, ...] = (
     0, -1, 1, 2, 255, 256, 65535, 65536, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**53 + 1, 2**63 - 1,

@@ -25,9 +25,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock
 
-from fuzz import targets
-from fuzz.target import CORPUS, LIMIT_S, MAX_INPUT, ROOT, Target
-from fuzz.worker import Board
+from tests import ROOT
+from tests.fuzz import targets
+from tests.fuzz.target import CORPUS, LIMIT_S, MAX_INPUT, Target
+from tests.fuzz.worker import Board
 
 RUNS = 100_000
 MAX_DEATHS = 20
@@ -131,13 +132,13 @@ class Fuzzing:
             return code != 0 or any(Path(name).glob("found-*"))
 
     def _start(self, folder: Path, seed: int, engine: str) -> subprocess.Popen[bytes]:
-        path = [str(ROOT), str(ROOT / "tests"), *filter(None, sys.path)]
+        path = [str(ROOT), *filter(None, sys.path)]
         environment = {**os.environ, "PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1",
                        "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(path)}
         what = (self._target.name, folder, self.result.inputs, self._runs, seed, engine)
         return subprocess.Popen(
-            [sys.executable, "-m", "fuzz.worker", *map(str, what)], env=environment, cwd=folder,
-            stdout=subprocess.DEVNULL,
+            [sys.executable, "-m", "tests.fuzz.worker", *map(str, what)], env=environment,
+            cwd=folder, stdout=subprocess.DEVNULL,
             stderr=None if "FUZZ_SHOW" in os.environ else subprocess.DEVNULL)
 
     def _collect(self, folder: Path) -> None:

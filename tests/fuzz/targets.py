@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from importlib import import_module
 
-from fuzz import file_targets, wire_targets
-from fuzz.target import ALL
+from tests.fuzz import file_targets, wire_targets
+from tests.fuzz.target import ALL
 
 MORE = "FUZZ_MODULES"
 """Environment variable with the modules that `--module` names, for workers."""

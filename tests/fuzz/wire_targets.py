@@ -6,8 +6,6 @@ from typing import Any
 
 import msgspec
 
-from fuzz.samples import sample
-from fuzz.target import target
 from rampart.actors.bus.envelope import UNREADABLE, ArrivalGuard, Header, encode
 from rampart.actors.bus.tap import frame, parse_frame
 from rampart.actors.operator.requests import WishError, read_wish
@@ -29,6 +27,8 @@ from rampart.actors.supervision.process_usage import parse_stat
 from rampart.actors.supervision.spawner import Adapt, ForkRequest, Ping, Reply, Request, SetOrigin
 from rampart.actors.web.access import Access, page_url, shown_token
 from rampart.manager.actor import MANAGER_STATE
+from tests.fuzz.samples import sample
+from tests.fuzz.target import target
 
 # -- the bus ---------------------------------------------------------------------------------------
 

@@ -74,7 +74,7 @@ class Worker:
     """
 
     def __init__(self, target: Any, folder: Path, board: Board) -> None:
-        from fuzz.target import LIMIT_BYTES, LIMIT_S, place_of
+        from tests.fuzz.target import LIMIT_BYTES, LIMIT_S, place_of
 
         self._target = target
         self.folder = folder
@@ -149,7 +149,7 @@ class Worker:
 
 def go_on(worker: Worker, target: Any, runs: int, seed: int) -> None:
     """Make inputs by our own engine: from samples, and from inputs whose outcome was new."""
-    from fuzz.mutate import Mutator
+    from tests.fuzz.mutate import Mutator
 
     draw = Random(seed)
     pool = [*target.samples(), *target.corpus()]
@@ -170,8 +170,8 @@ def go_on_guided(worker: Worker, target: Any, runs: int, seed: int, inputs: Iter
     """Make inputs by libFuzzer, which keeps those that reach new code; does not return."""
     import atheris
 
-    from fuzz.mutate import Mutator
-    from fuzz.target import MAX_INPUT
+    from tests.fuzz.mutate import Mutator
+    from tests.fuzz.target import MAX_INPUT
 
     folder = worker.folder / "reached"
     folder.mkdir(exist_ok=True)
@@ -202,10 +202,10 @@ def main() -> int:
     if engine == "guided":
         import atheris
         with atheris.instrument_imports(include=["rampart"]):
-            from fuzz import targets
+            from tests.fuzz import targets
     else:
-        from fuzz import targets
-    from fuzz.target import MAX_INPUT
+        from tests.fuzz import targets
+    from tests.fuzz.target import MAX_INPUT
 
     target = targets.ALL[name]
     samples = [*target.samples(), *target.corpus()]  # before the limits: they load what is lazy

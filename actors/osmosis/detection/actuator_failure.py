@@ -9,7 +9,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.actuator_failure_monitor import ActuatorMonitor, MotionLimits
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.manager.spec.schema import NonNegative, SystemSpec
+from rampart.manager.spec.schema import NonNegative
 
 _FIRST_STATUS_S = 0.3
 """A respawned module waits this long for a first status of the base before it says idle."""
@@ -35,7 +35,7 @@ class ActuatorFailure(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system: SystemSpec = context.shared["system"]
+        system = context.run.system
         self.monitor = ActuatorMonitor(
             MotionLimits(
                 wheel_radius_m=self.parameters.wheel_radius_m,

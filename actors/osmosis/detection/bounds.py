@@ -10,7 +10,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.bounds_check import BoundsCheck
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import NodeNames
-from rampart.manager.spec.schema import NonNegative, SystemSpec
+from rampart.manager.spec.schema import NonNegative
 
 _FIRST_COMMAND_S = 0.2
 """A respawned module waits this long for a first command, four periods, before it says idle."""
@@ -38,7 +38,7 @@ class Bounds(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system: SystemSpec = context.shared["system"]
+        system = context.run.system
         self.monitor = BoundsCheck(
             system.robot.top_speed_mps, system.robot.top_turn_rate_radps,
             self.parameters.hold_s,

@@ -13,8 +13,8 @@ import math
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.airport.route_check import RouteCheck
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.route_monitor import RouteMonitor
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.manager.spec.schema import NonNegative
@@ -39,7 +39,7 @@ class ErroneousRoute(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        airport: Airport = context.shared["airport"]
+        airport = Osmosis.of(context).airport
         check = RouteCheck(airport)
         self.monitor = RouteMonitor(
             lambda waypoints, goal: check.fault(waypoints, None, goal),

@@ -10,7 +10,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.pilot_output_monitor import PilotLimits, PilotOutputMonitor
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import ControlTimeout, NodeName
-from rampart.manager.spec.schema import NonNegative, SystemSpec
+from rampart.manager.spec.schema import NonNegative
 
 _USUAL = PilotLimits()
 
@@ -41,8 +41,7 @@ class PilotOutput(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system: SystemSpec = context.shared["system"]
-        parameters = self.parameters
+        system, parameters = context.run.system, self.parameters
         limits = PilotLimits(
             # As the Safety Pilot has it: without its checks it goes on for ever.
             held_s=(system.timing.command_timeout_s if system.layers.safety_pilot_checks

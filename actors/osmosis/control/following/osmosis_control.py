@@ -17,6 +17,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.airport.route_check import RouteCheck
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.following.blockage import BlockageWatch
 from rampart.actors.osmosis.control.following.control_checkpoint import (
     CONTROL_STATE,
@@ -90,7 +91,7 @@ class OsmosisControl(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system, airport = context.shared["system"], context.shared["airport"]
+        system, airport = context.run.system, Osmosis.of(context).airport
         self._hull = hull_of(system)
         self._motion = motion_of(system)
         self._lights = row_lights(airport)

@@ -10,7 +10,7 @@ from rampart.actors.bus.bounds import clip
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import ManagerStatus
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.mission import mission_state
 from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE, catch_up
 from rampart.actors.osmosis.control.mission.mission_state import MissionState
@@ -57,7 +57,7 @@ class MissionManager(Actor):
         super().__init__(context)
         self.state = MissionState()
         self._uncertain_until_s = -math.inf
-        airport: Airport | None = context.shared.get("airport")
+        airport = Osmosis.of(context).airport
         self._lights = frozenset(light.name for light in airport.lights) if airport else None
 
     @on(topics.MISSION_REQUEST)

@@ -35,7 +35,7 @@ class SafetyPilot(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system = context.shared["system"]
+        system = context.run.system
         self._recoveries = frozenset(recovery.name for recovery in system.recoveries)
         self._gate = SafetyGate(
             gate_of(system), checks_of(system), context.clock.now(), self._recoveries)

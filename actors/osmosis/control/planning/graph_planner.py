@@ -8,7 +8,7 @@ import msgspec
 
 from rampart.actors.bus.bounds import clip
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.planning.closures import Closures, without
 from rampart.actors.osmosis.control.planning.route_search import PlannedRoute, plan_route
 from rampart.actors.osmosis.control.plausible import is_sane
@@ -68,7 +68,7 @@ class GraphPlanner(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._airport: Airport = context.shared["airport"]
+        self._airport = Osmosis.of(context).airport
         self._pose: Pose | None = None
         self._order: GoalOrder | None = None
         self._route: Route | None = None

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     JoystickDevice,
     StickMapping,
@@ -74,7 +75,7 @@ class Teleoperation(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        robot = context.shared["system"].robot
+        robot = context.run.system.robot
         linear_mps, angular_radps = self.parameters.linear_mps, self.parameters.angular_radps
         self._linear_mps = robot.top_speed_mps if linear_mps is None else linear_mps
         self._angular_radps = (
@@ -86,7 +87,7 @@ class Teleoperation(Actor):
 
     def on_start(self) -> None:
         """Open the joystick, if there is to be one."""
-        asked = self.context.shared.get("joystick", "")
+        asked = Osmosis.of(self.context).joystick
         name = asked or self.parameters.device
         if not name or asked is None:
             return

@@ -11,7 +11,7 @@ import math
 from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
 from rampart.actors.osmosis.detection.area.geofence import FenceLimits, Fix
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
@@ -44,8 +44,8 @@ class ProhibitedArea(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system: SystemSpec = context.shared["system"]
-        airport: Airport = context.shared["airport"]
+        system = context.run.system
+        airport = Osmosis.of(context).airport
         timeout_s = self.parameters.gps_timeout_s
         self.monitor = FenceMonitor(
             airport.prohibited_distance_m,

@@ -14,7 +14,7 @@ import math
 from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
 from rampart.actors.osmosis.detection.area.geofence import FenceLimits, Fix
 from rampart.actors.osmosis.detection.area.position_vote import GPS, PositionVote
@@ -25,7 +25,7 @@ from rampart.actors.osmosis.detection.area.prohibited_area import (
 )
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.manager.spec.schema import NonNegative, Positive, SystemSpec
+from rampart.manager.spec.schema import NonNegative, Positive
 
 _ABSOLUTE = "absolute pose"
 _ERROR_PER_M = 0.06
@@ -105,8 +105,8 @@ class VotedArea(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system: SystemSpec = context.shared["system"]
-        airport: Airport = context.shared["airport"]
+        system = context.run.system
+        airport = Osmosis.of(context).airport
         robot = system.robot
         parameters = self.parameters
         timeout_s = parameters.unknown_s

@@ -1,0 +1,141 @@
+"""Everything that follows from the plan of a run and its system: processes, endpoints, partners."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.zenoh_bus import endpoint
+from rampart.actors.ftm.messages import AdaptedSystem
+from rampart.actors.layout.wiring import Member, import_class, load_class, load_member, partners
+from rampart.actors.run.application import Application
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan, load_document, tailor
+from rampart.manager.spec.specification import (
+    Kind,
+    NodeSpec,
+    SystemSpec,
+    check_document,
+    check_modules,
+)
+
+SUPERVISOR_CLASS = "rampart.actors.supervision.supervisor:Supervisor"
+OBSERVER_CLASS = "rampart.sim.runs.observer:Observer"
+
+
+class Unit(msgspec.Struct, frozen=True):
+    """One process to run: its name and the actors in it."""
+
+    name: str
+    nodes: tuple[NodeSpec, ...]
+
+    @property
+    def kind(self) -> str:
+        """Kind of the first actor."""
+        return self.nodes[0].kind.value
+
+    @property
+    def respawn(self) -> str:
+        """Who brings it back: a recovery module or `supervisor`."""
+        return self.nodes[0].respawn
+
+
+class Layout:
+    """Everything derived from plan and spec: units, endpoints, partners.
+
+    Args:
+        plan: of the run.
+        spec: the system, as the plan leaves it.
+        application: of the run; without one, what it tells the world is missing.
+
+    Raises:
+        ValueError: an actor class named in the spec does not exist, cannot be imported, belongs
+            into another table, or does not take its parameters.
+    """
+
+    def __init__(self, plan: RunPlan, spec: SystemSpec,
+                 application: Application | None = None) -> None:
+        self.plan = plan
+        self.spec = spec
+        self.units: dict[str, Unit] = {
+            name: Unit(name, nodes) for name, nodes in spec.processes().items()}
+        self.unit_of: dict[str, str] = {
+            node.name: unit.name for unit in self.units.values() for node in unit.nodes}
+        supervisor, observer = load_class(SUPERVISOR_CLASS), load_class(OBSERVER_CLASS)
+        heard = msgspec.convert({"nodes": tuple(self.unit_of)}, supervisor.Parameters)
+        own = [Member(SUPERVISOR, supervisor, heard),
+               Member(OBSERVER, observer, observer.Parameters())]
+        world = {"seed": plan.seed, **(application or Application()).world_parameters(),
+                 "dead_man": spec.layers.dead_man,
+                 "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
+        self.members: dict[str, Member] = {m.name: m for m in (*own, *(
+            load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
+            for n in spec.actors()))}
+        self._partners = partners(self.members.values())
+
+    def listen(self, node: str) -> str:
+        """Return the endpoint on which a node listens."""
+        return endpoint(self.plan.folder, node)
+
+    def dial(self, node: str) -> list[str]:
+        """Return the endpoints that a node connects to when it starts."""
+        return [endpoint(self.plan.folder, p) for p in self._partners[node]]
+
+
+def adapted_system(
+    layout: Layout, run: RunContext, adapted: AdaptedSystem
+) -> tuple[Layout, RunContext]:
+    """Return layout and context of the system as it was changed while running.
+
+    Raises:
+        ValueError: the changed system is unsound, has other processes, or names a module that the
+            system as it was started does not. The manager lets none of this happen; a message may.
+    """
+    try:
+        document = msgspec.json.decode(adapted.document, type=dict[str, Any])
+    except RecursionError:
+        raise ValueError("the changed system is nested too deep") from None
+    spec = tailor(layout.plan, check_document(document, layout.plan.system_file))
+    check_modules(layout.spec, spec)
+    if spec.processes().keys() != layout.units.keys():
+        raise ValueError(f"{layout.plan.system_file}: not the processes that were started")
+    return Layout(layout.plan, spec, run.application), replace(
+        run, system=spec, document=document, adapted=adapted)
+
+
+def load_run(plan: RunPlan, spec: SystemSpec) -> RunContext:
+    """Load what all actors of a run have in common; done once, before the fork.
+
+    Raises:
+        ValueError: the application's options are unsound; the message names file and value.
+    """
+    return RunContext(plan, spec, load_document(plan), load_application(plan, spec))
+
+
+def application_class(spec: SystemSpec) -> type[Application]:
+    """Return the class that a system names under `[application]`, `Application` if none.
+
+    Raises:
+        ValueError: there is no such class.
+    """
+    path = spec.application.get("class")
+    if path is None:
+        return Application
+    return import_class(str(path), Application, "$.application.class")
+
+
+def load_application(plan: RunPlan, spec: SystemSpec) -> Application:
+    """Return the application of a run: the options of the spec, replaced by those of the plan.
+
+    Raises:
+        ValueError: an option is unknown or unsound; the message names file, field and value.
+    """
+    kind = application_class(spec)
+    said = {name: value for name, value in spec.application.items() if name != "class"}
+    try:
+        options = msgspec.convert({**said, **plan.options}, kind.Options)
+    except msgspec.ValidationError as error:
+        raise ValueError(f"{plan.system_file}: $.application: {error}") from None
+    return kind(options)

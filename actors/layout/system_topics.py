@@ -1,0 +1,122 @@
+"""All topics of a system: the common ones, and what its actors declare besides."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import topics
+from rampart.actors.layout.layout import Layout, application_class
+from rampart.actors.layout.wiring import heard, load_class, published, topics_of
+from rampart.actors.run.run_plan import OBSERVER, RunPlan
+from rampart.manager.spec.specification import SystemSpec
+
+_ANY_RUN = RunPlan()
+"""Which keys a system publishes follows from its spec; nothing in the plan of a run matters."""
+
+_SHIPPED = "rampart."
+"""Where the actors that ship are; that their topics are declared is a test's business."""
+
+
+def declared_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return the topics of the engine and of the system's application.
+
+    Raises:
+        ValueError: the application's class does not exist.
+    """
+    return (*topics.ALL, *application_class(spec).topics)
+
+
+def system_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return every topic of a system once: the declared ones, then what its actors have besides.
+
+    The latter are in the order of the spec. A key that is declared keeps its contract.
+
+    Raises:
+        ValueError: the spec names an actor class that does not exist, or one of them declares a
+            topic that makes no sense.
+    """
+    known = declared_topics(spec)
+    return (*known, *_beyond(known, _actors(spec)))
+
+
+def own_topics(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return the topics that a system has beyond the declared ones.
+
+    Only actors that do not ship are loaded, for those that do have declared topics only: a tool
+    that looks at a run need not wait for controller and simulator to be imported.
+
+    Raises:
+        ValueError: as `system_topics`, of the actors that do not ship.
+    """
+    return _beyond(declared_topics(spec), (
+        path for path in _actors(spec) if not path.startswith(_SHIPPED)))
+
+
+def published_keys(spec: SystemSpec) -> tuple[str, ...]:
+    """Return the keys that the nodes of a system and its supervisor publish, families spelt out.
+
+    Raises:
+        ValueError: the spec names an actor class that does not exist.
+    """
+    members = [m for m in Layout(_ANY_RUN, spec).members.values() if m.name != OBSERVER]
+    wanted: dict[str, dict[str, None]] = {}
+    for member in members:
+        for key, names in heard(member).items():
+            wanted.setdefault(key, {}).update(dict.fromkeys(names or ()))
+    found: dict[str, None] = {}
+    for member in members:
+        for key, names in published(member).items():
+            # A node that may publish any member of a family publishes those that somebody hears.
+            chosen = wanted.get(key, {}) if names is None else names
+            spelt = [key.replace("{name}", n) for n in chosen] if "{name}" in key else [key]
+            found.update(dict.fromkeys(spelt))
+    return tuple(sorted(found))
+
+
+def find_topic(key: str, known: Iterable[Topic[Any]]) -> Topic[Any] | None:
+    """Return the topic of a key below the root, one member's if it is a family, or None."""
+    for topic in known:
+        if not topic.is_family:
+            if key == topic.key:
+                return topic
+            continue
+        head, tail = topic.key.split("{name}")
+        member = key[len(head):len(key) - len(tail)]
+        if key == f"{head}{member}{tail}" and member and not set("/*{}") & set(member):
+            return topic
+    return None
+
+
+def _actors(spec: SystemSpec) -> Iterator[str]:
+    """Yield the paths of all actor classes of a system."""
+    for part in (spec.nodes, spec.detections, spec.recoveries):
+        for one in part:
+            yield one.actor
+
+
+def _beyond(known: Iterable[Topic[Any]], paths: Iterable[str]) -> tuple[Topic[Any], ...]:
+    """Return what actors have that is not known, each key once."""
+    common = {topic.key for topic in known}
+    found: dict[str, Topic[Any]] = {}
+    for path in dict.fromkeys(paths):
+        inputs, outputs = topics_of(load_class(path))
+        for topic in (*inputs, *outputs):
+            if topic.key in common or topic.key in found:
+                continue
+            if reason := _flaw(topic):
+                raise ValueError(f"actor = {path!r}: topic {topic.key!r}: {reason}")
+            found[topic.key] = topic
+    return tuple(found.values())
+
+
+def _flaw(topic: Topic[Any]) -> str:
+    """Return what is wrong with a topic, or an empty text."""
+    if topic.key.count("{name}") > 1:
+        return "one {name} at most is right"
+    if not (isinstance(topic.type, type) and issubclass(topic.type, msgspec.Struct)):
+        return f"type = {topic.type!r}: must be derived from rampart.actors.bus.messages.Message"
+    return ""

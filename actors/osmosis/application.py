@@ -1,0 +1,108 @@
+"""The application of Osmosis: an airport, and a mission there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+
+from rampart.actors.osmosis import topics
+from rampart.actors.run.application import Application
+from rampart.manager.spec.schema import SystemSpec
+
+if TYPE_CHECKING:
+    from rampart.actors.osmosis.airport.model import Airport, Mission
+    from rampart.actors.osmosis.airport.world import WorldTruth
+
+_TELEOPERATION = "rampart.actors.osmosis.control.teleoperation.teleoperation:Teleoperation"
+
+
+class Osmosis(Application):
+    """What the nodes of Osmosis know of the airport and of their mission.
+
+    Attributes:
+        airport: where the robot drives, as the controller believes it to be.
+        mission: what it does there.
+        world: what differs in the world from the controller's map.
+        joystick: device to drive with, "auto" for the first; "" for what the spec says.
+    """
+
+    class Options(Application.Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+        """Choices for a run of Osmosis."""
+
+        airport: Annotated[str, msgspec.Meta(
+            description="shipped airport, a .toml, or a .graph with its image beside it",
+            extra={"metavar": "NAME|FILE", "file": True})]
+        mission: Annotated[str, msgspec.Meta(
+            description="mission of the airport, or a file with lines x=…,y=…,taxi=…",
+            extra={"metavar": "NAME|FILE", "file": True})]
+        obstacles: Annotated[int, msgspec.Meta(
+            ge=0, description="how many of the airport's obstacles stand on the way",
+            extra={"metavar": "N"})] = 0
+        joystick: Annotated[str, msgspec.Meta(
+            description="drive with a joystick or gamepad of this machine, e.g. /dev/input/js0 "
+            "(without DEVICE: the first one); hold its left shoulder button to drive",
+            extra={"metavar": "DEVICE", "alone": "auto"})] = ""
+
+    topics = topics.ROBOT
+    options: Options
+
+    def __init__(self, options: Options) -> None:
+        from rampart.actors.osmosis.airport.formats import (  # noqa: PLC0415 heavy for a tool
+            load_airport,
+            load_mission,
+            load_world,
+        )
+
+        super().__init__(options)
+        self.airport: Airport = load_airport(options.airport)
+        self.world: WorldTruth = load_world(options.airport)
+        self.mission: Mission = load_mission(options.mission, self.airport)
+        if options.obstacles > len(self.airport.obstacles):
+            raise ValueError(f"obstacles = {options.obstacles}: {self.airport.name} has places for "
+                             f"{len(self.airport.obstacles)}")
+
+    @property
+    def joystick(self) -> str:
+        """Device to drive with, "auto" for the first; "" for what the spec says."""
+        return self.options.joystick
+
+    @classmethod
+    def on_map(cls, airport: Airport, mission: Mission | None = None,
+               world: WorldTruth | None = None) -> Osmosis:
+        """Return an application of what is loaded already; without a mission, of none."""
+        from rampart.actors.osmosis.airport.model import Mission  # noqa: PLC0415 heavy for a tool
+        from rampart.actors.osmosis.airport.world import WorldTruth  # noqa: PLC0415
+
+        found = cls.__new__(cls)
+        found.options = cls.Options(airport=airport.source, mission="")
+        found.airport, found.world = airport, world or WorldTruth()
+        found.mission = mission or Mission("", ())
+        return found
+
+    def check(self, spec: SystemSpec, *, virtual: bool) -> str:
+        """Refuse a joystick that nobody can drive with; one that is not plugged in is waited for.
+
+        Raises:
+            ValueError: no node reads it, it is neither a device nor a FIFO, or nobody drives.
+        """
+        name = self.joystick
+        if not name:
+            return ""
+        if virtual:
+            raise ValueError(f"--joystick {name}: not with --virtual, nobody can drive that fast")
+        if all(node.actor != _TELEOPERATION for node in spec.nodes):
+            raise ValueError(f"--joystick {name}: no node of {spec.name} reads it")
+        device = Path(name)
+        if device.is_file() or device.is_dir():
+            raise ValueError(f"--joystick {name}: neither a device nor a FIFO; joysticks are "
+                             "/dev/input/js0, /dev/input/js1 …")
+        if name != "auto" and not device.exists():
+            return f"--joystick {name}: not there yet, waiting for it"
+        return ""
+
+    def world_parameters(self) -> Mapping[str, Any]:
+        """Return how many obstacles stand in the world."""
+        return {"obstacles": self.options.obstacles}

@@ -1,0 +1,81 @@
+"""What a system adds to the engine: its topics, and what its actors know of place and task.
+
+The table `[application]` of a system names a class derived from `Application` as `class`; the other
+keys there, and what the command line says, are its options:
+
+    [application]
+    class = "rampart.actors.osmosis.application:Osmosis"
+    airport = "vallombre"
+
+It is loaded once for a run, before its processes are forked, and read-only afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol, Self
+
+import msgspec
+
+from rampart.actors.bus.topic import Topic
+from rampart.manager.spec.schema import SystemSpec
+
+
+class HasRun(Protocol):
+    """What an actor is given: something with the context of the run."""
+
+    @property
+    def run(self) -> Any:
+        """The `RunContext`."""
+
+
+class Application:
+    """The application of a system that names none: no topics, no options, nothing to know.
+
+    Class attributes:
+        topics: what its actors publish and hear besides the engine's topics.
+
+    Attributes:
+        options: what was chosen for this run.
+
+    Raises:
+        ValueError: what the options name does not exist or is unsound; file, field and value.
+    """
+
+    class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+        """What a run can be told; fields are options of the command line, with their help."""
+
+    topics: ClassVar[tuple[Topic[Any], ...]] = ()
+
+    def __init__(self, options: Any = None) -> None:
+        self.options = options or self.Options()
+
+    def world_parameters(self) -> Mapping[str, Any]:
+        """Return what the node that simulates the world has to know of the options."""
+        return {}
+
+    def check(self, spec: SystemSpec, *, virtual: bool) -> str:
+        """Return what the user has to be told before the run starts, "" for nothing.
+
+        Args:
+            spec: the system.
+            virtual: whether it is run in virtual time.
+
+        Raises:
+            ValueError: the options do not fit the system or the kind of run.
+        """
+        del spec, virtual
+        return ""
+
+    @classmethod
+    def of(cls, context: HasRun) -> Self:
+        """Return the application of the run in which an actor is started.
+
+        Raises:
+            ValueError: it is another one.
+        """
+        found = context.run.application
+        if not isinstance(found, cls):
+            raise ValueError(f"needs an [application] of class {cls.__module__}:{cls.__name__}; "
+                             f"this system has {type(found).__name__}")
+        return found

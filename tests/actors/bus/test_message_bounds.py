@@ -1,0 +1,207 @@
+"""Every field of every message is bounded, and what is beyond a bound never reaches an actor."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import msgspec
+import pytest
+from msgspec import inspect
+
+from rampart.actors.bus import envelope
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, TEXT_CHARS, bare, clip, oversized
+from rampart.actors.bus.envelope import ArrivalGuard
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Actor, Context, on
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
+from tests.fuzz.message_extremes import HEADER, all_topics, edges, pack, smallest, unbounded
+
+NOW_S = 2e12
+"""Later than any stamp, so that none is ahead."""
+
+
+def bounds_of(topic):
+    return inspect.type_info(topic.type)
+
+
+@pytest.mark.parametrize("topic", all_topics(), ids=lambda t: t.key)
+def test_every_field_of_every_message_is_bounded(topic):
+    assert list(unbounded(bounds_of(topic))) == []
+
+
+def test_the_header_is_bounded():
+    assert list(unbounded(HEADER)) == []
+
+
+def test_a_field_without_bounds_is_found():
+    class Loose(bm.Message, frozen=True):
+        names: tuple[str, ...]
+        rows: dict[str, bytes]
+
+    assert len(list(unbounded(inspect.type_info(Loose)))) == 5
+
+
+def judged(topic, payload):
+    """Return whether an arriving payload is taken, and else why not."""
+    taken, refused = [], []
+    receive = ArrivalGuard(lambda: NOW_S).receiver(
+        topic, lambda key, _message: taken.append(key), lambda _key, reason: refused.append(reason))
+    receive("rampart/x", payload)
+    assert len(taken) + len(refused) == 1
+    return bool(taken), "".join(refused)
+
+
+@pytest.mark.parametrize("topic", all_topics(), ids=lambda t: t.key)
+def test_just_inside_a_bound_is_taken_and_just_outside_refused(topic):
+    wrong = []
+    for path, body, fits in edges(bounds_of(topic)):
+        payload = pack("x", 1, 1, 0.0, body)
+        taken, reason = judged(topic, payload)
+        if taken is not fits or not (taken or reason.startswith(f"not a {topic.type.__name__}: ")):
+            wrong.append((path, str(body)[:80], fits, reason))
+    assert wrong == []
+
+
+def test_a_header_beyond_its_bounds_is_refused():
+    good = {"source": "x", "incarnation": 1, "sequence": 1, "stamp": 0.0}
+    for path, value, fits in edges(HEADER):
+        name = path.removeprefix("$.")
+        parts = {**good, name: value[name]}
+        taken, _ = judged(bus_topics.HELLO, pack(*parts.values(), {}))
+        assert taken is fits, (name, value[name])
+
+
+def test_the_incarnation_that_killed_the_supervisor_is_refused():
+    taken, reason = judged(bus_topics.HEARTBEAT, pack(
+        "DM1", 2**64 - 1, 1, 0.0, smallest(bounds_of(bus_topics.HEARTBEAT))))
+    assert not taken
+    assert "Expected `int` <= 2147483647" in reason
+
+
+def test_a_payload_that_is_too_long_is_refused_before_it_is_decoded(monkeypatch):
+    def never(_payload):
+        raise AssertionError("it was decoded")
+
+    monkeypatch.setitem(envelope._decoders, fm.Reset, never)
+    taken, reason = judged(ftm_topics.RESET, b"\x95" + bytes(MAX_PAYLOAD_BYTES))
+    assert not taken
+    assert reason == (f"not a Reset: {MAX_PAYLOAD_BYTES + 1} bytes, "
+                      f"at most {MAX_PAYLOAD_BYTES} are right")
+
+
+class Reader(Actor):
+    """Hears one topic and keeps what it hears."""
+
+    heard: list = []
+
+    @on(ftm_topics.STUB_TRIGGER)
+    def take(self, message, _header):
+        self.heard.append(message)
+
+
+class Writer(Actor):
+    """Publishes what no reader would take."""
+
+    outputs = (topics.MISSION_STATUS,)
+
+    def on_start(self):
+        self.publish(topics.MISSION_STATUS, m.MissionStatus(
+            "", "", m.MissionPhase.IDLE, 0, (), (),
+            tuple(m.LightMeasurement("x" * 256, 0.0, 0.0, m.LightVerdict.OK)
+                  for _ in range(9999)), ""))
+
+
+def lived(kind, during=lambda _hub: None):
+    """Return what an actor that lived for a second has published: key, body."""
+    sent = []
+
+    async def run():
+        loop = asyncio.get_running_loop()
+        hub = Hub()
+        hub.taps.append(lambda _now, _source, key, payload: sent.append(
+            (key, msgspec.msgpack.decode(payload)[4])))
+        actor = kind(Context("node", 1, VirtualClock(loop, 0.0), VirtualBus(hub, "node"), pid=1))
+        task = asyncio.create_task(actor.run())
+        stranger = VirtualBus(hub, "stranger")
+        await stranger.open()
+        await asyncio.sleep(0.1)
+        during(stranger)
+        await asyncio.sleep(1.0)
+        actor.stop()
+        await task
+
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        runner.run(run())
+    return sent
+
+
+def test_what_is_beyond_a_bound_is_reported_counted_and_never_handled():
+    Reader.heard = []
+    key = ftm_topics.STUB_TRIGGER.at()
+
+    def during(stranger):
+        body = {"name": "n" * 257, "active": True, "reason": ""}
+        stranger.publish(ftm_topics.STUB_TRIGGER, key, pack("x", 1, 1, 0.0, body))
+        stranger.publish(ftm_topics.STUB_TRIGGER, key, pack("x", 1, 2, 0.0, {**body, "name": "n"}))
+
+    sent = lived(Reader, during)
+    assert [message.name for message in Reader.heard] == ["n"]
+    report = next(body for k, body in sent if k == "rampart/diagnostic/node")
+    assert (report["context"], report["offender"]) == ("payload rejected", key)
+    assert report["reason"] == "not a StubTrigger: Expected `str` of length <= 256 - at `$[4].name`"
+    beats = [body for k, body in sent if k == "rampart/heartbeat/node"]
+    assert beats[-1]["rejected_payloads"] == 1
+
+
+def test_a_node_does_not_send_what_no_reader_would_take_and_says_so():
+    sent = lived(Writer)
+    assert not [key for key, _ in sent if key == topics.MISSION_STATUS.at()]
+    report = next(body for key, body in sent if key == "rampart/diagnostic/node")
+    assert (report["context"], report["offender"]) == ("not sent", topics.MISSION_STATUS.at())
+
+
+def test_a_long_or_broken_text_is_shortened_where_it_is_reported():
+    class Talker(Actor):
+        def on_start(self):
+            self.report_diagnostic("c" * 5000, "r" * 5000 + "\udc80", "o" * 5000)
+
+    body = next(body for key, body in lived(Talker) if key == "rampart/diagnostic/node")
+    assert [len(body[name]) for name in ("context", "reason", "offender")] == [TEXT_CHARS] * 3
+
+
+@pytest.mark.parametrize(("text", "chars", "expected"), [
+    ("short", 5, "short"), ("longer", 5, "lo..."), ("", 5, ""), ("é" * 6, 5, "éé..."),
+    ("\udcff", 5, "?")])
+def test_clip_makes_a_text_fit(text, chars, expected):
+    assert clip(text, chars) == expected
+
+
+@pytest.mark.parametrize(("value", "too_much"), [
+    ({}, False), ({"x": 1.0}, False), ({"x": "y" * 99}, True), ([1] * 20, True),
+    ([[[1]]], False), ([[[[1]]]], True), (b"1234", False)])
+def test_oversized_counts_bytes_and_depth(value, too_much):
+    assert oversized(value, budget=100, depth=3) is too_much
+
+
+def test_a_value_to_be_injected_is_bounded_where_it_is_made_as_well():
+    with pytest.raises(ValueError, match="set_fields: more than"):
+        bm.Injection("i", "t", "corrupt", 1.0, set_fields={"x": ["y" * 1000] * 1000})
+
+
+def test_bare_takes_the_bounds_off_a_field_s_type():
+    fields = {f.name: f.type for f in msgspec.structs.fields(fm.NodeInfo)}
+    assert (bare(fields["pid"]), bare(fields["name"]), bare(m.Pose)) == (int, str, m.Pose)
+
+
+@pytest.mark.parametrize("field", ["x_m", "y_m", "yaw_rad"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_pose_that_is_no_pose_reaches_whoever_judges_it(field, value):
+    body = {**smallest(bounds_of(topics.POSE)), field: value}
+    assert judged(topics.POSE, pack("x", 1, 1, 0.0, body))[0]

@@ -1,0 +1,161 @@
+"""DM4, DM5, DM7: nodes that die, stop or hang, and come back."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import pytest
+
+from rampart.actors.detection.watchdog import Watchdog
+from rampart.actors.detection.watchdog_core import WatchdogCore
+from rampart.actors.ftm import messages as m
+from rampart.actors.layout.wiring import Member, heard
+from rampart.actors.runtime.actor import Actor
+from rampart.actors.runtime.parameters import read_parameters
+from tests.detection_timeline import Ear, play, table
+from tests.virtual_loop import System, run
+
+# One node. b heartbeat of the first life, B of the second, g one sent before the last change;
+# x first token vanishes, p it appears, X and P the second's.
+TIMELINES = {
+    "it lives": ("pbbbbbbb", "--------"),
+    "it hangs, and goes on": ("pbb....bb", "-----AA--"),
+    "it is never heard: the start is forgiven for 500 ms": ("......", "-----A"),
+    "its process exists but is never heard": ("p.....", "-----A"),
+    "it dies: seen at once": ("pbbx..", "---AAA"),
+    "it dies before its first heartbeat": ("px.", "-AA"),
+    "it comes back as a new life": ("pbbx.PBBB", "---AAA---"),
+    "a process is not enough, a heartbeat is": ("pbbxP....B", "---AAAAAA-"),
+    "the new life is heard before its token": ("pbbx.BPB", "---AA---"),
+    "the old life's death is told after the new one's birth": ("pbbPBxBB", "--------"),
+    "the old life's death is told after the first heartbeat": ("pbbBxBBB", "--------"),
+    "the old life's death is told twice": ("pbbxPBxBB", "---AA----"),
+    "a heartbeat was under way when it died": ("pbbxg..", "---AAAA"),
+    "replaced without a death notice, the new life never works": ("pbbP....", "------AA"),
+    "it dies twice": ("pbxPBBXX", "--AA--AA"),
+    "the new life hangs": ("pbxPB....", "--AA---AA"),
+    "a link was cut and mended: the same token comes again": ("pbxpb", "--AA-"),
+    "a link was cut and mended: only heartbeats come again": ("pbxbb", "--A--"),
+    "a heartbeat of the old life after the new one's": ("pbxPB.b..", "--AA---AA"),
+}
+
+
+def watch(core: WatchdogCore):
+    last = {"change": 0.0}
+
+    def handle(event: str, now_s: float) -> None:
+        match event:
+            case "b" | "B":
+                core.beat("node", 1 if event == "b" else 2, now_s, now_s)
+            case "g":
+                core.beat("node", 1, last["change"] - 0.001, now_s)
+            case _:
+                last["change"] = now_s
+                core.peer("node", 1 if event in "px" else 2, event in "pP", now_s)
+
+    return handle
+
+
+@pytest.mark.parametrize(("events", "expected"), **table(TIMELINES))
+def test_watchdog_timeline(events, expected):
+    core = WatchdogCore(["node"], timeout_s=0.3, start_s=0.0, grace_s=0.5)
+    assert play(core, watch(core), events) == expected
+
+
+@pytest.mark.parametrize(("events", "expected"), **table({
+    "it knows with the first heartbeat": ("p.b", "??-"),
+    "a token is not enough to know": ("p....", "???AA"),
+    "no token at all": (".....", "???AA"),
+}))
+def test_a_respawned_watchdog_claims_nothing_before_it_knows(events, expected):
+    core = WatchdogCore(["node"], timeout_s=0.3, start_s=0.0, grace_s=0.3, known=False)
+    assert play(core, watch(core), events) == expected
+
+
+def test_it_names_those_who_failed_and_why():
+    core = WatchdogCore(["a", "b", "c"], 0.3, 0.0, 0.5)
+    core.beat("a", 1, 0.0, 0.0)
+    core.beat("b", 4, 0.0, 0.0)
+    core.peer("b", 4, False, 0.1)
+    core.expire(0.3)
+    assert core.nodes == ("a", "b")
+    assert core.reason == "a: no heartbeat for 0.3 s; b: process of incarnation 4 is gone"
+    core.expire(0.5)
+    assert core.nodes == ("a", "b", "c")
+    core.beat("a", 2, 0.6, 0.6)
+    assert core.nodes == ("b", "c")
+
+
+@pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
+def test_a_heartbeat_of_no_possible_time_does_not_bring_the_dead_to_life(stamp_s):
+    core = WatchdogCore(["a"], 0.3, 0.0, 0.5)
+    core.beat("a", 1, 0.0, 0.0)
+    core.peer("a", 1, False, 0.1)
+    core.beat("a", 1, stamp_s, 0.11)
+    assert core.nodes == ("a",)
+    core.beat("a", 1, 0.12, 0.12)
+    assert core.nodes == ()
+
+
+def test_strangers_are_ignored():
+    core = WatchdogCore(["a"], 0.3, 0.0, 0.5)
+    core.peer("z", 1, False, 0.1)
+    core.beat("z", 1, 0.1, 0.1)
+    assert core.nodes == ()
+
+
+def test_it_hears_the_heartbeats_of_its_nodes_only():
+    member = Member("DM4", Watchdog, Watchdog.Parameters(watch=("a", "b")))
+    assert heard(member) == {"heartbeat/{name}": ("a", "b")}
+    assert Watchdog.watches("DM4", Watchdog.Parameters(watch=("a", "b"))) == ("a", "b")
+
+
+@pytest.mark.parametrize("watch_list", ["a", [], [1], [""]])
+def test_a_watch_list_that_is_none_is_refused_by_name(watch_list):
+    with pytest.raises(ValueError, match=r"DM4: x\.watch = .*: expected a list of node names"):
+        read_parameters(Watchdog.Parameters, {"watch": watch_list}, "DM4", "x")
+
+
+class Node(Actor):
+    """A node that does nothing but beat."""
+
+
+def test_a_killed_node_is_reported_without_any_time_passing():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            system.start("a", Node)
+            system.start("b", Node)
+            system.start("DM4", Watchdog, watch=["a", "b"], timeout_s=0.35)
+            await asyncio.sleep(1.0)
+            assert ear.states == ["idle"]
+            await system.kill("b")
+            killed_s = system.clock.now()
+            await system.settle()
+            at, report = ear.heard[-1]
+            assert (at, report.state, report.nodes) == (
+                killed_s, m.DetectionState.ACTIVE, ("b",))
+            system.start("b", Node)
+            await system.settle()
+            assert ear.states == ["idle", "active", "idle"]
+
+    run(scenario)
+
+
+def test_a_node_whose_loop_hangs_is_reported_after_the_timeout():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            node = system.start("a", Node)
+            system.start("DM4", Watchdog, watch=["a"], timeout_s=0.35)
+            await asyncio.sleep(0.55)
+            node.hold(True)
+            await asyncio.sleep(0.2)
+            assert ear.states == ["idle"]
+            await asyncio.sleep(0.2)
+            assert ear.heard[-1][1].reason == "a: no heartbeat for 0.35 s"
+            active_s = next(at for at, r in ear.heard if r.state is m.DetectionState.ACTIVE)
+            assert active_s == pytest.approx(0.5 + 0.35, abs=1e-3)
+
+    run(scenario)

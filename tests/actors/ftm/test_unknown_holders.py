@@ -1,0 +1,231 @@
+"""Who makes the robot stand and is no recovery module is obeyed, named, and can be made to let go.
+
+Nor does a forged later incarnation mute a recovery module, or a source of commands.
+"""
+
+from __future__ import annotations
+
+import asyncio
+
+import msgspec
+
+from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ftm.holders import OTHERS, UNKNOWN, Holders
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate
+from rampart.actors.osmosis.messages import PilotMode
+from rampart.actors.runtime.actor import Context
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
+from tests.fuzz.handler_fuzz import system
+
+FORGED = 999_999
+
+
+class World:
+    """One actor of the paper's system, what it says, and anybody who tells it something."""
+
+    def __init__(self, hub, clock, actor):
+        self.hub, self.clock, self.actor = hub, clock, actor
+        self.sent = []
+        self._sequence = 0
+        self._stranger = VirtualBus(hub, "stranger")
+        hub.taps.append(lambda _now, source, key, payload: self.sent.append(
+            (key, msgspec.msgpack.decode(payload)[4])) if source == actor.name else None)
+
+    async def tell(self, topic, body, source, incarnation=1, *, wait_s=0.05):
+        if not self._stranger._open:
+            await self._stranger.open()
+        self._sequence += 1
+        self._stranger.publish(
+            topic, topic.at(source) if topic.is_family else topic.at(),
+            encode(Header(source, incarnation, self._sequence, self.clock.now()), body))
+        await asyncio.sleep(wait_s)
+
+    def last(self, key):
+        return [body for found, body in self.sent if found == key][-1]
+
+    @property
+    def holders(self):
+        return tuple(self.last(f"rampart/holds/{self.actor.name}")["holders"])
+
+    @property
+    def reports(self):
+        return [(body["context"], body["offender"]) for key, body in self.sent
+                if key == f"rampart/diagnostic/{self.actor.name}"]
+
+
+def during(name, script):
+    """Let an actor of the paper's system live, and a script be played to it."""
+    of = system("paper")
+
+    async def run():
+        loop = asyncio.get_running_loop()
+        hub, clock = Hub(), VirtualClock(loop, 0.0)
+        member = of.layout.members[name]
+        actor = member.actor(Context(name, 1, clock, VirtualBus(hub, name), member.parameters,
+                                     of.run, pid=1, members=frozenset(of.layout.members),
+                                     register=dict.fromkeys(of.layout.members, 1).get))
+        world = World(hub, clock, actor)
+        task = asyncio.create_task(actor.run())
+        await asyncio.sleep(0.1)
+        await script(world)
+        actor.stop()
+        await task
+
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        runner.run(run())
+
+
+def brake(engaged):
+    return m.BrakeCommand(engaged, "test")
+
+
+def stop(engaged):
+    return m.PilotOrder(engaged, PilotMode.STOP, "test")
+
+
+def is_braked(world):
+    return bool(world.actor._brakes)
+
+
+# -- the base -----------------------------------------------------------------------------------
+
+
+def test_an_unknown_holder_of_the_brake_is_obeyed_reported_shown_and_can_be_made_to_let_go():
+    async def script(world):
+        await world.tell(topics.BRAKE, brake(True), "nobody")
+        assert is_braked(world)
+        assert world.holders == ("nobody",)
+        assert ("brake", "nobody") in world.reports
+        told = len(world.sent)
+        await asyncio.sleep(0.5)
+        assert [key for key, _ in world.sent[told:]].count("rampart/holds/simulator") == 2
+        await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
+        assert not is_braked(world)
+        assert world.holders == ()
+        told = len(world.sent)
+        await asyncio.sleep(0.5)
+        assert "rampart/holds/simulator" not in [key for key, _ in world.sent[told:]]
+
+    during("simulator", script)
+
+
+def test_an_unknown_holder_may_let_go_by_itself():
+    async def script(world):
+        await world.tell(topics.BRAKE, brake(True), "nobody")
+        await world.tell(topics.BRAKE, brake(False), "nobody")
+        assert (is_braked(world), world.holders) == (False, ())
+
+    during("simulator", script)
+
+
+def test_a_recovery_module_s_brake_is_its_own_to_release_and_is_no_stranger_s():
+    async def script(world):
+        await world.tell(topics.BRAKE, brake(True), "RM1")
+        await world.tell(ftm_topics.RESET, fm.Reset("RM1", "operator"), "tool")
+        assert is_braked(world)
+        assert not any(key.startswith("rampart/holds") for key, _ in world.sent)
+        assert world.reports == []
+        await world.tell(topics.BRAKE, brake(False), "RM1")
+        assert not is_braked(world)
+
+    during("simulator", script)
+
+
+def test_a_crowd_of_holders_is_one_that_an_operator_can_make_let_go():
+    async def script(world):
+        for number in range(2000):
+            await world.tell(topics.BRAKE, brake(True), f"s{number}", wait_s=1e-4)
+        assert len(world.actor._brakes) == UNKNOWN + 1
+        assert OTHERS in world.holders
+        for number in range(2000):
+            await world.tell(topics.BRAKE, brake(False), f"s{number}", wait_s=1e-4)
+        assert is_braked(world)
+        assert world.holders == (OTHERS,)
+        await world.tell(ftm_topics.RESET, fm.Reset(OTHERS, "operator"), "tool")
+        assert not is_braked(world)
+
+    during("simulator", script)
+
+
+def test_who_forges_a_later_incarnation_of_a_recovery_module_does_not_prevent_it_from_braking():
+    async def script(world):
+        await world.tell(topics.BRAKE, brake(False), "RM1", FORGED)
+        await world.tell(topics.BRAKE, brake(True), "RM1")
+        assert is_braked(world)
+        await world.tell(topics.BRAKE, brake(False), "RM1", FORGED)
+        assert is_braked(world)
+        await world.tell(topics.BRAKE, brake(False), "RM1")
+        assert not is_braked(world)
+
+    during("simulator", script)
+
+
+def test_who_forges_a_later_incarnation_of_the_safety_pilot_neither_drives_nor_mutes_it():
+    async def script(world):
+        await world.tell(topics.BASE_COMMAND, m.BaseCommand(3.0, 0.0), "safety_pilot", FORGED)
+        assert world.actor._world._drive._wanted == (0.0, 0.0)
+        await world.tell(topics.BASE_COMMAND, m.BaseCommand(0.5, 0.0), "safety_pilot")
+        assert world.actor._world._drive._wanted == (0.5, 0.0)
+        for _ in range(2):
+            await world.tell(topics.BASE_COMMAND, m.BaseCommand(0.0, 0.0), "safety_pilot")
+        assert world.actor._world._drive._wanted == (0.0, 0.0)
+
+    during("simulator", script)
+
+
+# -- the Safety Pilot ---------------------------------------------------------------------------
+
+
+def test_an_order_of_an_unknown_module_is_obeyed_reported_shown_and_can_be_ended():
+    async def script(world):
+        await world.tell(topics.PILOT_ORDER, stop(True), "nobody")
+        assert world.last("rampart/pilot/status")["mode"] == "stop"
+        assert world.holders == ("nobody",)
+        assert ("pilot order", "nobody") in world.reports
+        await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
+        assert world.last("rampart/pilot/status")["mode"] == "auto"
+        assert world.holders == ()
+
+    during("safety_pilot", script)
+
+
+def test_an_order_of_a_recovery_module_is_not_ended_by_a_reset_and_not_muted_by_a_forgery():
+    async def script(world):
+        await world.tell(topics.PILOT_ORDER, stop(False), "RM2", FORGED)
+        await world.tell(topics.PILOT_ORDER, stop(True), "RM2")
+        await world.tell(ftm_topics.RESET, fm.Reset("RM2", "operator"), "tool")
+        assert world.last("rampart/pilot/status")["mode"] == "stop"
+        assert not any(key.startswith("rampart/holds") for key, _ in world.sent)
+
+    during("safety_pilot", script)
+
+
+def test_orders_of_a_crowd_are_bounded_and_the_strictest_holds():
+    gate = SafetyGate(GateLimits(), Checks(), 0.0, ["RM2"])
+    for number in range(10_000):
+        gate.order(f"s{number}", True, PilotMode.AUTO, "", 0.1)
+    assert len(gate.unknown) == UNKNOWN + 1
+    assert gate.mode is PilotMode.STOP
+    for name in gate.unknown:
+        assert gate.reset(name)
+    assert (gate.mode, gate.top_speed_mps, gate.unknown) == (PilotMode.AUTO, 0.0, ())
+    gate.order("RM2", True, PilotMode.STOP, "")
+    assert not gate.reset("RM2")
+
+
+# -- the parts ----------------------------------------------------------------------------------
+
+
+def test_who_is_known_depends_on_the_system_and_without_one_everybody_is():
+    holders = Holders(["RM1"], True)
+    holders.hold("RM1", True)
+    holders.hold("x", True)
+    assert (holders.unknown, holders.reset("RM1"), holders.reset("x")) == (("x",), False, True)
+    anybody = Holders(None, True)
+    anybody.hold("x", True)
+    assert (anybody.unknown, anybody.reset("x")) == ((), False)

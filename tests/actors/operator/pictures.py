@@ -1,0 +1,85 @@
+"""Takes the pictures of the operator's page that README and docs show.
+
+Run it with `python -m tests.actors.operator.pictures [DIRECTORY]`; by default they go to
+docs/images. A real run of mission AB in which one wheel gets weak, so that the robot goes on at
+reduced speed, and Osmosis Control is killed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+from PIL import Image
+
+from tests import ROOT
+from tests.actors.operator.browser import Browser, browser
+from tests.real_run import RealRun
+
+PAGE_PORT = 8580
+MOST_BYTES = 250_000
+LIVE = "document.getElementById('link').textContent === 'live'"
+RATE = 1.0
+FAULT_S = 76.0
+WIDE = (1500, 1290)
+
+
+async def shoot(tab: Browser, file: Path, *, whole: bool = False) -> None:
+    """Take a picture; one that is large gets a palette, which the many colours of a photo need."""
+    await tab.until(f"{LIVE} && !document.getElementById('camera').hidden", 60)
+    raw = file.with_suffix(".raw.png")
+    await tab.screenshot(raw, whole=whole)
+    image = Image.open(io.BytesIO(raw.read_bytes())).convert("RGB")
+    raw.unlink()
+    image.save(file, optimize=True)
+    if file.stat().st_size > MOST_BYTES:
+        image.quantize(256, method=Image.Quantize.FASTOCTREE).save(file, optimize=True)
+    print(f"{file}: {image.size[0]} x {image.size[1]}, {file.stat().st_size / 1000:.0f} kB")
+
+
+async def look(tab: Browser, width: int, height: int, scheme: str) -> None:
+    """Open the page, and look through its camera until there is a picture."""
+    await tab.show(f"http://127.0.0.1:{PAGE_PORT}/", width, height, scheme)
+    await tab.call("Emulation.setScrollbarsHidden", hidden=True)
+    await tab.until(LIVE)
+    await tab.value("document.getElementById('camera-show').click()")
+    await tab.until("!document.getElementById('camera').hidden"
+                    " || document.getElementById('camera-text').textContent.startsWith('No')", 60)
+    await tab.until("document.querySelectorAll('#nodes tr').length > 20")
+    await asyncio.sleep(1.5)
+
+
+async def take(run: RealRun, into: Path) -> None:
+    """Take all pictures of a run."""
+    async with browser() as tab:
+        await asyncio.to_thread(run.sleep_until, 58.0)
+        await look(tab, *WIDE, "light")
+        await shoot(tab, into / "hmi-desktop.png")
+        await asyncio.to_thread(run.sleep_until, FAULT_S + 1)
+        await asyncio.to_thread(run.kill, "osmosis_control")
+        await look(tab, *WIDE, "dark")
+        await tab.until("document.querySelectorAll('#order .running').length > 0")
+        await tab.value("document.querySelector('#decisions details').open = true")
+        await shoot(tab, into / "hmi-recovery.png", whole=True)
+        await look(tab, 360, 740, "light")
+        await shoot(tab, into / "hmi-phone.png")
+
+
+def main() -> int:
+    """Run, and take the pictures."""
+    into = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
+    into.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder, RealRun(
+            Path(folder), "--rate", f"{RATE:g}", "--hmi-port", str(PAGE_PORT),
+            "--fault", f"weak-wheel@{FAULT_S:g}+60", hmi=True, system="osmosis") as run:
+        asyncio.run(take(run, into.resolve()))
+    return 0
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    sys.exit(main())

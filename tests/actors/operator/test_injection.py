@@ -1,0 +1,289 @@
+"""What the operator orders from the page: faults and strategies, and what becomes of them."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus.envelope import AHEAD_S
+from rampart.actors.ftm import messages as fm
+from rampart.actors.operator.adaptation import GIVE_UP_S, ChoiceError, StrategyChoice
+from rampart.actors.operator.injection import (
+    FIRST_EFFECT_S,
+    LATE_END_S,
+    MAX_WAITING,
+    TAKE_HOLD_S,
+    FaultError,
+    Injections,
+    places,
+)
+from rampart.actors.operator.operating import places_of
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.injection import MODES, flaw
+from rampart.cli import systems
+from rampart.sim.faults.offered_faults import offered_faults
+from rampart.sim.faults.topic_faults import modes_of
+from tests.porter_actors import write_porter_system
+
+BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+OFFERED = offered_faults()
+KEYS = places(topics.ALL, ["localization"], ["DM1"], ["RM1"])
+
+
+def injections() -> Injections:
+    return Injections("r1/hmi.1", OFFERED, KEYS)
+
+
+def report(order, affected: int = 0, *, finished: bool = False, reason: str = "",
+           node: str = "localization") -> bm.InjectionReport:
+    return bm.InjectionReport(order.injection, node, affected, finished, reason)
+
+
+def test_a_fault_is_sent_until_its_publisher_reports_and_its_effect_is_told_once():
+    faults = injections()
+    ordered = faults.order("localization-not-updated", 0.0, None, 5.0)
+    (order,) = faults.due(5.0)
+    assert (order.topic, order.mode, order.duration_s) == ("localization/pose", "freeze", 10.0)
+    assert faults.due(5.5) == [order]
+    assert faults.hear(report(order)) == ""
+    assert faults.due(6.0) == []
+    assert faults.hear(report(order, 1)) == "fault localization-not-updated takes effect"
+    assert faults.hear(report(order, 1)) == ""
+    told = faults.hear(report(order, 200, finished=True))
+    assert told == "fault localization-not-updated: over, 200 messages changed"
+    assert (ordered.effective, faults.view(16.0)[0]["ended"]) == (True, True)
+
+
+def test_a_fault_that_changes_nothing_is_called_without_effect():
+    faults = injections()
+    faults.order("freeze:plan/route", 0.0, 2.0, 0.0)
+    (order,) = faults.due(0.0)
+    faults.hear(report(order))
+    assert faults.hear(report(order, 0, finished=True)) == (
+        "fault freeze:plan/route: no effect: nothing was sent that it would have changed")
+
+
+def test_a_fault_that_nobody_takes_says_so():
+    faults = injections()
+    faults.order("drop:summit_xl/upper_scan", 0.0, 5.0, 0.0)
+    assert faults.expire(TAKE_HOLD_S - 0.1) == []
+    (told,) = faults.expire(TAKE_HOLD_S + 0.1)
+    assert "no effect: nobody that publishes summit_xl/upper_scan answers" in told
+    assert faults.due(TAKE_HOLD_S + 0.2) == []
+
+
+def test_a_fault_that_a_publisher_refuses_gives_its_reason():
+    faults = injections()
+    faults.order("gps-bias", 0.0, None, 0.0)
+    (order,) = faults.due(0.0)
+    told = faults.hear(report(order, finished=True, reason="field 'x' is unknown"))
+    assert told == "fault gps-bias: no effect: field 'x' is unknown"
+
+
+def test_a_fault_whose_publisher_is_restarted_ends_all_the_same():
+    faults = injections()
+    faults.order("gps-bias", 0.0, 3.0, 0.0)
+    (order,) = faults.due(0.0)
+    faults.hear(report(order, 7))
+    assert faults.expire(3.0 + LATE_END_S - 0.1) == []
+    (told,) = faults.expire(3.0 + LATE_END_S + 0.1)
+    assert "over, 7 messages changed; its publisher did not report the end" in told
+
+
+def test_a_planned_fault_waits_for_its_time_and_can_be_withdrawn():
+    faults = injections()
+    ordered = faults.order("gps-bias", 20.0, None, 5.0)
+    assert faults.due(24.9) == []
+    assert faults.view(10.0)[0]["state"] == "begins at 25 s"
+    withdrawn = faults.order("gps-bias", 20.0, None, 5.0)
+    assert faults.end(withdrawn.injection, 6.0)[0].duration_s == 0.0
+    with pytest.raises(FaultError, match=r"no fault .* is under way"):
+        faults.end(withdrawn.injection, 7.0)
+    (order,) = faults.due(25.0)
+    assert order.topic == "summit_xl/gps"
+    assert order.injection.startswith(ordered.injection)
+
+
+def test_a_fault_ended_before_its_first_report_is_over_only_when_its_publisher_says_so():
+    faults = injections()
+    ordered = faults.order("drop:localization/pose", 0.0, math.inf, 0.0)
+    (order,) = faults.due(0.0)
+    faults.end(ordered.injection, 1.0)
+    assert not faults.view(1.0)[0]["ended"]
+    (again,) = faults.due(1.5)
+    assert again.duration_s == 0.0
+    assert "over, 4 messages" in faults.hear(report(order, 4, finished=True))
+
+
+def test_a_permanent_fault_is_ended_on_request_and_the_order_repeated_until_that_is_reported():
+    faults = injections()
+    ordered = faults.order("drop:localization/pose", 0.0, math.inf, 0.0)
+    (order,) = faults.due(0.0)
+    assert math.isinf(order.duration_s)
+    faults.hear(report(order, 9))
+    faults.expire(1e6)
+    assert not faults.view(1e6)[0]["ended"]
+    faults.end(ordered.injection, 50.0)
+    (again,) = faults.due(50.5)
+    assert (again.injection, again.duration_s) == (order.injection, 0.0)
+    assert "over, 12 messages" in faults.hear(report(again, 12, finished=True))
+
+
+def test_a_permanent_fault_without_effect_is_told_and_stays():
+    faults = injections()
+    faults.order("drop:localization/pose", 0.0, math.inf, 0.0)
+    (order,) = faults.due(0.0)
+    faults.hear(report(order))
+    (told,) = faults.expire(FIRST_EFFECT_S + 0.1)
+    assert "no effect for 10 s; it stays" in told
+    assert faults.expire(FIRST_EFFECT_S + 1) == []
+
+
+def test_a_fault_of_the_base_counts_its_ticks():
+    faults = injections()
+    faults.order("stuck-wheel:rear-left", 0.0, 4.0, 0.0)
+    (order,) = faults.due(0.0)
+    assert isinstance(order, m.ActuatorFault)
+    assert (order.wheel, order.duration_s) == ("rear left", 4.0)
+    told = faults.hear(report(order, 400, finished=True, node="simulator"))
+    assert told == "fault stuck-wheel:rear-left: over, 400 ticks of the base changed"
+
+
+@pytest.mark.parametrize(("fault", "why"), [
+    ("no-such", "no fault 'no-such'"), ("explode:localization/pose", "mode 'explode'"),
+    ("drop:world/truth", "none of that key"), ("drop:inject/order", "none of that key"),
+    ("corrupt:localization/pose", "mode 'corrupt'"), ("drop:", "none of that key"),
+    ("drop:detection/DM99", "none of that key"), ("", "no fault ''"),
+])
+def test_what_cannot_be_injected_is_refused_by_name(fault, why):
+    with pytest.raises(FaultError, match=why):
+        injections().order(fault, 0.0, None, 0.0)
+
+
+def test_only_so_many_faults_wait_at_once_and_the_list_stays_short():
+    faults = injections()
+    for _ in range(MAX_WAITING):
+        faults.order("gps-bias", 100.0, None, 0.0)
+    with pytest.raises(FaultError, match="16 faults are under way"):
+        faults.order("gps-bias", 0.0, None, 0.0)
+    for i in range(100):
+        faults.expire(1000.0 * (i + 1))
+        faults.order("gps-bias", 0.0, None, 1000.0 * (i + 1))
+    assert len(faults.view(0.0)) <= 21
+
+
+def test_all_that_is_offered_survives_the_plan_and_is_sound():
+    assert msgspec.json.decode(msgspec.json.encode(OFFERED), type=tuple[m.NamedFault, ...]) == (
+        OFFERED)
+    faults = injections()
+    assert {f.group for f in OFFERED} == {"paper", "sensor", "actuator"}
+    for offered in OFFERED:
+        ordered = faults.order(offered.name, 0.0, None, 0.0)
+        for order in ordered.orders:
+            assert ordered.injection in order.injection
+            if isinstance(order, bm.Injection):
+                assert flaw(order) == ""
+        faults.end(ordered.injection, 0.0)
+
+
+def test_no_place_is_offered_that_must_not_be_disturbed():
+    assert set(KEYS) >= {"localization/pose", "detection/DM1", "recovery/RM1/command",
+                         "heartbeat/localization"}
+    assert all(modes_of(key) for key in KEYS)
+    assert set(injections().choice()["modes"]) < set(MODES)
+
+
+def test_the_topics_of_the_robot_s_own_are_offered_after_the_common_ones(tmp_path):
+    shipped = places_of(systems.load("osmosis"))
+    own = places_of(systems.load(str(write_porter_system(tmp_path))))
+    assert set(own) - set(shipped) == {
+        "heartbeat/platform", "heartbeat/display", "porter/load", "porter/axle/front",
+        "porter/axle/rear"}
+    assert not [key for key in shipped if key.startswith("porter/")]
+
+
+def test_every_mode_that_is_offered_can_be_ordered_as_it_stands():
+    faults = injections()
+    for mode in faults.choice()["modes"]:
+        (order,) = faults.order(f"{mode}:localization/pose", 0.0, None, 0.0).orders
+        assert (order.mode, order.delay_s > 0, order.stamp_s > AHEAD_S) == (
+            mode, mode == "delay", mode == "restamp")
+
+
+@BUSY
+@given(st.lists(st.tuples(st.sampled_from(["report", "order", "expire", "end"]),
+                          st.integers(0, 5), st.floats(0, 5)), max_size=30))
+def test_each_fault_is_concluded_once_whatever_is_reported(events):
+    faults, now_s, told = injections(), 0.0, []
+    names: list[str] = []
+    for kind, number, pause_s in events:
+        now_s += pause_s
+        if kind == "order" and len(names) < MAX_WAITING:
+            names.append(faults.order("gps-bias", 0.0, 3.0, now_s).injection)
+        elif kind == "report" and names:
+            name = names[number % len(names)]
+            told.append(faults.hear(bm.InjectionReport(
+                f"{name}.1", "simulator", number, number > 3, "")))
+        elif kind == "end" and names:
+            try:
+                faults.end(names[number % len(names)], now_s)
+            except FaultError:
+                continue
+        else:
+            told += faults.expire(now_s)
+    faults.expire(now_s + 100.0)
+    assert all(fault["ended"] for fault in faults.view(now_s + 100.0))
+    assert sum("over" in text or "no effect" in text for text in told) <= len(names)
+
+
+# ---- strategies ---------------------------------------------------------------------------------
+
+NAMES = ("safety-first", "mission-first")
+
+
+def answer(request: fm.AdaptationRequest, reason: str = "") -> fm.AdaptationAnswer:
+    return fm.AdaptationAnswer(request.request, not reason, reason, 3)
+
+
+def test_a_strategy_is_asked_for_until_the_manager_answers():
+    choice = StrategyChoice("r1/hmi.1", "operator", NAMES)
+    request = choice.ask("mission-first", "safety-first", 0.0)
+    assert (request.action, request.name, request.values) == (
+        "set", "strategy", '{"value":"mission-first"}')
+    assert choice.pending is request
+    with pytest.raises(ChoiceError, match="waits for its answer"):
+        choice.ask("mission-first", "safety-first", 0.1)
+    assert choice.answer(fm.AdaptationAnswer("another's", True, "", 1)) == ""
+    told = choice.answer(answer(request))
+    assert told == "strategy mission-first is in force, change 3 of the run"
+    assert choice.answer(answer(request)) == ""
+
+
+def test_a_refused_strategy_gives_the_managers_reason():
+    choice = StrategyChoice("p", "operator", NAMES)
+    request = choice.ask("mission-first", "", 0.0)
+    assert choice.answer(answer(request, "not in the middle of a recovery: RM2")) == (
+        "strategy mission-first refused: not in the middle of a recovery: RM2")
+    assert choice.ask("mission-first", "", 1.0).request != request.request
+
+
+def test_a_strategy_that_nobody_sets_is_withdrawn():
+    choice = StrategyChoice("p", "operator", NAMES)
+    choice.ask("mission-first", "", 0.0)
+    assert choice.expire(GIVE_UP_S - 0.1) == ""
+    assert "the FTM Manager does not answer" in choice.expire(GIVE_UP_S)
+    assert choice.pending is None
+
+
+@pytest.mark.parametrize(("name", "why"), [
+    ("safety-first", "is in force already"), ("luck", "there are: safety-first, mission-first"),
+    ("x" * 500, "no strategy 'x{40}'")])
+def test_a_strategy_that_makes_no_sense_is_refused(name, why):
+    with pytest.raises(ChoiceError, match=why):
+        StrategyChoice("p", "operator", NAMES).ask(name, "safety-first", 0.0)

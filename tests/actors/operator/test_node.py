@@ -1,0 +1,298 @@
+"""The HMI as a node: it asks for the mission, and serves the operator's page."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+
+import httpx
+import pytest
+import websockets
+
+from rampart.actors.ftm import messages as fm
+from rampart.actors.operator import feed as hmi_feed
+from rampart.actors.operator import server as hmi_server
+from rampart.actors.operator.hmi import Hmi
+from rampart.actors.operator.requests import OrderWish
+from rampart.actors.operator.server import MAX_MESSAGE_BYTES, Visitor
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from tests.actors.operator.browser import CHROMIUM, browser
+from tests.actors.operator.world import (
+    AIRPORT,
+    RATE,
+    eventually,
+    free_port,
+    hear,
+    repeated,
+    served,
+)
+
+
+async def test_the_mission_is_asked_for_until_it_is_taken_and_never_again(world):
+    async with world.hmi(mission=AIRPORT.mission("AB")):
+        await eventually(lambda: len(world.others.requests) >= 3)
+        assert len({r.mission_id for r in world.others.requests}) == 1
+        assert world.others.requests[0].goals[0] == m.Goal(-22.0, -18.5, m.Mode.TAXI)
+        world.say_running(world.others.requests[0])
+        await asyncio.sleep(0.05)
+        count = len(world.others.requests)
+        world.others.publish(topics.MISSION_STATUS, m.MissionStatus(
+            "", "", m.MissionPhase.IDLE, 0, (), (), (), ""))
+        await asyncio.sleep(2.0 / RATE)
+        assert len(world.others.requests) == count
+
+
+async def test_an_hmi_respawned_in_mid_run_starts_nothing(world):
+    await asyncio.sleep(9.0 / RATE)
+    async with world.hmi(incarnation=2, mission=AIRPORT.mission("AB")):
+        await asyncio.sleep(2.0 / RATE)
+    assert world.others.requests == []
+
+
+async def test_a_page_gets_the_map_once_and_then_states(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        world.others.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
+        async with websockets.connect(f"ws://{at}/ws", origin=f"http://{at}") as page:
+            hello = await hear(page, "hello")
+            assert hello["map"]["name"] == AIRPORT.name
+            assert hello["missions"] == ["A", "B", "AB"]
+            state = await hear(page, "state")
+            assert state["pose"]["value"] == {"x_m": 1.0, "y_m": 2.0, "yaw_rad": 0.5}
+
+
+async def test_nothing_is_pushed_and_no_task_is_left_when_the_page_is_closed(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        before = len(asyncio.all_tasks())
+        async with websockets.connect(f"ws://{at}/ws") as page:
+            await hear(page, "state")
+            assert hmi._server.pages == 1
+        await eventually(lambda: hmi._server.pages == 0 and len(asyncio.all_tasks()) <= before)
+
+
+async def test_the_emergency_stop_is_reset_from_the_page(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with websockets.connect(f"ws://{at}/ws") as page:
+            await page.send('{"type": "reset", "recovery": "RM1"}')
+            assert "'RM1' does not wait for a reset" in (await hear(page, "error"))["text"]
+            world.say_latched("RM1")
+            await eventually(lambda: hmi._state.latched == ("RM1",))
+            await page.send('{"type": "reset", "recovery": "RM1"}')
+            await hear(page, "done")
+            await eventually(lambda: world.others.resets == [fm.Reset("RM1", "hmi")])
+
+
+async def test_a_mission_is_started_from_the_page_unless_one_runs(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with websockets.connect(f"ws://{at}/ws") as page:
+            await page.send('{"type": "mission", "name": "Z"}')
+            assert (await hear(page, "error"))["text"] == "no mission 'Z'; there are: A, B, AB"
+            await page.send('{"type": "mission", "name": "B"}')
+            await hear(page, "done")
+            await eventually(lambda: bool(world.others.requests))
+            assert world.others.requests[0].name == "B"
+            world.say_running(world.others.requests[0])
+            await eventually(lambda: hmi._submission.pending is None)
+            await page.send('{"type": "mission", "name": "A"}')
+            assert (await hear(page, "error"))["text"] == "mission B is running"
+
+
+@pytest.mark.parametrize("text", [
+    "", "not json", "[]", "null", "{}", '{"type": "reset"}', '{"type": "reset", "recovery": 1}',
+    '{"type": "format", "disk": "c"}', '{"type": "reset", "recovery": "RM1", "extra": 1}',
+    "[" * 4000, b"\xff\xfe\x00",
+    '{"type": "order"}', '{"type": "order", "action": "explode"}',
+    '{"type": "order", "action": "PAUSE"}', '{"type": "order", "action": null}',
+    '{"type": "order", "action": ["pause"]}', '{"type": "order", "action": "pause", "by": "RM6"}',
+    '{"type": "order", "action": "pause", "reason": 7}',
+    '{"type": "order", "action": "pause", "reason": "' + 201 * "x" + '"}',
+])
+async def test_a_malformed_message_is_answered_with_an_error_and_ignored(world, text):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with websockets.connect(f"ws://{at}/ws") as page:
+            await page.send(text)
+            assert "not understood" in (await hear(page, "error"))["text"]
+            world.others.publish(topics.POSE, m.Pose(1.0, 2.0, 0.5))
+            assert (await hear(page, "state"))["pose"]
+    assert (world.others.resets, world.others.orders) == ([], [])
+
+
+async def test_an_order_is_given_from_the_page_if_it_makes_sense_and_its_answer_is_shown(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with websockets.connect(f"ws://{at}/ws") as page:
+            await page.send('{"type": "order", "action": "pause"}')
+            assert (await hear(page, "error"))["text"] == "the Mission Manager was not heard yet"
+            world.say(m.MissionPhase.RUNNING, m.MissionAction.PAUSE)
+            await eventually(lambda: hmi._state.snapshot(0.0)["mission"] is not None)
+            await page.send('{"type": "order", "action": "resume"}')
+            assert (await hear(page, "error"))["text"] == (
+                "resume makes no sense while the mission is running; possible: pause")
+            await page.send('{"type": "order", "action": "pause", "reason": "runway in use"}')
+            assert (await hear(page, "done"))["text"] == "pause asked for"
+            await eventually(lambda: bool(world.others.orders))
+            order = world.others.orders[0]
+            assert (order.action, order.reason, order.by) == ("pause", "runway in use", "operator")
+            world.others.publish(topics.MISSION_ORDER_ANSWER, m.MissionOrderAnswer(
+                order.order, False, "a reason"))
+            await eventually(lambda: hmi._orders.pending is None)
+            while (state := await hear(page, "state"))["order"]["number"] == 0:
+                pass
+            assert state["order"]["text"] == "pause refused: a reason"
+            assert state["events"][-1]["text"] == "order to the mission: pause refused: a reason"
+    assert {o.order for o in world.others.orders} == {order.order}
+
+
+async def test_an_order_without_an_answer_is_repeated_to_a_mission_manager_that_comes_back(world):
+    async with world.hmi() as hmi:
+        world.say(m.MissionPhase.RUNNING, *m.MissionAction)
+        await eventually(lambda: hmi._orders._status is not None)
+        hmi._fulfil(OrderWish(m.MissionAction.HOME), Visitor(1))
+        sent = []
+        hmi.publish = lambda topic, body, *_: topic is topics.MISSION_ORDER and sent.append(body)
+        await eventually(lambda: len(sent) >= 2)
+        await eventually(lambda: hmi._orders.pending is None)
+        assert len(set(sent)) == 1
+        assert "does not answer" in hmi._state.snapshot(0.0)["order"]["text"]
+
+
+async def test_a_huge_message_closes_that_page_only(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with (websockets.connect(f"ws://{at}/ws") as good,
+                    websockets.connect(f"ws://{at}/ws") as bad):
+            await bad.send("x" * (MAX_MESSAGE_BYTES + 1))
+            with pytest.raises(websockets.ConnectionClosedError):
+                await hear(bad, "never")
+            await hear(good, "state")
+
+
+async def test_a_page_that_takes_nothing_gives_its_place_back(world, monkeypatch):
+    monkeypatch.setattr(hmi_feed, "SEND_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(hmi_server, "CLOSE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(Hmi, "_hello", lambda _hmi: {"type": "hello", "much": "x" * (1 << 25)})
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        host, port = (await served(hmi)).split(":")
+        with socket.create_connection((host, int(port))) as mute:
+            mute.sendall(f"GET /ws HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\n"
+                         "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+                         "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode())
+            await eventually(lambda: hmi._server.pages == 1)
+            await eventually(lambda: hmi._server.pages == 0)
+
+
+async def test_on_loopback_the_name_of_the_machine_is_a_foreign_host(world, monkeypatch):
+    monkeypatch.setattr(socket, "gethostname", lambda: "robot.example")
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with httpx.AsyncClient() as client:
+            named = await client.get(f"http://{at}/", headers={"host": "robot.example"})
+            assert named.status_code == 400
+
+
+async def test_a_foreign_origin_and_a_foreign_host_are_refused(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        with pytest.raises(websockets.InvalidStatus, match="403"):
+            await websockets.connect(f"ws://{at}/ws", origin="http://evil.example")
+        async with httpx.AsyncClient() as client:
+            assert (await client.get(f"http://{at}/")).status_code == 200
+            rebound = await client.get(f"http://{at}/", headers={"host": "evil.example"})
+            assert rebound.status_code == 400
+            assert (await client.get(f"http://{at}/../hmi.py")).status_code == 404
+
+
+async def test_without_a_free_port_the_hmi_works_without_a_page_and_says_why(world):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        async with world.hmi(hmi_port=port, mission=AIRPORT.mission("A")) as hmi:
+            await eventually(lambda: bool(world.others.diagnostics and world.others.requests))
+            assert hmi.page_port is None
+    report = world.others.diagnostics[0]
+    assert report.offender == f"port {port}"
+    assert "Address already in use" in report.reason
+    assert "choose another hmi_port" in report.reason
+
+
+async def test_a_successor_takes_the_page_over_at_once(world):
+    port = free_port()
+    async with world.hmi(hmi_port=port) as first:
+        at = await served(first)
+        page = await websockets.connect(f"ws://{at}/ws")
+        await hear(page, "state")
+    async with world.hmi(incarnation=2, hmi_port=port) as second:
+        at = await served(second)
+        async with websockets.connect(f"ws://{at}/ws") as again:
+            await hear(again, "state")
+    await page.close()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+async def test_chromium_shows_the_system_resets_the_stop_and_reconnects_by_itself(world):
+    port = free_port()
+    async with browser() as tab:
+        async with world.hmi(hmi_port=port) as hmi:
+            await tab.show(f"http://{await served(hmi)}/")
+            await tab.until("document.getElementById('link').textContent === 'live'")
+            await tab.until("document.querySelectorAll('.light').length === 22")
+            world.others.publish(topics.POSE, m.Pose(-10.0, 5.0, 0.0))
+            await tab.until("document.querySelector('.robot').getAttribute('transform')"
+                            " === 'translate(-10 -5) rotate(0)'")
+            world.say_latched("RM1")
+            await tab.until("!document.getElementById('alarm').hidden")
+            await tab.value("document.querySelector('#resets button').click()")
+            await eventually(lambda: world.others.resets == [fm.Reset("RM1", "hmi")])
+            assert tab.errors == []
+        await tab.until("document.body.classList.contains('offline')")
+        async with world.hmi(incarnation=2, hmi_port=port):
+            await tab.until("document.getElementById('link').textContent === 'live'")
+
+
+BUTTONS = "[...document.querySelectorAll('#orders button:enabled')].map((b) => b.dataset.order)"
+
+
+async def press(tab, key: str) -> None:
+    for kind in ("rawKeyDown", "char", "keyUp"):
+        await tab.call("Input.dispatchKeyEvent", type=kind, key=key, code="Enter",
+                       windowsVirtualKeyCode=13, text="\r" if kind == "char" else "")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+async def test_in_chromium_the_orders_that_make_sense_are_buttons_for_mouse_and_keyboard(world):
+    p, a = m.MissionPhase, m.MissionAction
+    async with world.hmi(hmi_port=free_port()) as hmi, browser() as tab:
+        await tab.show(f"http://{await served(hmi)}/")
+        await tab.until("document.getElementById('link').textContent === 'live'")
+        assert await tab.value("document.getElementById('orders').hidden") is True
+        for phase, possible in ((p.RUNNING, (a.PAUSE, a.SKIP, a.CANCEL, a.HOME)),
+                                (p.PAUSED, (a.RESUME, a.SKIP, a.CANCEL, a.HOME)),
+                                (p.RETURNING, (a.PAUSE, a.CANCEL))):
+            async with repeated(lambda phase=phase, possible=possible: world.say(phase, *possible)):
+                shown = [x.value for x in (a.PAUSE, a.RESUME, a.SKIP, a.HOME, a.CANCEL)
+                         if x in possible]
+                await tab.until(f"JSON.stringify({BUTTONS}) === '{json.dumps(shown)}'"
+                                .replace(", ", ","))
+        async with repeated(lambda: world.say(p.RUNNING, *a)):
+            await tab.until(f"{BUTTONS}.length === 5")
+            await tab.value("document.querySelector('[data-order=pause]').focus()")
+            await press(tab, "Enter")
+            # The HMI repeats an order until it is answered.
+            await eventually(lambda: {o.action for o in world.others.orders} == {a.PAUSE})
+            world.others.publish(topics.MISSION_ORDER_ANSWER, m.MissionOrderAnswer(
+                world.others.orders[0].order, True, ""))
+            await tab.until("document.getElementById('toast').textContent === 'pause obeyed'")
+            cancel = "document.querySelector('[data-order=cancel]')"
+            await tab.value(f"{cancel}.click()")
+            assert await tab.value(f"{cancel}.textContent") == "Sure?"
+            assert len({o.order for o in world.others.orders}) == 1
+            await tab.value(f"{cancel}.click()")
+            await eventually(lambda: world.others.orders[-1].action == a.CANCEL)
+        world.say(p.CANCELLED)
+        await tab.until("document.getElementById('orders').hidden")
+        assert tab.errors == []

@@ -1,0 +1,340 @@
+"""The operator's hands on the page's WebSocket: driving, strategy, signals, faults, who may."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+
+import httpx
+import pytest
+import websockets
+
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.supervision.kill_node import SignalError
+from rampart.actors.supervision.process_title import RunProcess
+from rampart.sim.faults.offered_faults import offered_faults
+from tests.actors.operator.world import eventually, free_port, hear, repeated, served
+
+TOKEN = "abcdefghijklmnop"
+RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
+
+
+async def ask(page, **wish) -> dict:
+    """Send a wish and return what the page is told."""
+    await page.send(json.dumps(wish))
+    return await hear(page, "done", "error", "stick")
+
+
+async def operating(page, shown) -> dict:
+    """Wait until the section "operating" is as wanted."""
+    async with asyncio.timeout(5):
+        while not shown(found := (await hear(page, "state"))["operating"]):
+            pass
+    return found
+
+
+class Hand:
+    """Drives from a page as fast as it is answered."""
+
+    def __init__(self, page) -> None:
+        self.page = page
+        self.ticket = 0
+
+    async def hold(self, forward: float = 0.5, left: float = 0.0) -> dict:
+        told = await ask(self.page, type="stick", held=True, ticket=self.ticket, forward=forward,
+                         left=left)
+        self.ticket = told["ticket"]
+        return told
+
+    async def take(self) -> None:
+        assert (await self.hold())["grip"] == "waits"
+        assert (await self.hold())["grip"] == "drives"
+
+
+def open_page(at: str, **options):
+    return websockets.connect(f"ws://{at}/ws", **options)
+
+
+# ---- driving ------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("patient")
+async def test_a_page_drives_while_it_holds_the_stick_and_letting_go_stops(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        async with open_page(await served(hmi)) as page:
+            hand = Hand(page)
+            await hand.take()
+            await hand.hold(0.25, -1.0)
+            await eventually(lambda: m.Joystick(0.25, -1.0, dead_man=True) in world.others.stick)
+            assert (await ask(page, type="stick", held=False))["grip"] == "free"
+            await eventually(lambda: world.others.stick[-1] == RELEASED)
+    assert world.others.stick.count(RELEASED) == 2  # at the start of its life, and now
+
+
+@pytest.mark.usefixtures("patient")
+async def test_a_held_stick_is_repeated_as_often_as_the_robot_needs_it(world):
+    """At twenty times real time, the Safety Pilot's 0.3 s are 15 ms: no page is that fast."""
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        async with open_page(await served(hmi)) as page:
+            await Hand(page).take()
+            count = len(world.others.stick)
+            await eventually(lambda: len(world.others.stick) >= count + 5)
+            assert world.others.stick[-1].dead_man
+
+
+async def test_a_page_that_falls_silent_has_let_go(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        async with open_page(await served(hmi)) as page:
+            hand = Hand(page)
+            await hand.take()
+            await eventually(lambda: world.others.stick[-1] == RELEASED)
+            shown = await operating(page, lambda o: o["holder"] is None)
+            assert shown["note"] == "page 1 was silent for 0.3 s"
+            told = await hand.hold()
+            assert (told["grip"], told["text"]) == ("lapsed",
+                                                    "let go of the stick and press again")
+            assert world.others.stick[-1] == RELEASED
+
+
+@pytest.mark.usefixtures("patient")
+async def test_a_page_that_closes_or_vanishes_has_let_go(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        for end in (lambda page: page.close(), None):
+            world.others.stick.clear()
+            page = await open_page(at)
+            await Hand(page).take()
+            if end is None:
+                page.transport.abort()  # as when the machine is unplugged
+            else:
+                await end(page)
+            await eventually(lambda: RELEASED in world.others.stick)
+            await eventually(lambda: hmi._server.pages == 0)
+
+
+@pytest.mark.usefixtures("patient")
+async def test_an_hmi_that_is_stopped_lets_go(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        page = await open_page(await served(hmi))
+        await Hand(page).take()
+    await eventually(lambda: world.others.stick[-1] == RELEASED)
+    await page.close()
+
+
+@pytest.mark.usefixtures("patient")
+async def test_of_two_operators_one_has_the_stick_and_the_other_is_told(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with open_page(at) as one, open_page(at) as two:
+            first, second = Hand(one), Hand(two)
+            await first.take()
+            for _ in range(3):
+                told = await second.hold(-1.0, -1.0)
+                assert (told["grip"], told["text"]) == ("taken", "page 1 has the stick")
+                assert (await first.hold())["grip"] == "drives"
+            assert (await operating(two, lambda o: o["holder"] is not None))["holder"] == 1
+            await ask(one, type="stick", held=False)
+            assert (await second.hold(0.75, 0.0))["grip"] == "lapsed"
+            await ask(two, type="stick", held=False)
+            assert (await second.hold(0.75, 0.0))["grip"] == "drives"
+            await eventually(lambda: m.Joystick(0.75, 0.0, dead_man=True) in world.others.stick)
+    assert not any(s.forward < 0 for s in world.others.stick)
+
+
+@pytest.mark.usefixtures("patient")
+async def test_a_stick_out_of_bounds_is_refused_and_stops(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        async with open_page(await served(hmi)) as page:
+            hand = Hand(page)
+            await hand.take()
+            told = await hand.hold(7.0)
+            assert told["grip"] == "refused"
+            assert "forward = 7: must be between -1 and 1" in told["text"]
+            await eventually(lambda: world.others.stick[-1] == RELEASED)
+    assert max(s.forward for s in world.others.stick) == 0.5
+
+
+def pilot(mode: m.PilotMode, forbids: str = "") -> m.PilotStatus:
+    return m.PilotStatus(mode, bool(forbids), forbids, 0, forbids=forbids)
+
+
+async def test_the_page_says_whether_the_stick_has_an_effect_now(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        async with open_page(await served(hmi)) as page:
+            shown = await operating(page, lambda _: True)
+            assert shown["text"] == "no effect: the Safety Pilot is not heard"
+            for said, works, text in (
+                    (pilot(m.PilotMode.AUTO), True, "overrides the mission"),
+                    (pilot(m.PilotMode.TELEOPERATION), True, "obeys the stick alone"),
+                    (pilot(m.PilotMode.STOP, "RM2: stale"), False, "no effect: RM2: stale")):
+                async with repeated(
+                        lambda said=said: world.others.publish(topics.PILOT_STATUS, said)):
+                    shown = await operating(page, lambda o, t=text: t in o["text"])
+                    assert shown["works"] is works
+            async with repeated(lambda: world.others.publish(
+                    topics.PILOT_STATUS, pilot(m.PilotMode.AUTO))):
+                world.others.publish(topics.BASE_STATUS, m.BaseStatus(
+                    True, False, 0.0, (0.0, 0.0, 0.0, 0.0)))
+                await operating(page, lambda o: "the brake is engaged" in o["text"])
+
+
+# ---- strategy, signals, faults ------------------------------------------------------------------
+
+
+async def test_a_strategy_is_asked_for_from_the_page_and_the_answer_shown(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        async with open_page(await served(hmi)) as page:
+            assert "mission-first" in (await hear(page, "operating"))["strategies"]
+            told = await ask(page, type="strategy", name="luck")
+            assert "no strategy 'luck'; there are: " in told["text"]
+            assert (await ask(page, type="strategy", name="mission-first"))["type"] == "done"
+            await eventually(lambda: bool(world.others.adaptations))
+            request = world.others.adaptations[0]
+            assert (request.action, request.name, json.loads(request.values)) == (
+                "set", "strategy", {"value": "mission-first"})
+            world.others.publish(ftm_topics.ADAPTATION, fm.AdaptationAnswer(
+                request.request, False, "not in the middle of a recovery: RM2", 0))
+            async with asyncio.timeout(5):
+                while "RM2" not in (state := await hear(page, "state"))["order"]["text"]:
+                    pass
+            assert state["order"]["text"] == (
+                "strategy mission-first refused: not in the middle of a recovery: RM2")
+
+
+async def test_a_signal_is_sent_to_a_node_and_to_the_hmi_itself_after_its_answer(world):
+    sent = []
+
+    def signal_node(node: str, name: str) -> RunProcess:
+        if node not in ("localization", "hmi"):
+            raise SignalError(f"unknown node {node!r}")
+        sent.append((node, name))
+        return RunProcess(77, 7450, 1, (node,), 1)
+
+    async with world.hmi(hmi_port=free_port(), signal_node=signal_node) as hmi:
+        async with open_page(await served(hmi)) as page:
+            told = await ask(page, type="signal", node="localization", signal="KILL")
+            assert told == {"type": "done", "text": "localization (pid 77): KILL"}
+            for node, name, why in (("localization", "HUP", "unknown signal 'HUP'"),
+                                    ("launchd", "KILL", "unknown node 'launchd'")):
+                told = await ask(page, type="signal", node=node, signal=name)
+                assert told["type"] == "error"
+                assert why in told["text"]
+            assert "will be back" in (await ask(page, type="signal", node="hmi", signal="KILL"
+                                                ))["text"]
+            assert sent == [("localization", "KILL")]
+            await eventually(lambda: sent[1:] == [("hmi", "KILL")])
+
+
+async def test_without_processes_nothing_can_be_signalled(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        async with open_page(await served(hmi)) as page:
+            told = await ask(page, type="signal", node="localization", signal="KILL")
+            assert "no processes that could be signalled" in told["text"]
+
+
+async def test_a_fault_is_injected_from_the_page_and_its_effect_shown(world):
+    async with world.hmi(hmi_port=free_port(), faults=offered_faults()) as hmi:
+        async with open_page(await served(hmi)) as page:
+            names = {f["name"] for f in (await hear(page, "operating"))["faults"]}
+            assert {"command-out-of-bounds", "gps-bias", "brake-failure"} <= names
+            told = await ask(page, type="inject", fault="command-out-of-bounds", duration_s=3)
+            assert told["text"] == "fault command-out-of-bounds asked for, for 3 s"
+            await eventually(lambda: bool(world.others.injections))
+            order = world.others.injections[0]
+            assert (order.topic, order.set_fields["linear_mps"], order.duration_s) == (
+                "control/command", 3.0, 3.0)
+            world.others.publish(bus_topics.INJECTION_RESULT, bm.InjectionReport(
+                order.injection, "osmosis_control", 60, True, ""))
+            shown = await operating(page, lambda o: o["faults"] and o["faults"][0]["ended"])
+            assert shown["faults"][0]["state"] == "over, 60 messages changed"
+            told = await ask(page, type="inject", fault="brake-failure", permanent=True)
+            assert told["text"] == "fault brake-failure asked for, until its process ends"
+            await eventually(lambda: bool(world.others.actuator_faults))
+
+
+async def test_a_fault_that_nobody_takes_is_shown_to_have_no_effect(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        async with open_page(await served(hmi)) as page:
+            told = await ask(page, type="inject", fault="drop:world/truth")
+            assert told["type"] == "error"
+            await ask(page, type="inject", fault="drop:plan/route")
+            shown = await operating(page, lambda o: o["faults"] and o["faults"][0]["ended"])
+            assert shown["faults"][0]["state"] == (
+                "no effect: nobody that publishes plan/route answers")
+            assert len({o.injection for o in world.others.injections}) == 1
+
+
+# ---- too much, and by whom ----------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("patient")
+async def test_a_page_that_floods_is_told_and_closed_and_nobody_else_notices(world):
+    async with world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        async with open_page(at) as good, open_page(at, ping_interval=None) as bad:
+            driver = Hand(good)
+            await driver.take()
+            told = []
+
+            async def listen() -> None:
+                async for text in bad:
+                    told.append(json.loads(text))
+
+            listening = asyncio.create_task(listen())
+            with contextlib.suppress(websockets.ConnectionClosed):
+                for _ in range(100_000):
+                    await bad.send('{"type": "reset", "recovery": "RM1"}')
+            with pytest.raises(websockets.ConnectionClosedError, match="flooding"):
+                await listening
+            errors = [message["text"] for message in told if message["type"] == "error"]
+            assert sum("too many messages" in text for text in errors) == 1
+            await ask(good, type="stick", held=False)
+            assert (await driver.hold())["grip"] in ("drives", "waits")
+            await eventually(lambda: hmi._server.pages == 1)
+    assert world.others.resets == []
+
+
+@pytest.mark.parametrize("key", ["header", "query", "subprotocol"])
+async def test_with_a_token_the_files_are_open_and_everything_else_is_not(world, key):
+    async with world.hmi(hmi_port=free_port(), hmi_token=TOKEN) as hmi:
+        at = await served(hmi)
+        options = {"header": {"additional_headers": {"Authorization": f"Bearer {TOKEN}"}},
+                   "query": {}, "subprotocol": {"subprotocols": ["rampart", f"token.{TOKEN}"]}}[key]
+        query = f"?token={TOKEN}" if key == "query" else ""
+        async with websockets.connect(f"ws://{at}/ws{query}", **options) as page:
+            assert (await hear(page, "operating"))["page"] == 1
+        async with open_page(at, subprotocols=["rampart", "token.wrongwrongwrong"]) as page:
+            with pytest.raises(websockets.ConnectionClosedError) as closed:
+                await hear(page, "never")
+            assert closed.value.rcvd.code == 4401
+        async with httpx.AsyncClient() as client:
+            assert (await client.get(f"http://{at}/")).status_code == 200
+            assert (await client.get(f"http://{at}/other")).status_code == 401
+            assert (await client.get(f"http://{at}/other?token={TOKEN}")).status_code == 404
+        with pytest.raises(websockets.InvalidStatus, match="403"):
+            await open_page(at, origin="http://evil.example", **options)
+    assert set(world.others.stick) <= {RELEASED}
+
+
+async def test_a_page_for_everybody_without_a_token_is_not_served_and_the_reason_reported(world):
+    async with world.hmi(hmi_port=free_port(), hmi_host="0.0.0.0") as hmi:
+        await eventually(lambda: bool(world.others.diagnostics))
+        assert hmi.page_port is None
+    assert "needs a token" in world.others.diagnostics[0].reason
+
+
+async def test_on_another_address_a_foreign_host_is_refused_also_with_the_token(world):
+    async with world.hmi(hmi_port=free_port(), hmi_host="127.0.0.2", hmi_token=TOKEN) as hmi:
+        await served(hmi)
+        at = f"127.0.0.2:{hmi.page_port}"
+        async with httpx.AsyncClient() as client:
+            assert (await client.get(f"http://{at}/")).status_code == 200
+            for host in ("evil.example", ""):
+                refused = await client.get(f"http://{at}/?token={TOKEN}", headers={"host": host})
+                assert refused.status_code == 400

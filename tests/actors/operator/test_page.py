@@ -1,0 +1,123 @@
+"""What the operator's page shows, in a real Chromium: tree, laser, processes, certificates."""
+
+from __future__ import annotations
+
+import math
+import os
+
+import pytest
+
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
+from tests.actors.operator.browser import CHROMIUM, browser
+from tests.actors.operator.page import LIVE, SPEC, events, page, speaking_world
+from tests.actors.operator.world import free_port, repeated, served
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+
+
+@pytest.fixture
+async def world():
+    async with speaking_world() as made:
+        yield made
+
+
+async def test_the_fault_tree_is_lit_when_a_detection_comes_and_dark_when_it_goes(world):
+    async with page(world) as tab:
+        assert await tab.value("document.querySelectorAll('#tree .event').length") == len(
+            SPEC.events)
+        assert await tab.value("document.querySelectorAll('#tree .barrier').length") == len(
+            SPEC.mechanisms)
+        async with repeated(lambda: world.others.manager("FTM4", activated=("RM3",))):
+            await tab.until(f"{events('active')} === 'FTM4'")
+            assert await tab.value(events("ahead")) == "FTM2"
+            assert await tab.value("document.querySelectorAll('#tree .line.lit').length") == 1
+            words = await tab.value("document.getElementById('tree-words').textContent")
+            assert words == ("Detected: FTM4, Control node crash: detected · RM3 runs "
+                             "(DM4: a test).")
+            running = "[...document.querySelectorAll('#order .running text')][0].textContent"
+            assert await tab.value(running) == "RM3"
+        async with repeated(world.others.manager):
+            await tab.until(f"{events('active')} === ''")
+            assert await tab.value("document.querySelectorAll('#tree .line.lit').length") == 0
+            assert await tab.value("document.querySelectorAll('#order .running').length") == 0
+
+
+async def test_the_way_to_the_next_barrier_leads_through_events_without_one(world):
+    async with page(world) as tab, repeated(lambda: world.others.manager("FTM9")):
+        await tab.until(f"{events('active')} === 'FTM9'")
+        # Two events without a barrier lie between it and the top.
+        assert await tab.value(events("ahead")) == "FTM1"
+        assert await tab.value("document.querySelectorAll('#tree .line.lit').length") == 3
+
+
+async def test_the_laser_is_drawn_in_the_robots_frame_and_vanishes_when_it_is_not_heard(world):
+    area = "(document.querySelector('.sweep.lower .sweep-area').getAttribute('d') || '')"
+    echoes = "(document.querySelector('.sweep.lower .sweep-echoes').getAttribute('d') || '')"
+    async with page(world) as tab:
+        async with repeated(world.others.sweep):
+            await tab.until(f"{area}.split('L').length === 92")
+            echo = (await tab.value(echoes)).removeprefix("M").removesuffix("h0").split()
+            assert math.dist(map(float, echo), (3.0, 0.0)) < 0.05
+            parent = "document.querySelector('.sweep.lower').parentElement.classList.contains"
+            assert await tab.value(f"{parent}('robot')") is True
+        await tab.until(f"{area} === ''")
+
+
+async def test_a_page_that_reconnects_shows_the_whole_new_picture_and_nothing_of_the_old(world):
+    port = free_port()
+    async with browser() as tab:
+        async with world.hmi(hmi_port=port, system=SPEC) as hmi:
+            await tab.show(f"http://{await served(hmi)}/")
+            async with repeated(world.others.busy):
+                await tab.until(f"{events('active')} === 'FTM4'")
+                await tab.until("document.querySelectorAll('#events .fault').length === 1")
+        await tab.until("document.body.classList.contains('offline')")
+        async with world.hmi(incarnation=2, hmi_port=port, system=SPEC):
+            async with repeated(world.others.manager):
+                await tab.until(f"{LIVE} && {events('active')} === ''"
+                                " && document.getElementById('alarm').hidden")
+                assert await tab.value("document.querySelectorAll('#events .fault').length") == 0
+                assert await tab.value("document.querySelectorAll('#tree .event').length") == len(
+                    SPEC.events)
+
+
+async def test_every_process_has_its_state_age_processor_share_and_memory(world):
+    cells = "[...document.querySelectorAll('#nodes tr[data-node=hmi] td')].map(" \
+            "(c) => c.textContent)"
+    async with page(world) as tab, repeated(world.others.busy):
+        await tab.until(f"document.querySelectorAll('#nodes tr').length === {len(SPEC.actors())}")
+        await tab.until(f"Number({cells}[6]) > 10")
+        _, state, pid, age, restarts, cpu, _ = await tab.value(cells)
+        assert (state, pid, restarts) == ("running", str(os.getpid()), "0")
+        assert age.endswith((" s", " min"))
+        assert float(cpu) > 0
+
+
+async def test_a_certificate_can_be_opened_and_stays_open_when_decisions_follow(world):
+    def decide(number: int) -> None:
+        world.others.publish(topics.DECISION, m.DecisionRecord(
+            number, "safety-first", ("FTM1", "FTM4"), 2, ("RM1",), ("FTM1 > FTM2", "FTM2 > FTM4"),
+            (("RM3", "FTM4 is dominated by FTM1"),), 1.0))
+
+    async with page(world) as tab:
+        decide(4)
+        await tab.until("document.querySelectorAll('#decisions details').length === 1")
+        await tab.value("document.querySelector('#decisions summary').click()")
+        decide(5)
+        await tab.until("document.querySelectorAll('#decisions details').length === 2")
+        opened = "document.querySelector('#decisions details[open]').textContent"
+        text = await tab.value(opened)
+        assert "Certificate of decision 4" in text
+        assert "FTM1 > FTM2" in text
+        assert "RM3: FTM4 is dominated by FTM1" in text
+
+
+async def test_the_map_follows_the_robot_on_request(world):
+    async with page(world) as tab, repeated(world.others.sweep):
+        await tab.until("document.querySelector('.robot').getAttribute('visibility') === 'visible'")
+        await tab.value("document.getElementById('follow').click()")
+        box = "document.getElementById('map').viewBox.baseVal"
+        await tab.until(f"{box}.width < 30")
+        assert await tab.value(f"Math.abs({box}.x + {box}.width / 2 + 10) < 0.1") is True
+        assert await tab.value("document.getElementById('follow').ariaPressed") == "true"

@@ -1,0 +1,143 @@
+"""The operator's page for everybody: on a phone, in the dark, by keyboard, by ear, offline."""
+
+from __future__ import annotations
+
+import json
+from urllib.parse import urlsplit
+
+import pytest
+
+from tests.actors.operator.browser import CHROMIUM
+from tests.actors.operator.page import events, page, speaking_world
+from tests.actors.operator.world import repeated
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+
+
+@pytest.fixture
+async def world():
+    async with speaking_world() as made:
+        yield made
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+async def test_on_a_phone_nothing_is_wider_than_the_screen(world, scheme):
+    async with page(world, width=360, height=740, scheme=scheme) as tab, \
+            repeated(world.others.busy):
+        await tab.until(f"{events('active')} === 'FTM4'")
+        await tab.until("document.querySelectorAll('#nodes tr').length > 0")
+        assert await tab.value("document.documentElement.scrollWidth") == 360
+        wide = """[...document.querySelectorAll('main *')].filter((e) =>
+            e.getBoundingClientRect().right > 361 && !e.closest('.across, .scroll'))
+            .map((e) => e.tagName + '#' + e.id + '.' + e.className).join()"""
+        assert await tab.value(wide) == ""
+
+
+async def test_the_page_asks_nobody_but_the_hmi_for_anything(world):
+    async with page(world) as tab, repeated(world.others.busy):
+        await tab.until(f"{events('active')} === 'FTM4'")
+        hosts = {urlsplit(url).hostname for url in tab.requests if not url.startswith("data:")}
+        assert hosts == {"127.0.0.1"}
+        assert any(url.startswith("ws://") for url in tab.requests)
+
+
+NAMELESS = """(() => {
+  const wrong = [];
+  const seen = (e) => e.checkVisibility && e.checkVisibility();
+  const named = (e) => (e.getAttribute('aria-label') || '').trim() || (e.textContent || '').trim()
+    || (e.labels && [...e.labels].some((l) => l.textContent.trim()))
+    || (e.getAttribute('aria-labelledby') || '').split(' ').some(
+      (id) => (document.getElementById(id) || {}).textContent);
+  for (const e of document.querySelectorAll(
+      'button, select, input, textarea, [role=img], [role=group], [role=application], section,'
+      + ' progress, [tabindex="0"]')) {
+    if (!seen(e)) continue;
+    const own = e.matches('select, input') ? e.labels.length || e.getAttribute('aria-label')
+      : e.matches('section, [role=img], [role=group], progress, ol')
+        ? e.getAttribute('aria-label') || e.getAttribute('aria-labelledby') : named(e);
+    if (!own || !named(e) && !e.labels?.length) wrong.push(`no name: ${e.outerHTML.slice(0, 90)}`);
+  }
+  for (const e of document.querySelectorAll('[aria-labelledby], [aria-describedby], [for]')) {
+    for (const name of ['aria-labelledby', 'aria-describedby', 'for']) {
+      for (const id of (e.getAttribute(name) || '').split(' ').filter(Boolean)) {
+        if (!document.getElementById(id)) wrong.push(`${name} names nobody: ${id}`);
+      }
+    }
+  }
+  const ids = [...document.querySelectorAll('[id]')].map((e) => e.id);
+  ids.filter((id, i) => ids.indexOf(id) !== i).forEach((id) => wrong.push(`twice: ${id}`));
+  for (const [what, count] of [['main', 1], ['h1', 1], ['header', 1]]) {
+    if (document.querySelectorAll(what).length !== count) wrong.push(`not one ${what}`);
+  }
+  for (const e of document.querySelectorAll('th')) if (!e.scope) wrong.push('th without scope');
+  for (const e of document.querySelectorAll('[tabindex]')) {
+    if (e.tabIndex > 0) wrong.push(`tabindex ${e.tabIndex}`);
+  }
+  for (const e of document.querySelectorAll('main *')) {
+    const style = getComputedStyle(e);
+    if (seen(e) && /(auto|scroll)/.test(style.overflowX + style.overflowY)
+        && (e.scrollHeight > e.clientHeight + 1 || e.scrollWidth > e.clientWidth + 1)
+        && e.tabIndex < 0) wrong.push(`scrolls without the keyboard: ${e.id || e.className}`);
+  }
+  if (!document.documentElement.lang) wrong.push('no language');
+  if (document.getElementById('alarm').getAttribute('role') !== 'alert') wrong.push('no alert');
+  return wrong.join('\\n');
+})()"""
+
+PALE = """(() => {
+  const pale = new Set();
+  const canvas = document.createElement('canvas').getContext('2d', { willReadFrequently: true });
+  const rgb = (colour) => {
+    canvas.clearRect(0, 0, 1, 1);
+    canvas.fillStyle = colour;
+    canvas.fillRect(0, 0, 1, 1);
+    return [...canvas.getImageData(0, 0, 1, 1).data];
+  };
+  const light = ([r, g, b]) => [r, g, b].map((c) => c / 255).map(
+    (c) => (c <= .03928 ? c / 12.92 : ((c + .055) / 1.055) ** 2.4))
+    .reduce((sum, c, i) => sum + c * [.2126, .7152, .0722][i], 0);
+  const behind = (e) => {
+    for (; e; e = e.parentElement) {
+      const back = rgb(getComputedStyle(e).backgroundColor);
+      if (back[3] > 250) return back;
+    }
+    return [255, 255, 255];
+  };
+  for (const e of document.querySelectorAll('body *:not(svg *)')) {
+    const text = [...e.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim());
+    if (!text || !e.checkVisibility() || e.closest('.unseen, .skip, :disabled, option')) continue;
+    const [a, b] = [light(rgb(getComputedStyle(e).color)), light(behind(e))];
+    const ratio = (Math.max(a, b) + .05) / (Math.min(a, b) + .05);
+    if (ratio < 4.5) pale.add(`${ratio.toFixed(2)} ${e.className} ${e.textContent.slice(0, 30)}`);
+  }
+  return [...pale].join('\\n');
+})()"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+async def test_everything_has_a_name_and_can_be_read_and_reached(world, scheme):
+    async with page(world, scheme=scheme) as tab, repeated(world.others.busy):
+        await tab.until(f"{events('active')} === 'FTM4'")
+        await tab.until("document.querySelectorAll('#nodes tr').length > 0")
+        assert await tab.value(NAMELESS) == ""
+        assert await tab.value(PALE) == ""
+
+
+async def test_by_keyboard_the_focus_is_seen_and_the_first_stop_skips_to_the_map(world):
+    async with page(world) as tab:
+        for kind in ("rawKeyDown", "keyUp"):
+            await tab.call("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab",
+                           windowsVirtualKeyCode=9)
+        assert await tab.value("document.activeElement.className") == "skip"
+        outline = "getComputedStyle(document.activeElement).outlineStyle"
+        assert await tab.value(outline) != "none"
+        await tab.value("window.still = true; document.activeElement.click()")
+        await tab.until("location.hash === '#main'")
+        await tab.until("document.getElementById('link').textContent === 'live'")
+        assert await tab.value("window.still") is True  # and the connection was kept
+
+
+async def test_who_wants_no_motion_sees_none(world):
+    moving = "getComputedStyle(document.querySelector('.event .box')).transitionDuration"
+    async with page(world, motion="reduce") as tab:
+        assert json.loads(f"[{(await tab.value(moving)).replace('s', '')}]") == [0]

@@ -1,0 +1,376 @@
+"""The operator's hands in a real browser: dead man, two operators, signals, strategy, faults."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+
+import pytest
+import websockets
+
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.page import stick as hmi_stick
+from rampart.actors.osmosis.page.stick import Grip
+from rampart.actors.supervision.process_title import RunProcess
+from rampart.sim.faults.offered_faults import offered_faults
+from tests.actors.operator.browser import CHROMIUM, browser
+from tests.actors.operator.world import World, eventually, free_port, hear, repeated, served
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+
+TOKEN = "abcdefghijklmnop"
+RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
+LIVE = "document.getElementById('link').textContent === 'live'"
+FREE = "document.getElementById('stick-state').textContent === 'free'"
+WORDS = "document.getElementById('stick-text').textContent"
+PAD = "document.getElementById('stick')"
+
+
+def alive(world: World):
+    """Have the Safety Pilot and the manager heard, as in a run in which all is well."""
+    def say() -> None:
+        world.others.publish(topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.AUTO, False, "", 0))
+        world.others.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus(
+            (), (), (), (), "safety-first", 0))
+    return repeated(say)
+
+
+CONTROL_HELD = 2
+
+
+async def key(tab, name: str, *, down: bool, repeat: bool = False, modifiers: int = 0) -> None:
+    await tab.call("Input.dispatchKeyEvent", type="rawKeyDown" if down else "keyUp", key=name,
+                   code=f"Key{name.upper()}" if len(name) == 1 else name,
+                   autoRepeat=repeat, modifiers=modifiers)
+
+
+def moved(world) -> bool:
+    return any(stick != RELEASED for stick in world.others.stick)
+
+
+async def mouse(tab, kind: str, x: float, y: float) -> None:
+    await tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1,
+                   clickCount=1)
+
+
+async def drives(tab, world, **position: float) -> None:
+    """Wait until the robot is told to drive like this."""
+    wanted = m.Joystick(position.get("forward", 0.0), position.get("left", 0.0), dead_man=True)
+    await eventually(lambda: bool(world.others.stick) and world.others.stick[-1] == wanted)
+    await tab.until("document.getElementById('stick-state').textContent === 'you drive'")
+
+
+async def drive_ahead(tab, world, hmi) -> None:
+    """Open the page and hold the key W on its stick."""
+    await tab.show(f"http://{await served(hmi)}/")
+    await tab.until(FREE)
+    await tab.value(f"{PAD}.focus()")
+    await key(tab, "w", down=True)
+    await drives(tab, world, forward=0.5)
+
+
+async def stops(world) -> None:
+    await eventually(lambda: world.others.stick[-1] == RELEASED)
+    count = len(world.others.stick)
+    await asyncio.sleep(0.15)  # three periods of a page that would go on
+    assert len(world.others.stick) == count
+
+
+@pytest.mark.usefixtures("patient")
+async def test_the_keyboard_drives_while_a_key_is_held_and_everything_else_stops(world):
+    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
+        await tab.show(f"http://{await served(hmi)}/")
+        await tab.until(FREE)
+        await key(tab, "ArrowUp", down=True)
+        await asyncio.sleep(0.15)
+        assert not moved(world)  # only with the focus on the stick
+        await key(tab, "ArrowUp", down=False)
+
+        await tab.value(f"{PAD}.focus()")
+        await key(tab, "ArrowUp", down=True)
+        await drives(tab, world, forward=0.5)
+        await key(tab, "a", down=True)
+        await drives(tab, world, forward=0.5, left=0.5)
+        await key(tab, "ArrowUp", down=False)
+        await drives(tab, world, left=0.5)
+        await key(tab, "a", down=False)
+        await stops(world)
+
+        for lost in (f"{PAD}.blur()", "dispatchEvent(new Event('blur'))",
+                     "Object.defineProperty(document, 'hidden', {value: true, configurable: true});"
+                     "document.dispatchEvent(new Event('visibilitychange'));"
+                     "delete document.hidden"):
+            await tab.value(f"{PAD}.focus()")
+            await key(tab, "ArrowDown", down=True)
+            await drives(tab, world, forward=-0.5)
+            await tab.value(lost)
+            await stops(world)
+            await tab.value(f"{PAD}.focus()")
+            await key(tab, "ArrowDown", down=True, repeat=True)  # held since before
+            await stops(world)
+            await key(tab, "ArrowDown", down=False)
+        assert tab.errors == []
+
+
+@pytest.mark.usefixtures("patient")
+@pytest.mark.parametrize("name", ["Control", "Alt", "Meta"])
+async def test_a_key_that_is_let_go_under_another_one_is_let_go(world, name):
+    held = {"Alt": 1, "Control": CONTROL_HELD, "Meta": 4}[name]
+    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
+        await drive_ahead(tab, world, hmi)
+        await key(tab, f"{name}Left", down=True, modifiers=held)
+        await stops(world)
+        await key(tab, "w", down=False, modifiers=held)
+        await key(tab, f"{name}Left", down=False)
+        await stops(world)
+        await tab.value(f"{PAD}.focus()")
+        await key(tab, "w", down=True)
+        await drives(tab, world, forward=0.5)
+        await key(tab, "w", down=False)
+        await stops(world)
+
+
+async def test_a_connection_that_is_too_slow_is_told_so_and_not_flooded(world, monkeypatch):
+    monkeypatch.setattr(hmi_stick, "TICKET_S", -1.0)  # every ticket comes too late
+    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
+        await tab.show(f"http://{await served(hmi)}/")
+        await tab.until(FREE)
+        await tab.value(
+            "window.sent = 0; const send = WebSocket.prototype.send;"
+            "WebSocket.prototype.send = function(text) {"
+            " window.sent += text.includes('\"held\":true'); send.call(this, text); }")
+        await tab.value(f"{PAD}.focus()")
+        await key(tab, "w", down=True)
+        await tab.until(f"{WORDS}.includes('the connection is too slow to drive')")
+        assert await tab.value("window.sent") <= 1 + 1 + 21  # first, with a ticket, each 50 ms
+        await key(tab, "w", down=True, repeat=True)
+        await asyncio.sleep(0.15)
+        assert await tab.value("window.sent") <= 1 + 1 + 21
+        assert not moved(world)
+
+
+@pytest.mark.usefixtures("patient")
+async def test_the_page_says_why_teleoperation_does_not_follow_it(world):
+    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
+        await drive_ahead(tab, world, hmi)
+        world.others.publish(ftm_topics.ERROR_REPORT, bm.Diagnostic(
+            "teleoperation", "joystick", "not followed: /dev/input/js0 has the stick", "hmi", 1))
+        await tab.until("document.getElementById('stick-state').textContent === 'not followed'")
+        assert "/dev/input/js0 has the stick" in await tab.value(WORDS)
+        await key(tab, "w", down=False)
+        await stops(world)
+
+
+async def test_a_page_that_hangs_has_let_go_and_is_to_press_again(world):
+    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
+        await drive_ahead(tab, world, hmi)
+        await tab.value("{ const end = Date.now() + 700; while (Date.now() < end); }")
+        await tab.until(f"{WORDS}.includes('let go of the stick and press again')")
+        await stops(world)
+        await key(tab, "w", down=False)
+        await tab.until(FREE)
+        await key(tab, "w", down=True)
+        await drives(tab, world, forward=0.5)
+        await tab.call("Page.navigate", url="about:blank")
+        await stops(world)
+
+
+@pytest.mark.usefixtures("patient")
+async def test_an_hmi_that_comes_back_is_not_driven_by_a_key_that_is_still_held(world):
+    port = free_port()
+    async with browser() as tab, alive(world):
+        async with world.hmi(hmi_port=port) as hmi:
+            await tab.show(f"http://{await served(hmi)}/")
+            await tab.until(FREE)
+            await tab.value(f"{PAD}.focus()")
+            await key(tab, "ArrowUp", down=True)
+            await drives(tab, world, forward=0.5)
+        await stops(world)
+        async with world.hmi(incarnation=2, hmi_port=port):
+            await tab.until(FREE)
+            await key(tab, "ArrowUp", down=True, repeat=True)
+            await tab.until(f"{WORDS}.includes('let go first, then press again')")
+            await stops(world)
+            await key(tab, "ArrowUp", down=False)
+            await key(tab, "ArrowUp", down=True)
+            await drives(tab, world, forward=0.5)
+        await key(tab, "ArrowUp", down=False)
+        await tab.until("document.body.classList.contains('offline')")
+        await key(tab, "ArrowUp", down=True)  # pressed while nobody listens
+        async with world.hmi(incarnation=3, hmi_port=port):
+            await tab.until(LIVE)
+            await key(tab, "ArrowUp", down=True, repeat=True)
+            await tab.until(f"{WORDS}.includes('let go first, then press again')")
+            await stops(world)
+
+
+@pytest.mark.usefixtures("patient")
+async def test_the_stick_on_the_screen_and_a_gamepad_drive(world):
+    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
+        await tab.show(f"http://{await served(hmi)}/")
+        await tab.until(FREE)
+        await tab.value(f"{PAD}.scrollIntoView({{block: 'center'}})")
+        await tab.value("document.getElementById('stick-share').value = 100")
+        x, y, radius = json.loads(await tab.value(
+            f"(() => {{ const b = {PAD}.getBoundingClientRect(); return JSON.stringify("
+            "[b.left + b.width / 2, b.top + b.height / 2, b.width / 2]); })()"))
+        await mouse(tab, "mousePressed", x, y)
+        await mouse(tab, "mouseMoved", x, y - 3 * radius)  # outside: full ahead, no more
+        await drives(tab, world, forward=1.0)
+        await mouse(tab, "mouseReleased", x, y - 3 * radius)
+        await stops(world)
+
+        await tab.value(
+            "window.pad = {connected: true, axes: [0.5, 0.05], buttons: Array.from({length: 8},"
+            " () => ({pressed: false}))}; navigator.getGamepads = () => [window.pad];"
+            " dispatchEvent(new Event('gamepadconnected'))")
+        await stops(world)  # moved, but the dead man is not held
+        await tab.value("window.pad.buttons[4].pressed = true")
+        await drives(tab, world, left=-0.5)
+        await tab.value("window.pad.buttons[4].pressed = false")
+        await stops(world)
+
+        await tab.value("window.pad.buttons[4].pressed = true")
+        await drives(tab, world, left=-0.5)
+        await tab.value("window.pad.connected = false;"
+                        "dispatchEvent(new Event('gamepaddisconnected'))")
+        await stops(world)
+        await tab.value("window.pad.connected = true;"
+                        "dispatchEvent(new Event('gamepadconnected'))")
+        await tab.until(f"{WORDS}.includes('let go first, then press again')")
+        await stops(world)  # plugging in moves nothing
+        await tab.value("window.pad.buttons[4].pressed = false")
+        await tab.until(f"!{WORDS}.includes('let go first')")
+        await tab.value("window.focusless = true; document.hasFocus = () => !window.focusless;"
+                        "window.pad.buttons[4].pressed = true")
+        await stops(world)  # meant for another window
+        await tab.value("window.focusless = false")
+        await tab.until(f"{WORDS}.includes('let go first, then press again')")
+        await stops(world)
+        assert tab.errors == []
+
+
+@pytest.mark.usefixtures("patient")
+async def test_the_second_operator_sees_who_drives(world):
+    async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
+        at = await served(hmi)
+        await tab.show(f"http://{at}/")
+        await tab.until(FREE)
+        async with websockets.connect(f"ws://{at}/ws") as other:
+            number = (await hear(other, "operating"))["page"]
+            ticket = 0
+
+            async def drive() -> None:
+                nonlocal ticket
+                while True:
+                    await other.send(json.dumps({"type": "stick", "held": True, "ticket": ticket,
+                                                 "forward": 0.25}))
+                    told = await hear(other, "stick")
+                    ticket = told["ticket"]
+                    assert told["grip"] in (Grip.WAITS, Grip.DRIVES)
+                    await asyncio.sleep(0.03)
+
+            driving = asyncio.create_task(drive())
+            await tab.until("document.getElementById('stick-state').textContent"
+                            f" === 'page {number} drives'")
+            await tab.value(f"{PAD}.focus()")
+            await key(tab, "ArrowDown", down=True)
+            await tab.until(f"{WORDS}.includes('page {number} has the stick')")
+            driving.cancel()
+            await asyncio.gather(driving, return_exceptions=True)
+        await tab.until(f"{WORDS}.includes('let go of the stick and press again')")
+        await stops(world)
+        await key(tab, "ArrowDown", down=False)
+        await key(tab, "ArrowDown", down=True)
+        await drives(tab, world, forward=-0.5)
+        await key(tab, "ArrowDown", down=False)
+    assert {s.forward for s in world.others.stick} == {0.25, 0.0, -0.5}
+
+
+async def test_a_node_is_signalled_from_its_row_after_a_second_press(world):
+    sent = []
+
+    def signal_node(node: str, name: str) -> RunProcess:
+        sent.append((node, name))
+        return RunProcess(77, 7450, 1, (node,), 1)
+
+    def table(state: fm.NodeState, restarts: int) -> None:
+        world.others.publish(ftm_topics.NODES, fm.NodeTable(tuple(
+            fm.NodeInfo(name, "control", 77, state, 1 + restarts, restarts)
+            for name in ("safety_pilot", "osmosis_control"))))
+
+    row = "document.querySelector('tr[data-node=osmosis_control]')"
+    async with (browser() as tab, alive(world),
+                world.hmi(hmi_port=free_port(), signal_node=signal_node) as hmi):
+        await tab.show(f"http://{await served(hmi)}/")
+        await tab.until(LIVE)
+        async with repeated(lambda: table(fm.NodeState.RUNNING, 0)):
+            await tab.until(f"{row} !== null")
+            await tab.value(f"{row}.querySelector('button').click()")
+            assert await tab.value("document.getElementById('signal-dialog').open") is True
+            assert await tab.value("document.getElementById('signal-confirm').hidden") is True
+            choose = "[...document.querySelectorAll('#signals button')].find((b) => b.textContent"
+            await tab.value(f"{choose} === 'KILL').click()")
+            assert await tab.value("document.getElementById('signal-confirm').textContent") == (
+                "Send KILL to osmosis_control")
+            assert sent == []
+            await tab.value("document.getElementById('signal-confirm').click()")
+            await eventually(lambda: sent == [("osmosis_control", "KILL")])
+            await tab.until("document.getElementById('toast').textContent"
+                            " === 'osmosis_control (pid 77): KILL'")
+            assert await tab.value("document.getElementById('signal-dialog').open") is False
+        assert tab.errors == []
+
+
+async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world):
+    async with (browser() as tab, alive(world),
+                world.hmi(hmi_port=free_port(), faults=offered_faults()) as hmi):
+        await tab.show(f"http://{await served(hmi)}/")
+        await tab.until("!document.getElementById('strategy-set').disabled")
+        assert await tab.value("document.getElementById('strategy-name').value") == "safety-first"
+        await tab.value("document.getElementById('strategy-name').value = 'mission-first';"
+                        "document.getElementById('strategy-set').click()")
+        await eventually(lambda: bool(world.others.adaptations))
+        world.others.publish(ftm_topics.ADAPTATION, fm.AdaptationAnswer(
+            world.others.adaptations[0].request, True, "", 1))
+        await tab.until("document.getElementById('toast').textContent"
+                        " === 'strategy mission-first is in force, change 1 of the run'")
+
+        submit = "document.getElementById('inject').requestSubmit()"
+        for chosen, topic in (("gps-bias", "summit_xl/gps"), ("freeze:", "plan/route")):
+            await tab.value(
+                f"document.getElementById('fault').value = '{chosen}';"
+                "document.getElementById('fault').dispatchEvent(new Event('change'));"
+                "document.getElementById('fault-topic').value = 'plan/route';"
+                f"document.getElementById('fault-duration').value = '4'; {submit}")
+            await eventually(lambda topic=topic: any(
+                o.topic == topic for o in world.others.injections))
+            order = next(o for o in world.others.injections if o.topic == topic)
+            assert order.duration_s == 4.0
+            world.others.publish(bus_topics.INJECTION_RESULT, bm.InjectionReport(
+                order.injection, "simulator", 12, True, ""))
+            await tab.until("document.querySelector('#faults li').textContent"
+                            f".startsWith('{chosen}')")
+            await tab.until("document.querySelector('#faults li').textContent"
+                            ".includes('over, 12 messages changed')")
+        assert tab.errors == []
+
+
+async def test_the_token_of_the_address_is_kept_by_the_tab_and_hidden(world):
+    async with (browser() as tab, alive(world),
+                world.hmi(hmi_port=free_port(), hmi_token=TOKEN) as hmi):
+        at = await served(hmi)
+        await tab.show(f"http://{at}/")
+        await tab.until("document.getElementById('link').textContent.includes('token missing')")
+        await tab.call("Page.navigate", url=f"http://{at}/#token={TOKEN}")
+        await tab.until(LIVE)
+        assert await tab.value("location.hash") == ""
+        await tab.value("window.before = true")
+        await tab.call("Page.reload")
+        await tab.until(f"{LIVE} && window.before === undefined")
+        assert [url for url in tab.requests if TOKEN in url.partition("#")[0]] == []

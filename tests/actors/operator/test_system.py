@@ -1,0 +1,149 @@
+"""The drawing of a system for the page, and what its processes use."""
+
+from __future__ import annotations
+
+from itertools import combinations, pairwise
+
+import msgspec
+import pytest
+
+from rampart.actors.ftm import messages as m
+from rampart.actors.operator.processes import SEARCH_EVERY, ProcessObserver
+from rampart.actors.operator.system import BARRIER, MAX_BOXES, draw_system
+from rampart.actors.supervision.process_title import RunProcess
+from rampart.actors.supervision.process_usage import ProcessCount, UsageMeter
+from rampart.manager.spec.schema import EventSpec
+from rampart.manager.spec.specification import parse_specification
+from tests import ROOT
+
+SYSTEMS = ROOT / "systems"
+
+
+def system(name: str):
+    return parse_specification((SYSTEMS / f"{name}.toml").read_text(encoding="utf-8"), name)
+
+
+@pytest.mark.parametrize("name", ["osmosis", "paper", "cell"])
+def test_no_two_boxes_touch_and_all_is_within_the_drawing(name):
+    for drawing in (draw_system(system(name))[key] for key in ("tree", "order")):
+        for one, other in combinations(drawing.boxes, 2):
+            assert (one.x + one.width < other.x or other.x + other.width < one.x
+                    or one.y + one.height < other.y or other.y + other.height < one.y)
+        for box in drawing.boxes:
+            assert box.x >= 0
+            assert box.y >= 0
+            assert box.x + box.width <= drawing.width
+            assert box.y + box.height <= drawing.height
+
+
+@pytest.mark.parametrize("name", ["osmosis", "paper", "cell"])
+def test_a_tree_grows_to_the_right_and_its_lines_join_the_boxes(name):
+    tree = draw_system(system(name))["tree"]
+    at = {box.name: box for box in tree.boxes}
+    for line in tree.lines:
+        upper, lower = at[line.upper], at[line.lower]
+        assert upper.x + upper.width < line.points[0][0] < line.points[-1][0] <= lower.x - BARRIER
+        assert line.points[0][1] == pytest.approx(upper.y + upper.height / 2)
+        assert lower.y <= line.points[-1][1] <= lower.y + lower.height
+        for (x1, y1), (x2, y2) in pairwise(line.points):
+            assert x1 <= x2 + 0.01
+            assert x1 == x2 or y1 == y2 or abs(y1 - y2) <= 4.01  # square, or leaning over a little
+
+
+def test_the_way_of_an_event_ends_at_the_first_barrier_above():
+    way = {box.name: box.way for box in draw_system(system("osmosis"))["tree"].boxes}
+    assert way["control_node_crash"] == ("command_not_updated",)
+    assert way["command_out_of_bounds"] == (
+        "command_calculation_error", "erroneous_command", "moving_inside_prohibited_area")
+    assert way["moving_inside_prohibited_area"] == ()
+
+
+def test_an_event_with_several_parents_leads_all_their_ways():
+    way = {box.name: box.way for box in draw_system(system("cell"))["tree"].boxes}
+    assert {"encoder_a_lost", "encoder_b_lost", "vision_node_crash"} <= set(way["power_dip"])
+
+
+def test_who_cannot_see_the_drawing_is_told_the_same():
+    words = draw_system(system("osmosis"))["tree"].words
+    assert "Control node crash; barrier FTM4(DM4, RM3)." in words
+    assert "Command not updated; barrier FTM2(DM2, RM3); or of " in words
+
+
+def test_a_tree_that_nobody_could_read_is_not_drawn_and_the_page_says_so():
+    spec = system("paper")
+    leaf = next(event for event in spec.events if not event.of)
+    more = tuple(EventSpec(f"more_{i}") for i in range(MAX_BOXES))
+    events = tuple(
+        msgspec.structs.replace(e, gate="or", of=tuple(x.name for x in more)) if e is leaf else e
+        for e in spec.events)
+    drawn = draw_system(msgspec.structs.replace(spec, events=(*events, *more)))
+    assert drawn["tree"] is None
+    assert drawn["order"] is not None
+    assert drawn["note"] == (
+        f"The fault tree has {len(events) + MAX_BOXES} events; up to {MAX_BOXES} are drawn.")
+
+
+# ---- processes -----------------------------------------------------------------------------------
+
+
+class Kernel:
+    """Processes that use half a core each."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+        self.searches = 0
+        self.alive = {10, 11, 20, 30}
+        self.found = [RunProcess(10, 7450, 5, ("hmi",), 1),
+                      RunProcess(20, 7450, 5, ("spawner_a",), 3),
+                      RunProcess(30, 7450, 99, ("spawner_a",), 1)]
+
+    def count(self, pid: int) -> ProcessCount | None:
+        return ProcessCount((self.now_s - 90) / 2, 50_000_000, 90.0) if pid in self.alive else None
+
+    def find(self, _port: int) -> list[RunProcess]:
+        self.searches += 1
+        return self.found
+
+    def observer(self) -> ProcessObserver:
+        return ProcessObserver(
+            7450, 5, UsageMeter(self.count, lambda: self.now_s), self.find,
+            lambda pid: "S" if pid in self.alive else "X")
+
+
+def table(**pids: int) -> m.NodeTable:
+    return m.NodeTable(tuple(
+        m.NodeInfo(name, "control", pid, m.NodeState.RUNNING, 1, 0) for name, pid in pids.items()))
+
+
+def test_nodes_and_guards_are_looked_at_and_processes_of_another_run_are_not():
+    kernel = Kernel()
+    looked = kernel.observer().look(table(hmi=10, localization=11))
+    assert looked["nodes"] == {
+        name: {"cpu": 50.0, "mb": 50.0, "age_s": 10}
+        for name in ("hmi", "localization", "spawner_a")}
+    assert [(g["name"], g["pid"], g["state"], g["restarts"]) for g in looked["guards"]] == [
+        ("launch.py", 5, "crashed", 0), ("spawner_a", 20, "running", 2)]
+
+
+def test_a_process_that_died_has_no_figures_and_its_row_stays():
+    kernel = Kernel()
+    observer = kernel.observer()
+    observer.look(table(hmi=10))
+    kernel.alive = {20}
+    kernel.now_s += 1
+    assert set(observer.look(table(hmi=10, never=0))["nodes"]) == {"spawner_a"}
+
+
+def test_all_of_proc_is_searched_now_and_then_only():
+    kernel = Kernel()
+    observer = kernel.observer()
+    for _ in range(2 * SEARCH_EVERY):
+        observer.look(table(hmi=10))
+    assert kernel.searches == 2
+
+
+def test_without_a_table_nobody_is_taken_for_a_guard_by_mistake():
+    kernel = Kernel()
+    looked = kernel.observer().look(None)
+    assert [g["name"] for g in looked["guards"]] == ["launch.py"]
+    assert looked["nodes"] == {}

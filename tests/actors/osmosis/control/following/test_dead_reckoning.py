@@ -1,0 +1,245 @@
+"""Bridging a stale pose by odometry, at the one who needs it."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rampart.actors.layout.wiring import Member, heard
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.following.bridged_control import BridgedControl, BridgedStandby
+from rampart.actors.osmosis.control.following.dead_reckoning import AFTER_S, DeadReckoning
+from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from tests.actors.osmosis.control.laser_sweeps import full_sweep
+from tests.actors.osmosis.control.localization_drive import Reading, Truth, disturbed
+from tests.actors.osmosis.control.world import World
+from tests.virtual_loop import System, run, shipped_system
+
+PERIOD_S = 0.02
+
+
+def reckoning(bridge_m: float = 3.0) -> DeadReckoning:
+    return DeadReckoning(bridge_m)
+
+
+def straight(it: DeadReckoning, from_s: float, to_s: float, speed_mps: float = 1.0) -> None:
+    for i in range(round(from_s / PERIOD_S), round(to_s / PERIOD_S) + 1):
+        it.odometry(i * PERIOD_S, (speed_mps * i * PERIOD_S, 0.0, 0.0), i * PERIOD_S)
+
+
+def test_before_the_first_pose_there_is_none():
+    it = reckoning()
+    straight(it, 0.0, 1.0)
+    assert it.estimate(1.0) is None
+
+
+def test_a_fresh_pose_is_given_as_it_is():
+    it = reckoning()
+    straight(it, 0.0, 1.0)
+    it.pose(1.0, (5.0, 6.0, 0.7), 1.0)
+    assert it.estimate(1.0 + AFTER_S) == (5.0, 6.0, 0.7)
+
+
+def test_a_stale_pose_is_carried_on_from_its_stamp_not_from_its_arrival():
+    it = reckoning()
+    straight(it, 0.0, 2.0)
+    it.pose(0.5, (5.0, 6.0, math.pi / 2), 2.0)  # it arrives 1.5 s late
+    assert it.estimate(2.0) == pytest.approx((5.0, 7.5, math.pi / 2))
+
+
+def test_beyond_the_bound_there_is_no_pose_and_a_fresh_one_helps():
+    it = reckoning(bridge_m=2.0)
+    straight(it, 0.0, 1.0)
+    it.pose(1.0, (0.0, 0.0, 0.0), 1.0)
+    straight(it, 1.0, 2.9)
+    assert it.estimate(2.9) == pytest.approx((1.9, 0.0, 0.0))
+    straight(it, 2.92, 3.1)
+    assert it.estimate(3.1) is None
+    it.pose(3.1, (9.0, 0.0, 0.0), 3.1)
+    assert it.estimate(3.1) == (9.0, 0.0, 0.0)
+
+
+def test_standing_it_may_be_bridged_for_long():
+    it = reckoning(bridge_m=0.5)
+    straight(it, 0.0, 60.0, speed_mps=0.0)
+    it.pose(59.0, (1.0, 2.0, 3.0), 60.0)
+    assert it.estimate(60.0) == pytest.approx((1.0, 2.0, 3.0))
+
+
+def test_without_fresh_odometry_a_stale_pose_is_not_bridged():
+    it = reckoning()
+    straight(it, 0.0, 1.0)
+    it.pose(1.0, (0.0, 0.0, 0.0), 1.0)
+    assert it.estimate(1.19) is not None
+    assert it.estimate(1.3) is None
+
+
+def test_a_pose_older_than_the_odometry_that_is_kept_is_not_bridged():
+    it = reckoning(bridge_m=100.0)
+    it.pose(0.0, (0.0, 0.0, 0.0), 0.0)
+    straight(it, 1.0, 5.0, speed_mps=0.1)
+    assert it.estimate(5.0) is None
+
+
+@pytest.mark.parametrize("pose", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0)])
+def test_what_is_no_number_changes_nothing(pose):
+    it = reckoning()
+    straight(it, 0.0, 1.0)
+    it.pose(0.9, (1.0, 2.0, 0.0), 1.0)
+    it.pose(1.0, pose, 1.0)
+    it.odometry(1.02, pose, 1.02)
+    assert it.estimate(1.1) == pytest.approx((1.1, 2.0, 0.0))
+
+
+WRONG_STAMPS = [1e9, 1.3, math.inf, math.nan]
+
+
+@pytest.mark.parametrize("stamp_s", WRONG_STAMPS)
+def test_odometry_of_no_possible_time_shuts_out_none(stamp_s):
+    it = reckoning()
+    it.odometry(stamp_s, (50.0, 0.0, 0.0), 0.0)
+    straight(it, 0.0, 1.0)
+    it.pose(1.0, (5.0, 6.0, 0.0), 1.0)
+    it.odometry(stamp_s, (50.0, 0.0, 0.0), 1.01)
+    straight(it, 1.02, 2.0)
+    assert it.estimate(2.0) == pytest.approx((6.0, 6.0, 0.0))
+
+
+@pytest.mark.parametrize("stamp_s", WRONG_STAMPS)
+def test_a_pose_of_no_possible_time_is_not_believed_and_shuts_out_none(stamp_s):
+    it = reckoning()
+    straight(it, 0.0, 1.0)
+    it.pose(1.0, (5.0, 6.0, 0.0), 1.0)
+    it.pose(stamp_s, (50.0, 60.0, 0.0), 1.05)
+    straight(it, 1.02, 2.0)
+    assert it.estimate(2.0) == pytest.approx((6.0, 6.0, 0.0))
+    it.pose(2.0, (6.1, 6.0, 0.0), 2.0)
+    assert it.estimate(2.0) == (6.1, 6.0, 0.0)
+
+
+@pytest.mark.parametrize("absurd", [1e160, 1.7e308, -1.7e308])
+def test_a_number_beyond_all_measure_is_as_good_as_none(absurd):
+    it = reckoning()
+    straight(it, 0.0, 1.0)
+    it.pose(0.9, (1.0, 2.0, 0.0), 0.9)
+    it.pose(1.0, (absurd, absurd, -absurd), 1.0)
+    it.odometry(1.02, (-absurd, absurd, absurd), 1.02)
+    straight(it, 1.04, 1.1)
+    assert it.estimate(1.1) == pytest.approx((1.2, 2.0, 0.0))
+
+
+@pytest.mark.parametrize("bridge_m", [0.0, -1.0, math.nan, math.inf])
+def test_a_bound_that_is_none_is_refused(bridge_m):
+    with pytest.raises(ValueError, match="bridge_m"):
+        DeadReckoning(bridge_m)
+
+
+moves = st.lists(st.tuples(st.floats(-0.02, 0.02), st.floats(-0.05, 0.05)), min_size=1,
+                 max_size=60)
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])  # a busy machine
+@given(moves, st.floats(-3, 3), st.floats(-3.1, 3.1), st.floats(-3.1, 3.1))
+def test_it_moves_the_pose_as_the_wheels_moved_whatever_the_frame_of_odom(moves, x_m, yaw, start):
+    it = DeadReckoning(100.0, after_s=0.0)
+    odom, truth = (1.0, -2.0, start), (x_m, 0.5, yaw)
+    it.odometry(0.0, odom, 0.0)
+    it.pose(0.0, truth, 0.0)
+    for i, (forward, turn) in enumerate(moves, start=1):
+        odom, truth = ((x + forward * math.cos(w + turn / 2), y + forward * math.sin(w + turn / 2),
+                        w + turn) for x, y, w in (odom, truth))
+        it.odometry(i * PERIOD_S, odom, i * PERIOD_S)
+    found = it.estimate(len(moves) * PERIOD_S)
+    assert found is not None
+    assert found[:2] == pytest.approx(truth[:2], abs=1e-9)
+    assert math.remainder(found[2] - truth[2], math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("from_s", [2.0, 6.0, 12.0, 20.0])
+def test_on_the_simulated_robot_three_metres_cost_a_quarter_of_a_metre_at_most(from_s):
+    it, worst_m, bridged = reckoning(), 0.0, 0
+    for now_s, item in disturbed([]):
+        if isinstance(item, Reading) and item.topic is topics.ODOMETRY:
+            pose = item.body.pose
+            it.odometry(now_s, (pose.x_m, pose.y_m, pose.yaw_rad), now_s)
+        elif isinstance(item, Reading) and item.topic is topics.ABSOLUTE_POSE and now_s <= from_s:
+            it.pose(now_s, (item.body.x_m, item.body.y_m, item.body.yaw_rad), now_s)
+        elif isinstance(item, Truth) and now_s > from_s + AFTER_S:
+            found = it.estimate(now_s)
+            if found is None:
+                break
+            bridged += 1
+            worst_m = max(worst_m, math.dist(found[:2], (item.x_m, item.y_m)))
+    assert bridged > 20
+    assert worst_m < 0.25
+
+
+# ---- in Osmosis Control --------------------------------------------------------------------------
+
+
+class Robot(Actor):
+    """Publishes what it is told, and hears the command."""
+
+    outputs = (topics.POSE, topics.ODOMETRY, topics.SCAN, topics.ROUTE)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.speeds: list[float] = []
+
+    @on(topics.COMMAND)
+    def command(self, message: m.Twist, _header: Header) -> None:
+        self.speeds.append(message.linear_mps)
+
+
+@pytest.mark.parametrize("mis_stamped", [None, topics.ODOMETRY, topics.POSE],
+                         ids=["nothing", "odometry", "a pose"])
+def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
+    """Also when it has once heard something from the future."""
+
+    async def scenario(system: System) -> list[tuple[float, float]]:
+        robot = system.start("robot", Robot)
+        system.start("control", BridgedControl, bridge_m=2.0)
+        await system.settle()
+        world, seen = World(), []
+        robot.publish(topics.ROUTE, m.Route("m", 0, m.Mode.TAXI, True, ((0.0, 0.0), (30.0, 0.0)),
+                                            ""))
+        for i in range(250):
+            odom = m.Pose(world.x_m, world.y_m, world.yaw_rad)
+            robot.publish(topics.ODOMETRY, m.Odometry(odom, m.Twist(world.linear_mps, 0.0)))
+            robot.publish(topics.SCAN, full_sweep(number=i))
+            if world.x_m < 3.0:
+                robot.publish(topics.POSE, odom)
+                lost_at_m = world.x_m
+            if i == 60 and mis_stamped is not None:
+                robot.publish(mis_stamped, m.Odometry(odom, m.Twist(0.0, 0.0))
+                              if mis_stamped is topics.ODOMETRY else odom, stamp=1e9)
+            await asyncio.sleep(0.05)
+            world.move(robot.speeds[-1], 0.0)
+            seen.append((world.x_m - lost_at_m, robot.speeds[-1]))
+            assert i < 40 or seen[-1][0] > -1.0
+        return seen
+
+    async def whole() -> list[tuple[float, float]]:
+        from tests.actors.osmosis.control.test_actors import AIRPORT
+
+        async with System(system=shipped_system(), airport=AIRPORT) as system:
+            return await scenario(system)
+
+    seen = run(whole)
+    assert all(speed > 0.4 for gone_m, speed in seen if 0.3 < gone_m < 1.9)
+    assert seen[-1][1] == 0.0
+    assert 2.0 < seen[-1][0] < 2.8
+
+
+def test_the_papers_control_does_not_make_the_base_publish_odometry():
+    key = topics.ODOMETRY.key
+    assert key not in heard(Member("osmosis_control", OsmosisControl, OsmosisControl.Parameters()))
+    assert key in heard(Member("osmosis_control", BridgedControl, BridgedControl.Parameters()))
+    assert key in heard(Member("standby", BridgedStandby, BridgedStandby.Parameters()))
+    assert BridgedStandby.outputs == (topics.STANDBY_COMMAND,)

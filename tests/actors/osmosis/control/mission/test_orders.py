@@ -1,0 +1,271 @@
+"""Orders to the Mission Manager, and the robot's truth in the mission's state: whole chains."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import pytest
+
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
+from rampart.actors.osmosis.messages import MissionAction, MissionPhase, Mode, PilotMode
+from rampart.actors.osmosis.recovery.replan import Replan
+from rampart.actors.runtime.actor import Actor, on
+from rampart.sim.virtual.virtual_loop import VirtualLoop
+from tests.actors.osmosis.control.mission_world import full_house
+from tests.actors.osmosis.control.test_actors import AIRPORT
+from tests.actors.osmosis.control.world import World
+from tests.actors.osmosis.recovery.world import Boss
+from tests.virtual_loop import System, run
+
+START = (AIRPORT.start.x_m, AIRPORT.start.y_m, AIRPORT.start.yaw_rad)
+DOWN = m.Goal(-29.5, -3.0, Mode.TAXI)
+ROW = m.Goal(-22.0, -18.5, Mode.TAXI)
+
+
+def play(scenario, world=None):
+    async def scene():
+        house = full_house(world or World(*START))
+        try:
+            await asyncio.sleep(1.0)
+            house.request(DOWN, ROW)
+            await asyncio.sleep(5.0)
+            await scenario(house, house.base)
+        finally:
+            await house.close()
+
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        runner.run(scene())
+
+
+def place(house):
+    return house.base.world.x_m, house.base.world.y_m
+
+
+def standing(house):
+    return house.base.command == m.BaseCommand(0.0, 0.0)
+
+
+def test_pause_and_resume():
+    async def scenario(house, operator):
+        operator.ask(MissionAction.PAUSE, "aircraft passing")
+        await asyncio.sleep(1.5)
+        assert standing(house)
+        assert operator.status.phase is MissionPhase.PAUSED
+        assert operator.status.reason == "operator: aircraft passing"
+        where = place(house)
+        await asyncio.sleep(5.0)
+        assert place(house) == pytest.approx(where, abs=0.01)
+        operator.ask(MissionAction.PAUSE)
+        operator.ask(MissionAction.RESUME)
+        assert await house.until(lambda: operator.status.phase is MissionPhase.SUCCEEDED, 90)
+        assert [a.accepted for a in operator.answers] == [True, False, True]
+        assert operator.answers[1].reason == "it is paused already, operator: aircraft passing"
+
+    play(scenario)
+
+
+def test_home():
+    async def scenario(house, operator):
+        await asyncio.sleep(6.0)
+        operator.ask(MissionAction.HOME, "rain")
+        assert await house.until(lambda: operator.status.phase is MissionPhase.CANCELLED, 60)
+        assert operator.phases == ["idle", "running", "returning home", "cancelled"]
+        assert operator.status.reason == "returned home, operator: rain"
+        assert math.dist(place(house), START[:2]) < 1.1
+        await asyncio.sleep(1.0)
+        assert standing(house)
+
+    play(scenario)
+
+
+def test_skip_and_cancel():
+    async def scenario(house, operator):
+        operator.ask(MissionAction.SKIP, "closed")
+        await asyncio.sleep(1.0)
+        assert operator.status.step == 1
+        assert operator.status.skipped == (0,)
+        operator.ask(MissionAction.CANCEL, "enough")
+        await asyncio.sleep(1.5)
+        assert standing(house)
+        assert operator.status.phase is MissionPhase.CANCELLED
+
+    play(scenario)
+
+
+def test_another_plan_for_the_same_goal_is_driven_without_a_stop():
+    async def scenario(house, operator):
+        operator.ask(MissionAction.REPLAN)
+        await asyncio.sleep(0.5)
+        assert operator.routes[-1].plan == 1
+        assert operator.answers[-1].plan == 1
+        assert operator.status.phase is MissionPhase.RUNNING
+        assert operator.command.linear_mps > 0.3
+
+    play(scenario)
+
+
+def test_a_transient_controlled_stop_pauses_the_mission_and_its_end_resumes_it():
+    async def scenario(house, operator):
+        operator.hold("RM2", PilotMode.STOP)
+        await asyncio.sleep(2.0)
+        assert standing(house)
+        assert operator.status.phase is MissionPhase.PAUSED
+        assert operator.status.reason == "held by RM2: DM6: localization not updated"
+        operator.ask(MissionAction.RESUME)
+        await asyncio.sleep(0.2)
+        assert "goes on by itself" in operator.answers[-1].reason
+        operator.release()
+        assert await house.until(lambda: operator.status.phase is MissionPhase.SUCCEEDED, 90)
+        assert operator.phases == ["idle", "running", "paused", "running", "succeeded"]
+
+    play(scenario)
+
+
+def test_the_operator_drives_elsewhere_and_hands_back_and_the_mission_goes_on_from_there():
+    async def scenario(house, operator):
+        operator.hold("RM5", PilotMode.TELEOPERATION)
+        await asyncio.sleep(1.0)
+        assert operator.status.reason.startswith("held by RM5")
+        where = place(house)
+        for forward, left, ticks in ((0.0, 1.0, 60), (0.8, 0.0, 120)):
+            for _ in range(ticks):
+                operator.publish(topics.JOYSTICK, m.Joystick(forward, left, True))
+                await asyncio.sleep(0.05)
+        moved_m = math.dist(where, place(house))
+        assert moved_m > 2.0
+        assert operator.status.phase is MissionPhase.PAUSED
+        operator.publish(topics.JOYSTICK, m.Joystick(0.0, 0.0, False))
+        routes = len(operator.routes)
+        operator.release()
+        await asyncio.sleep(1.0)
+        anew = operator.routes[routes:][-1]
+        assert anew.active
+        assert math.dist(anew.waypoints[0], place(house)) < 2.5, "planned from where it is now"
+        assert await house.until(lambda: operator.status.phase is MissionPhase.SUCCEEDED, 120)
+        assert operator.phases == ["idle", "running", "paused", "running", "succeeded"]
+
+    play(scenario)
+
+
+def test_a_wrong_route_is_refused_and_the_good_one_driven_on():
+    async def scenario(house, operator):
+        good = operator.routes[-1]
+        bad = (*good.waypoints[:-1], (-24.0, 0.0), good.waypoints[-1])
+        control = house.actors["osmosis_control"]
+        await house.kill("graph_planner")
+        control.route(m.Route(good.mission_id, good.step, good.mode, True, bad, ""), None)
+        await asyncio.sleep(0.5)
+        assert "crosses the prohibited area" in control._status.reason
+        assert control._status.phase is m.ControlPhase.FOLLOWING
+        assert operator.command.linear_mps > 0.2
+        control.route(good, None)
+        await asyncio.sleep(0.1)
+        assert control._status.reason == ""
+
+    play(scenario)
+
+
+def test_without_a_good_route_for_the_goal_the_robot_stands_and_control_says_why():
+    async def scenario(house, operator):
+        control = house.actors["osmosis_control"]
+        good = operator.routes[-1]
+        await house.kill("graph_planner")
+        control.route(m.Route(good.mission_id, 1, good.mode, True, (
+            (-29.0, 5.0), (20.0, 5.0)), ""), None)
+        await asyncio.sleep(1.5)
+        assert standing(house)
+        told = control._status
+        assert (told.phase, told.step) == (m.ControlPhase.REFUSED, 1)
+        assert "crosses the prohibited area" in told.reason
+
+    play(scenario)
+
+
+# ---- RM6 ----------------------------------------------------------------------------------------
+
+
+class Planner(Actor):
+    """Answers each goal with a route, unless it is told to be dumb."""
+
+    outputs = (topics.ROUTE, topics.MISSION_REQUEST)
+
+    def __init__(self, context):
+        super().__init__(context)
+        self.way = ((0.0, 0.0), (1.0, 0.0))
+        self.dumb = False
+
+    @on(topics.GOAL)
+    def goal(self, message, header):
+        if not self.dumb:
+            self.publish(topics.ROUTE, m.Route(
+                message.mission_id, message.step, message.goal.mode, message.active,
+                self.way if message.active else (), "" if self.way else "no way", message.plan))
+
+
+def replanning(scenario, *, mission=True):
+    async def scene():
+        async with System() as system:
+            boss, planner = system.start("boss", Boss), system.start("planner", Planner)
+            manager = system.start("mission_manager", MissionManager)
+            system.start("RM6", Replan)
+            await system.settle()
+            if mission:
+                planner.publish(topics.MISSION_REQUEST, m.MissionRequest("m1", "A", (DOWN,)))
+            await asyncio.sleep(0.5)
+            await scenario(boss, planner, manager)
+
+    run(scene)
+
+
+def test_a_replan_is_done_when_the_new_route_is_there():
+    async def scenario(boss, planner, manager):
+        boss.order("RM6")
+        await asyncio.sleep(0.1)
+        assert boss.phases == ["idle", "acting", "done"]
+        assert manager.state.plan == 1
+        boss.order("RM6")
+        await asyncio.sleep(0.5)
+        assert manager.state.plan == 1, "the same command is the same order"
+        boss.order("RM6", decision=2)
+        await asyncio.sleep(0.5)
+        assert manager.state.plan == 2
+        boss.release("RM6", decision=3)
+        await asyncio.sleep(0.1)
+        assert boss.phases == ["idle", "acting", "done", "acting", "done", "idle"]
+
+    replanning(scenario)
+
+
+def test_a_replan_fails_without_a_mission_with_the_managers_reason():
+    async def scenario(boss, planner, manager):
+        boss.order("RM6")
+        await asyncio.sleep(0.1)
+        assert boss.phases == ["idle", "acting", "failed"]
+        assert boss.reports[-1][1].reason == "refused: no mission is under way"
+
+    replanning(scenario, mission=False)
+
+
+def test_a_replan_fails_if_there_is_no_way():
+    async def scenario(boss, planner, manager):
+        planner.way = ()
+        boss.order("RM6")
+        await asyncio.sleep(0.1)
+        assert boss.reports[-1][1].reason == "no way: no way"
+
+    replanning(scenario)
+
+
+def test_a_replan_fails_at_its_deadline_if_no_route_comes():
+    async def scenario(boss, planner, manager):
+        planner.dumb = True
+        boss.order("RM6")
+        await asyncio.sleep(1.9)
+        assert boss.phases == ["idle", "acting"]
+        await asyncio.sleep(0.3)
+        assert boss.reports[-1][1].reason == "not done within 2 s: no new route"
+
+    replanning(scenario)

@@ -1,0 +1,278 @@
+"""Two lasers: whatever happens to one of them, the other's view stays, and nothing is unseen."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.pilot.laser_check import LaserReach
+from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair
+from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
+from rampart.actors.osmosis.messages import LaserScan
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from tests.actors.osmosis.control.laser_sweeps import full_sweep
+from tests.virtual_loop import System, run, shipped_system
+
+RAYS, TOP_M, PERIOD_S = 5, 8.0, 0.05
+ANGLE_MIN = -0.2
+REACH = LaserReach(range_m=5.0, field_rad=0.4, gap_rad=0.1)
+
+
+def sweep(ranges, reference_m=0.1):
+    return LaserScan(ANGLE_MIN, 0.1, TOP_M, np.array(ranges, "<f4").tobytes(), reference_m)
+
+
+def healthy(i, ranges=(8, 8, 3, 8, 8)):
+    return sweep(ranges, 0.1 + 0.001 * math.sin(i + 1))
+
+
+def distances(view):
+    return sorted(round(float(np.hypot(*point)), 3) for point in view.points)
+
+
+class Bench:
+    """Feeds a pair sweep by sweep and keeps the view that is in force."""
+
+    def __init__(self):
+        self.pair, self.view, self.changes = LaserPair(REACH), None, 0
+
+    def feed(self, laser, message, stamp_s, now_s=None):
+        view = self.pair.take(laser, message, stamp_s, stamp_s if now_s is None else now_s)
+        if view is not None:
+            self.view = view
+            self.changes += 1
+
+
+def test_one_laser_alone_gives_every_view():
+    bench = Bench()
+    for i in range(10):
+        bench.feed(LOWER, healthy(i), i * PERIOD_S)
+        assert bench.changes == i + 1
+        assert (bench.view.stamp_s, bench.view.fault) == (i * PERIOD_S, "")
+        assert distances(bench.view) == [3.0]
+
+
+def test_two_make_one_view_at_the_rate_of_one():
+    bench = Bench()
+    for i in range(20):
+        bench.feed(LOWER, healthy(i), i * PERIOD_S)
+        bench.feed(UPPER, healthy(i + 100), i * PERIOD_S)
+    assert bench.changes == 20
+
+
+def test_a_ray_is_as_short_as_the_shorter_of_the_two():
+    bench = Bench()
+    bench.feed(UPPER, healthy(1, (8, 2, 4, 8, 8)), 0.0)
+    bench.feed(LOWER, healthy(2, (1, 8, 5, 8, 8)), 0.0)
+    assert distances(bench.view) == [1.0, 2.0, 4.0]
+
+
+def broken(way, i):
+    """Return sweep and stamp of a laser with a fault, or None for silence."""
+    now_s = i * PERIOD_S
+    match way:
+        case "silent":
+            return None
+        case "stuck":
+            return sweep((8, 8, 8, 8, 8), 0.1), now_s
+        case "biased":
+            return sweep((8, 8, 3.5, 8, 8), 0.6), now_s
+        case "frozen":
+            return healthy(0, (8, 8, 8, 8, 8)), 0.0
+        case "late":
+            return healthy(i, (8, 8, 8, 8, 8)), now_s - 1.5
+    raise AssertionError(way)
+
+
+@pytest.mark.parametrize("bad", [LOWER, UPPER])
+@pytest.mark.parametrize("way", ["silent", "stuck", "biased", "frozen", "late"])
+def test_whatever_one_of_them_does_the_view_stays_fresh_and_right(bad, way):
+    bench, good = Bench(), 1 - bad
+    for i in range(100):
+        now_s = i * PERIOD_S
+        found = broken(way, i) if i >= 20 else (healthy(i + 1000), now_s)
+        if found is not None:
+            bench.feed(bad, *found)
+        bench.feed(good, healthy(i), now_s)
+        assert bench.view.fault == ""
+        assert now_s - bench.view.stamp_s <= 0.15, "the view is old"
+        if i > 30:
+            assert bench.view.stamp_s == now_s
+            assert distances(bench.view)[0] == 3.0
+
+
+WRONG_STAMPS = [1e9, 0.6, math.inf, math.nan]
+
+
+@pytest.mark.parametrize("stamp_s", WRONG_STAMPS)
+@pytest.mark.parametrize("laser", [LOWER, UPPER])
+def test_a_sweep_of_no_possible_time_is_no_view_and_shuts_out_none(laser, stamp_s):
+    bench = Bench()
+    for i in range(20):
+        now_s = i * PERIOD_S
+        bench.feed(LOWER, healthy(i), now_s)
+        if i == 8:
+            assert bench.pair.take(laser, healthy(99, (8,) * 5), stamp_s, now_s) is None
+        bench.feed(UPPER, healthy(i + 100), now_s)
+        assert (bench.view.stamp_s, distances(bench.view)[0]) == (now_s, 3.0)
+
+
+@pytest.mark.parametrize("stamp_s", WRONG_STAMPS)
+def test_if_all_stamps_are_wrong_the_view_grows_old(stamp_s):
+    bench = Bench()
+    bench.feed(LOWER, healthy(0), 0.0)
+    for i in range(1, 10):
+        bench.feed(LOWER, healthy(i), stamp_s, i * PERIOD_S)
+        bench.feed(UPPER, healthy(i), stamp_s, i * PERIOD_S)
+    assert bench.view.stamp_s == 0.0
+
+
+@pytest.mark.parametrize("way", ["stuck", "biased"])
+def test_without_any_that_can_be_believed_there_is_no_view_and_a_reason(way):
+    bench = Bench()
+    for i in range(20):
+        for laser in (LOWER, UPPER):
+            bench.feed(laser, *broken(way, i))
+    assert "laser" in bench.view.fault
+    assert not len(bench.view.points)
+
+
+def test_if_both_are_silent_the_view_grows_old():
+    bench = Bench()
+    bench.feed(LOWER, healthy(1), 1.0)
+    assert bench.view.stamp_s == 1.0  # and no word since: its reader sees its age
+
+
+def test_one_that_comes_back_is_used_again():
+    bench = Bench()
+    for i in range(200):
+        now_s = i * PERIOD_S
+        bad = 20 <= i < 60
+        bench.feed(LOWER, sweep((8,) * 5, 0.1) if bad else healthy(i, (8, 8, 2, 8, 8)), now_s)
+        bench.feed(UPPER, healthy(i), now_s)
+    assert distances(bench.view) == [2.0]
+
+
+@pytest.mark.parametrize("other", [
+    LaserScan(-0.3, 0.1, TOP_M, np.full(7, 4, "<f4").tobytes(), 0.1001),
+    LaserScan(-0.2, 0.05, TOP_M, np.full(9, 4, "<f4").tobytes(), 0.1001),
+    LaserScan(-0.2, 0.1, 6.0, np.full(5, 4, "<f4").tobytes(), 0.1001)])
+@pytest.mark.parametrize("first", [LOWER, UPPER])
+def test_of_lasers_that_differ_in_their_rays_all_echoes_count(first, other):
+    bench = Bench()
+    bench.feed(first, other, 0.0)
+    bench.feed(1 - first, healthy(1), 0.0)
+    bench.feed(first, msgspec.structs.replace(other, reference_m=0.1002), PERIOD_S)
+    assert set(distances(bench.view)) == {3.0, 4.0}
+    assert len(bench.view.points) == 1 + len(other.ranges_f32) // 4
+
+
+def lacking(way, i):
+    """Return a sweep that shows less than it should and looks like free space."""
+    sound = healthy(i, (8, 8, 8, 8, 8))
+    return msgspec.structs.replace(sound, **{
+        "empty": {"ranges_f32": b""}, "torn": {"ranges_f32": sound.ranges_f32[:-1]},
+        "few rays": {"ranges_f32": sound.ranges_f32[:8]},
+        "near": {"range_max_m": 0.3}, "no range": {"range_max_m": math.nan},
+        "endless": {"range_max_m": math.inf},
+        "turned": {"angle_min_rad": ANGLE_MIN + math.pi / 2},
+        "turned a little": {"angle_min_rad": ANGLE_MIN + 0.06},
+        "nowhere": {"angle_min_rad": math.nan}, "behind": {"angle_min_rad": ANGLE_MIN - math.tau},
+        "narrow": {"angle_increment_rad": 0.01}, "wide": {"angle_increment_rad": 0.2},
+        "backwards": {"angle_increment_rad": -0.1}, "on the spot": {"angle_increment_rad": 0.0},
+    }[way])
+
+
+WAYS = ["empty", "torn", "few rays", "near", "no range", "endless", "turned", "turned a little",
+        "nowhere", "behind", "narrow", "wide", "backwards", "on the spot"]
+
+
+@pytest.mark.parametrize("bad", [LOWER, UPPER])
+@pytest.mark.parametrize("way", WAYS)
+def test_a_sweep_that_shows_less_than_it_should_hides_nothing_that_the_other_sees(way, bad):
+    bench = Bench()
+    for i in range(20):
+        bench.feed(bad, lacking(way, i) if i >= 5 else healthy(i + 100), i * PERIOD_S)
+        bench.feed(1 - bad, healthy(i), i * PERIOD_S)
+        assert (bench.view.stamp_s, bench.view.fault) == (i * PERIOD_S, "")
+        assert distances(bench.view)[0] == 3.0
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_robot_with_one_laser_does_not_take_for_free_what_that_does_not_show(way):
+    bench = Bench()
+    bench.feed(LOWER, lacking(way, 1), 0.0)
+    assert "laser" in bench.view.fault
+    bench.feed(LOWER, healthy(2), PERIOD_S)
+    assert (bench.view.fault, distances(bench.view)) == ("", [3.0])
+
+
+def test_a_laser_that_proved_itself_and_does_so_no_more_is_not_believed():
+    bench = Bench()
+    bench.feed(LOWER, healthy(1), 0.0)
+    bench.feed(LOWER, sweep((8, 8, 8, 8, 8), -1.0), PERIOD_S)
+    assert "reference" in bench.view.fault
+
+
+def test_a_number_that_is_none_hides_no_echo_of_the_other():
+    bench = Bench()
+    bench.feed(UPPER, healthy(1, (math.nan, 8, 3, 8, 8)), 0.0)
+    bench.feed(LOWER, healthy(2, (1, math.nan, math.nan, 8, 8)), 0.0)
+    assert distances(bench.view) == [1.0, 3.0]
+
+
+class Rest(Actor):
+    """All that the pilot hears, and the base."""
+
+    outputs = (topics.COMMAND, topics.SCAN, ftm_topics.MANAGER_STATUS)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.speeds: list[float] = []
+
+    @on(topics.BASE_COMMAND)
+    def base(self, message: m.BaseCommand, _header: Header) -> None:
+        self.speeds.append(message.linear_mps)
+
+
+@pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
+def test_one_sweep_from_the_future_neither_blinds_the_safety_pilot_nor_stops_it_for_good(stamp_s):
+    async def scenario() -> None:
+        async with System(system=shipped_system()) as system:
+            rest = system.start("rest", Rest)
+            system.start("safety_pilot", SafetyPilot)
+            await system.settle()
+            for i in range(80):
+                rest.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus((), (), (), (), "", 0))
+                rest.publish(topics.COMMAND, m.Twist(0.8, 0.0))
+                rest.publish(topics.SCAN, full_sweep(8.0 if i < 60 else 0.6, i),
+                             stamp=stamp_s if i == 30 else None)
+                await asyncio.sleep(PERIOD_S)
+                if i == 58:
+                    assert set(rest.speeds[-20:]) == {0.8}
+            assert rest.speeds[-1] == 0.0, "there is something in the way"
+
+    run(scenario)
+
+
+rays = st.lists(st.floats(0.25, 8.0, width=32), min_size=RAYS, max_size=RAYS)
+
+
+@given(rays, rays)
+def test_no_echo_of_either_is_lost_and_none_is_invented(a, b):
+    bench = Bench()
+    bench.feed(UPPER, healthy(1, a), 0.0)
+    bench.feed(LOWER, healthy(2, b), 0.0)
+    nearest = [min(x, y) for x, y in zip(a, b, strict=True)]
+    expected = sorted(r for r in nearest if r < TOP_M * (1 - 1e-6))
+    assert distances(bench.view) == pytest.approx(expected, abs=2e-3)

@@ -1,0 +1,333 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate, Stamped
+from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, is_free, limited
+from rampart.actors.osmosis.control.polyline import NO_POINTS
+from rampart.actors.osmosis.messages import PilotMode
+from tests.actors.osmosis.control.world import DT_S, Circle, World
+
+LIMITS = GateLimits()
+BASELINE = Checks(bounds=False, freshness=False, sequence=False, scan=False, manager=False)
+ROOM = StoppingRoom()
+
+
+class Bench:
+    """A gate that has settled, with its manager and scanner alive until told otherwise."""
+
+    def __init__(self, checks=None):
+        self.gate = SafetyGate(LIMITS, checks or Checks(), 0.0)
+        self.now = 1.0
+        self.sequence = 0
+        self.manager = self.scanner = True
+        self.points = NO_POINTS
+        self.wait(0.0)
+
+    def wait(self, seconds):
+        self.now += seconds
+        if self.manager:
+            self.gate.manager_alive(self.now)
+        if self.scanner:
+            self.gate.scan(self.points, self.now)
+
+    def send(self, linear, angular=0.0, *, age=0.0, sequence=None, incarnation=1, stick=False):
+        self.sequence = self.sequence + 1 if sequence is None else sequence
+        take = self.gate.joystick if stick else self.gate.command
+        return take(Stamped(linear, angular, "teleoperation" if stick else "osmosis_control",
+                            incarnation, self.sequence, self.now - age), self.now)
+
+    def out(self):
+        output = self.gate.output(self.now)
+        return output.linear_mps, output.angular_radps
+
+    def reason(self):
+        return self.gate.output(self.now).reason
+
+
+def wall(distance_m, width_m=1.0):
+    """Echoes of a wall across, so far ahead of the hull."""
+    y = np.linspace(-width_m / 2, width_m / 2, 41)
+    return np.column_stack((np.full(41, 0.36 + distance_m), y))
+
+
+def test_a_good_command_passes_unchanged_and_without_a_reason():
+    bench = Bench()
+    assert bench.send(0.8, -0.5) == ""
+    assert bench.out() == (0.8, -0.5)
+    assert bench.reason() == ""
+    assert not bench.gate.output(bench.now).stopped
+
+
+@pytest.mark.parametrize(("engaged", "mode"), [
+    ([], PilotMode.AUTO),
+    ([PilotMode.AUTO], PilotMode.AUTO),
+    ([PilotMode.TELEOPERATION], PilotMode.TELEOPERATION),
+    ([PilotMode.TELEOPERATION, PilotMode.STOP], PilotMode.STOP),
+    ([PilotMode.STOP, PilotMode.AUTO], PilotMode.STOP),
+    ([PilotMode.AUTO, PilotMode.TELEOPERATION], PilotMode.TELEOPERATION),
+])
+def test_the_strictest_engaged_order_wins(engaged, mode):
+    bench = Bench()
+    for index, wanted in enumerate(engaged):
+        bench.gate.order(f"RM{index}", True, wanted, "")
+    assert bench.gate.mode is mode
+
+
+@pytest.mark.parametrize(("mode", "auto", "stick", "expected"), [
+    (PilotMode.AUTO, 0.5, None, 0.5),
+    (PilotMode.AUTO, 0.5, -0.2, -0.2),
+    (PilotMode.AUTO, None, -0.2, -0.2),
+    (PilotMode.TELEOPERATION, 0.5, None, 0.0),
+    (PilotMode.TELEOPERATION, 0.5, -0.2, -0.2),
+    (PilotMode.STOP, 0.5, None, 0.0),
+    (PilotMode.STOP, 0.5, -0.2, 0.0),
+])
+@pytest.mark.parametrize("checks", [Checks(), BASELINE], ids=["checked", "baseline"])
+def test_who_drives(mode, auto, stick, expected, checks):
+    bench = Bench(checks)
+    bench.gate.order("RM2", mode is not PilotMode.AUTO, mode, "because")
+    if auto is not None:
+        bench.send(auto)
+    if stick is not None:
+        bench.send(stick, stick=True)
+    assert bench.out() == (expected, 0.0)
+
+
+def test_an_order_ends_only_by_the_word_of_who_gave_it():
+    bench = Bench()
+    bench.send(0.5)
+    bench.gate.order("RM2", True, PilotMode.STOP, "stale command")
+    bench.gate.order("RM5", False, PilotMode.TELEOPERATION, "")
+    assert bench.out() == (0.0, 0.0)
+    assert bench.reason() == "RM2: stale command"
+    bench.gate.order("RM2", False, PilotMode.STOP, "")
+    assert bench.out() == (0.5, 0.0)
+
+
+def test_the_stick_pre_empts_until_it_is_silent():
+    bench = Bench()
+    bench.send(0.3, stick=True)
+    bench.send(0.5)
+    assert bench.out() == (0.3, 0.0)
+    bench.wait(0.31)
+    bench.send(0.5)
+    assert bench.out() == (0.5, 0.0)
+
+
+@pytest.mark.parametrize("bad", [
+    (1.01, 0.0), (-1.01, 0.0), (0.0, 2.1), (0.0, -2.1), (math.nan, 0.0), (0.5, math.nan),
+    (math.inf, 0.0), (0.0, -math.inf)])
+def test_a_command_out_of_bounds_is_refused_counted_and_leaves_zero(bad):
+    bench = Bench()
+    bench.send(0.5)
+    assert bench.send(*bad) != ""
+    assert bench.gate.refused == 1
+    assert bench.out() == (0.0, 0.0)
+    assert bench.reason() != ""
+    bench.send(0.4)
+    assert bench.out() == (0.4, 0.0)
+
+
+floats = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(floats, floats, st.booleans(), st.floats(-2, 2),
+                          st.integers(0, 5), st.integers(1, 3)), max_size=8))
+def test_whatever_comes_nothing_out_of_bounds_leaves_the_gate(messages):
+    bench = Bench()
+    for linear, angular, stick, age, sequence, incarnation in messages:
+        bench.wait(0.05)
+        bench.send(linear, angular, age=age, sequence=sequence, incarnation=incarnation,
+                   stick=stick)
+        out = bench.out()
+        assert abs(out[0]) <= LIMITS.max_linear_mps * 1.00001
+        assert abs(out[1]) <= LIMITS.max_angular_radps * 1.00001
+
+
+def test_a_stale_command_is_refused_and_one_that_grows_stale_is_dropped():
+    bench = Bench()
+    assert "0.60 s old" in bench.send(0.5, age=0.6)
+    assert bench.out() == (0.0, 0.0)
+    bench.send(0.5)
+    bench.wait(0.49)
+    assert bench.out() == (0.5, 0.0)
+    bench.wait(0.02)
+    assert bench.out() == (0.0, 0.0)
+    assert bench.reason() == "no fresh command"
+
+
+def test_a_command_from_the_future_or_without_a_time_is_refused():
+    bench = Bench()
+    assert "ahead" in bench.send(0.5, age=-0.5)
+    assert bench.send(0.5, age=math.nan) != ""
+    assert bench.out() == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("incarnation", "sequence", "taken"), [
+    (2, 11, True), (2, 10, False), (2, 9, False), (1, 99, False), (3, 1, True)])
+def test_the_sequence_only_goes_forward(incarnation, sequence, taken):
+    bench = Bench()
+    bench.send(0.5, incarnation=2, sequence=10)
+    refused = bench.send(0.1, incarnation=incarnation, sequence=sequence)
+    assert (refused == "") is taken
+    assert bench.out() == (0.1 if taken else 0.5, 0.0), "the newer command stays in force"
+
+
+def test_a_silent_manager_stops_the_robot_until_it_is_back():
+    bench = Bench()
+    bench.manager = False
+    for _ in range(11):
+        bench.wait(0.05)
+        bench.send(0.5)
+    assert bench.out() == (0.0, 0.0)
+    assert bench.reason() == "the manager is silent"
+    bench.manager = True
+    bench.wait(0.05)
+    assert bench.out() == (0.5, 0.0)
+
+
+def test_a_missing_or_stale_scan_stops_the_robot():
+    bench = Bench()
+    bench.scanner = False
+    bench.wait(0.6)
+    bench.send(0.5)
+    assert bench.out() == (0.0, 0.0)
+    assert bench.reason() == "no fresh laser scan"
+
+
+def test_a_gate_just_started_waits_for_the_orders_it_may_have_missed():
+    gate = SafetyGate(LIMITS, Checks(), 10.0)
+    gate.manager_alive(10.1)
+    gate.scan(NO_POINTS, 10.1)
+    gate.command(Stamped(0.5, 0.0, "osmosis_control", 1, 1, 10.1), 10.1)
+    assert gate.output(10.1).linear_mps == 0.0
+    gate.order("RM2", True, PilotMode.STOP, "")
+    assert gate.output(10.5).linear_mps == 0.0
+    gate.order("RM2", False, PilotMode.STOP, "")
+    assert gate.output(10.5).linear_mps == 0.5
+
+
+def test_old_news_of_the_manager_is_no_sign_of_life():
+    gate = SafetyGate(LIMITS, Checks(), 0.0)
+    for tick in range(200):
+        now = tick * 0.05
+        gate.manager_alive(min(now, 5.0))
+        if tick % 7 == 0:
+            gate.manager_alive(1.0)  # it was overtaken
+        gate.scan(NO_POINTS, now)
+        gate.command(Stamped(0.5, 0.0, "osmosis_control", 1, tick, now), now)
+        assert (gate.output(now).linear_mps > 0) == (
+            LIMITS.settling_s <= now <= 5.0 + LIMITS.manager_timeout_s)
+
+
+def test_the_baseline_keeps_only_repetition_obstacle_stop_and_joystick():
+    bench = Bench(BASELINE)
+    bench.manager = bench.scanner = False
+    bench.send(3.0, 5.0, age=9.0)
+    bench.wait(60.0)
+    assert bench.out() == (3.0, 5.0), "out of bounds, stale, no manager, no scan: it goes on"
+    bench.send(0.5, sequence=0)
+    assert bench.out() == (0.5, 0.0), "older sequence: taken"
+    bench.send(math.nan)
+    assert bench.out() == (0.5, 0.0), "what no base can execute is not kept"
+    bench.gate.scan(wall(0.1), bench.now)
+    assert bench.out() == (0.0, 0.0)
+
+
+def test_backwards_where_no_laser_looks_drives_the_stick_alone_and_slowly():
+    bench = Bench()
+    bench.send(-0.2, 0.4, stick=True)
+    assert bench.out() == (-0.2, 0.4)
+    bench.send(-1.0, 0.4, stick=True)
+    assert bench.out() == (-LIMITS.reverse_mps, 0.4)
+    assert "no laser looks back" in bench.gate.output(bench.now).reason
+    bench.wait(0.31)
+    assert "backwards, where no laser looks" in bench.send(-0.2)
+    assert bench.out() == (0.0, 0.0)
+    assert bench.send(0.2) == ""
+    assert bench.out() == (0.2, 0.0)
+
+
+@pytest.mark.parametrize("stamp_s", [3600.0, math.inf, math.nan, -math.inf])
+def test_a_sweep_with_a_stamp_from_elsewhere_is_no_fresh_one(stamp_s):
+    bench = Bench()
+    bench.scanner = False
+    bench.gate.scan(NO_POINTS, bench.now + stamp_s)
+    for _ in range(20):
+        bench.wait(0.1)
+        bench.send(0.5)
+        assert bench.out() == (0.0, 0.0)
+        assert bench.reason() == "no fresh laser scan"
+
+
+@pytest.mark.parametrize(("points", "linear", "angular", "expected"), [
+    (NO_POINTS, 1.0, 0.0, "free"),
+    (wall(1.0), 1.0, 0.0, "free"),
+    (wall(0.6), 1.0, 0.0, "slower"),
+    (wall(0.15), 1.0, 0.0, "stopped"),
+    (wall(0.6), -1.0, 0.0, "free"),
+    (wall(0.6), 0.3, 0.0, "free"),
+    (wall(0.2), 0.0, 1.5, "free"),
+    (np.array(((0.0, 0.55),)), 0.7, 0.0, "free"),
+    (np.array(((0.5, 0.45),)), 1.0, 0.0, "slower"),
+    (np.array(((0.30, 0.36),)), 0.0, 1.0, "stopped"),
+    (np.array(((0.30, 0.36),)), 0.0, -1.0, "free"),
+    (np.array(((-0.45, 0.0),)), -0.5, 0.0, "stopped"),
+    (np.array(((0.6, 0.7),)), 0.8, 1.5, "slower"),
+], ids=["nothing", "wall far", "wall near", "wall at once", "away from it", "slowly towards it",
+        "turn in place", "flank passed", "corner brushed", "turn into it", "turn away from it",
+        "something behind", "in the bend"])
+def test_what_the_echoes_allow(points, linear, angular, expected):
+    out = limited(linear, angular, points, ROOM)
+    if expected == "free":
+        assert out == (linear, angular)
+    elif expected == "slower":
+        assert 0.0 < out[0] < linear
+        assert out[1] == angular
+    else:
+        assert out[0] == 0.0
+        assert out[1] == 0.0
+
+
+def test_in_front_of_a_wall_the_robot_may_still_turn_away():
+    assert limited(0.5, 1.5, wall(0.2), ROOM) == (0.0, 1.5)
+
+
+def test_the_room_needed_is_the_specs_at_top_speed_and_shrinks_with_it():
+    assert ROOM.ahead_m(1.0) == pytest.approx(0.8)
+    assert ROOM.beside_m(1.0) == pytest.approx(0.3)
+    needs = [ROOM.ahead_m(v) for v in (0.0, 0.25, 0.5, 1.0, 2.0)]
+    assert needs == sorted(needs)
+    feeble = StoppingRoom(deceleration_mps2=0.5)
+    assert feeble.ahead_m(1.0) > 1.2, "braking decides when it needs more than the spec says"
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.floats(-1, 1), st.floats(-2, 2),
+       st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=6))
+def test_what_is_let_through_is_free_or_standstill(linear, angular, places):
+    points = np.array(places)
+    out = limited(linear, angular, points, ROOM)
+    assert out == (0.0, 0.0) or is_free(*out, points, ROOM)
+    assert abs(out[0]) <= abs(linear)
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0])
+def test_an_obstacle_that_appears_1_2_m_ahead_is_not_touched(speed):
+    world = World(linear_mps=speed)
+    world.circles.append(Circle(0.36 + 1.2 + 0.3, 0.0, 0.3))
+    speeds = []
+    for _ in range(120):
+        world.move(*limited(speed, 0.0, world.scan(noise_m=0.01), ROOM))
+        speeds.append(world.linear_mps)
+    assert speeds[-1] == 0.0
+    assert 0.1 < world.least_clearance_m < 0.35
+    changes = np.abs(np.diff(speeds))
+    assert changes.max() <= 1.5 * DT_S + 1e-9
+    assert len({round(v, 1) for v in speeds}) >= 5, "gradually, no bang-bang"
+    assert np.diff(speeds).max() <= 0.1

@@ -1,0 +1,308 @@
+"""What is done about something on the way: noticed, driven round, or planned round."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.control.following.blockage import (
+    BlockageLimits,
+    BlockageWatch,
+    nearest_ahead,
+)
+from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
+from rampart.actors.osmosis.control.planning.closures import Closures, without
+from rampart.actors.osmosis.control.planning.graph_planner import GraphPlanner
+from rampart.actors.osmosis.control.planning.route_search import plan_route
+from rampart.actors.osmosis.control.polyline import NO_POINTS
+from rampart.actors.osmosis.messages import Mode
+from rampart.actors.runtime.actor import Actor, on
+from tests.actors.osmosis.control.world import Circle, World, drive
+from tests.virtual_loop import System, run
+
+AIRPORT = load_airport("vallombre")
+RING = {"A": (0.0, 0.0), "B": (20.0, 0.0), "C": (20.0, 20.0), "D": (0.0, 20.0)}
+EDGES = [("A", "B"), ("B", "C"), ("C", "D"), ("D", "A")]
+
+
+# ---- closures -----------------------------------------------------------------------------------
+
+
+def samples(nodes, edges, step_m=0.1):
+    for a, b in edges:
+        count = max(2, math.ceil(math.dist(nodes[a], nodes[b]) / step_m) + 1)
+        for share in np.linspace(0.0, 1.0, count):
+            yield tuple(nodes[a][i] + share * (nodes[b][i] - nodes[a][i]) for i in (0, 1))
+
+
+def on_graph(point, nodes, edges):
+    return any(
+        math.dist(a, point) + math.dist(point, b) <= math.dist(a, b) + 1e-6
+        for a, b in ((nodes[x], nodes[y]) for x, y in edges))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.floats(-1, 21), st.floats(-1, 21)), max_size=3),
+       st.floats(0.3, 3.0))
+def test_what_is_left_of_the_graph_is_what_is_not_near_a_closed_place(places, gap_m):
+    nodes, edges = without(RING, EDGES, places, gap_m)
+    assert set(RING) <= set(nodes)
+    for point in samples(RING, EDGES, 0.5):
+        nearest_m = min((math.dist(point, place) for place in places), default=math.inf)
+        if nearest_m > gap_m + 0.1:
+            assert on_graph(point, nodes, edges), "open, so it is still there"
+        elif nearest_m < gap_m - 0.01:
+            assert not on_graph(point, nodes, edges), "closed, so it is gone"
+    for point in samples(nodes, edges, 0.5):
+        assert on_graph(point, RING, EDGES), "nothing is added"
+
+
+def test_a_robot_in_front_of_something_turns_and_takes_the_other_way():
+    nodes, edges = without(RING, EDGES, [(10.0, 0.3)], 1.0)
+    plan = plan_route(nodes, edges, (8.0, 0.0), (18.0, 0.0))
+    assert plan.waypoints == ((8.0, 0.0), (0.0, 0.0), (0.0, 20.0), (20.0, 20.0), (20.0, 0.0),
+                              (18.0, 0.0))
+
+
+def test_a_place_is_closed_for_a_while_and_near_ones_count_as_one():
+    closures = Closures(gap_m=1.0, lasts_s=60.0)
+    closures.close((5.0, 0.0), 10.0)
+    closures.close((5.5, 0.0), 40.0)
+    closures.close((9.0, 0.0), 50.0)
+    assert closures.closed(99.9) == ((5.0, 0.0), (9.0, 0.0))
+    assert closures.closed(100.0) == ((9.0, 0.0),)
+    closures.reopen()
+    assert closures.closed(100.0) == ()
+
+
+# ---- blockage -----------------------------------------------------------------------------------
+
+AHEAD = np.array([(1.0, 0.1), (2.0, 0.0), (0.2, 0.9)])
+BESIDE = np.array([(0.2, 0.9)])
+HERE = (10.0, 5.0, math.pi / 2)
+
+
+def test_no_progress_with_something_ahead_is_a_blockage_since_the_last_progress():
+    watch = BlockageWatch(BlockageLimits(after_s=3.0))
+    for now_s, to_go_m in ((0.0, 20.0), (1.0, 19.0), (2.0, 18.9), (3.0, 18.8), (3.9, 18.8)):
+        assert watch.update(to_go_m, HERE, AHEAD, now_s) is None
+    found = watch.update(18.8, HERE, AHEAD, 4.0)
+    assert (found.x_m, found.y_m) == pytest.approx((9.9, 6.0))
+    assert found.since_s == 1.0
+    assert watch.update(18.9, (10.0, 5.0, 0.0), NO_POINTS, 9.0) == found, "it stays where it was"
+    assert watch.update(18.6, HERE, AHEAD, 10.0) is None, "the robot gets on"
+
+
+def test_who_stands_on_an_empty_runway_is_not_blocked():
+    watch = BlockageWatch()
+    assert all(watch.update(20.0, HERE, BESIDE, t) is None for t in range(30))
+
+
+def test_another_route_begins_anew():
+    watch = BlockageWatch(BlockageLimits(after_s=3.0))
+    watch.update(20.0, HERE, AHEAD, 0.0)
+    assert watch.update(20.0, HERE, AHEAD, 3.0) is not None
+    watch.restart()
+    assert watch.update(50.0, HERE, AHEAD, 3.1) is None
+    assert watch.update(50.0, HERE, AHEAD, 6.2).since_s == 3.1
+
+
+def test_what_is_ahead_is_the_nearest_echo_in_front_within_reach():
+    limits = BlockageLimits(reach_m=3.0)
+    assert nearest_ahead(np.array([(3.5, 0.0)]), HERE, limits) is None
+    assert nearest_ahead(np.array([(-1.0, 0.0)]), HERE, limits) is None
+    assert nearest_ahead(NO_POINTS, HERE, limits) is None
+
+
+# ---- light verification -------------------------------------------------------------------------
+
+ROW = ((0.0, 0.0), (30.0, 0.0))
+
+
+def row(pass_after_s=5.0, half_width_m=2.75):
+    return LightRow(ROW, limits=RowLimits(pass_after_s=pass_after_s),
+                    edge_m=lambda _x, y: half_width_m - abs(y))
+
+
+@pytest.mark.parametrize("aside_m", [-0.4, 0.0, 0.25])
+def test_an_obstacle_that_stays_is_passed_after_a_wait_and_the_row_is_taken_up_behind_it(aside_m):
+    world = World(circles=[Circle(12.0, aside_m, 0.4)])
+    motion = drive(world, row(), 70.0)
+    assert motion.arrived
+    assert world.least_clearance_m >= 0.2
+    assert max(abs(y) for _, y in world.track) <= 1.45
+    behind = [abs(y) for x, y in world.track if x > 16.0]
+    assert behind
+    assert max(behind) <= 0.25, "on the row again soon"
+
+
+def test_it_waits_as_long_as_it_is_told_to():
+    world = World(circles=[Circle(12.0, 0.0, 0.4)])
+    drive(world, row(pass_after_s=5.0), 14.5 + 4.0)
+    assert max(abs(y) for _, y in world.track) < 0.05
+
+
+@pytest.mark.parametrize("follower", [
+    pytest.param(lambda: LightRow(ROW), id="as in the paper"),
+    pytest.param(lambda: row(half_width_m=1.3), id="no room on the pavement"),
+    pytest.param(lambda: LightRow(ROW, limits=RowLimits(pass_after_s=5.0)), id="no map")])
+def test_else_it_waits_for_ever(follower):
+    world = World(circles=[Circle(12.0, 0.0, 0.4)])
+    motion = drive(world, follower(), 40.0)
+    assert motion.waiting
+    assert max(abs(y) for _, y in world.track) < 0.05
+
+
+def test_where_both_sides_are_blocked_it_comes_back_to_waiting_and_touches_nothing():
+    world = World(circles=[Circle(12.0, y, 0.4) for y in (-2.0, -1.0, 0.0, 1.0, 2.0)])
+    motion = drive(world, row(), 60.0)
+    assert not motion.arrived
+    assert motion.linear_mps == 0.0
+    assert world.least_clearance_m >= 0.2
+
+
+def test_an_obstacle_that_goes_away_is_not_driven_round():
+    world = World(circles=[Circle(12.0, 0.0, 0.4)])
+
+    def go_away(now_s):
+        if now_s > 14.0:
+            world.circles.clear()
+
+    assert drive(world, row(), 60.0, each=go_away).arrived
+    assert max(abs(y) for _, y in world.track) < 0.05
+
+
+# ---- the planner as an actor --------------------------------------------------------------------
+
+
+class Chain(Actor):
+    """Everybody round the planner."""
+
+    outputs = (topics.POSE, topics.GOAL, topics.CONTROL_STATUS)
+
+    def __init__(self, context):
+        super().__init__(context)
+        self.routes = []
+
+    @on(topics.ROUTE)
+    def route(self, message, header):
+        if not self.routes or message != self.routes[-1]:
+            self.routes.append(message)
+
+    def blocked(self, x_m, y_m, step=0, for_s=20.0):
+        now_s = self.clock.now()
+        self.publish(topics.CONTROL_STATUS, m.ControlStatus(
+            "m1", step, m.ControlPhase.WAITING, 0, 20.0,
+            (m.Blockage(x_m, y_m, now_s - for_s),)))
+
+
+ORDER = m.GoalOrder("m1", 0, m.Goal(-22.0, -18.5, Mode.TAXI), True)
+CRATE = (-29.3, -5.0)
+
+
+def planned(scenario, **parameters):
+    async def play():
+        async with System(airport=AIRPORT) as system:
+            chain = system.start("chain", Chain)
+            system.start("graph_planner", GraphPlanner, **parameters)
+            await system.settle()
+            chain.publish(topics.POSE, m.Pose(-29.4, -3.6, -math.pi / 2))
+            chain.publish(topics.GOAL, ORDER)
+            await asyncio.sleep(0.1)
+            await scenario(chain)
+            return chain.routes
+
+    return run(play)
+
+
+def passes(route, place):
+    return any(
+        math.dist(a, place) + math.dist(place, b) < math.dist(a, b) + 0.2
+        for a, b in itertools.pairwise(route.waypoints))
+
+
+def test_the_planner_plans_round_what_has_blocked_the_robot_for_long_enough():
+    async def scenario(chain):
+        chain.blocked(*CRATE, for_s=15.0)
+        await asyncio.sleep(0.3)
+        assert len(chain.routes) == 1
+        chain.blocked(*CRATE, for_s=16.5)
+        await asyncio.sleep(0.3)
+
+    direct, detour = planned(scenario, replan_after_s=16.0)
+    assert passes(direct, CRATE)
+    assert not passes(detour, CRATE)
+    assert detour.waypoints[-1] == direct.waypoints[-1]
+    assert detour.reason == "way round (-29.3, -5.0), which is blocked"
+
+
+def test_as_in_the_paper_it_does_not():
+    async def scenario(chain):
+        chain.blocked(*CRATE, for_s=500.0)
+        await asyncio.sleep(0.3)
+
+    assert len(planned(scenario)) == 1
+
+
+def test_the_place_is_avoided_for_later_goals_too_and_then_tried_again():
+    async def scenario(chain):
+        chain.blocked(*CRATE)
+        for step in (1, 2):
+            await asyncio.sleep(31.0)
+            chain.publish(topics.GOAL, m.GoalOrder("m1", step, ORDER.goal, True))
+        await asyncio.sleep(0.1)
+
+    _, _, soon, late = planned(scenario, replan_after_s=16.0, avoid_for_s=60.0)
+    assert not passes(soon, CRATE)
+    assert passes(late, CRATE)
+
+
+def test_without_another_way_the_route_stays():
+    async def scenario(chain):
+        chain.publish(topics.GOAL, m.GoalOrder("m1", 1, m.Goal(-29.4, -3.3, Mode.TAXI), True))
+        await asyncio.sleep(0.1)
+        chain.blocked(-29.4, -3.3, step=1)
+        await asyncio.sleep(0.3)
+
+    routes = planned(scenario, replan_after_s=16.0, avoid_gap_m=30.0)
+    assert [route.step for route in routes] == [0, 1]
+
+
+@pytest.mark.parametrize("report", [
+    m.ControlStatus("m2", 0, m.ControlPhase.WAITING, 0, 9.0, (m.Blockage(*CRATE, -99.0),)),
+    m.ControlStatus("m1", 1, m.ControlPhase.WAITING, 0, 9.0, (m.Blockage(*CRATE, -99.0),)),
+    m.ControlStatus("m1", 0, m.ControlPhase.WAITING, 0, 9.0, (m.Blockage(math.nan, 0.0, -99.0),)),
+    m.ControlStatus("m1", 0, m.ControlPhase.WAITING, 0, 9.0)])
+def test_reports_about_something_else_change_nothing(report):
+    async def scenario(chain):
+        chain.publish(topics.CONTROL_STATUS, report)
+        await asyncio.sleep(0.3)
+
+    assert len(planned(scenario, replan_after_s=16.0)) == 1
+
+
+def test_another_plan_that_is_asked_for_avoids_what_is_in_the_way():
+    async def scenario(chain):
+        chain.blocked(*CRATE, for_s=4.0)
+        await asyncio.sleep(0.1)
+        chain.publish(topics.GOAL, m.GoalOrder("m1", 0, ORDER.goal, True, 1))
+        await asyncio.sleep(0.1)
+
+    direct, detour = planned(scenario)
+    assert passes(direct, CRATE)
+    assert not passes(detour, CRATE)
+    assert (direct.plan, detour.plan) == (0, 1)
+
+
+def test_a_parameter_that_is_no_number_is_refused():
+    with pytest.raises(ValueError, match=r"replan_after_s = 'soon': expected a number, 0 or more"):
+        planned(lambda _chain: asyncio.sleep(0), replan_after_s="soon")

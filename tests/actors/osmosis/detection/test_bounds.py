@@ -1,0 +1,74 @@
+"""DM3: commands that the robot was never meant to drive."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rampart.actors.osmosis.detection.bounds_check import BoundsCheck
+from tests.detection_timeline import play, table
+
+COMMANDS = {
+    "0": (0.0, 0.0), "v": (1.0, 0.0), "r": (-1.0, 2.0), "t": (0.3, -2.0),
+    "V": (1.01, 0.0), "R": (-3.0, 0.0), "T": (0.0, 2.1), "n": (math.nan, 0.0),
+    "i": (0.0, -math.inf),
+}
+
+
+def checker(**changes: float) -> BoundsCheck:
+    return BoundsCheck(1.0, 2.0, **{"hold_s": 0.3, **changes})
+
+
+def command(check: BoundsCheck):
+    return lambda event, now_s: check.command(*COMMANDS[event], now_s)
+
+
+# small letters and 0 are within bounds, V R T are beyond, n and i are no numbers
+TIMELINES = {
+    "good commands": ("0vrt0v", "------"),
+    "the first bad command": ("vvVvvv", "--AAAA"),
+    "it comes twice": ("VvvvvTvvvv", "AAAA-AAAA-"),
+    "good again, but not for long enough": ("VvvVvvvv", "AAAAAAA-"),
+    "too fast backward": ("R", "A"),
+    "not a number": ("vn", "-A"),
+    "infinite turn rate": ("vi", "-A"),
+    "it never comes: that is the subject of DM2": ("......", "------"),
+    "nonsense and then silence is not cured": ("V......", "AAAAAAA"),
+    "every second command is bad": ("VvVvVvVv", "AAAAAAAA"),
+}
+
+
+@pytest.mark.parametrize(("events", "expected"), **table(TIMELINES))
+def test_bounds_timeline(events, expected):
+    check = checker()
+    assert play(check, command(check), events) == expected
+
+
+@pytest.mark.parametrize(("events", "expected"), **table({
+    "it knows with the first command": (".v", "?-"),
+    "a bad one": (".V", "?A"),
+    "no command is no evidence": ("....", "??--"),
+}))
+def test_a_respawned_check_claims_nothing_before_it_knows(events, expected):
+    check = checker(known_after_s=0.2)
+    assert play(check, command(check), events) == expected
+
+
+def test_the_reason_names_value_and_limit_of_the_first_bad_command():
+    check = checker()
+    check.command(2.5, 0.0, 0.0)
+    check.command(0.0, 9.0, 0.1)
+    assert check.reason == "commanded speed 2.50 m/s exceeds 1 m/s"
+
+
+@given(st.floats(), st.floats())
+def test_active_if_and_only_if_the_command_is_out_of_bounds(linear, angular):
+    check = checker()
+    check.command(linear, angular, 0.0)
+    outside = not abs(linear) <= 1.0 + 2.1e-6 or not abs(angular) <= 2.0 + 3.1e-6
+    inside = abs(linear) <= 1.0 and abs(angular) <= 2.0
+    assert check.active or not outside
+    assert not (check.active and inside)

@@ -1,0 +1,115 @@
+"""DM9: two computers of one command that disagree, and who is accused."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.actors.osmosis.detection.command_comparison import CommandComparison, ComparisonLimits
+from tests.detection_timeline import play, table
+
+LIMITS = ComparisonLimits(angular_s=0.3, linear_s=0.6, hold_s=0.2, forget_s=1.0)
+GOOD, TURNS, SLOW = (0.8, 0.0), (0.8, 0.9), (0.2, 0.0)
+PAIRS = {
+    "=": (GOOD, GOOD), "w": (GOOD, TURNS), "W": (TURNS, GOOD), "v": (GOOD, SLOW),
+    "~": ((0.8, 0.1), (0.7, -0.1)), "a": (GOOD, None), "s": (None, GOOD),
+    "n": (GOOD, (math.nan, 0.0)),
+}
+SOURCES = ("standby", "active")
+
+
+class Bench:
+    """A comparison and the lives of those that it compares."""
+
+    def __init__(self, **changes) -> None:
+        self.comparison = CommandComparison(SOURCES, LIMITS, **changes)
+        self.lives = {"standby": 1, "active": 1}
+
+    def handle(self, event: str, now_s: float) -> None:
+        if event in "12":
+            self.lives[SOURCES[int(event) - 1]] += 1
+            return
+        for source, command in zip(("active", "standby"), PAIRS[event], strict=True):
+            if command is not None:
+                self.comparison.heard(source, command, now_s, self.lives[source], now_s)
+
+    def play(self, events: str) -> str:
+        return play(self.comparison, self.handle, events)
+
+
+# = agree, ~ nearly, w W turn rates differ, v speeds differ, a s one is silent, 1 2 one is reborn
+@pytest.mark.parametrize(("events", "expected"), **table({
+    "agreement": ("==~~==", "------"),
+    "turn rates differ for too long": ("==wwww", "-----A"),
+    "whichever it is": ("==WWWW", "-----A"),
+    "a moment's difference": ("==ww==ww==", "----------"),
+    "speeds may differ longer: a follower accelerates": ("==vvvvv===", "----------"),
+    "but not for ever": ("==vvvvvvvv", "--------AA"),
+    "agreement has to last": ("wwww=ww===", "---AAAAAA-"),
+    "one is silent: nothing to compare": ("==aaaaaa", "--------"),
+    "accused, then silent for so long that nothing is claimed": ("wwwwaaaaaaaaaaaaa",
+                                                                "---AAAAAAAAAAAA--"),
+    "not a number is the subject of others": ("==nnnnnn", "--------"),
+}))
+def test_disagreement_timeline(events, expected):
+    assert Bench().play(events) == expected
+
+
+@pytest.mark.parametrize(("events", "accused"), **table({
+    "nobody": ("====", ()),
+    "first the standby, whose restart costs nothing": ("wwww", ("standby#1",)),
+    "it stays accused until it is reborn": ("wwwwwwww", ("standby#1",)),
+    "they differ still when it is back: it was the other": ("wwww1wwww", ("active#1",)),
+    "not at once, a new life has its time": ("wwww1ww", ("standby#1",)),
+    "back and agreed: nobody": ("wwww1====", ()),
+    "both are new and differ still: the last one stays accused": ("wwww1wwww2wwwww", ("active#1",)),
+    "another time, from the beginning": ("wwww1====wwww", ("standby#2",)),
+}))
+def test_who_is_accused(events, accused):
+    bench = Bench()
+    bench.play(events)
+    assert bench.comparison.nodes == accused
+
+
+@pytest.mark.parametrize(("events", "expected"), **table({
+    "it knows with the first pair": (".=", "?-"),
+    "one alone is no pair": ("aaaa", "??--"),
+}))
+def test_a_respawned_comparison_claims_nothing_before_it_knows(events, expected):
+    assert Bench(known_after_s=0.2).play(events) == expected
+
+
+@pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
+def test_a_command_from_the_future_is_not_compared_when_its_sender_is_silent(stamp_s):
+    bench = Bench()
+    bench.play("==")
+    bench.comparison.heard("active", GOOD, stamp_s, 1, 0.2)
+    for tick in range(20):
+        now_s = 0.5 + 0.05 * tick
+        bench.comparison.heard("standby", TURNS, now_s, 1, now_s)
+    assert not bench.comparison.active
+
+
+def test_the_reason_names_both_commands():
+    bench = Bench()
+    bench.play("wwww")
+    assert bench.comparison.reason == (
+        "commands differ: 0.80 m/s 0.90 rad/s and 0.80 m/s 0.00 rad/s")
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.text("=~", min_size=1, max_size=40))
+def test_who_agrees_is_never_accused(events):
+    bench = Bench()
+    assert "A" not in bench.play(events)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.text("=wv1a", max_size=30))
+def test_active_and_an_accused_life_go_together(events):
+    bench = Bench()
+    bench.play(events)
+    assert bool(bench.comparison.nodes) == bench.comparison.active

@@ -1,0 +1,367 @@
+"""DM10 and DM11: a route that must not be driven, and control nodes that contradict each other."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.detection.consistency_monitor import (
+    ConsistencyLimits,
+    ConsistencyMonitor,
+)
+from rampart.actors.osmosis.detection.erroneous_route import ErroneousRoute
+from rampart.actors.osmosis.detection.mission_consistency import MissionConsistency
+from rampart.actors.osmosis.detection.route_monitor import RouteMonitor
+from rampart.actors.osmosis.messages import ControlPhase, Goal, MissionPhase, Mode
+from rampart.actors.runtime.actor import Actor
+from tests.detection_timeline import Ear, play, table, wake
+from tests.virtual_loop import System, run
+
+AIRPORT = load_airport("vallombre")
+GOALS = (Goal(10.0, 0.0, Mode.TAXI), Goal(40.0, 0.0, Mode.LIGHT_VERIFICATION))
+GOOD, BAD = ((0.0, 0.0), (10.0, 0.0)), ((0.0, 0.0), (10.0, 5.0))
+
+
+# ---- DM10 ---------------------------------------------------------------------------------------
+
+# g a good route of the planner's first life, b a bad one, G and B of its second; n none.
+ROUTES = {
+    "good routes": ("g.g.g.g", "-------"),
+    "one bad route is enough, and good ones must come for 500 ms": (
+        "g.b.g.g.g.g.g", "--AAAAAAAA---"),
+    "a planner that is wrong now and then": ("gbgggbggggggg", "-AAAAAAAAAA--"),
+    "silence cures nobody": ("gb..........", "-AAAAAAAAAAA"),
+    "a planner that was respawned is believed": ("gb..GG", "-AAA--"),
+    "unless it is wrong as well": ("gb..BBGGGGGGG", "-AAAAAAAAAA--"),
+    "an inactive route is not bad": ("gbnnnnnnn", "-AAAAAA--"),
+}
+
+
+def routes(monitor):
+    def handle(event, now_s):
+        active = event != "n"
+        waypoints = (BAD if event in "bB" else GOOD) if active else ()
+        monitor.route(m.Route("m1", 0, Mode.TAXI, active, waypoints, ""), "graph_planner",
+                      1 if event.islower() else 2, now_s)
+
+    return handle
+
+
+def wrong(waypoints, _goal):
+    return "leg 1 is wrong" if waypoints == BAD else ""
+
+
+@pytest.mark.parametrize(("events", "expected"), **table(ROUTES))
+def test_timeline_of_routes(events, expected):
+    monitor = RouteMonitor(wrong, 0.5)
+    assert expected == play(monitor, routes(monitor), events)
+
+
+def test_the_life_that_gave_the_bad_route_is_named():
+    monitor = RouteMonitor(wrong, 0.5)
+    routes(monitor)("B", 1.0)
+    assert monitor.nodes == ("graph_planner#2",)
+
+
+def test_a_respawned_module_waits_for_a_route_before_it_says_anything():
+    monitor = RouteMonitor(wrong, 0.5, known_after_s=0.45)
+    assert play(monitor, routes(monitor), "........") == "????----"
+
+
+def test_the_goal_is_that_of_the_same_step():
+    asked = []
+    monitor = RouteMonitor(lambda _w, goal: asked.append(goal) or "", 0.5)
+    monitor.goal(m.GoalOrder("m1", 1, GOALS[1], True), "mission_manager", 1)
+    for step in (0, 1):
+        monitor.route(m.Route("m1", step, Mode.TAXI, True, GOOD, ""), "p", 1, 0.0)
+    assert asked == [None, (40.0, 0.0)]
+
+
+STATUS = m.MissionStatus("m1", "A", MissionPhase.RUNNING, 0, GOALS, (), (), "")
+
+
+@pytest.mark.parametrize(("goal", "status", "blamed"), [
+    (GOALS[0], STATUS, "graph_planner#1"),
+    (Goal(10.0, 4.0, Mode.TAXI), STATUS, "mission_manager#3"),
+    (Goal(10.0, 4.0, Mode.TAXI), msgspec.structs.replace(STATUS, phase=MissionPhase.RETURNING),
+     "graph_planner#1"),
+    (GOALS[0], msgspec.structs.replace(STATUS, mission_id="m2"), "mission_manager#3")])
+def test_who_gave_a_wrong_goal_is_to_blame_for_the_bad_route_to_it(goal, status, blamed):
+    monitor = RouteMonitor(wrong, 0.5)
+    monitor.mission(status)
+    monitor.goal(m.GoalOrder("m1", 0, goal, True), "mission_manager", 3)
+    routes(monitor)("b", 1.0)
+    assert monitor.nodes == (blamed,)
+
+
+def test_who_gave_a_wrong_goal_is_believed_in_the_next_life():
+    monitor = RouteMonitor(wrong, 0.5)
+    monitor.mission(STATUS)
+    monitor.goal(m.GoalOrder("m1", 0, GOALS[1], True), "mission_manager", 1)
+    routes(monitor)("b", 1.0)
+    monitor.goal(m.GoalOrder("m1", 0, GOALS[0], True), "mission_manager", 2)
+    routes(monitor)("g", 1.1)
+    assert not monitor.active
+
+
+class Planner(Actor):
+    outputs = (topics.ROUTE, topics.GOAL)
+
+
+def test_a_way_across_the_grass_is_reported_at_once_on_a_map_of_its_own():
+    start, goal = (-27.0, 11.0), (-22.0, -18.5)
+
+    async def scenario():
+        async with System(airport=AIRPORT) as system:
+            ear, planner = system.start("ear", Ear), system.start("graph_planner", Planner)
+            system.start("DM10", ErroneousRoute)
+            await system.settle()
+            planner.publish(topics.GOAL, m.GoalOrder("m1", 0, Goal(*goal, Mode.TAXI), True))
+            before_s = system.clock.now()
+            planner.publish(topics.ROUTE, m.Route("m1", 0, Mode.TAXI, True, (start, goal), ""))
+            await asyncio.sleep(0.05)
+            at_s, report = ear.heard[-1]
+            assert at_s - before_s < 0.01
+            assert report.nodes == ("graph_planner#1",)
+            assert "crosses the prohibited area" in report.reason
+
+    run(scenario)
+
+
+# ---- DM11 ---------------------------------------------------------------------------------------
+
+
+class Story:
+    """The chain in order, and what may be changed about it."""
+
+    def __init__(self):
+        self.mission = m.MissionStatus("m1", "A", MissionPhase.RUNNING, 0, GOALS, (), (), "")
+        self.goal = m.GoalOrder("m1", 0, GOALS[0], True)
+        self.route = m.Route("m1", 0, Mode.TAXI, True, GOOD, "")
+        self.control = m.ControlStatus("m1", 0, ControlPhase.FOLLOWING, 0, 9.0)
+        self.pose = (0.0, 0.0)
+        self.lives = {"mission": 1, "goal": 1, "route": 1, "control": 1}
+        self.silent: set[str] = set()
+        self.age_s = 0.0
+
+    SOURCES = {"mission": "mission_manager", "goal": "mission_manager", "route": "graph_planner",
+               "control": "osmosis_control"}
+
+    def change(self, what, **fields):
+        setattr(self, what, msgspec.structs.replace(getattr(self, what), **fields))
+
+    def tell(self, monitor, now_s):
+        for what, source in self.SOURCES.items():
+            if what not in self.silent:
+                monitor.heard(getattr(self, what), source, self.lives[what],
+                              now_s - (self.age_s if what == "route" else 0.0), now_s)
+        monitor.pose(*self.pose, now_s)
+
+
+def watch(story, seconds, monitor=None, start_s=0.0, each=None):
+    """Let the chain talk at 5 Hz; return when the monitor became active, or None."""
+    monitor = monitor or ConsistencyMonitor(ConsistencyLimits(), start_s)
+    found = None
+    for tick in range(round(seconds / 0.2)):
+        now_s = round(start_s + 0.2 * tick, 9)
+        wake(monitor, now_s - 1e-9)
+        if each:
+            each(story, now_s)
+        story.tell(monitor, now_s)
+        if monitor.active and found is None:
+            found = now_s
+    return monitor, found
+
+
+def test_a_chain_in_agreement_is_consistent():
+    def drive(story, now_s):
+        story.pose = (min(now_s, 9.0), 0.0)
+        story.change("control", distance_to_go_m=9.0 - story.pose[0])
+
+    monitor, found = watch(Story(), 9.0, each=drive)
+    assert found is None
+    assert monitor.known
+
+
+PAUSED = {"mission": {"phase": MissionPhase.PAUSED}}
+IDLE_GOAL = {"goal": {"active": False, "goal": Goal(0.0, 0.0, Mode.TAXI)}}
+IDLE_ROUTE = {"route": {"active": False, "waypoints": ()}}
+CONTRADICTIONS = {
+    "an old goal": ({"mission": {"step": 1}}, "mission_manager#1",
+                    "gives goal 1, the mission is at goal 2"),
+    "another point": ({"goal": {"goal": Goal(11.0, 0.0, Mode.TAXI)}}, "mission_manager#1",
+                      "another point"),
+    "another mode": ({"route": {"mode": Mode.LIGHT_VERIFICATION}}, "graph_planner#1", "anew"),
+    "a goal while paused": (PAUSED, "mission_manager#1", "mission m1 is paused"),
+    "no goal while running": (IDLE_GOAL, "mission_manager#1", "no goal of mission m1"),
+    "a goal of another mission": ({"goal": {"mission_id": "m0"}}, "mission_manager#1", "m0"),
+    "an old route": ({"route": {"step": 3}}, "graph_planner#1", "plans to goal 4"),
+    "an old plan": ({"goal": {"plan": 1}}, "graph_planner#1", "not planned goal 1 anew"),
+    "a route while paused": ({**PAUSED, **IDLE_GOAL}, "graph_planner#1", "plans, the goal"),
+    "an old progress": ({"control": {"step": 2}}, "osmosis_control#1", "is at goal 3"),
+    "nothing moves on": ({"control": {"phase": ControlPhase.ARRIVED}}, "mission_manager#1",
+                         "goes on with goal 1, which is reached"),
+    "a step beyond the last": ({"mission": {"step": 2}, "goal": {"step": 2}}, "mission_manager#1",
+                               "goal 3"),
+}
+
+
+@pytest.mark.parametrize("case", CONTRADICTIONS.values(), ids=CONTRADICTIONS.keys())
+def test_a_lasting_contradiction_names_the_first_in_the_chain_who_is_wrong(case):
+    changes, node, reason = case
+    story = Story()
+    watch(story, 1.0)
+    for what, fields in changes.items():
+        story.change(what, **fields)
+    monitor, found = watch(story, 4.0)
+    assert found == pytest.approx(2.5, abs=0.21)
+    assert monitor.nodes == (node,)
+    assert reason in monitor.reason
+
+
+@pytest.mark.parametrize("changes", [
+    {},
+    {**PAUSED, **IDLE_GOAL, **IDLE_ROUTE},
+    {"mission": {"phase": MissionPhase.RETURNING}, "goal": {"step": 2}, "route": {"step": 2},
+     "control": {"step": 2}},
+    {"mission": {"phase": MissionPhase.SUCCEEDED, "step": 2},
+     "goal": {"step": 2, "active": False}, "route": {"step": 2, "active": False},
+     "control": {"step": 1, "phase": ControlPhase.ARRIVED}}],
+    ids=["running", "paused", "returning home", "over"])
+def test_states_of_a_healthy_chain_are_consistent(changes):
+    story = Story()
+    for what, fields in changes.items():
+        story.change(what, **fields)
+    _, found = watch(story, 8.0)
+    assert found is None
+
+
+@pytest.mark.parametrize(("what", "node"), Story.SOURCES.items())
+def test_who_falls_silent_is_named(what, node):
+    story = Story()
+    monitor, _ = watch(story, 1.0)
+    story.silent = {what}
+    monitor, found = watch(story, 4.0, monitor, 1.0)
+    assert found == pytest.approx(0.8 + 2.5, abs=0.21)
+    assert monitor.nodes == (f"{node}#1",)
+
+
+def test_content_that_is_old_is_as_good_as_none():
+    story = Story()
+    monitor, _ = watch(story, 1.0)
+    story.age_s = 2.6
+    monitor, found = watch(story, 4.0, monitor, 1.0)
+    assert found is not None
+    assert monitor.nodes == ("graph_planner#1",)
+
+
+@pytest.mark.parametrize("stamp_s", [1e9, math.inf, math.nan])
+def test_a_stamp_of_no_possible_time_does_not_hide_that_its_sender_is_silent(stamp_s):
+    monitor, _ = watch(Story(), 1.0)
+    monitor.heard(Story().route, "graph_planner", 1, stamp_s, 1.0)
+    story = Story()
+    story.silent = {"route"}
+    monitor, _ = watch(story, 4.0, monitor, 1.0)
+    assert monitor.nodes == ("graph_planner#1",)
+    monitor.heard(story.route, "graph_planner", 1, 5.0, 5.0)
+    assert not monitor.active
+
+
+def test_a_pose_beyond_all_measure_does_not_end_the_watch_on_progress():
+    def drive(story, now_s):
+        story.pose = (now_s, 20.0)
+
+    monitor = ConsistencyMonitor(ConsistencyLimits(), 0.0)
+    for x_m in (0.0, 1e300):
+        monitor.pose(x_m, 20.0, 0.0)
+    monitor, found = watch(Story(), 6.0, monitor, each=drive)
+    assert found == pytest.approx(3.0, abs=0.21)
+    assert monitor.nodes == ("osmosis_control#1",)
+
+
+def test_a_delay_that_is_shorter_is_borne():
+    story = Story()
+    story.age_s = 1.7
+    assert watch(story, 9.0)[1] is None
+
+
+def test_progress_that_stays_the_same_while_the_robot_drives_is_wrong():
+    def drive(story, now_s):
+        story.pose = (now_s, 20.0)
+
+    monitor, found = watch(Story(), 6.0, each=drive)
+    assert found == pytest.approx(3.0, abs=0.21)
+    assert monitor.nodes == ("osmosis_control#1",)
+
+
+def test_an_arrival_that_is_not_reported_is_noticed_later():
+    story = Story()
+    story.pose = (10.2, 0.0)
+    monitor, found = watch(story, 9.0)
+    assert found == pytest.approx(6.0, abs=0.21)
+    assert monitor.nodes == ("osmosis_control#1",)
+    story.change("control", phase=ControlPhase.WAITING)
+    assert watch(story, 9.0)[1] is None, "it waits for something"
+
+
+def test_a_new_life_is_forgiven_and_judged_by_what_it_says():
+    story = Story()
+    story.change("route", step=3)
+    monitor, _ = watch(story, 3.0)
+    assert monitor.active
+    story.lives["route"] = 2
+    monitor, found = watch(story, 2.0, monitor, 3.0)
+    assert found is None
+    monitor, found = watch(story, 2.0, monitor, 5.0)
+    assert monitor.nodes == ("graph_planner#2",)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(
+    st.sampled_from(["mission", "goal", "route", "control"]), st.integers(0, 2),
+    st.floats(0.05, 1.2)), max_size=25))
+def test_contradictions_that_do_not_last_are_none(changes):
+    story, monitor, now_s = Story(), ConsistencyMonitor(ConsistencyLimits(), 0.0), 0.0
+    for what, step, lasts_s in changes:
+        story.change(what, step=step)
+        story.tell(monitor, now_s)
+        now_s += lasts_s
+        for healed in Story.SOURCES:
+            story.change(healed, step=0)
+        wake(monitor, now_s - 1e-9)
+        story.tell(monitor, now_s)
+        assert not monitor.active
+        now_s += 0.1
+
+
+class Chain(Actor):
+    outputs = (topics.MISSION_STATUS, topics.GOAL, topics.ROUTE, topics.CONTROL_STATUS,
+               topics.POSE)
+
+
+def test_the_module_reports_what_the_monitor_finds():
+    async def scenario():
+        async with System() as system:
+            ear, chain = system.start("ear", Ear), system.start("mission_manager", Chain)
+            system.start("DM11", MissionConsistency, patience_s=1.0)
+            await system.settle()
+            story = Story()
+            story.change("mission", step=1)
+            for _ in range(8):
+                for topic, said in ((topics.MISSION_STATUS, story.mission),
+                                    (topics.GOAL, story.goal), (topics.ROUTE, story.route),
+                                    (topics.CONTROL_STATUS, story.control)):
+                    chain.publish(topic, said)
+                await asyncio.sleep(0.2)
+            assert ear.states == ["idle", "active"]
+            assert ear.heard[-1][1].nodes == ("mission_manager#1",)
+
+    run(scenario)

@@ -1,0 +1,309 @@
+"""DM2 and DM6: a topic that goes stale, by the stamps of its samples."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import pytest
+
+from rampart.actors.detection.module import EXCUSE_S, DetectionModule, IllegalTransitionError
+from rampart.actors.detection.stub import StubDetection
+from rampart.actors.ftm import messages as fm
+from rampart.actors.layout.wiring import Member, heard
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.detection.freshness import CommandFreshness, LocalizationFreshness
+from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.runtime.actor import Header, on
+from tests.detection_timeline import Ear, Source, play, table
+from tests.virtual_loop import System, VirtualLoop, run
+
+# f fresh sample, o the first sample once more, d delayed by 1 s, + stamped 100 s ahead,
+# i infinitely far ahead, n no number
+TIMELINES = {
+    "a steady stream is fresh": ("ffffffff", "--------"),
+    "it stops and goes on": ("ff......fff.", "----AAAAAA--"),
+    "it never comes: the start is forgiven for 500 ms, no longer": (".......", "-----AA"),
+    "it comes late, but within the grace": ("....ffff", "--------"),
+    "a frozen source repeats its old sample": ("ffoooooooo", "----AAAAAA"),
+    "a link delivers every sample a second late": ("fddddddd", "---AAAAA"),
+    "it stutters just inside the timeout": ("f..f..f..f", "----------"),
+    "it goes stale twice": ("f...fff...fff.", "---AAA---AAA--"),
+    "the hold starts anew when it goes stale in between": ("f...f....fff", "---AAAAAAAA-"),
+    "one sample is not enough to be fresh again": ("f...f......", "---AAAAAAAA"),
+    "samples that come too rarely are not enough": ("f....f...f...f", "---AAAAAAAAAAA"),
+    "a stamp from the future is not a sample": ("+++++++", "-----AA"),
+    "a source with a wrong clock is not fresh for ever": ("f++++++", "---AAAA"),
+    "a stamp from the future does not make honest ones look old": ("+f+fffff", "--------"),
+    "a stamp that is no number is not a sample": ("fnnnnn", "---AAA"),
+    "an infinite one neither": ("fiiiii", "---AAA"),
+    "old samples after fresh ones change nothing": ("ffofofof", "--------"),
+}
+
+
+def stamp(event: str, now_s: float) -> float:
+    return {"f": now_s, "o": 0.0, "d": now_s - 1.0, "+": now_s + 100.0, "n": math.nan,
+            "i": math.inf}[event]
+
+
+@pytest.mark.parametrize(("events", "expected"), **table(TIMELINES))
+def test_freshness_timeline(events, expected):
+    monitor = FreshnessMonitor("command", timeout_s=0.3, hold_s=0.2, start_s=0.0, grace_s=0.5)
+    assert play(monitor, lambda e, t: monitor.heard(stamp(e, t), t), events) == expected
+
+
+@pytest.mark.parametrize(("events", "expected"), **table({
+    "it knows with the first sample": ("..ff", "??--"),
+    "it knows when none has come": ("......", "?????A"),
+    "an old sample tells it that the topic is stale": ("d", "A"),
+}))
+def test_a_respawned_monitor_claims_nothing_before_it_knows(events, expected):
+    monitor = FreshnessMonitor("pose", timeout_s=0.3, hold_s=0.2, start_s=0.0, grace_s=0.5,
+                               known=False)
+    assert play(monitor, lambda e, t: monitor.heard(stamp(e, t), t), events) == expected
+
+
+def test_it_becomes_active_exactly_when_the_age_reaches_the_timeout():
+    monitor = FreshnessMonitor("command", 0.3, 0.2, 0.0, 0.5)
+    monitor.heard(stamp_s=0.98, now_s=1.0)
+    assert monitor.due_s == pytest.approx(1.28)
+    monitor.expire(1.2799)
+    assert not monitor.active
+    monitor.expire(1.28)
+    assert monitor.active
+    assert monitor.reason == "command not updated for 0.3 s"
+
+
+def test_the_actor_reports_at_once_and_repeats_at_5_hz():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            source = system.start("source", Source)
+            dm2 = system.start("DM2", CommandFreshness, timeout_s=0.3)
+            await asyncio.sleep(0.01)
+            assert ear.states == ["idle"]
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            sent_s = system.clock.now()
+            await asyncio.sleep(2.0)
+            first = next(at for at, report in ear.heard if report.state == "active")
+            assert first == pytest.approx(sent_s + 0.3, abs=1e-6)
+            assert len(ear.heard) == pytest.approx(2.0 * 5, abs=2)
+            for _ in range(10):
+                source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+                await asyncio.sleep(0.05)
+            assert ear.states == ["idle", "active", "idle"]
+            assert dm2.state is fm.DetectionState.IDLE
+            assert ear.heard[-1][1].reason == ""
+
+    run(scenario)
+
+
+def test_a_respawned_module_is_silent_until_it_knows_that_the_topic_is_stale():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            system.start("DM6", LocalizationFreshness, timeout_s=0.5)
+            await asyncio.sleep(0.1)
+            await system.kill("DM6")
+            ear.heard.clear()
+            system.start("DM6", LocalizationFreshness, timeout_s=0.5)
+            await asyncio.sleep(0.45)
+            assert ear.heard == []
+            await asyncio.sleep(0.1)
+            assert ear.states == ["active"]
+
+    run(scenario)
+
+
+def test_a_respawned_module_is_idle_as_soon_as_it_hears_a_fresh_sample():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            source = system.start("source", Source)
+            system.start("DM6", LocalizationFreshness)
+            await system.settle()
+            await system.kill("DM6")
+            ear.heard.clear()
+            system.start("DM6", LocalizationFreshness)
+            await system.settle()
+            source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+            await system.settle()
+            assert ear.states == ["idle"]
+
+    run(scenario)
+
+
+def test_a_respawned_module_whose_first_sample_is_old_never_says_idle():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            source = system.start("source", Source)
+            system.start("DM6", LocalizationFreshness, timeout_s=0.5)
+            await asyncio.sleep(1.05)
+            await system.kill("DM6")
+            ear.heard.clear()
+            system.start("DM6", LocalizationFreshness, timeout_s=0.5)
+            await system.settle()
+            source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0), stamp=system.clock.now() - 0.9)
+            await asyncio.sleep(0.001)
+            assert ear.states == ["active"]
+
+    run(scenario)
+
+
+def test_a_module_that_was_itself_stopped_may_find_an_old_sample_first_in_its_mail():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            source = system.start("source", Source)
+            system.start("DM2", CommandFreshness, timeout_s=0.3)
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            await asyncio.sleep(0.1)
+            loop = asyncio.get_running_loop()
+            assert isinstance(loop, VirtualLoop)
+            loop.jump(2.0)
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0), stamp=system.clock.now() - 1.0)
+            await asyncio.sleep(EXCUSE_S / 2)
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            await asyncio.sleep(0.2)
+            assert ear.states == ["idle"]
+
+    run(scenario)
+
+
+def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_judges():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            source = system.start("source", Source)
+            system.start("DM2", CommandFreshness, timeout_s=0.3)
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            await asyncio.sleep(0.1)
+            loop = asyncio.get_running_loop()
+            assert isinstance(loop, VirtualLoop)
+            loop.jump(2.0)  # all are late, and so are the messages
+            await asyncio.sleep(0.01)
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            await asyncio.sleep(0.2)
+            assert ear.states == ["idle"]
+            loop.jump(2.0)  # the mail is read, but there was none
+            await asyncio.sleep(EXCUSE_S + 0.02)
+            assert ear.states == ["idle", "active"]
+
+    run(scenario)
+
+
+@pytest.mark.parametrize(("cls", "key"), [
+    (CommandFreshness, "control/command"), (LocalizationFreshness, "localization/pose")])
+def test_each_module_hears_its_own_topic_only(cls, key):
+    assert list(heard(Member("DM", cls, cls.Parameters()))) == [key]
+
+
+@pytest.mark.parametrize("value", ["soon", -1.0, True, None])
+def test_a_timeout_that_is_no_duration_is_refused_by_name(value):
+    async def scenario() -> None:
+        async with System() as system:
+            with pytest.raises(ValueError, match=r"parameters\.timeout_s = .*: expected a number"):
+                system.start("DM2", CommandFreshness, timeout_s=value)
+
+    run(scenario)
+
+
+def test_an_illegal_transition_names_both_states():
+    async def scenario() -> None:
+        async with System() as system:
+            module = system.start("DM9", DetectionModule)
+            await system.settle()
+            error = "DM9: no transition from idle to idle"
+            with pytest.raises(IllegalTransitionError, match=error):
+                module.clear()
+            module.activate("a fault", ("a",))
+            module.activate("two faults", ("a", "b"))
+            module.clear()
+            assert module.state is fm.DetectionState.IDLE
+
+    run(scenario)
+
+
+class TooFast(DetectionModule):
+    """A module without a monitor, as somebody might write it."""
+
+    @on(topics.COMMAND)
+    def command(self, message: m.Twist, _header: Header) -> None:
+        if message.linear_mps > 1.0:
+            self.activate("too fast")
+        else:
+            self.know_idle()
+
+
+def test_a_respawned_module_without_a_monitor_is_silent_until_it_says_that_it_knows():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            source = system.start("source", Source)
+            system.start("D_FAST", TooFast)
+            await asyncio.sleep(0.3)
+            await system.kill("D_FAST")
+            ear.heard.clear()
+            system.start("D_FAST", TooFast)
+            await asyncio.sleep(1.0)
+            assert ear.heard == []
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            await asyncio.sleep(1.0)
+            assert ear.states == ["idle"]
+            assert len(ear.heard) == pytest.approx(5, abs=1)
+            source.publish(topics.COMMAND, m.Twist(1.5, 0.0))
+            await system.settle()
+            source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
+            await system.settle()
+            assert ear.states == ["idle", "active", "idle"]
+
+    run(scenario)
+
+
+def test_a_respawned_stand_in_is_idle_and_not_silent_for_ever():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            system.start("D_LEVEL", StubDetection)
+            await asyncio.sleep(0.3)
+            await system.kill("D_LEVEL")
+            ear.heard.clear()
+            system.start("D_LEVEL", StubDetection)
+            await asyncio.sleep(1.0)
+            assert ear.states == ["idle"]
+            assert len(ear.heard) >= 4
+
+    run(scenario)
+
+
+def test_it_names_the_suspected_node_and_the_life_that_was_heard_last():
+    async def scenario() -> None:
+        async with System() as system:
+            ear = system.start("ear", Ear)
+            system.start("localization", Source)
+            await system.kill("localization")
+            source = system.start("localization", Source)
+            system.start("DM6", LocalizationFreshness, timeout_s=0.3, suspects=["localization"])
+            system.start("DM2", CommandFreshness, timeout_s=0.3, startup_grace_s=0.3,
+                         suspects=["osmosis_control"])
+            await system.settle()
+            for _ in range(5):
+                source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+                await asyncio.sleep(0.1)
+            await asyncio.sleep(0.5)
+            named = {report.reason: report.nodes for _, report in ear.heard if report.reason}
+            assert named == {"localization not updated for 0.3 s": ("localization#2",),
+                             "command never heard": ("osmosis_control",)}
+
+    run(scenario)
+
+
+def test_suspects_that_are_no_names_are_refused():
+    async def scenario() -> None:
+        async with System() as system:
+            with pytest.raises(ValueError, match=r"parameters.suspects = 'x': expected a list"):
+                system.start("DM6", LocalizationFreshness, suspects="x")
+
+    run(scenario)

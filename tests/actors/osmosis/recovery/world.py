@@ -1,0 +1,153 @@
+"""What recovery modules act upon, played by small actors: base, pilot, supervisor, manager."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+
+
+class Boss(Actor):
+    """Commands recovery modules as it is told, and keeps their reports."""
+
+    outputs = (ftm_topics.RECOVERY_COMMAND,)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.reports: list[tuple[float, fm.RecoveryReport]] = []
+
+    @classmethod
+    def output_names(
+        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]
+    ) -> tuple[str, ...] | None:
+        return None if topic is ftm_topics.RECOVERY_COMMAND else (name,)
+
+    @on(ftm_topics.RECOVERY)
+    def recovery(self, message: fm.RecoveryReport, _header: Header) -> None:
+        self.reports.append((self.clock.now(), message))
+
+    @property
+    def phases(self) -> list[str]:
+        """Phases in sequence, repetitions left out."""
+        phases = [report.phase.value for _, report in self.reports]
+        return [p for i, p in enumerate(phases) if i == 0 or phases[i - 1] != p]
+
+    def order(self, recovery: str, decision: int = 1, nodes: tuple[str, ...] = (),
+              reason: str = "a fault") -> None:
+        self.publish(ftm_topics.RECOVERY_COMMAND, fm.RecoveryCommand(True, decision, nodes, reason),
+                     name=recovery)
+
+    def release(self, recovery: str, decision: int = 2) -> None:
+        self.publish(ftm_topics.RECOVERY_COMMAND, fm.RecoveryCommand(False, decision, (), "gone"),
+                     name=recovery)
+
+
+class Base(Actor):
+    """A Summit XL layer: brake and status. Deaf, it hears no orders."""
+
+    outputs = (topics.BASE_STATUS,)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.holders: set[str] = set()
+        self.deaf = False
+        self.orders: list[bool] = []
+
+    @property
+    def engaged(self) -> bool:
+        return bool(self.holders)
+
+    @on(topics.BRAKE)
+    def brake(self, message: m.BrakeCommand, header: Header) -> None:
+        self.orders.append(message.engaged)
+        if not self.deaf:
+            (self.holders.add if message.engaged else self.holders.discard)(header.source)
+
+    @every(0.1)
+    def status(self) -> None:
+        self.publish(topics.BASE_STATUS, m.BaseStatus(self.engaged, False, 0.0, (0.0,) * 4))
+
+
+class Pilot(Actor):
+    """A Safety Pilot: obeys orders, the strictest wins. Deaf, it hears none."""
+
+    outputs = (topics.PILOT_STATUS,)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.deaf = False
+        self.orders: dict[str, m.PilotOrder] = {}
+        self.heard = 0
+
+    @on(topics.PILOT_ORDER)
+    def order(self, message: m.PilotOrder, header: Header) -> None:
+        self.heard += 1
+        if self.deaf:
+            return
+        self.orders[header.source] = message
+        self.status()
+
+    @property
+    def mode(self) -> m.PilotMode:
+        modes = {order.mode for order in self.orders.values() if order.engaged}
+        strictest_first = (m.PilotMode.STOP, m.PilotMode.TELEOPERATION)
+        return next((mode for mode in strictest_first if mode in modes), m.PilotMode.AUTO)
+
+    @every(0.2)
+    def status(self) -> None:
+        self.publish(topics.PILOT_STATUS, m.PilotStatus(self.mode, False, "", 0))
+
+
+class Node(Actor):
+    """A node that does nothing but beat."""
+
+
+class Supervisor(Actor):
+    """Respawns what it is asked to, after `delay_s`; `answer` is what it says then."""
+
+    outputs = (ftm_topics.PROCESS_EVENT,)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.answer = "respawned"
+        self.delay_s = 0.05
+        self.requests: list[tuple[float, fm.RespawnRequest]] = []
+        self.tasks: list[asyncio.Task[None]] = []
+
+    @on(ftm_topics.RESPAWN)
+    def respawn(self, message: fm.RespawnRequest, _header: Header) -> None:
+        self.requests.append((self.clock.now(), message))
+        life = self.around.incarnations.get(message.node, 0)
+        alive = message.node in self.around.tasks
+        if self.answer == "nothing":
+            return
+        if self.answer != "respawned":
+            self._say(message, self.answer, life)
+        elif alive and life > message.failed_incarnation:
+            self._say(message, "respawned", life)
+        else:
+            self.tasks.append(asyncio.create_task(self._replace(message, alive)))
+
+    async def _replace(self, message: fm.RespawnRequest, alive: bool) -> None:
+        if alive:
+            await self.around.kill(message.node)
+        await asyncio.sleep(self.delay_s)
+        if message.node not in self.around.tasks:
+            self.around.start(message.node, Node)
+        self._say(message, "respawned", self.around.incarnations[message.node])
+
+    def _say(self, message: fm.RespawnRequest, event: str, incarnation: int) -> None:
+        self.publish(ftm_topics.PROCESS_EVENT, fm.ProcessEvent(
+            message.node, event, 1, incarnation, message.by, ""))
+
+
+def hang(actor: Actor) -> None:
+    """Stop an actor's loop as SIGSTOP would: it stays announced, and says nothing more."""
+    actor.hold(True)

@@ -1,0 +1,459 @@
+"""Recordings as files: read back by the independent `mcap` library, torn, foreign and damaged."""
+
+from __future__ import annotations
+
+import errno
+import inspect
+import itertools
+import json
+import re
+import resource
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus.envelope import Header, encode
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.recording import foxglove as fg
+from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
+from rampart.actors.recording.bag_repair import repair
+from rampart.actors.recording.bag_writer import BagError, BagWriter, check_target, open_target
+from rampart.actors.recording.json_schema import plain_schema
+from rampart.actors.recording.message_form import form_of
+from rampart.actors.recording.run_documents import AIRPORT, footprint_m, restore
+from rampart.actors.recording.sequence_gaps import SequenceGaps
+from rampart.actors.recording.views import CHANNELS, Views
+from rampart.actors.recording.virtual import VirtualRecording
+from rampart.cli.main import main
+from tests.actors.recording.samples import NAN, PLAN, documents, pose, sample, write
+
+
+def played(reader):
+    """What is on the bus's channels: time, key, payload."""
+    zero_s = float(reader.metadata.get("rampart.run", {}).get("time_zero_s", 0))
+    return [(round(message.log_time / 1e9 + zero_s, 6), key, form_of(key).payload(message.data))
+            for channel, message in reader.messages() if (key := key_of(channel))]
+
+
+# ---- whole ----------------------------------------------------------------------------------
+
+
+def test_the_independent_reader_finds_every_message_channel_schema_and_document(tmp_path):
+    path = tmp_path / "run.mcap"
+    sent = sample()
+    write(path, sent)
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == "rampart"
+        summary = reader.get_summary()
+        by_key = {c.topic: c for c in summary.channels.values()}
+        assert by_key["localization/pose"].metadata["key"] == "rampart/localization/pose"
+        assert {s.name for s in summary.schemas.values()} >= {
+            "rampart.Pose", "rampart.DetectionReport", "foxglove.PoseInFrame",
+            "foxglove.FrameTransforms", "foxglove.SceneUpdate", "foxglove.Log"}
+        assert {s.encoding for s in summary.schemas.values()} == {"jsonschema"}
+        found = [(message.log_time / 1e9, channel.topic, message.sequence)
+                 for _, channel, message in reader.iter_messages(topics=["localization/pose"])]
+        assert [f[2] for f in found if f[2]] == list(range(1, 21))
+        told = {record.name: record.metadata for record in reader.iter_metadata()}
+        assert told["rampart.run"]["airport"] == "vallombre"
+        assert told["rampart.end"]["messages"] == str(len(sent))
+        assert {a.name for a in reader.iter_attachments()} == {
+            "system.toml", "airport/vallombre.toml"}
+        shown = [json.loads(message.data) for _, _, message in
+                 reader.iter_messages(topics=["localization/pose"])]
+        assert shown[0]["body"] == {"x_m": 1.0, "y_m": 0.0, "yaw_rad": 0.1}
+        assert any(message["body"]["yaw_rad"] is None for message in shown if "body" in message)
+
+
+def test_all_payloads_come_back_to_the_byte_in_order_with_their_times(tmp_path):
+    sent = sample()
+    write(tmp_path / "run.mcap", sent)
+    reader = BagReader(tmp_path / "run.mcap")
+    assert played(reader) == [(round(at_s, 6), key, payload) for at_s, key, payload in sent]
+    assert (reader.closed, reader.damage) == (True, "")
+
+
+def test_time_is_simulated_and_begins_before_zero_where_the_run_does(tmp_path):
+    with (tmp_path / "run.mcap").open("wb") as file:
+        writer = BagWriter(file, documents(), time_zero_s=-3.0)
+        for number, at_s in enumerate((-2.5, 0.0, 1.25)):
+            writer.take(*pose(number + 1, at_s))
+        for at_s, stamp in ((-1e30, -1e12), (1e300, -1e12), (float("inf"), 1e12)):
+            writer.take(at_s, topics.POSE.at(),
+                        encode(Header("x", 1, 1, stamp), m.Pose(0.0, 0.0, 0.0)))
+        writer.close()
+    reader = BagReader(tmp_path / "run.mcap")
+    times = [(message.log_time, message.publish_time) for _, message in reader.messages()]
+    assert times == [(500_000_000,) * 2, (3_000_000_000,) * 2, (4_250_000_000,) * 2, (0, 0),
+                     (2**64 - 1, 0), (0, 2**64 - 1)]
+    assert Summary(reader).time_zero_s == -3.0
+
+
+def test_the_airport_in_a_recording_is_all_that_its_map_needs(tmp_path):
+    write(tmp_path / "run.mcap", sample())
+    files = Summary(BagReader(tmp_path / "run.mcap")).files
+    again = load_airport(restore(files, tmp_path))
+    assert again.lights == load_airport("vallombre").lights
+
+
+def test_files_of_a_recording_cannot_be_written_elsewhere(tmp_path):
+    evil = [(f"{AIRPORT}../out.toml", "", b"x"), ("/etc/out.toml", "", b"x"),
+            (f"{AIRPORT}..", "", b"x"), ("airport/a/b.toml", "", b"x")]
+    assert restore(evil, tmp_path) is None
+    assert list(tmp_path.parent.rglob("out.toml")) == list(tmp_path.iterdir()) == []
+
+
+def virtual_recording(path):
+    return VirtualRecording(path, PLAN, "a run", nodes=("localization", "DM1"), lead_s=1.0,
+                            overwrite=False)
+
+
+def test_the_same_run_in_virtual_time_gives_the_same_file(tmp_path):
+    for name in ("a", "b"):
+        recording = virtual_recording(tmp_path / name)
+        for one in sample():
+            recording.take(*one)
+        assert recording.close().startswith("recorded 24 messages")
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    summary = Summary(BagReader(tmp_path / "a"))
+    assert json.loads(summary.run["nodes"]) == ["localization", "DM1"]
+    assert summary.time_zero_s == -1.0
+
+
+# ---- views ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [
+    fg.PoseInFrame, fg.FrameTransforms, fg.FrameTransform, fg.LaserScan, fg.SceneUpdate,
+    fg.SceneEntity, fg.SceneEntityDeletion, fg.LinePrimitive, fg.TriangleListPrimitive,
+    fg.CubePrimitive, fg.CylinderPrimitive, fg.SpherePrimitive, fg.ArrowPrimitive,
+    fg.TextPrimitive, fg.Log, fg.Pose, fg.Color, fg.Quaternion, fg.Vector3, fg.KeyValuePair])
+def test_fields_are_those_of_the_viewers_own_library(kind):
+    library = pytest.importorskip("foxglove.messages")
+    published = re.findall(r":param (\w+):", inspect.getdoc(getattr(library, kind.__name__)) or "")
+    own = list(json.loads(plain_schema(kind))["properties"])
+    missing = {"models"} if kind is fg.SceneEntity else set()
+    assert set(own) == set(published) - missing
+
+
+def test_odometry_and_pose_make_a_chain_of_frames_from_map_to_base_link():
+    views = Views()
+    odometry = m.Odometry(m.Pose(2.0, 1.0, 0.5), m.Twist(0.0, 0.0))
+    header = Header("localization", 1, 1, 0.0)
+    assert views.of(topics.ODOMETRY, "", header, odometry, 0) == []
+    shown = dict(views.of(topics.POSE, "", header, m.Pose(10.0, 5.0, 2.0707963), 10**9))
+    first, second = shown["view/tf"].transforms
+    assert [(t.parent_frame_id, t.child_frame_id) for t in (first, second)] == [
+        ("map", "odom"), ("odom", "base_link")]
+    # odom is turned by 1.5707963: its x axis is the map's y axis
+    assert (first.translation.x, first.translation.y) == pytest.approx((11.0, 3.0), abs=1e-6)
+    assert shown["view/pose"].pose.position == fg.Vector3(10.0, 5.0, 0.0)
+    assert shown["view/pose"].timestamp == fg.Time(1, 0)
+
+
+def test_a_pose_that_is_no_number_is_not_shown():
+    assert Views().of(topics.POSE, "", Header("x", 1, 1, 0.0), m.Pose(NAN, 0.0, 0.0), 0) == []
+
+
+def test_a_lost_echo_is_no_ring_of_obstacles():
+    import struct
+
+    sweep = m.LaserScan(-1.0, 0.5, 30.0, struct.pack("<5f", 1.0, 30.0, 2.5, float("inf"), NAN))
+    [(channel, scan)] = Views().of(topics.SCAN, "", Header("x", 1, 1, 0.0), sweep, 0)
+    assert channel == "view/scan"
+    assert (scan.start_angle, scan.end_angle, scan.ranges) == (-1.0, 1.0, [1.0, 0.0, 2.5, 0.0, 0.0])
+
+
+def test_the_scene_shows_map_lights_by_verdict_and_obstacles_while_they_are_there():
+    views = Views(load_airport("vallombre"))
+    shown = dict(views.start(0))
+    assert set(shown) == {"view/robot", "view/map", "view/lights"}
+    assert [e.id for e in shown["view/map"].entities] == [
+        "ground", "prohibited", "graph", "buildings"]
+    header = Header("osmosis_control", 1, 1, 0.0)
+    dim = m.LightMeasurement("A03", 20.0, 0.4, m.LightVerdict.DIM)
+    [(channel, update)] = views.of(topics.LIGHT_MEASURED, "k", header, dim, 0)
+    assert channel == "view/lights"
+    assert "A03 dim 40%" in {text.text for text in update.entities[0].texts}
+    assert views.of(topics.LIGHT_MEASURED, "k", header, dim, 1) == []
+    crate = m.ObstacleCommand("crate", True, 1.0, 2.0, 0.4)
+    for present, count in (((crate,), 1), ((), 0)):
+        [(_, update)] = views.of(topics.OBSTACLES, "k", header, m.ObstacleList(present), 0)
+        assert len(update.entities[0].cylinders) == count
+
+
+@pytest.mark.parametrize(("text", "size"), [
+    (b"[robot]\nlength_m = 1.5\nwidth_m = 0.9\n", (1.5, 0.9)), (b"[robot]\nlength_m = 1.5\n", None),
+    (b"not = [toml", None), (b"\xff", None), (b"robot = 3\n", None)])
+def test_the_robot_is_as_large_as_the_system_says(text, size):
+    footprint = footprint_m([("system.toml", "application/toml", text)])
+    assert footprint == size
+    shown = dict(Views(None, footprint).start(0))["view/robot"].entities[0].cubes[0].size
+    assert (shown.x, shown.y) == (size or (0.72, 0.614))
+
+
+def test_the_log_tells_decisions_detections_and_processes_once_each():
+    views = Views()
+    header = Header("ftm_manager", 1, 4, 0.0)
+    decision = fm.DecisionRecord(3, "safety-first", ("FTM1",), 1, ("RM1",), (), (), 0.0)
+    lines = [view for _ in range(2)
+             for view in views.of(ftm_topics.DECISION, "d", header, decision, 0)]
+    assert [line.message for _, line in lines] == [
+        "decision 3: FTM1 is active: run RM1, because it is the only active mechanism (block 1)."]
+    states = [fm.DetectionState.IDLE, fm.DetectionState.ACTIVE, fm.DetectionState.ACTIVE,
+              fm.DetectionState.IDLE]
+    told = [line.message for number, state in enumerate(states) for _, line in views.of(
+        ftm_topics.DETECTION, "DM1", Header("DM1", 1, number, 0.0),
+        fm.DetectionReport(state, "fence", (), 0.0), 0)]
+    assert told == ["detects: fence", "is idle again"]
+    died = fm.ProcessEvent("hmi", "crashed", 1, 1, "", "killed by SIGKILL")
+    [(_, line)] = views.of(ftm_topics.PROCESS_EVENT, "e", header, died, 0)
+    assert (line.level, line.message) == (fg.LogLevel.WARNING, "hmi crashed: killed by SIGKILL")
+
+
+def test_every_view_is_of_the_type_that_its_channel_announces(tmp_path):
+    write(tmp_path / "run.mcap", sample())
+    reader = BagReader(tmp_path / "run.mcap")
+    list(reader.records())
+    views = {c.topic: reader.schemas[c.schema_id].name for c in reader.channels.values()
+             if c.topic.startswith("view/")}
+    assert views == {name: f"foxglove.{CHANNELS[name].__name__}" for name in views}
+    assert len(views) >= 6
+
+
+# ---- gaps -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("from_start", "heard", "lost"), [
+    (True, [("a", 1, 1), ("a", 1, 2), ("a", 1, 2), ("a", 1, 3)], {}),
+    (True, [("a", 1, 3)], {"a": 2}),
+    (False, [("a", 4, 300), ("a", 4, 301)], {}),  # joined in mid-run
+    (False, [("a", 4, 300), ("a", 4, 305)], {"a": 4}),
+    (False, [("a", 4, 300), ("a", 5, 2)], {"a": 1}),  # a life that began while it recorded
+    (True, [("a", 1, 1), ("b", 1, 1), ("a", 2, 1), ("a", 1, 2)], {}),  # last words of a dead node
+])
+def test_what_is_missing_shows_in_the_numbers(from_start, heard, lost):
+    gaps = SequenceGaps(from_start=from_start)
+    for source, incarnation, sequence in heard:
+        gaps.hear(Header(source, incarnation, sequence, 0.0))
+    assert gaps.lost() == lost
+
+
+# ---- torn, damaged, foreign -----------------------------------------------------------------
+
+
+def test_topics_that_only_the_robot_knows_are_neither_garbage_nor_lost(tmp_path):
+    with (tmp_path / "run.mcap").open("wb") as file:
+        writer = BagWriter(file, documents(), from_start=True)
+        for number in range(1, 11):
+            key = "rampart/heartbeat/driver" if number % 5 == 0 else "rampart/porter/speed/driver"
+            body = bm.Heartbeat(1, 2, 0.1, 0, 0) if number % 5 == 0 else m.Twist(0.5, 0.0)
+            writer.take(number / 10, key, encode(Header("driver", 1, number, number / 10), body))
+        writer.take(2.0, "rampart/porter/speed/driver", b"\xc1")
+        writer.close()
+    told = Summary(BagReader(tmp_path / "run.mcap")).end
+    assert (told["messages"], told["garbage"], told["lost"]) == ("11", "1", "{}")
+
+
+def test_a_file_cut_off_anywhere_is_read_as_far_as_it_goes(tmp_path):
+    path = tmp_path / "run.mcap"
+    sent = sample()
+    write(path, sent)
+    whole = path.read_bytes()
+    everything = played(BagReader(path))
+    counts = []
+    ends = [len(whole) - cut for cut in (8, 4, 1)]  # of the bytes that end every file
+    for length in [*range(8, len(whole), max(1, len(whole) // 150)), *ends]:
+        path.write_bytes(whole[:length])
+        reader = BagReader(path)
+        found = played(reader)
+        assert found == everything[:len(found)], length
+        assert reader.damage, length
+        counts.append(len(found))
+    assert counts == sorted(counts)
+    assert (counts[0], counts[-1]) == (0, len(everything))
+
+
+def test_a_file_whose_last_bytes_were_overwritten_is_damaged(tmp_path, capsys):
+    path = tmp_path / "run.mcap"
+    write(path, sample())
+    path.write_bytes(path.read_bytes()[:-8] + b"overgone")
+    assert main(["bag", "info", str(path)]) == 0
+    assert "closed     yes; damaged: the last bytes" in capsys.readouterr().out
+
+
+def test_a_recording_that_was_never_closed_keeps_what_was_flushed(tmp_path):
+    path = tmp_path / "run.mcap"
+    writer = write(path, sample(), close=False, flush_every=1)
+    reader = BagReader(path)
+    assert len(played(reader)) == 24
+    assert not reader.closed
+    writer.abandon()
+    assert main(["bag", "info", str(path)]) == 0
+
+
+def test_an_independent_reader_takes_a_repaired_file(tmp_path, capsys):
+    path, whole = tmp_path / "torn.mcap", tmp_path / "whole.mcap"
+    write(path, sample())
+    path.write_bytes(path.read_bytes()[:-3000])
+    before = played(BagReader(path))
+    assert main(["bag", "repair", str(path), str(whole)]) == 0
+    assert "left behind: cut off" in capsys.readouterr().out
+    assert played(BagReader(whole)) == before != []
+    with whole.open("rb") as file:
+        assert make_reader(file, validate_crcs=True).get_summary().statistics.message_count > 0
+    with pytest.raises(BagError, match="is the file to be repaired"):
+        repair(BagReader(path), path, overwrite=True)
+
+
+def test_a_repair_that_fails_leaves_nothing_behind_and_names_the_file_that_failed(
+        tmp_path, monkeypatch):
+    path, whole = tmp_path / "torn.mcap", tmp_path / "whole.mcap"
+    write(path, sample(4000), flush_every=500)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(BagError, match=f"^{whole}: File too large"):
+            repair(BagReader(path), whole)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not whole.exists()
+    raw = BagReader._raw
+
+    def failing(reader, file):
+        yield from itertools.islice(raw(reader, file), 5)
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(BagReader, "_raw", failing)
+    with pytest.raises(BagError, match=f"^{path}: cannot be read: Input/output error"):
+        repair(BagReader(path), whole)
+    assert not whole.exists()
+
+
+def test_a_chunk_that_was_overwritten_is_left_out_and_the_rest_is_read(tmp_path, capsys):
+    path = tmp_path / "run.mcap"
+    write(path, sample(200), flush_every=50)
+    with path.open("rb") as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[-2]
+    data = bytearray(path.read_bytes())
+    everything = len(played(BagReader(path)))
+    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
+    data[middle:middle + 40] = b"\xee" * 40
+    path.write_bytes(data)
+    reader = BagReader(path)
+    assert everything - 60 < len(played(reader)) < everything
+    assert reader.damage
+    assert main(["bag", "info", str(path)]) == 0
+    assert "damage" in capsys.readouterr().out
+
+
+def foreign(path):
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start("ros2", "somebody else")
+        schema = writer.register_schema("std_msgs/String", "ros2msg", b"string data")
+        channel = writer.register_channel("/chatter", "cdr", schema)
+        for number in range(5):
+            writer.add_message(channel, 10**18 + number * 10**9, b"....", 0)
+        writer.finish()
+    return path
+
+
+def test_mcap_files_of_others_can_be_looked_at_and_not_replayed(tmp_path, capsys):
+    path = foreign(tmp_path / "other.mcap")
+    assert main(["bag", "info", str(path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["recording"], told["messages"], told["duration_s"], told["profile"]) == (
+        False, 5, 4.0, "ros2")
+    assert main(["bag", "info", str(path)]) == 0
+    assert "not a recording of a run, profile 'ros2'" in capsys.readouterr().out
+    assert main(["replay", str(path)]) == 2
+    assert "not a recording of a run" in capsys.readouterr().err
+
+
+def test_a_file_compressed_in_a_way_that_nobody_here_knows_is_refused(tmp_path, capsys):
+    path = foreign(tmp_path / "other.mcap")
+    path.write_bytes(path.read_bytes().replace(b"zstd", b"zpaq"))
+    assert main(["bag", "info", str(path)]) == 2
+    assert "compressed by 'zpaq'; known are lz4, zstd and none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("content", "words"), [
+    (None, "No such file"), (b"", "is empty"), (b"just a text file, and no more", "not an MCAP"),
+    (b"\x89MC", "not an MCAP")])
+@pytest.mark.parametrize("verb", [["bag", "info"], ["replay"]])
+def test_what_is_no_recording_is_refused_in_one_line(tmp_path, capsys, verb, content, words):
+    path = tmp_path / "it.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    assert main([*verb, str(path)]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert str(path) in error
+    assert error.count("\n") == 1
+
+
+def test_bag_info_tells_run_channels_and_closing(tmp_path, capsys):
+    write(tmp_path / "run.mcap", sample())
+    assert main(["bag", "info", str(tmp_path / "run.mcap"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["recording"] is told["closed"] is True
+    assert (told["damage"], told["lost"], told["run"]["title"]) == ("", {}, "a sample")
+    row = next(r for r in told["channels"] if r["channel"] == "localization/pose")
+    assert (row["schema"], row["messages"], row["bus"]) == ("rampart.Pose", 21, True)
+    assert row["rate_hz"] == pytest.approx(21 / told["duration_s"], rel=0.01)
+    assert main(["bag", "info", str(tmp_path / "run.mcap")]) == 0
+    shown = capsys.readouterr().out
+    assert "lost       none" in shown
+    assert "closed     properly" in shown
+
+
+# ---- places -----------------------------------------------------------------------------------
+
+
+def test_an_existing_file_is_replaced_only_on_demand(tmp_path):
+    path = tmp_path / "run.mcap"
+    path.write_text("precious")
+    for attempt in (check_target, open_target):
+        with pytest.raises(BagError, match="exists already"):
+            attempt(path, overwrite=False)
+    check_target(path, overwrite=True)
+    assert path.read_text() == "precious"
+    open_target(path, overwrite=True).close()
+    assert path.read_text() == ""
+
+
+@pytest.mark.parametrize(("place", "words"), [
+    ("no/such/place/run.mcap", "no such directory"), ("", "Is a directory|exists already"),
+    ("/proc/run.mcap", "/proc/run.mcap: cannot be written"),
+    ("file.txt/run.mcap", "Not a directory")])
+def test_a_place_that_cannot_be_written_is_refused_before_anything_starts(tmp_path, place, words):
+    (tmp_path / "file.txt").touch()
+    with pytest.raises(BagError, match=words):
+        check_target(tmp_path / place, overwrite=place == "")
+
+
+def test_a_probe_leaves_nothing_behind(tmp_path):
+    check_target(tmp_path / "run.mcap", overwrite=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_fills_up_ends_the_recording_and_not_the_run(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    recording = virtual_recording(tmp_path / "run.mcap")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))
+    try:
+        for number in range(8000):
+            recording.take(*pose(number + 1, number * 0.1))
+        told = recording.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert re.search(r"File too large: the recording ends after \d+ messages", told)
+    assert len(played(BagReader(tmp_path / "run.mcap"))) > 100

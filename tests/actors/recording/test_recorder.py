@@ -1,0 +1,493 @@
+"""The recorder process: it loses nothing, waits for nobody, and nobody waits for it."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+
+from rampart.actors.bus import tap as taps
+from rampart.actors.bus.tap import Tap, frame, parse_frame
+from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
+from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.recording.message_form import form_of, header_of
+from rampart.actors.recording.process import Order, RecorderProcess
+from rampart.actors.recording.recorder import FLUSH_S, PERIOD_S, Recorder
+from rampart.actors.run.run_info import RunInfo
+from rampart.cli.main import main
+from tests import ROOT
+from tests.actors.recording.samples import AnsweringLauncher, pose
+from tests.porter_actors import write_porter_system
+from tests.real_run import HEEDS_SIGNALS, RealRun
+from tests.stub_actors import free_base_port
+
+
+def until(condition, what, timeout_s=15.0):
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.01)
+
+
+def numbers(path):
+    """The numbers of the messages that are in a file so far."""
+    if not path.exists() or not path.stat().st_size:
+        return []
+    return [header_of(form_of(key).payload(message.data)).sequence
+            for channel, message in BagReader(path).messages() if (key := key_of(channel))]
+
+
+@pytest.fixture
+def port():
+    return free_base_port()
+
+
+@pytest.fixture
+def launcher():
+    """A process that may be killed for a launcher."""
+    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    yield process
+    process.kill()
+    process.wait()
+    process.stdin.close()
+
+
+@pytest.fixture
+def dead():
+    """The number of a process that has ended."""
+    process = subprocess.Popen(["true"])
+    process.wait()
+    return process.pid
+
+
+class Robot:
+    """One node that sends poses, numbered."""
+
+    def __init__(self, port):
+        self.tap = Tap(port)
+        self.sent = 0
+        self.begun_s = time.monotonic()
+
+    def send(self, count=1):
+        for _ in range(count):
+            self.sent += 1
+            _, key, payload = pose(self.sent, time.monotonic() - self.begun_s)
+            self.tap.take(key, payload)
+
+
+def recorder_pid(port):
+    title = f"rampart-recorder[{port}/".encode()
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            if entry.name.isdecimal() and (entry / "cmdline").read_bytes().startswith(title):
+                return int(entry.name)
+    return None
+
+
+@pytest.fixture
+def recording(port, launcher, tmp_path):
+    """A recorder process, the launcher that it belongs to, and a robot of one node."""
+    path = tmp_path / "run.mcap"
+    with AnsweringLauncher(port, time.monotonic() + 100.5, launcher.pid):
+        process = RecorderProcess(Order(port, str(path), launcher.pid))
+        process.start()
+        robot = Robot(port)
+        yield process, robot, path
+        process.end()
+        robot.tap.close()
+
+
+def test_everything_is_written_from_the_first_message_to_the_last(recording):
+    process, robot, path = recording
+    robot.send(500)
+    until(lambda: numbers(path), "nothing is written")
+    robot.send(500)
+    process.end()
+    assert numbers(path) == list(range(1, 1001))
+    summary = Summary(BagReader(path))
+    assert (summary.reader.closed, summary.end["lost"]) == (True, "{}")
+    assert summary.end["ended"] == "the run has ended"
+    assert -102 < summary.time_zero_s < -50  # it was there before simulated time 0
+    assert summary.first_ns < 1e9
+
+
+def test_a_killed_recorder_leaves_a_readable_file_that_lacks_the_last_second_at_most(
+        recording, port):
+    _, robot, path = recording
+    while not numbers(path):
+        robot.send()
+        time.sleep(0.02)
+    lost_s = FLUSH_S + PERIOD_S + 2 * FLUSH_S  # the last is for a busy machine
+    sent_s = [time.monotonic()] * robot.sent
+    while sent_s[-1] - sent_s[0] < lost_s + 1.0:  # it writes while it is being talked to
+        robot.send()  # not so many that they would fill a chunk, which is written when it is full
+        sent_s.append(time.monotonic())
+        time.sleep(0.02)
+    pid, killed_s = recorder_pid(port), time.monotonic()
+    os.kill(pid, signal.SIGKILL)
+    kept = numbers(path)
+    assert kept == list(range(1, len(kept) + 1))
+    assert len(kept) >= sum(at_s < killed_s - lost_s for at_s in sent_s) > 0
+    assert not BagReader(path).closed
+    found = []
+    with path.open("rb") as file, pytest.raises(EndOfFile):  # the independent reader
+        found.extend(StreamReader(file).records)
+    assert sum(isinstance(record, Message) for record in found) >= len(kept)
+    assert main(["bag", "info", str(path)]) == 0
+
+
+def test_the_robot_does_not_notice_that_its_recorder_died(recording, port):
+    _, robot, _ = recording
+    robot.send(10)
+    os.kill(recorder_pid(port), signal.SIGKILL)
+
+    def let_go() -> bool:
+        robot.send(100)  # raises nothing, waits for nothing
+        return robot.tap._socket is None
+
+    until(let_go, "the connection is still there")
+
+
+def test_a_stopped_recorder_holds_nobody_up_and_what_did_not_fit_is_counted(recording, port):
+    process, robot, path = recording
+    robot.send(10)
+    until(lambda: len(numbers(path)) == 10, "nothing is written")
+    pid = recorder_pid(port)
+    os.kill(pid, signal.SIGSTOP)
+    big = 40_000
+    robot.send(big)  # far more than the kernel keeps
+    os.kill(pid, signal.SIGCONT)
+    until(lambda: len(numbers(path)) > 10, "it does not go on")
+    robot.send(1)
+    process.end()
+    kept = numbers(path)
+    lost = json.loads(Summary(BagReader(path)).end["lost"])
+    assert lost == {"localization": big + 11 - len(kept)}
+    assert lost["localization"] > 0
+    assert kept[-1] == big + 11
+
+
+def test_a_launcher_that_is_killed_leaves_a_whole_recording_and_no_recorder(
+        recording, port, launcher):
+    _, robot, path = recording
+    robot.send(100)
+    until(path.exists, "it has not begun")
+    robot.send(100)
+    robot.tap.close()
+    launcher.kill()
+    until(lambda: recorder_pid(port) is None, "the recorder was left")
+    assert numbers(path) == list(range(1, 201))
+    assert Summary(BagReader(path)).end["ended"] == "the run has ended"
+
+
+def test_who_ended_a_recording_is_told(recording, port):
+    _, robot, path = recording
+    robot.send(100)
+    until(lambda: numbers(path), "nothing is written")
+    os.kill(recorder_pid(port), signal.SIGTERM)
+    until(lambda: recorder_pid(port) is None, "it lives")
+    assert Summary(BagReader(path)).end["ended"] == "it was told to"
+
+
+def test_a_launcher_that_has_ended_before_its_recorder_has_begun_leaves_no_recorder(
+        port, tmp_path, dead):
+    read_end, write_end = os.pipe()
+    recorder = Recorder(port, tmp_path / "run.mcap", launcher=dead)
+    recorder.open()
+    assert recorder.run(read_end) == "the run has ended"
+    os.close(write_end)  # nobody reads that it is ready
+    os.close(read_end)
+    unread, answers = os.pipe()
+    os.close(unread)
+    order = msgspec.json.encode(Order(port, str(tmp_path / "run.mcap"), dead)).decode()
+    done = subprocess.run([sys.executable, "-m", "rampart.actors.recording.process", order],
+                          cwd=ROOT,
+                          stdout=answers, stderr=subprocess.PIPE, check=False, timeout=60)
+    os.close(answers)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_nodes_send_after_their_launcher_has_ended_is_recorded(port, tmp_path, dead):
+    path = tmp_path / "run.mcap"
+    read_end, write_end = os.pipe()
+    with AnsweringLauncher(port, time.monotonic(), dead):
+        recorder = Recorder(port, path)
+        recorder.open()
+        thread = threading.Thread(target=recorder.run, args=(read_end,))
+        robot = Robot(port)
+        robot.send(1)
+        thread.start()
+        until(path.exists, "it has not begun")
+        for _ in range(20):
+            time.sleep(0.02)
+            robot.send()
+        robot.tap.close()
+        thread.join()
+    os.close(read_end)
+    os.close(write_end)
+    assert numbers(path) == list(range(1, 22))
+    assert Summary(BagReader(path)).end["ended"] == "the run has ended"
+
+
+def test_a_recorder_that_does_not_start_is_not_waited_for(port, tmp_path, monkeypatch):
+    program = tmp_path / "python"
+    program.write_text("#!/bin/sh\nexec sleep 60\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr("rampart.actors.recording.process._START_S", 0.2)
+    recorder = RecorderProcess(Order(port, str(tmp_path / "run.mcap"), os.getpid()))
+    with pytest.raises(BagError, match=r"the recorder did not start within 0\.2 s"):
+        recorder.start()
+    assert recorder._process.returncode == -signal.SIGKILL
+    recorder.end()
+
+
+def test_a_recorder_that_is_stopped_when_its_launcher_dies_is_not_left_over(port, tmp_path):
+    script = (
+        "import sys, os\n"
+        "from rampart.actors.recording.process import Order, RecorderProcess\n"
+        f"r = RecorderProcess(Order({port}, {str(tmp_path / 'run.mcap')!r}, os.getpid()))\n"
+        "r.start(); print('started', flush=True); input()\n")
+    parent = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE,
+                              stdout=subprocess.PIPE, cwd=ROOT, text=True)
+    assert parent.stdout.readline().strip() == "started"
+    os.kill(recorder_pid(port), signal.SIGSTOP)
+    parent.kill()
+    parent.wait()
+    parent.stdin.close()
+    parent.stdout.close()
+    until(lambda: recorder_pid(port) is None, "the recorder was left")
+
+
+def test_what_a_node_sent_before_it_was_killed_is_recorded(recording, port):
+    process, _, path = recording
+    script = (
+        "import os\n"
+        "from tests.actors.recording.test_recorder import Robot\n"
+        f"Robot({port}).send(300); os.kill(os.getpid(), 9)\n")
+    subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=False)
+    process.end()
+    assert numbers(path) == list(range(1, 301))
+
+
+def test_one_run_has_one_recorder(recording, port, launcher, tmp_path):
+    second = RecorderProcess(Order(port, str(tmp_path / "second.mcap"), launcher.pid))
+    with pytest.raises(BagError, match=f"port {port} is being recorded already"):
+        second.start()
+
+
+def test_a_full_disk_is_said_and_ends_only_the_recording(port, launcher, capfd):
+    with AnsweringLauncher(port, time.monotonic(), launcher.pid):
+        process = RecorderProcess(Order(port, "/dev/full", launcher.pid, overwrite=True))
+        process.start()
+        robot = Robot(port)
+        robot.send(10)
+        until(lambda: recorder_pid(port) is None, "it lives")
+        robot.send(10)
+        process.end()
+    error = capfd.readouterr().err
+    assert "/dev/full: No space left on device: the recording ends after" in error
+    assert error.count("\n") == 1
+
+
+def test_strangers_at_the_socket_are_not_recorded_and_do_no_harm(recording, port):
+    process, robot, path = recording
+    import socket
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
+        stranger.connect(taps.address(port))
+        for junk in (b"x", b"\xff" * 100, frame(float("nan"), "k", b"")[:-1]):
+            stranger.send(junk)
+        robot.send(5)
+    process.end()
+    assert numbers(path) == [1, 2, 3, 4, 5]
+
+
+def test_a_frame_comes_back_and_a_broken_one_is_refused():
+    assert parse_frame(frame(1.5, "rampart/küche", b"\x00\xff")) == (
+        1.5, "rampart/küche", b"\x00\xff")
+    for broken in (b"", b"\x00" * 9, frame(0.0, "abc", b"")[:-1], frame(0.0, "é", b"")[:11],
+                   frame(float("nan"), "abc", b"")):
+        with pytest.raises(ValueError, match=r"frame|announced"):
+            parse_frame(broken)
+
+
+def test_a_tap_looks_for_a_recorder_once_a_second_and_not_with_every_message(port, monkeypatch):
+    looks = []
+    monkeypatch.setattr(Tap, "_look", lambda self: looks.append(now_s))
+    now_s = 0.0
+    node = Tap(port, lambda: now_s)
+    for step in range(400):
+        now_s = step * 0.01
+        node.take("rampart/k", b"")
+    assert looks == pytest.approx([0.0, 1.0, 2.0, 3.0], abs=0.02)
+
+
+def test_a_node_without_a_descriptor_left_goes_on_unrecorded(port, monkeypatch):
+    def none_left(*_arguments: object) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    node = Tap(port)
+    monkeypatch.setattr(socket, "socket", none_left)
+    node.take("rampart/k", b"")
+
+
+def test_topics_that_nobody_wants_are_left_out_and_gaps_are_told_all_the_same(
+        port, tmp_path):
+    path = tmp_path / "run.mcap"
+    read_end, write_end = os.pipe()
+    with AnsweringLauncher(port, time.monotonic()):
+        recorder = Recorder(port, path, wants=lambda key: "detection" in key)
+        recorder.open()
+        thread = threading.Thread(target=recorder.run, args=(read_end,))
+        thread.start()
+        robot = Robot(port)
+        robot.send(5)
+        robot.sent += 3  # lost somewhere
+        robot.send(1)
+        until(path.exists, "it has not begun")
+        os.write(write_end, b"x")
+        thread.join()
+        robot.tap.close()
+    os.close(read_end)
+    os.close(write_end)
+    assert numbers(path) == []
+    assert Summary(BagReader(path)).end["lost"] == '{"localization": 3}'
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["--topics", "detection/*", "nothing/like/it"], "--topics nothing/like/it: matches no topic"),
+    (["--duration", "0"], "--duration 0: must be above 0")])
+def test_a_wish_that_makes_no_sense_is_refused(port, tmp_path, capsys, arguments, words):
+    with AnsweringLauncher(port, time.monotonic()):
+        code = main(["record", str(tmp_path / "x.mcap"), "--port", str(port), *arguments])
+    assert code == 2
+    assert words in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_topics_of_the_robot_s_own_can_be_wished_for(port, tmp_path, monkeypatch, capsys):
+    own = RunInfo(1, port, 1.0, 0.0, str(write_porter_system(tmp_path)), "",
+                  (), "r1", 0, "porter")
+    monkeypatch.setattr("rampart.cli.record.record_verbs.find_run", lambda _port: own)
+    taken = tmp_path / "x.mcap"
+    taken.touch()
+    assert main(["record", str(taken), "--topics", "porter/*", "plan/route"]) == 2
+    assert "exists already" in capsys.readouterr().err  # the next thing that is checked
+    assert main(["record", str(taken), "--topics", "porter/*", "nothing/like/it"]) == 2
+    assert "--topics nothing/like/it: matches no topic" in capsys.readouterr().err
+
+
+def test_a_message_too_long_for_a_recording_is_left_out_and_those_after_it_are_not(recording):
+    process, robot, path = recording
+    robot.send(1)
+    robot.tap.take("rampart/manager/system", b"x" * (taps.MAX_FRAME_BYTES + 1))
+    robot.send(1)
+    process.end()
+    assert numbers(path) == [1, 2]
+    assert Summary(BagReader(path)).messages >= 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_run_that_is_there_is_recorded_until_ctrl_c_or_the_terminal_is_closed(
+        port, tmp_path, number):
+    path = tmp_path / "run.mcap"
+    robot = Robot(port)
+    robot.send(10)  # nobody records yet
+    with AnsweringLauncher(port, time.monotonic() - 100.0):
+        verb = subprocess.Popen(
+            [*HEEDS_SIGNALS, sys.executable, "-m", "rampart.cli.main", "record", str(path),
+             "--port", str(port)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        until(lambda: robot.send() or numbers(path), "nothing is written", 30)
+        verb.send_signal(number)
+        told = verb.communicate(timeout=20)[0]
+    robot.tap.close()
+    assert verb.returncode == 0, told
+    kept = numbers(path)
+    assert f"recorded {len(kept)} messages in {path}, none lost; it ends because" in told
+    assert kept == list(range(kept[0], kept[-1] + 1))
+    assert kept[0] > 10
+    summary = Summary(BagReader(path))
+    assert summary.reader.closed
+    assert summary.time_zero_s == 0.0
+    assert summary.first_ns >= 100e9
+
+
+@pytest.mark.parametrize("error", [
+    BagError("it is full"), ValueError("no number"), OSError(24, "Too many open files")])
+def test_a_recording_that_fails_is_one_line(port, tmp_path, monkeypatch, capsys, error):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(Recorder, "run", fail)
+    monkeypatch.setattr("rampart.cli.record.record_verbs.stop_pipe", lambda: -1)
+    with AnsweringLauncher(port, time.monotonic()):
+        assert main(["record", str(tmp_path / "x.mcap"), "--port", str(port)]) == 1
+    assert capsys.readouterr().err == f"rampart: {error}\n"
+
+
+def test_without_a_run_there_is_nothing_to_record(port, capsys):
+    assert main(["record", "--port", str(port)]) == 2
+    assert f"--port {port}: no run there" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["--record", "no/such/place/x.mcap"], "no/such/place/x.mcap: cannot be written"),
+    (["--record", "here.mcap"], "here.mcap: exists already"),
+    (["--overwrite"], "--overwrite: only with --record FILE")])
+def test_a_run_whose_recording_cannot_begin_does_not_begin(tmp_path, arguments, words):
+    (tmp_path / "here.mcap").write_text("precious")
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "launch.py"), "--no-hmi", "--report", "report", *arguments],
+        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["here.mcap"]
+
+
+@pytest.mark.processes
+def test_a_real_run_is_recorded_whole_with_a_node_killed_on_the_way(tmp_path):
+    path = tmp_path / "run.mcap"
+    with RealRun(tmp_path, "--record", str(path), "--rate", "2") as run:
+        run.sleep_until(4)
+        run.kill("localization")
+        run.wait_until(lambda: (run.pid("localization") or 0) > 0, 5, "it does not come back")
+        told = run.tool("topic", "echo", "localization/pose", "-n", "1")
+        assert told.returncode == 0, told.stderr
+        run.sleep_until(8)
+        run.process.send_signal(signal.SIGTERM)
+        run.result()
+    assert recorder_pid(run.port) is None
+    summary = Summary(BagReader(path))
+    assert (summary.reader.closed, summary.reader.damage) == (True, "")
+    assert (summary.end["lost"], summary.end["ended"]) == ("{}", "the run has ended")
+    assert summary.run["mission"] == "AB"
+    lives = {}
+    for channel, message in BagReader(path).messages():
+        if (key := key_of(channel)) is not None:
+            header = header_of(form_of(key).payload(message.data))
+            lives.setdefault((header.source, header.incarnation), set()).add(header.sequence)
+    assert ("localization", 2) in lives
+    gaps = {life for life, heard in lives.items() if heard != set(range(1, len(heard) + 1))}
+    assert gaps == set()
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_summary().statistics.message_count == summary.messages
+        assert sum(1 for _ in reader.iter_messages(topics=["view/tf"])) > 20

@@ -1,0 +1,418 @@
+"""What is played back is what was recorded, readers take it, and no robot can hear it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+
+import msgspec
+import pytest
+from websockets.asyncio.client import connect as open_socket
+
+from rampart.actors.bus.envelope import ArrivalGuard, Header, encode
+from rampart.actors.bus.topic import ROOT
+from rampart.actors.bus.zenoh_bus import ZenohBus
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.operator.requests import Wish
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.recording.bag_reader import BagReader, key_of
+from rampart.actors.recording.bag_writer import BagWriter
+from rampart.actors.recording.message_form import MessageForm, form_of
+from rampart.actors.recording.recorder import Recorder
+from rampart.actors.run import run_info
+from rampart.actors.supervision.process_title import RunProcess
+from rampart.cli.main import main
+from rampart.cli.output import UsageError
+from rampart.cli.record import replaying
+from rampart.cli.record.replaying import Replay
+from rampart.cli.session import connect
+from tests import ROOT as HERE
+from tests.actors.recording.samples import AnsweringLauncher, documents, pose, sample, write
+from tests.real_run import HEEDS_SIGNALS
+from tests.stub_actors import free_base_port
+
+STRANGE = f"{ROOT}/no/such/topic"
+
+
+@pytest.fixture
+def port():
+    return free_base_port()
+
+
+@contextlib.asynccontextmanager
+async def playing(player, delay_s=0.5):
+    """A replay that runs meanwhile, on a loop of its own: who asks it for its run waits."""
+    loop = asyncio.get_running_loop()
+    ready, stops = asyncio.Event(), []
+
+    async def play():
+        stops.append((asyncio.get_running_loop(), stop := asyncio.Event()))
+        loop.call_soon_threadsafe(ready.set)
+        await player.run(stop, delay_s)
+
+    task = loop.run_in_executor(None, asyncio.run, play())
+    await ready.wait()
+    try:
+        yield task
+    finally:
+        with contextlib.suppress(RuntimeError):  # it has come to its end
+            stops[0][0].call_soon_threadsafe(stops[0][1].set)
+        await task
+
+
+@contextlib.asynccontextmanager
+async def reading(port, *keys):
+    """All that can be heard on keys meanwhile: key and payload in order."""
+    heard = []
+    deadline = time.monotonic() + 10
+    while not (found := [run for run in run_info.find_runs() if run.base_port == port]):
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.01)
+    bus = ZenohBus("", 0, None, found[0].endpoints)
+    await bus.open()
+    for key in keys:
+        bus.subscribe(topics.POSE, key, lambda key, payload: heard.append((key, payload)))
+    try:
+        yield heard
+    finally:
+        await bus.close()
+
+
+async def test_readers_hear_every_payload_as_it_was_sent_garbage_and_nan_included(tmp_path, port):
+    sent = sample()
+    write(tmp_path / "run.mcap", sent)
+    player = Replay(tmp_path / "run.mcap", port=port, rate=4.0)
+    async with playing(player) as task, reading(port, f"{ROOT}/**") as heard:
+        await task
+        assert sorted(heard) == sorted((key, payload) for _, key, payload in sent)
+    poses = [payload for key, payload in heard if key == topics.POSE.at()]
+    assert poses == [payload for _, key, payload in sent if key == topics.POSE.at()]
+    assert (player.played, player.refused) == (len(sent), 0)
+
+
+async def test_a_recording_of_a_replay_is_the_recording(tmp_path, port):
+    """The whole way: recording, bus, tap, recorder, recording."""
+    sent = sample(60)
+    write(tmp_path / "first.mcap", sent)
+    player = Replay(tmp_path / "first.mcap", port=port, rate=4.0)
+    recorder = Recorder(port, tmp_path / "second.mcap")
+    recorder.open()
+    read_end, write_end = socket.socketpair()
+    loop = asyncio.get_running_loop()
+    running = loop.run_in_executor(None, recorder.run, read_end.fileno())
+    async with playing(player) as task:
+        await task
+        write_end.send(b"x")
+        await running
+    read_end.close()
+    write_end.close()
+
+    def content(path):
+        return [(key, form_of(key).payload(message.data))
+                for channel, message in BagReader(path).messages() if (key := key_of(channel))]
+
+    assert content(tmp_path / "second.mcap") == content(tmp_path / "first.mcap")
+    assert recorder.writer.gaps.lost() == {}
+
+
+async def test_every_lap_passes_the_guard_that_drops_copies(tmp_path, port):
+    sent = [*(pose(n + 1, n * 0.02) for n in range(5)),
+            *(pose(n + 1, 0.1 + n * 0.02, incarnation=2) for n in range(5))]
+    write(tmp_path / "run.mcap", sent)
+    guard, taken, refused = ArrivalGuard(lambda: math.inf), [], []
+    receive = guard.receiver(topics.POSE, lambda _key, message: taken.append(message),
+                             lambda key, reason: refused.append(reason))
+    player = Replay(tmp_path / "run.mcap", port=port, loop=True, rate=2.0)
+    async with playing(player), reading(port, topics.POSE.at()) as heard:
+        deadline = time.monotonic() + 15
+        while len(heard) < 30:
+            assert time.monotonic() < deadline
+            await asyncio.sleep(0.01)
+    for key, payload in heard[:30]:
+        receive(key, payload)
+    assert refused == []
+    assert [message.incarnation for message in taken] == [
+        *[1] * 5, *[2] * 5, *[3] * 5, *[4] * 5, *[5] * 5, *[6] * 5]
+    assert [message.sequence for message in taken] == [1, 2, 3, 4, 5] * 6
+    stamps = [message.stamp for message in taken]
+    assert stamps == sorted(stamps)
+    assert heard[0][1] == sent[0][2]  # the first lap is as it was recorded
+
+
+async def test_only_what_is_wanted_is_played_from_where_it_is_wanted(tmp_path, port):
+    sent = sample()
+    write(tmp_path / "run.mcap", sent)
+    player = Replay(tmp_path / "run.mcap", port=port, rate=4.0, start_s=0.3,
+                    wants=lambda key: key.startswith(f"{ROOT}/detection/"))
+    async with playing(player) as task, reading(port, f"{ROOT}/**") as heard:
+        await task
+    key_of_dm1 = ftm_topics.DETECTION.at("DM1")
+    assert heard == [(key_of_dm1, sent_payload) for at_s, key, sent_payload in sent
+                     if key == key_of_dm1 and at_s >= 0.3]
+    assert len(heard) == 1
+
+
+async def test_what_lies_before_the_start_holds_nobody_up_and_is_not_caught_up_with(
+        tmp_path, port, monkeypatch):
+    write(tmp_path / "run.mcap", [pose(n + 1, n * 0.2) for n in range(206)])
+    turns, begun, sent, decoded = [0], [], [], []
+    messages, payload = BagReader.messages, MessageForm.payload
+
+    def slow(reader):  # as of a file that is 1000 times as large
+        begun.append(turns[0])
+        for found in messages(reader):
+            time.sleep(0.005)
+            yield found
+
+    monkeypatch.setattr(BagReader, "messages", slow)
+    monkeypatch.setattr(MessageForm, "payload", lambda form, text: (
+        decoded.append(text), payload(form, text))[1])
+    player = Replay(tmp_path / "run.mcap", port=port, start_s=40.0)
+    monkeypatch.setattr(player, "_send", lambda *_: sent.append((time.monotonic(), turns[0])))
+
+    async def others():
+        while True:
+            turns[0] += 1
+            await asyncio.sleep(0)
+
+    task = asyncio.create_task(others())
+    monkeypatch.setattr(replaying, "ZenohBus", QuietBus)
+    await player.run(asyncio.Event())
+    task.cancel()
+    assert len(sent) == len(decoded) == 6
+    assert sent[-1][0] - sent[0][0] > 0.9, "one each 0.2 s, never sooner"
+    assert sent[0][1] - begun[0] >= 4, "others had their turn"
+
+
+class QuietBus:
+    """A bus that needs no time."""
+
+    def __init__(self, *_) -> None:
+        pass
+
+    async def open(self) -> None:
+        pass
+
+    async def close(self) -> None:
+        pass
+
+
+async def test_a_start_before_the_beginning_is_the_beginning(tmp_path, port):
+    write(tmp_path / "run.mcap", sample())
+    player = Replay(tmp_path / "run.mcap", port=port, start_s=-1000.0, rate=4.0)
+    async with asyncio.timeout(30):
+        await player.run(asyncio.Event())
+    assert player.played == len(sample())
+
+
+async def test_a_recording_of_which_nothing_can_be_read_ends_also_in_a_loop(
+        tmp_path, port, monkeypatch):
+    write(tmp_path / "run.mcap", sample())
+    monkeypatch.setattr(replaying, "form_of", lambda _key: form_of("rampart/no/topic"))
+    monkeypatch.setattr(MessageForm, "payload", lambda *_: int("no payload"))
+    player = Replay(tmp_path / "run.mcap", port=port, loop=True)
+    async with asyncio.timeout(30):
+        await player.run(asyncio.Event())
+    assert player.played == 0
+
+
+async def test_a_page_that_fails_is_said_to_have_ended(tmp_path, port, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("it is\nbroken")
+
+    write(tmp_path / "run.mcap", sample())
+    monkeypatch.setattr(replaying.ReplayPage, "_pose", fail)
+    said = []
+    player = Replay(tmp_path / "run.mcap", port=port, hmi_port=port + 30, rate=4.0,
+                    said=said.append)
+    async with asyncio.timeout(60):
+        await player.run(asyncio.Event(), 0.5)
+    assert said == ["the page has ended: RuntimeError: it is broken"]
+
+
+def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(tmp_path, port):
+    write(tmp_path / "run.mcap", sample())
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    verb = subprocess.Popen(
+        [*HEEDS_SIGNALS, sys.executable, "-m", "rampart.cli.main", "replay",
+         str(tmp_path / "run.mcap"),
+         "--loop", "--port", str(port)], cwd=HERE, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "TMPDIR": str(folder)})
+    assert "playing" in verb.stdout.readline()
+    deadline = time.monotonic() + 30
+    while not list(folder.iterdir()):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    verb.send_signal(signal.SIGHUP)
+    told = verb.communicate(timeout=30)[0]
+    assert (verb.returncode in (0, 1), "played" in told) == (True, True), told
+    assert list(folder.iterdir()) == []
+
+
+async def test_the_rate_is_kept(tmp_path, port):
+    write(tmp_path / "run.mcap", [pose(n + 1, n * 0.1) for n in range(11)])
+    times = {}
+    for rate in (1.0, 10.0):
+        player = Replay(tmp_path / "run.mcap", port=port, rate=rate)
+        begun = time.monotonic()
+        await player.run(asyncio.Event())
+        times[rate] = time.monotonic() - begun
+    assert times[1.0] > 1.0  # never sooner
+    assert times[10.0] < times[1.0]
+
+
+async def test_tools_find_a_replay_and_give_it_no_orders(tmp_path, port):
+    write(tmp_path / "run.mcap", sample())
+    async with playing(Replay(tmp_path / "run.mcap", port=port, loop=True)), reading(port):
+        async with connect(port) as session:
+            assert session.run.replay_of.endswith("run.mcap")
+            assert session.run.title == "replay of run.mcap: a sample"
+            assert set(session.run.nodes) == {"localization", "DM1"}
+            found = await session.latest((topics.POSE,), 10.0)
+            assert isinstance(found[topics.POSE.key], m.Pose)
+            with pytest.raises(UsageError, match=f"port {port} is a replay of"):
+                await session.command(ftm_topics.RESET, fm.Reset("RM1", "me"), lambda: True, 1.0)
+
+
+async def test_who_names_no_port_means_the_robot_and_not_the_replay(tmp_path, port, monkeypatch):
+    write(tmp_path / "run.mcap", sample())
+    other = free_base_port()
+    found = run_info.find_runs
+    async with playing(Replay(tmp_path / "run.mcap", port=port, loop=True)), reading(port):
+        monkeypatch.setattr(run_info, "find_runs", lambda: [
+            run for run in found() if run.base_port in (port, other)])
+        assert run_info.find_run().replay_of
+        with AnsweringLauncher(other, 0.0):
+            assert run_info.find_run().base_port == other
+            assert run_info.find_run(port).replay_of
+
+
+def test_a_replay_does_not_take_the_number_of_whatever_lives(tmp_path, port, monkeypatch):
+    write(tmp_path / "run.mcap", sample())
+    monkeypatch.setattr(replaying, "find_processes", lambda: [
+        RunProcess(1, port, 1, ("localization",), 1)])
+    with pytest.raises(UsageError, match=f"--port {port}: belongs to a run"):
+        Replay(tmp_path / "run.mcap", port=port)
+    monkeypatch.setattr(replaying, "find_processes", lambda: [
+        RunProcess(1, port + 1, 1, ("localization",), 1)])
+    Replay(tmp_path / "run.mcap", port=port)
+
+
+def test_a_port_in_use_is_refused(tmp_path, port, capsys):
+    write(tmp_path / "run.mcap", sample())
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", port))
+        taken.listen()
+        assert main(["replay", str(tmp_path / "run.mcap"), "--hmi-port", str(port)]) == 2
+        assert f"--hmi-port {port}: in use" in capsys.readouterr().err
+    with AnsweringLauncher(port, 0.0):  # none of whose nodes lives just now
+        assert main(["replay", str(tmp_path / "run.mcap"), "--port", str(port)]) == 2
+    assert f"--port {port}: belongs to a run" in capsys.readouterr().err
+
+
+async def test_a_second_replay_on_the_same_port_is_refused(tmp_path, port):
+    write(tmp_path / "run.mcap", sample())
+    second = Replay(tmp_path / "run.mcap", port=port)
+    async with playing(Replay(tmp_path / "run.mcap", port=port, loop=True)), reading(port):
+        with pytest.raises(UsageError, match=f"--port {port}: in use"):
+            await second.run(asyncio.Event())
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["--topics", "nothing"], "--topics nothing: matches no topic; there are detection/…"),
+    (["--rate", "0"], "--rate 0: must be between"), (["--rate", "nan"], "--rate nan"),
+    (["--start", "1000"], "--start 1000: the recording goes from 0.0 to 0.9"),
+    (["--delay", "-1"], "--delay -1: must not be negative"),
+    (["--hmi-port", "80"], "--hmi-port 80: must be between 1024"),
+    (["--port", "7411", "--hmi-port", "7411"], "--hmi-port 7411: is the replay's own --port")])
+def test_a_replay_that_makes_no_sense_is_refused_in_one_line(
+        tmp_path, port, capsys, arguments, words):
+    write(tmp_path / "run.mcap", sample())
+    assert main(["replay", str(tmp_path / "run.mcap"), "--port", str(port), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+
+
+def test_a_recording_without_messages_has_nothing_to_play(tmp_path, port, capsys):
+    with (tmp_path / "run.mcap").open("wb") as file:
+        BagWriter(file, documents()).close()
+    assert main(["replay", str(tmp_path / "run.mcap"), "--port", str(port)]) == 2
+    assert "no message to play" in capsys.readouterr().err
+
+
+def test_a_torn_recording_is_played_as_far_as_it_goes(tmp_path, port, capsys):
+    path = tmp_path / "run.mcap"
+    write(path, sample(100))
+    path.write_bytes(path.read_bytes()[:-9000])
+    assert main(["replay", str(path), "--port", str(port), "--rate", "50"]) == 0
+    shown = capsys.readouterr().out
+    assert "damaged (cut off after byte" in shown
+    assert "played" in shown
+
+
+def test_messages_of_another_version_are_left_out_and_counted(tmp_path, port, capsys):
+    path = tmp_path / "run.mcap"
+    write(path, [pose(1, 0.0), pose(2, 0.1)])
+    reader = BagReader(path)
+    texts = [message.data for channel, message in reader.messages() if key_of(channel)]
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("rampart")
+        writer.add_metadata("rampart.run", {"time_zero_s": "0"})
+        channel = writer.register_channel("localization/pose", "json", 0, {
+            "key": topics.POSE.at()})
+        writer.add_message(channel, 0, texts[0], 0)
+        writer.add_message(channel, 1, texts[1].replace(b"yaw_rad", b"heading"), 1)
+        writer.finish()
+    assert main(["replay", str(path), "--port", str(port)]) == 0
+    assert "played 1 messages, 1 of another version left out" in capsys.readouterr().out
+
+
+async def test_the_page_shows_the_past_and_obeys_nobody(tmp_path, port):
+    status = m.MissionStatus("1", "AB", m.MissionPhase.RUNNING, 0, (), (), (), "")
+    manager = fm.ManagerStatus(("FTM1",), (), ("RM1",), ("RM1",), "safety-first", 1)
+    sent = [*(pose(n + 1, n * 0.05) for n in range(20)),
+            *((n * 0.1, topics.MISSION_STATUS.at(),
+               encode(Header("mission_manager", 1, n + 1, n * 0.1), status)) for n in range(10)),
+            *((n * 0.1, ftm_topics.MANAGER_STATUS.at(),
+               encode(Header("ftm_manager", 1, n + 1, n * 0.1), manager)) for n in range(10))]
+    write(tmp_path / "run.mcap", sorted(sent))
+    page_port = port + 30
+    player = Replay(tmp_path / "run.mcap", port=port, loop=True, hmi_port=page_port)
+    wish = next(kind for kind in Wish.__args__ if kind.__name__ == "ResetWish")
+    async with playing(player), reading(port, ftm_topics.RESET.at()) as heard:
+        url = f"http://127.0.0.1:{page_port}/"
+        document = await asyncio.to_thread(lambda: urllib.request.urlopen(url).read())
+        assert b"<html" in document
+        async with open_socket(f"ws://127.0.0.1:{page_port}/ws") as page:
+            await page.send(msgspec.json.encode(wish(recovery="RM1")).decode())
+            told, airport, seen = "", None, ""
+            deadline = time.monotonic() + 15
+            while not (told and airport and "FTM1" in seen):
+                assert time.monotonic() < deadline, (told, airport, seen[:500])
+                text = await asyncio.wait_for(page.recv(), 10)
+                message = json.loads(text)
+                if message.get("type") == "hello":
+                    airport = message["map"]["name"]
+                elif "replay" in text and message.get("type") not in ("state", "hello"):
+                    told = text
+                else:
+                    seen += text if isinstance(text, str) else text.decode()
+        assert "there is no robot to obey" in told
+        assert airport
+        assert heard == []

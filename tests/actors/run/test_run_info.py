@@ -1,0 +1,81 @@
+"""How tools find runs, whatever else is on the machine."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import islice
+
+import msgspec
+import pytest
+
+from rampart.actors.run import run_info
+from tests.stub_actors import bases, free_base_port
+
+
+@contextmanager
+def answering(answer: bytes) -> Iterator[int]:
+    """Stand for a launcher that answers once; yields its base port."""
+    port = free_base_port()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as launcher:
+        launcher.bind(run_info.address(port))
+        launcher.listen()
+
+        def tell() -> None:
+            connection, _ = launcher.accept()
+            with connection, contextlib.suppress(OSError):  # who asks need not wait
+                connection.send(answer)
+
+        teller = threading.Thread(target=tell)
+        teller.start()
+        yield port
+        teller.join()
+
+
+INFO = run_info.RunInfo(1, 7450, 1.0, 0.0, "x.toml", "", (), "r", 0, "a run")
+
+
+def test_a_launcher_tells_what_it_runs():
+    with answering(msgspec.json.encode(INFO)) as port:
+        assert run_info.ask(port) == INFO
+
+
+def test_another_users_socket_of_that_name_is_no_launcher(monkeypatch):
+    monkeypatch.setattr(run_info, "is_same_user", lambda _connection: False)
+    with answering(msgspec.json.encode(INFO)) as port:
+        assert run_info.ask(port) is None
+
+
+@pytest.mark.parametrize("answer", [b"nothing", b"{}", b'{"title": "\xff"}'])
+def test_an_answer_that_is_none_is_no_run(answer):
+    with answering(answer) as port:
+        assert run_info.ask(port) is None
+
+
+def test_somebodys_socket_whose_name_is_no_text_does_not_matter():
+    with (answering(msgspec.json.encode(INFO)) as port,
+          socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stranger):
+        stranger.bind(b"\0caf\xe9." + str(os.getpid()).encode())
+        assert INFO in run_info.find_runs(), port
+
+
+def test_the_workers_of_a_test_run_take_different_ports(monkeypatch):
+    monkeypatch.setenv("PYTEST_XDIST_WORKER_COUNT", "3")
+    taken = []
+    for worker in range(3):
+        monkeypatch.setenv("PYTEST_XDIST_WORKER", f"gw{worker}")
+        taken.extend(islice(bases(), 100))
+    assert len(set(taken)) == 300
+    assert not any(base % 40 for base in taken)
+
+
+def test_a_base_whose_launcher_s_name_is_taken_is_not_free(monkeypatch):
+    free, other = free_base_port(), free_base_port()
+    monkeypatch.setattr("tests.stub_actors._BASES", iter((free, other)))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as launcher:
+        launcher.bind(run_info.address(free))
+        assert free_base_port() == other

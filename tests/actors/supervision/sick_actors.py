@@ -1,0 +1,94 @@
+"""Nodes that fail whenever they start, for a while, and are well after it."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from pathlib import Path
+
+from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
+from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
+from rampart.actors.osmosis.detection.freshness import CommandFreshness
+from rampart.actors.runtime.actor import Actor
+from rampart.actors.supervision import supervisor
+from rampart.actors.supervision.restart_policy import RestartPolicy
+from rampart.manager.actor import FtmManager
+from tests import ROOT
+from tests.stub_actors import Idler, write_stub_system
+
+SICK_S = (14.0, 40.0)
+"""Simulated seconds, far longer than it takes to be given up."""
+
+SOON = partial(RestartPolicy, intensity=8, period_s=6.0, backoff_max_s=0.2, attempt_s=1.0,
+               attempt_max_s=4.0)
+"""A policy that gives up sooner than the real one."""
+
+WELL = "RAMPART_TEST_WELL"
+"""Of the environment: names a file; as long as there is none, a `SickIdler` fails."""
+
+
+class Sick(Actor):
+    def on_start(self) -> None:
+        if SICK_S[0] <= self.clock.now() < SICK_S[1]:
+            raise RuntimeError("sick")
+        super().on_start()
+
+
+class SickIdler(Idler):
+    """For real processes. Whoever imports this has a supervisor that gives up soon."""
+
+    def on_start(self) -> None:
+        if self.context.incarnation > 1 and not Path(os.environ[WELL]).exists():
+            raise RuntimeError("sick")
+
+
+if WELL in os.environ:
+    supervisor.RestartPolicy = SOON  # type: ignore[misc,assignment]
+
+
+class SickControl(Sick, OsmosisControl):
+    pass
+
+
+class SickPilot(Sick, SafetyPilot):
+    pass
+
+
+class SickModule(Sick, CommandFreshness):
+    pass
+
+
+class SickManager(Sick, FtmManager):
+    pass
+
+
+ACTORS = {
+    "osmosis_control": (
+        "rampart.actors.osmosis.control.following.osmosis_control:OsmosisControl", SickControl),
+    "safety_pilot": ("rampart.actors.osmosis.control.pilot.safety_pilot:SafetyPilot", SickPilot),
+    "DM2": ("rampart.actors.osmosis.detection.freshness:CommandFreshness", SickModule),
+    "ftm_manager": ("rampart.manager.actor:FtmManager", SickManager),
+}
+
+
+def write_sick_system(directory: Path, node: str) -> Path:
+    """Write the paper's system in which one node is sick for a while."""
+    text = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
+    usual, sick = ACTORS[node]
+    assert text.count(f'"{usual}"') == 1
+    file = directory / "sick.toml"
+    file.write_text(text.replace(f'"{usual}"', f'"{sick.__module__}:{sick.__name__}"'),
+                    encoding="utf-8")
+    return file
+
+
+def write_sick_stubs(directory: Path, *nodes: str) -> Path:
+    """Write the stub system in which some nodes are sick."""
+    text = write_stub_system(directory).read_text(encoding="utf-8")
+    for node in nodes:
+        at = text.index(f'"{node}"')
+        text = text[:at] + text[at:].replace("tests.stub_actors:Idler",
+                                               f"{SickIdler.__module__}:SickIdler", 1)
+    file = directory / "sick.toml"
+    file.write_text(text, encoding="utf-8")
+    return file

@@ -1,0 +1,164 @@
+"""What is given up on is tried again as long as the run lasts, and meanwhile the robot stands."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from itertools import pairwise
+
+import pytest
+
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import RespawnRequest
+from rampart.actors.supervision import supervisor
+from rampart.actors.supervision.restart_policy import RestartPolicy
+from rampart.sim.campaign.job import Job, run_virtually
+from rampart.sim.faults.scenario import parse_fault
+from tests.actors.supervision.sick_actors import (
+    ACTORS,
+    SICK_S,
+    SOON,
+    WELL,
+    write_sick_stubs,
+    write_sick_system,
+)
+from tests.actors.supervision.test_supervision import eventually, running
+from tests.actors.supervision.test_supervisor import running as played
+from tests.virtual_loop import run, until
+
+
+def lives(policy: RestartPolicy, until_s: float, lasts_s: float = 0.0) -> list[tuple[float, bool]]:
+    """Return when a process that always lasts so long is restarted, and whether by an attempt."""
+    now_s, restarts = 0.0, []
+    while now_s < until_s:
+        delay_s = policy.delay_s(now_s)
+        is_attempt = delay_s is None
+        now_s += policy.attempt_in_s(now_s) if delay_s is None else delay_s
+        policy.restarted(now_s)
+        restarts.append((now_s, is_attempt))
+        now_s += lasts_s
+    return restarts
+
+
+def test_attempts_begin_when_the_window_has_room_and_come_further_and_further_apart():
+    restarts = lives(RestartPolicy(), 24 * 3600)
+    free = [at_s for at_s, is_attempt in restarts if not is_attempt]
+    attempts = [at_s for at_s, is_attempt in restarts if is_attempt]
+    assert len(free) == 50
+    assert attempts[0] == pytest.approx(free[0] + 60)
+    gaps = [b - a for a, b in pairwise(attempts)]
+    assert gaps[:4] == [20.0, 40.0, 60.0, 60.0]
+    assert set(gaps[2:]) == {60.0}
+    assert len(attempts) > 24 * 60 - 5  # for as long as the run lasts
+    at_s = [restart for restart, _ in restarts]
+    assert all(at_s[i + 50] - at_s[i] >= 60 for i in range(len(at_s) - 50))
+
+
+def test_one_that_lasts_for_a_whole_period_is_as_good_as_any_other_again():
+    policy = RestartPolicy()
+    lives(policy, 100)
+    assert policy.attempts
+    assert policy.delay_s(130) is None
+    policy.restarted(200)
+    assert policy.delay_s(259) is None
+    assert policy.delay_s(260.1) == 0.0
+    assert policy.attempts == 0
+
+
+@pytest.mark.parametrize("name", ["DM2", "osmosis_control"])
+def test_a_process_that_fails_at_its_start_is_given_up_tried_again_and_comes_back(
+        monkeypatch, name):
+    monkeypatch.setattr(supervisor, "RestartPolicy", SOON)
+
+    async def scenario() -> None:
+        async with played() as world:
+            add, well = world.machine.add, []
+
+            def sick(names, incarnation, **how):
+                process = add(names, incarnation, **how)
+                if name in names and not well:
+                    process.bound = False  # it is never heard, and ends
+                    asyncio.get_running_loop().call_later(0.03, world.machine.kill, process)
+                return process
+
+            world.machine.add = sick
+            world.kill(name)
+            await asyncio.sleep(0.02)
+            world.respawn(name, 1)  # of RM3's node; once: the module may have been released since
+            await until(lambda: world.row(name)[0] == "given up", 20)
+            await asyncio.sleep(0.01)
+            forks = len(world.machine.forks)
+            assert forks == 8
+            asked = len(world.events)
+            world.respawn(name, 2)  # whoever asks meanwhile is answered, and gets no process
+            await asyncio.sleep(0.05)
+            assert (name, "given up", world.row(name)[1]) in world.events[asked:]
+            assert len(world.machine.forks) == forks
+            await asyncio.sleep(60)
+            attempts = len(world.machine.forks) - forks
+            assert 13 <= attempts <= 17  # 5 s, 2 s, and then one in four seconds
+            assert world.row(name)[0] == "given up"
+            well.append(True)
+            await until(lambda: world.row(name)[0] == "running", 10)
+            assert len(world.machine.of(name)) == 1
+            await asyncio.sleep(10)
+            world.kill(name)  # it is like any other again
+            await asyncio.sleep(0.02)
+            world.respawn(name, world.row(name)[1])
+            await until(lambda: world.row(name)[0] == "running", 0.2)
+
+    run(scenario)
+
+
+def test_a_node_that_is_adapted_is_not_held_to_what_it_was_given_up_for(monkeypatch):
+    monkeypatch.setattr(supervisor, "RestartPolicy", SOON)
+
+    async def scenario() -> None:
+        async with played() as world:
+            process = world.supervisor._processes["DM2"]
+            for _ in range(20):
+                process.policy.restarted(asyncio.get_running_loop().time())
+            world.kill("DM2")
+            await until(lambda: world.row("DM2")[0] == "given up")
+            world.supervisor._anew(process)
+            world.supervisor._respawn(process, "supervisor")
+            await until(lambda: world.row("DM2")[0] == "running", 0.3)
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("node", ACTORS)
+def test_the_robot_stands_until_what_was_given_up_is_back_and_then_goes_on(
+        tmp_path, monkeypatch, node):
+    monkeypatch.setattr(supervisor, "RestartPolicy", SOON)
+    result = run_virtually(Job(
+        row="x", system=str(write_sick_system(tmp_path, node)), mission="A", patience_s=120,
+        faults=(parse_fault(f"kill:{node}@15"),)))
+    record = result.record
+    assert (record.mission, record.safety, record.reasons) == ("success", "safe", ())
+    given_up = [e.t_s for e in record.events if f"{node} given up" in e.text]
+    assert len(given_up) >= 3
+    assert {name for name, _ in result.failures} == {node}
+    stands_s = given_up[0] + 3.0  # silence is noticed after 0.99 s, and then it brakes
+    assert [at for at in record.track if stands_s < at[0] < SICK_S[1]] == []
+
+
+@pytest.mark.processes
+async def test_real_processes_that_fail_at_their_start_come_back_by_themselves(
+        tmp_path, monkeypatch):
+    well = tmp_path / "well"
+    monkeypatch.setenv(WELL, str(well))
+    async with running(tmp_path, system_file=str(write_sick_stubs(
+            tmp_path, "DM2", "osmosis_control"))) as (_, witness):
+        for node in ("DM2", "osmosis_control"):
+            os.kill(witness.pid(node), signal.SIGKILL)
+        await eventually(lambda: witness.state("osmosis_control")[0] == "crashed")
+        witness.publish(topics.RESPAWN, RespawnRequest(1, "osmosis_control", 1, "RM3"))
+        for node in ("DM2", "osmosis_control"):
+            await eventually(lambda n=node: witness.state(n)[0] == "given up", 30)
+            await eventually(lambda n=node: any(
+                e.node == n and "attempt 2" in e.detail for e in witness.events), 30)
+        well.touch()
+        for node in ("DM2", "osmosis_control"):
+            await eventually(lambda n=node: witness.state(n)[0] == "running", 30)

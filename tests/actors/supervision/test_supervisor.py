@@ -1,0 +1,624 @@
+"""The supervisor's decisions, on a machine that is played: what happens when is exact here."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+
+import msgspec
+import pytest
+
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.envelope import decode, pack
+from rampart.actors.bus.messages import Heartbeat
+from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import AdaptedSystem, ManagerStatus, NodeState, RespawnRequest
+from rampart.actors.layout.layout import Layout
+from rampart.actors.run.run_plan import SUPERVISOR, RunPlan, load_document, load_system
+from rampart.actors.runtime.actor import Context
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.patience import Usage
+from rampart.actors.supervision.processes import Living, SpawnerUnavailableError
+from rampart.actors.supervision.supervisor import Supervisor
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from tests import ROOT
+from tests.virtual_loop import run, turns, until
+
+PLAN = RunPlan("r", 20000, system_file=str(ROOT / "systems" / "paper.toml"))
+EXIT_S = 0.005
+"""From a SIGKILL to the moment when the last thread has let go of the port."""
+
+
+class Process:
+    """One process; without its port it never says anything and soon ends."""
+
+    def __init__(self, names: tuple[str, ...], incarnation: int, pid: int, bound: bool) -> None:
+        self.names, self.incarnation, self.pid, self.bound = names, incarnation, pid, bound
+        self.killed = self.gone = False
+        self.holders: list[Callable[[], None]] = []
+
+
+class Handle:
+    def __init__(self, machine: Machine, process: Process, ended: Callable[[], None]) -> None:
+        self._machine, self._process, self._ended = machine, process, ended
+        process.holders.append(ended)
+
+    def kill(self) -> None:
+        self._machine.kill(self._process)
+
+    def gone(self) -> bool:
+        self._machine.questions += 1
+        return self._process.gone
+
+    def stopped(self) -> bool:
+        return False
+
+    def usage(self) -> Usage:
+        return self._machine.usage(self._process)
+
+    def ignore(self) -> None:
+        if self._ended in self._process.holders:
+            self._process.holders.remove(self._ended)
+
+    def close(self) -> None:
+        self.ignore()
+
+
+class Machine:
+    """`Processes` on which forks and holds fail when a test says so."""
+
+    def __init__(self) -> None:
+        self.processes: dict[int, Process] = {}
+        self.forks: list[tuple[str, int]] = []
+        self.issued: dict[str, int] = {}
+        self.fork_error: Exception | None = None
+        self.hold_error: Exception | None = None
+        self.look_error: Exception | None = None
+        self.ended: list[str] = []
+        self.starving: set[str] = set()
+        self.starves_from_s = 0.0
+        self.questions = 0
+        self.searches = 0
+
+    def usage(self, process: Process) -> Usage:
+        return Usage("S", 0.0, max(0.0, asyncio.get_running_loop().time() - self.starves_from_s)
+                     if process.names[0] in self.starving else 0.0)
+
+    def add(self, names: tuple[str, ...], incarnation: int, *, bound: bool = False) -> Process:
+        self.issued |= dict.fromkeys(names, incarnation)
+        bound = bound or not any(
+            p.names == names and not p.gone for p in self.processes.values())
+        pid = 1000 + len(self.processes)
+        process = self.processes[pid] = Process(names, incarnation, pid, bound)
+        if not bound:
+            asyncio.get_running_loop().call_later(0.03, self.kill, process)
+        return process
+
+    def of(self, name: str) -> list[Process]:
+        return [p for p in self.processes.values() if name in p.names and not p.killed]
+
+    def kill(self, process: Process) -> None:
+        if not process.killed:
+            process.killed = True
+            asyncio.get_running_loop().call_later(EXIT_S, self._exited, process)
+
+    def _exited(self, process: Process) -> None:
+        process.gone = True
+        for ended in list(process.holders):
+            ended()
+
+    def living(self) -> list[Living]:
+        self.searches += 1
+        if self.look_error:
+            raise self.look_error
+        return [Living(p.names, p.pid, p.incarnation)
+                for p in self.processes.values() if not p.killed]
+
+    def fork(self, names: tuple[str, ...], incarnation: int) -> int:
+        if self.fork_error:
+            raise self.fork_error
+        self.forks.append((names[0], incarnation))
+        return self.add(names, incarnation).pid
+
+    def hold(self, pid: int, ended: Callable[[], None]) -> Handle:
+        if self.hold_error:
+            raise self.hold_error
+        process = self.processes.get(pid)
+        if process is None or process.gone:
+            raise ProcessLookupError(pid)
+        return Handle(self, process, ended)
+
+    def adapt(self, adapted: AdaptedSystem) -> None:
+        pass
+
+    def end(self, handles: Sequence[Handle], grace_s: float) -> None:
+        for handle in handles:
+            self.ended.append(handle._process.names[0])
+            handle.kill()
+
+    def close(self) -> None:
+        pass
+
+
+class World:
+    """A supervisor, its machine, and the bus between them."""
+
+    def __init__(self) -> None:
+        loop = asyncio.get_running_loop()
+        self.machine = Machine()
+        self.clock = Clock(loop.time(), source=loop.time)
+        self.hub = Hub()
+        self.bus = VirtualBus(self.hub, "tester", 1)
+        self.events: list[tuple[str, str, int]] = []
+        self.silent: set[int] = set()
+        self.hub.taps.append(self.see)
+        self.spec = load_system(PLAN)
+        self.lives = 0
+        self._sequence = 0
+        self.supervisor, self.task = self.start()
+
+    def start(self, known: dict[str, int] | None = None) -> tuple[Supervisor, asyncio.Task[None]]:
+        self.lives += 1
+        parameters = Layout(PLAN, self.spec).members[SUPERVISOR].parameters
+        self.supervisor = Supervisor(Context(
+            SUPERVISOR, self.lives, self.clock, VirtualBus(self.hub, SUPERVISOR, self.lives),
+            parameters, {"plan": PLAN, "system": self.spec, "processes": self.machine,
+                         "known_incarnations": known or {}}, register=self.machine.issued.get))
+        self.task = asyncio.create_task(self.supervisor.run())
+        return self.supervisor, self.task
+
+    def say(self, topic: Topic, body: msgspec.Struct, source: str = "tester", life: int = 1,
+            *, key: str = "", stamp_s: float | None = None) -> None:
+        self._sequence += 1
+        self.bus.publish(topic, key or topic.at(), pack((
+            source, life, self._sequence, self.clock.now() if stamp_s is None else stamp_s,
+            body)))
+
+    def see(self, _now_s: float, _source: str, key: str, payload: bytes) -> None:
+        if key == topics.PROCESS_EVENT.at():
+            event = decode(topics.PROCESS_EVENT, payload)[1]
+            self.events.append((event.node, event.event, event.incarnation))
+
+    def beat(self, process: Process) -> None:
+        for name in process.names:
+            self.say(bus_topics.HEARTBEAT, Heartbeat(process.pid, 0, 0.1, 0, 0), name,
+                     process.incarnation, key=bus_topics.HEARTBEAT.at(name))
+
+    async def beats(self) -> None:
+        while True:
+            for process in self.machine.processes.values():
+                if process.bound and not process.killed and process.pid not in self.silent:
+                    self.beat(process)
+            await asyncio.sleep(0.1)
+
+    def row(self, name: str) -> tuple[str, int, int]:
+        process = self.supervisor._processes[name]
+        return process.state.value, process.incarnation, process.pid
+
+    def all_run(self) -> bool:
+        return all(p.state is NodeState.RUNNING for p in self.supervisor._processes.values())
+
+    def kill(self, name: str) -> Process:
+        (process,) = self.machine.of(name)
+        self.machine.kill(process)
+        return process
+
+    def respawn(self, name: str, failed: int) -> None:
+        self.say(topics.RESPAWN, RespawnRequest(1, name, failed, "RM7"))
+
+
+@asynccontextmanager
+async def running() -> AsyncIterator[World]:
+    world = World()
+    await world.bus.open()
+    beats = asyncio.create_task(world.beats())
+    await until(world.all_run)
+    world.machine.forks.clear()
+    world.machine.searches = 0
+    try:
+        yield world
+    finally:
+        for task in (beats, world.task):
+            task.cancel()
+        await asyncio.gather(beats, world.task, return_exceptions=True)
+
+
+def no_descriptor() -> OSError:
+    return OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+
+@pytest.mark.parametrize("mute", [False, True])
+def test_a_supervisor_that_fails_ends_nobody_and_its_next_life_adopts_all(mute):
+    async def scenario() -> None:
+        async with running() as world:
+            before = set(world.machine.processes)
+            killed = world.kill("DM1")
+            world.machine.fork_error = RuntimeError("a defect")
+            if mute:  # it cannot say that it failed, either
+                def publish(*_: object) -> None:
+                    raise RuntimeError("no bus")
+                world.supervisor.context.bus.publish = publish
+            with contextlib.suppress(RuntimeError):
+                await world.task
+            assert world.machine.ended == []
+            assert set(world.machine.processes) - {killed.pid} == {
+                p.pid for p in world.machine.processes.values() if not p.killed}
+            world.machine.fork_error = None
+            world.start()
+            await until(world.all_run)
+            after = {p.pid for p in world.machine.processes.values() if not p.killed}
+            assert len(after) == len(before)
+            assert len(before - after) == 1
+
+    run(scenario)
+
+
+def test_a_supervisor_that_is_told_to_stop_ends_all_in_reverse():
+    async def scenario() -> None:
+        async with running() as world:
+            started = [p.names[0] for p in world.machine.processes.values()]
+            world.supervisor.stop()
+            await world.task
+            assert world.machine.ended == started[::-1]
+
+    run(scenario)
+
+
+def test_a_heartbeat_of_a_node_that_it_does_not_start_is_nothing_to_it():
+    async def scenario() -> None:
+        async with running() as world:
+            world.say(bus_topics.HEARTBEAT, Heartbeat(1, 1, 0.1, 0, 0), "stranger", 1,
+                      key=bus_topics.HEARTBEAT.at("hmi"))
+            await turns()
+            assert not world.task.done()
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("way", ["silent", "repeats old news"])
+def test_a_manager_that_beats_and_whose_status_is_not_heard_is_replaced(way):
+    async def scenario() -> None:
+        async with running() as world:
+            _, life, pid = world.row("ftm_manager")
+            for _ in range(20):
+                status(world, life)
+                await asyncio.sleep(0.1)
+            assert world.row("ftm_manager") == ("running", life, pid)
+            heard_s = world.clock.now()
+            for _ in range(10):
+                if way == "repeats old news":
+                    status(world, life, heard_s)
+                await asyncio.sleep(0.1)
+            assert world.row("ftm_manager")[:2] == ("running", life + 1)
+            assert ("ftm_manager", "wedged", life) in world.events
+            # Its next life is given the time that it needs.
+            await asyncio.sleep(2.0)
+            assert world.row("ftm_manager")[:2] == ("running", life + 1)
+            status(world, life)  # nor does its old life speak for it
+            await asyncio.sleep(2.0)
+            assert world.row("ftm_manager")[:2] == ("running", life + 1)
+
+    run(scenario)
+
+
+def test_who_waits_for_a_processor_is_not_taken_for_wedged_and_who_waits_for_nothing_is():
+    async def scenario() -> None:
+        async with running() as world:
+            (starved,), (wedged,) = world.machine.of("DM1"), world.machine.of("DM2")
+            world.machine.starving = {"DM1"}
+            world.machine.starves_from_s = asyncio.get_running_loop().time()
+            world.silent |= {starved.pid, wedged.pid}
+            await until(lambda: wedged.killed, 0.8)
+            await asyncio.sleep(3.0)
+            assert not starved.killed
+            assert world.row("DM1") == ("running", 1, starved.pid)
+            world.machine.starving.clear()  # it has a processor, and says nothing all the same
+            await until(lambda: starved.killed, 0.8)
+
+    run(scenario)
+
+
+def test_a_process_that_waits_for_a_processor_has_longer_to_start():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.starving = {"DM1"}
+            world.machine.starves_from_s = asyncio.get_running_loop().time()
+            bound = world.machine.add
+            world.machine.add = lambda names, life: mute(bound(names, life))
+
+            def mute(process: Process) -> Process:
+                world.silent.add(process.pid)
+                return process
+
+            for name in ("DM1", "DM2"):
+                world.kill(name)
+            await until(lambda: ("DM2", "wedged", 2) in world.events, 5.0)
+            assert ("DM1", "wedged", 2) not in world.events
+            world.silent.clear()
+            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+
+    run(scenario)
+
+
+def status(world: World, life: int, stamp_s: float | None = None) -> None:
+    world.say(topics.MANAGER_STATUS, ManagerStatus((), (), (), (), "safety-first", 0),
+              "ftm_manager", life, stamp_s=stamp_s)
+
+
+def test_a_process_that_no_descriptor_is_left_for_is_held_as_soon_as_there_is_one():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.hold_error = no_descriptor()
+            world.kill("DM1")
+            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            world.machine.hold_error = None
+            await asyncio.sleep(0.1)
+            world.kill("DM1")
+            await until(lambda: world.row("DM1")[:2] == ("running", 3))
+            assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
+
+    run(scenario)
+
+
+def test_a_process_that_ends_while_nobody_can_hold_it_is_missed():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.hold_error = no_descriptor()
+            world.kill("DM1")
+            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            world.kill("DM1")
+            await asyncio.sleep(0.1)
+            world.machine.hold_error = None
+            await until(lambda: world.row("DM1")[:2] == ("running", 3))
+            assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
+
+    run(scenario)
+
+
+def test_a_process_that_nobody_can_hold_is_not_replaced_before_it_is_gone():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.hold_error = no_descriptor()
+            world.kill("DM1")
+            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            world.respawn("DM1", 2)
+            await asyncio.sleep(1.0)
+            assert world.machine.forks == [("DM1", 2)]
+            world.machine.hold_error = None
+            await until(lambda: world.row("DM1")[:2] == ("running", 3))
+            assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
+
+    run(scenario)
+
+
+def test_the_end_of_a_process_that_is_being_replaced_anyway_is_no_crash():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.hold_error = no_descriptor()
+            world.kill("DM1")
+            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            world.events.clear()
+            world.respawn("DM1", 2)
+            await asyncio.sleep(0.02)
+            world.kill("DM1")
+            world.machine.hold_error = None
+            await until(lambda: world.row("DM1")[:2] == ("running", 3))
+            assert world.events == [("DM1", "respawned", 3), ("DM1", "running", 3)]
+
+    run(scenario)
+
+
+def test_a_process_that_was_replaced_is_not_held_in_the_place_of_its_successor():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.hold_error = no_descriptor()
+            world.kill("DM1")
+            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            (old,) = world.machine.of("DM1")
+            world.machine.hold_error = None
+            successor = world.machine.add(old.names, 5, bound=True)
+            world.beat(successor)
+            await asyncio.sleep(0.1)
+            world.machine.kill(old)
+            world.respawn("DM1", 5)
+            await until(lambda: world.row("DM1")[:2] == ("running", 6))
+            assert successor.gone
+            assert world.machine.forks == [("DM1", 2), ("DM1", 6)]
+
+    run(scenario)
+
+
+def test_what_a_process_said_before_it_was_killed_does_not_make_it_run():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.fork_error = SpawnerUnavailableError("none")
+            (victim,) = world.machine.of("DM1")
+            world.silent.add(victim.pid)
+            await until(lambda: victim.killed)
+            world.beat(victim)
+            await turns()
+            assert world.row("DM1")[0] == "wedged"
+            world.machine.fork_error = None
+            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+
+    run(scenario)
+
+
+def test_a_fork_that_fails_for_want_of_descriptors_is_tried_again():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.fork_error = no_descriptor()
+            world.kill("DM1")
+            await asyncio.sleep(0.3)
+            world.machine.fork_error = None
+            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            assert world.machine.forks == [("DM1", 2)]
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("outage_s", [0.3, 1.2, 6.0])
+def test_a_living_process_is_replaced_once_however_long_nobody_can_fork(outage_s):
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.fork_error = SpawnerUnavailableError("none")
+            for _ in range(3):  # it is asked for again while nobody answers
+                world.respawn("safety_pilot", 1)
+                await asyncio.sleep(0.01)
+            await asyncio.sleep(outage_s)
+            assert world.row("safety_pilot")[0] == "crashed"
+            world.machine.fork_error = None
+            await asyncio.sleep(1.0)
+            assert world.machine.forks == [("safety_pilot", 2)]
+            assert world.row("safety_pilot")[:2] == ("running", 2)
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("outage_s", [0.2, 0.24])  # whichever of two chains would go on first
+def test_a_process_that_is_adapted_while_it_is_replaced_is_replaced_once(outage_s):
+    async def scenario() -> None:
+        async with running() as world:
+            document = load_document(PLAN)
+            row = next(r for r in document["detection"] if r["name"] == "DM2")
+            row["parameters"] = {**row.get("parameters", {}), "hold_s": 0.9}
+            world.machine.fork_error = SpawnerUnavailableError("none")
+            world.kill("DM2")
+            await asyncio.sleep(0.02)
+            world.say(topics.ADAPTED_SYSTEM, AdaptedSystem(
+                1, "retune DM2", "tester", msgspec.json.encode(document).decode()))
+            await asyncio.sleep(outage_s)
+            world.machine.fork_error = None
+            await until(lambda: world.row("DM2")[:2] == ("running", 2))
+            world.machine.questions = 0
+            await asyncio.sleep(1.0)
+            assert world.machine.forks == [("DM2", 2)]
+            assert world.machine.questions == 0  # nobody waits for its end any more
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("life", [1, 2, 77, 2 ** 31 - 1])
+def test_a_heartbeat_that_names_a_process_of_somebody_elses_has_nobody_adopted_or_killed(life):
+    async def scenario() -> None:
+        async with running() as world:
+            (own,) = world.machine.of("DM1")
+            stranger = world.machine.add(("editor",), 1)
+            world.machine.kill(own)
+            for _ in range(20):
+                world.say(bus_topics.HEARTBEAT, Heartbeat(stranger.pid, 0, 0.1, 0, 0), "DM1", life,
+                          key=bus_topics.HEARTBEAT.at("DM1"))
+                await asyncio.sleep(0.05)
+            assert not stranger.killed
+            assert world.row("DM1")[0] == "running"
+            assert world.row("DM1")[2] not in {stranger.pid, own.pid}
+
+    run(scenario)
+
+
+def test_a_life_that_is_adopted_while_it_is_replaced_is_not_forked_again():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.fork_error = SpawnerUnavailableError("its answer was lost")
+            names = world.kill("DM2").names
+            await asyncio.sleep(0.02)
+            orphan = world.machine.add(names, 2)
+            await until(lambda: world.row("DM2") == ("running", 2, orphan.pid))
+            world.machine.fork_error = None
+            await asyncio.sleep(1.0)
+            assert world.machine.forks == []
+            assert world.row("DM2") == ("running", 2, orphan.pid)
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("name", ["DM2", "osmosis_control"])
+@pytest.mark.parametrize("phase_s", [0.0, 0.03, 0.06, 0.09])
+def test_a_life_without_its_port_leads_to_the_one_that_nobody_holds(name, phase_s):
+    async def scenario() -> None:
+        async with running() as world:
+            fork, orphans = world.machine.fork, []
+
+            def twice(names: tuple[str, ...], incarnation: int) -> int:
+                if not orphans:  # the child of a spawner that was killed before it answered
+                    orphans.append(world.machine.add(names, incarnation))
+                return fork(names, incarnation)
+
+            world.machine.fork = twice
+            await asyncio.sleep(phase_s)  # the orphan is heard before or after the other ends
+            world.kill(name)
+            await asyncio.sleep(0.02)
+            world.respawn(name, 1)  # owned by RM3, or respawned by then
+            await asyncio.sleep(1.0)
+            assert world.row(name) == ("running", 2, orphans[0].pid)
+            assert world.machine.of(name) == orphans
+            assert world.machine.forks == [(name, 2)]
+            world.kill(name)  # it is held like any other
+            await asyncio.sleep(0.02)
+            world.respawn(name, 2)
+            await until(lambda: world.row(name)[:2] == ("running", 3))
+
+    run(scenario)
+
+
+def test_an_incarnation_that_was_given_is_never_given_again():
+    async def scenario() -> None:
+        async with running() as world:
+            names = world.machine.of("DM2")[0].names
+            world.kill("DM2")
+            await until(lambda: world.row("DM2")[:2] == ("running", 2))
+            world.kill("DM2")
+            orphan = world.machine.add(names, 2, bound=True)
+            await until(lambda: world.row("DM2") == ("running", 2, orphan.pid))
+            world.kill("DM2")
+            await until(lambda: world.row("DM2")[:2] == ("running", 4))
+            assert world.machine.forks == [("DM2", 2), ("DM2", 3), ("DM2", 4)]
+
+    run(scenario)
+
+
+def test_a_search_for_which_no_descriptor_is_left_ends_nothing():
+    async def scenario() -> None:
+        async with running() as world:
+            world.machine.look_error = no_descriptor()
+            world.kill("DM2")
+            await until(lambda: world.row("DM2")[0] == "starting")
+            world.kill("DM2")
+            await until(lambda: world.row("DM2")[:2] == ("running", 3))
+            assert world.machine.searches == 1
+            assert not world.task.done()
+
+    run(scenario)
+
+
+def test_an_ordinary_respawn_searches_for_nobody():
+    async def scenario() -> None:
+        async with running() as world:
+            for life in (2, 3, 4):
+                world.kill("DM2")
+                await until(lambda n=life: world.row("DM2")[:2] == ("running", n))
+            assert world.machine.searches == 0
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("numbers", [(3, 7), (7, 3)])
+def test_of_two_lives_of_one_node_a_new_supervisor_adopts_the_higher_and_ends_the_other(numbers):
+    async def scenario() -> None:
+        async with running() as world:
+            names = world.kill("DM2").names
+            world.task.cancel()
+            await asyncio.gather(world.task, return_exceptions=True)
+            two = [world.machine.add(names, number, bound=True) for number in numbers]
+            world.start(known={"DM2": 7})
+            await turns()
+            higher = max(two, key=lambda p: p.incarnation)
+            assert world.row("DM2") == ("running", 7, higher.pid)
+            assert world.machine.of("DM2") == [higher]
+
+    run(scenario)

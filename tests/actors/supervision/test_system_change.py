@@ -1,0 +1,64 @@
+"""A changed system that arrives as a message: what the supervisor and the spawners accept of it."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tomllib
+
+import msgspec
+import pytest
+
+from rampart.actors.ftm.messages import AdaptedSystem
+from rampart.actors.layout.layout import Layout, adapted_system
+from rampart.actors.run.run_plan import RunPlan, load_system
+from tests import ROOT
+
+FILE = ROOT / "systems" / "paper.toml"
+PLAN = RunPlan("r", 20000, system_file=str(FILE))
+
+
+@pytest.fixture
+def layout():
+    return Layout(PLAN, load_system(PLAN))
+
+
+@pytest.fixture
+def document():
+    return tomllib.loads(FILE.read_text())
+
+
+def change(layout, document) -> Layout:
+    text = document if isinstance(document, str) else json.dumps(document)
+    return adapted_system(layout, {}, AdaptedSystem(1, "a change", "me", text))[0]
+
+
+def test_a_sound_one_is_taken(layout, document):
+    document["strategy"] = "guarded-repair"
+    assert change(layout, document).spec.strategy == "guarded-repair"
+
+
+@pytest.mark.parametrize("table", ["node", "detection", "recovery"])
+def test_a_module_that_was_not_there_at_the_start_is_never_imported(
+        layout, document, table, tmp_path, monkeypatch):
+    (tmp_path / "intruder.py").write_text("class Node: pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    document[table][0]["actor"] = "intruder:Node"
+    with pytest.raises(ValueError, match="no actor of the system that was started is in that"):
+        change(layout, document)
+    assert "intruder" not in sys.modules
+
+
+def test_other_processes_than_those_that_run_are_refused(layout, document):
+    document["detection"][0]["process"] = "another"
+    with pytest.raises(ValueError, match="not the processes that were started"):
+        change(layout, document)
+
+
+@pytest.mark.parametrize("text", [
+    "", "null", "1", "[]", '"a"', "{}", '{"node": 3}', '{"node": [[]]}', "[" * 5000,
+    '{"name": "x", "node": [{"name": "' + "n" * 100_000 + '"}]}'])
+def test_what_is_no_system_is_one_error(layout, text):
+    with pytest.raises((ValueError, msgspec.MsgspecError)) as caught:
+        change(layout, text)
+    assert "Error" not in str(caught.value)

@@ -1,0 +1,168 @@
+"""Whatever fails on an event loop is told; a run of which a part fails ends in order, with why."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import resource
+import subprocess
+import sys
+
+import pytest
+
+from rampart.actors.osmosis.airport.formats import load_airport, load_mission
+from rampart.actors.run.run_plan import load_system
+from rampart.actors.supervision.descriptors import needed_descriptors
+from rampart.actors.supervision.launcher import Launcher
+from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.unseen import tell_of_callbacks, watch
+from rampart.sim.runs.console import Console
+from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.runs.process_run import ProcessRun
+from rampart.sim.runs.watched_run import WatchedRun
+from tests import ROOT
+from tests.stub_actors import Idler, free_base_port, launched, stub_plan, write_stub_system
+
+
+class Stumbler(Idler):
+    """Raises where no mailbox is: in a callback and in a task that nobody waits for."""
+
+    def on_start(self) -> None:
+        async def forgotten() -> None:
+            raise RuntimeError("forgotten")
+
+        loop = asyncio.get_running_loop()
+        loop.call_soon(fail, "stumbled")
+        self.task = loop.create_task(forgotten())
+        self.task.add_done_callback(lambda _: delattr(self, "task"))
+
+
+def fail(why: str) -> None:
+    raise RuntimeError(why)
+
+
+async def turns() -> None:
+    for _ in range(5):
+        await asyncio.sleep(0)
+
+
+async def test_the_end_of_a_task_is_told_unless_it_was_cancelled():
+    told: list[str] = []
+
+    async def failing() -> None:
+        fail("two\nlines")
+
+    async def ending() -> None:
+        pass
+
+    for make, what in ((failing, "one"), (ending, "another"), (asyncio.Event().wait, "a third")):
+        watch(asyncio.create_task(make()), what, told.append)
+    await turns()
+    assert told == ["one failed: RuntimeError: two lines", "another ended by itself"]
+    for task in asyncio.all_tasks() - {asyncio.current_task()}:
+        task.cancel()
+    await turns()
+    assert len(told) == 2
+
+
+async def test_what_a_callback_raises_is_told_once_and_a_flood_of_it_is_bounded():
+    told: list[str] = []
+    loop = asyncio.get_running_loop()
+    tell_of_callbacks(loop, told.append)
+    for _ in range(3):
+        loop.call_soon(fail, "again")
+    await turns()
+    assert len(told) == 1
+    assert told[0].startswith("Exception in callback fail('again')")
+    assert told[0].endswith(": RuntimeError: again")
+    for number in range(500):
+        loop.call_soon(fail, str(number))
+    await turns()
+    assert len(told) == 100
+
+
+@pytest.mark.processes
+async def test_what_a_nodes_callbacks_and_forgotten_tasks_raise_is_told_and_it_goes_on(
+        tmp_path, capfd):
+    system = write_stub_system(tmp_path)
+    text = system.read_text()
+    at = text.index('name = "localization"')
+    system.write_text(text[:at] + text[at:].replace(
+        "tests.stub_actors:Idler", "tests.actors.supervision.test_unseen:Stumbler", 1))
+    async with launched(stub_plan(system)) as launcher:
+        said = ""
+        async with asyncio.timeout(20):
+            while not ("RuntimeError: stumbled" in said and "RuntimeError: forgotten" in said):
+                await asyncio.sleep(0.05)
+                said += capfd.readouterr().err
+        assert [p.incarnation for p in find_processes(launcher.plan.base_port)
+                if "localization" in p.names] == [1]
+    lines = [line for line in said.splitlines() if "RuntimeError" in line]
+    assert len(lines) == 2
+    assert all(line.startswith("rampart: localization #1: ") for line in lines)
+
+
+def broken_sink(_topic: object, message: object, _header: object) -> None:
+    if type(message).__name__ == "NodeTable":
+        fail("no room for tables")
+
+
+WHY = "the launcher's observer failed: RuntimeError: no room for tables"
+
+
+@pytest.mark.processes
+async def test_a_run_whose_observer_fails_ends_in_order_and_says_why(tmp_path, monkeypatch):
+    plan = stub_plan(write_stub_system(tmp_path))
+    airport = load_airport("vallombre")
+    stream = io.StringIO()
+    mission = MissionRun(plan, airport, load_mission("AB", airport), strategy="",
+                         patience_s=60, console=Console(stream))
+    usual = mission.sinks
+    monkeypatch.setattr(mission, "sinks", lambda clock: [*usual(clock), broken_sink])
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    async with asyncio.timeout(30):
+        record = await ProcessRun(Launcher(plan, "test"), load_system(plan), mission).run()
+    assert (record.mission, record.safety) == ("fail", "not known")
+    assert f"ended: {WHY}" in record.reasons
+    assert WHY in stream.getvalue()
+    assert find_processes(plan.base_port) == []
+
+
+@pytest.mark.processes
+async def test_a_run_without_a_mission_whose_observer_fails_ends_too(tmp_path, monkeypatch):
+    plan = stub_plan(write_stub_system(tmp_path))
+    stream = io.StringIO()
+    run = WatchedRun(plan, load_system(plan), None, stream)
+    monkeypatch.setattr(run, "_take", broken_sink)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    async with asyncio.timeout(30):
+        await run.run()
+    assert run.launcher.failure == WHY
+    assert WHY in stream.getvalue()
+    assert find_processes(plan.base_port) == []
+
+
+@pytest.mark.processes
+async def test_a_run_may_open_as_many_files_as_the_hard_limit_allows(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, before[1]))
+    try:
+        async with launched(stub_plan(write_stub_system(tmp_path))) as launcher:
+            for process in find_processes(launcher.plan.base_port):
+                assert resource.prlimit(process.pid, resource.RLIMIT_NOFILE)[0] == before[1]
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+@pytest.mark.processes
+def test_a_run_that_may_open_too_few_files_is_refused_in_one_line(tmp_path):
+    result = subprocess.run(
+        ["sh", "-c", 'ulimit -n 64; exec "$@"', "sh", sys.executable, str(ROOT / "launch.py"),
+         "--system", "paper", "--no-hmi", "--port", str(free_base_port()),
+         "--report", str(tmp_path / "report")],
+        check=False, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 2
+    assert result.stderr == (
+        "launch.py: open files: the hard limit is 64, and 23 processes need "
+        f"{needed_descriptors(23)}; raise it, as with `ulimit -Hn {needed_descriptors(23)}` in the "
+        "shell of a privileged user\n")

@@ -1,0 +1,70 @@
+"""`rampart cut-sets` as a user calls it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from tests import ROOT
+
+
+def rampart(*arguments: str, cwd=ROOT) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "rampart.cli.main", *arguments], cwd=cwd,
+                          check=False,
+                          capture_output=True, text=True, timeout=60)
+
+
+def test_the_papers_system_is_listed_with_its_barriers():
+    done = rampart("cut-sets", "paper")
+    assert done.returncode == 0, done.stderr
+    assert "7 minimal cut sets" in done.stdout
+    assert "fewer than two barriers:\n  erroneous_graph: only FTM1" in done.stdout
+
+
+def test_counts_are_json_for_scripts():
+    done = rampart("cut-sets", "paper", "--count", "--json")
+    assert json.loads(done.stdout) == {
+        "top": "moving_inside_prohibited_area", "minimal_cut_sets": 7}
+
+
+def test_what_is_exported_is_read_again(tmp_path):
+    file = tmp_path / "cell.xml"
+    assert rampart("cut-sets", "cell", "--export", str(file)).returncode == 0
+    there, back = (json.loads(rampart("cut-sets", name, "--json").stdout)
+                   for name in ("cell", str(file)))
+    assert [s["events"] for s in there["sets"]] == [s["events"] for s in back["sets"]]
+    assert there["by_size"] == back["by_size"]
+
+
+def test_what_is_left_before_the_top():
+    done = rampart("cut-sets", "paper", "--active", "FTM2", "FTM1", "--json")
+    view = json.loads(done.stdout)
+    assert view["left"] == {"FTM1": [], "FTM2": []}
+    assert view["next_events"][0]["barriers"] == []
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["nowhere.xml"], "nowhere.xml: No such file or directory"),
+    (["--active", "FTM99"], "unknown mechanism 'FTM99'; known: FTM1"),
+    (["--limit", "-1"], "--limit -1: must be 0 or more"),
+    (["--top", "nobody"], "unknown top 'nobody'"),
+    (["nowhere.toml"], "nowhere.toml: No such file or directory"),
+])
+def test_bad_usage_is_one_line_and_exit_code_2(arguments, words):
+    done = rampart("cut-sets", *arguments)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_file_that_is_no_open_psa_is_one_line_and_exit_code_2(tmp_path):
+    file = tmp_path / "x.xml"
+    file.write_text("<!DOCTYPE x [<!ENTITY a 'b'>]><opsa-mef>&a;</opsa-mef>")
+    done = rampart("cut-sets", str(file))
+    assert done.returncode == 2
+    assert "document type definitions and entities are not read" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert rampart("cut-sets", str(file), "--export", "y.xml").returncode == 2

@@ -1,0 +1,506 @@
+"""`rampart tree`: every renderer shows everything, escapes everything, and survives large trees."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import random
+import re
+import shutil
+import subprocess
+from graphlib import CycleError
+from io import BytesIO, TextIOWrapper
+from xml.etree import ElementTree as ET
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.cli import systems
+from rampart.cli.analyse.tree_dot import quote, to_dot
+from rampart.cli.analyse.tree_svg import to_svg
+from rampart.cli.analyse.tree_text import to_text
+from rampart.cli.main import main
+from rampart.manager.drawing.diagram import Box, Diagram, Situation, clean, covers, draw
+from rampart.manager.drawing.layered import arrange_in_layers, crossings
+from rampart.manager.drawing.placing import _isotonic, place
+from rampart.manager.model.order import PartialOrder
+from rampart.systems import SHIPPED
+from tests import ROOT
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+OSMOSIS = """\
+Fault tree: Runway light inspection with a Summit XL
+‖ moving_inside_prohibited_area [or]  Moving inside a prohibited area  FTM1(DM1, RM1)
+├── erroneous_graph
+├── erroneous_command [or]
+│   ├── localization_error [or]
+│   │   ├── localization_estimation_error  Error in localization estimation
+│   │   └─‖ localization_not_updated [or]  FTM6(DM6, RM5)
+│   │       └─‖ localization_node_crash  FTM7(DM7, RM4)
+│   ├─‖ command_not_updated [or]  FTM2(DM2, RM2)
+│   │   ├─‖ control_node_crash  FTM4(DM4, RM3)
+│   │   └─‖ non_control_node_crash  FTM5(DM5, RM4)
+│   └─‖ command_calculation_error  FTM3(DM3, RM2)
+└── actuator_failure
+
+Tree of mechanisms: Runway light inspection with a Summit XL
+FTM1(DM1, RM1)  Prohibited area → Emergency stop
+├── FTM2(DM2, RM2)  Command not updated → Controlled stop
+│   ├── FTM4(DM4, RM3)  Control node crash → Respawn control nodes
+│   └── FTM5(DM5, RM4)  Non-control node crash → Respawn non-control nodes
+├── FTM3(DM3, RM2)  Wrong command value → Controlled stop
+└── FTM6(DM6, RM5)  Localization not updated → Switch to teleoperation
+    └── FTM7(DM7, RM4)  Localization node crash → Respawn non-control nodes
+
+Order of recoveries (safer): Runway light inspection with a Summit XL
+RM1  Emergency stop
+├── RM2  Controlled stop
+│   ├── RM3  Respawn control nodes
+│   └── RM4  Respawn non-control nodes
+└── RM5  Switch to teleoperation
+    ├── RM3 ↑
+    └── RM4 ↑
+"""
+
+
+@pytest.fixture(autouse=True)
+def _the_papers_system(monkeypatch):
+    """Its decisions are known by heart; the full system's are judged elsewhere."""
+    monkeypatch.setattr(systems, "DEFAULT", SHIPPED / "paper.toml")
+
+
+def told(capsys) -> str:
+    return capsys.readouterr().out
+
+
+def graph(edges, **boxes) -> Diagram:
+    """Return a fault tree; the gates follow from the edges."""
+    names = list(dict.fromkeys([*itertools.chain.from_iterable(edges), *boxes]))
+    inputs = {name: sum(upper == name for upper, _ in edges) for name in names}
+    return Diagram("fault-tree", "T", "", tuple(
+        boxes.get(name) or Box(name, gate="or" if inputs[name] else "", inputs=inputs[name],
+                               required=min(1, inputs[name])) for name in names), tuple(edges))
+
+
+@st.composite
+def fault_trees(draw_from):
+    """A random graph under one top, with shared events, all kinds of gates, and barriers."""
+    count = draw_from(st.integers(1, 14))
+    uppers = [draw_from(st.sets(st.integers(0, i - 1), min_size=1, max_size=3))
+              for i in range(1, count)]
+    edges = [(f"e{u}", f"e{i}") for i, us in enumerate(uppers, 1) for u in sorted(us)]
+    boxes = []
+    for i in range(count):
+        name = f"e{i}"
+        inputs = sum(upper == name for upper, _ in edges)
+        required = draw_from(st.integers(1, inputs)) if inputs else 0
+        gate = "" if not inputs else draw_from(st.sampled_from(["or", "and", "at-least"]))
+        mechanism = f"F{i}" if draw_from(st.booleans()) else ""
+        title = clean(draw_from(st.text(max_size=40)))
+        boxes.append(Box(name, title, gate, required, inputs, mechanism, f"D{i}", f"R{i}",
+                         draw_from(st.booleans()), draw_from(st.booleans())))
+    return Diagram("fault-tree", "T", "", tuple(boxes), tuple(edges))
+
+
+def rectangles(root) -> list[tuple[float, float, float, float]]:
+    return [tuple(float(r.get(key)) for key in ("x", "y", "width", "height"))
+            for r in root.iter(f"{SVG}rect") if r.get("class") == "box"]
+
+
+def assert_apart(boxes) -> None:
+    for (x, y, w, h), (x2, y2, w2, h2) in itertools.combinations(boxes, 2):
+        assert x + w <= x2 or x2 + w2 <= x or y + h <= y2 or y2 + h2 <= y
+
+
+# The strings, names and signs of DOT; quoted strings may hold any character but a bare quote.
+DOT_TOKEN = re.compile(r'\s+|"(?:[^"\\\n]|\\.)*"|->|[A-Za-z_]\w*|[{}\[\];=,]')
+
+
+def tokens_of(dot: str) -> list[str]:
+    """Split DOT into tokens; what is none fails, and so do brackets that do not match."""
+    tokens, at = [], 0
+    while at < len(dot):
+        match = DOT_TOKEN.match(dot, at)
+        assert match, f"no DOT from here: {dot[at:at + 40]!r}"
+        at = match.end()
+        if not match[0].isspace():
+            tokens.append(match[0])
+    opened = []
+    for token in tokens:
+        if token in "{[":
+            opened.append(token)
+        elif token in "}]":
+            assert opened.pop() == {"}": "{", "]": "["}[token]
+    assert opened == []
+    assert tokens[:3] == ["digraph", "rampart", "{"]
+    return tokens
+
+
+def test_the_papers_system_as_text(capsys):
+    assert main(["tree"]) == 0
+    assert told(capsys) == OSMOSIS
+
+
+@pytest.mark.parametrize("form", ["text", "svg", "dot", "json"])
+@pytest.mark.parametrize("what", ["fault-tree", "ftm-tree", "order"])
+def test_every_name_appears_in_every_format(capsys, what, form):
+    assert main(["tree", "--what", what, "--format", form]) == 0
+    out = told(capsys)
+    spec = systems.load(None)
+    names = {"fault-tree": [*(e.name for e in spec.events), *(m.name for m in spec.mechanisms)],
+             "ftm-tree": [m.name for m in spec.mechanisms],
+             "order": [r.name for r in spec.recoveries]}[what]
+    for name in names:
+        assert re.search(rf"\b{name}\b", out), name
+
+
+@settings(max_examples=60, deadline=None)
+@given(fault_trees())
+def test_every_renderer_shows_every_box_of_any_graph(diagram):
+    text, dot, svg = to_text([diagram]), to_dot([diagram]), to_svg([diagram])
+    tokens_of(dot)
+    root = ET.fromstring(svg)
+    tooltips = [t.text.split(";")[0] for t in root.iter(f"{SVG}title")][1:]
+    assert sorted(tooltips) == sorted(box.name for box in diagram.boxes)
+    assert_apart(rectangles(root))
+    for box in diagram.boxes:
+        first = [line for line in text.splitlines()
+                 if re.search(rf"(^|[‖─] ){box.name}( |$)(?!↑)", line)]
+        assert len(first) == 1
+        assert quote(f"fault-tree/{box.name}") in dot
+    assert len(rectangles(root)) == len(diagram.boxes)
+    assert svg.count('class="bar"') == 2 * sum(bool(b.mechanism) for b in diagram.boxes)
+    assert svg.count("<circle") == sum(not b.gate for b in diagram.boxes)
+
+
+@settings(max_examples=60, deadline=None)
+@given(fault_trees(), st.booleans())
+def test_boxes_stay_apart_and_lines_go_from_box_to_box(diagram, square):
+    sizes = {box.name: (40.0 + 7 * len(box.title), 50.0) for box in diagram.boxes}
+    placing = place(sizes, diagram.edges, square=square)
+    places = placing.places
+    assert_apart([(p.left, p.top, p.width, p.height) for p in places.values()])
+    for (upper, lower), line in zip(diagram.edges, placing.lines, strict=True):
+        assert line[0] == (pytest.approx(places[upper].x, abs=0.01), places[upper].bottom)
+        assert line[-1][1] == places[lower].top
+        assert places[lower].left <= line[-1][0] <= places[lower].left + places[lower].width
+        assert places[upper].bottom < places[lower].top
+        assert [y for _, y in line] == sorted(y for _, y in line)
+    for place_ in places.values():
+        assert place_.left >= -0.01
+        assert place_.left + place_.width <= placing.width + 0.01
+
+
+@settings(max_examples=60, deadline=None)
+@given(fault_trees())
+def test_lines_of_different_origin_do_not_lie_on_each_other_across(diagram):
+    placing = place({box.name: (60.0, 50.0) for box in diagram.boxes}, diagram.edges, square=True)
+    across = [(upper, y, min(x, x2), max(x, x2))
+              for (upper, _), line in zip(diagram.edges, placing.lines, strict=True)
+              for (x, y), (x2, y2) in itertools.pairwise(line) if y == y2]
+    for (one, y, a, b), (other, y2, a2, b2) in itertools.combinations(across, 2):
+        assert one == other or y != y2 or b < a2 or b2 < a
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.floats(-100, 100), st.floats(0.1, 6)), min_size=1, max_size=8))
+def test_the_nearest_rising_values_are_those_of_the_closed_form(pairs):
+    def mean(i, k):
+        part = pairs[i:k + 1]
+        return sum(v * w for v, w in part) / sum(w for _, w in part)
+
+    last = len(pairs) - 1  # Robertson, Wright, Dykstra (1988): the max-min formula
+    expected = [max(min(mean(j, k) for k in range(i, last + 1)) for j in range(i + 1))
+                for i in range(last + 1)]
+    assert _isotonic(*zip(*pairs, strict=True)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_what_is_above_stands_centred_over_what_is_below():
+    edges = [("t", "a"), ("t", "b"), ("a", "c"), ("a", "d"), ("d", "e")]
+    places = place(dict.fromkeys("tabcde", (60.0, 30.0)), edges, square=True).places
+    assert places["a"].x == pytest.approx((places["c"].x + places["d"].x) / 2, abs=0.02)
+    assert places["t"].x == pytest.approx((places["a"].x + places["b"].x) / 2, abs=0.02)
+    assert places["e"].x == places["d"].x
+
+
+def test_crossings_are_counted_as_by_hand():
+    # 0 1 above 2 3: 0-3 and 1-2 cross; 0-2 and 1-3 do not; all four lines have one crossing.
+    assert crossings([[0, 1], [2, 3]], [[3], [2], [], []]) == 1
+    assert crossings([[0, 1], [2, 3]], [[2], [3], [], []]) == 0
+    assert crossings([[0, 1], [2, 3]], [[2, 3], [2, 3], [], []]) == 1
+
+
+def test_a_crossing_that_can_be_avoided_is():
+    edges = [("a", "x"), ("a", "y"), ("x", "p"), ("y", "q"), ("x", "q"), ("y", "r"), ("y", "p")]
+    layering = arrange_in_layers(("a", "x", "y", "q", "p", "r"), edges)
+    _, lowers = layering.links()
+    fewest = min(crossings([layering.layers[0], second, third], lowers)
+                 for second in itertools.permutations(layering.layers[1])
+                 for third in itertools.permutations(layering.layers[2]))
+    assert crossings(layering.layers, lowers) == fewest
+
+
+def test_a_tree_has_no_crossing_and_keeps_the_declared_sequence():
+    edges = [("t", "b"), ("t", "a"), ("b", "z"), ("a", "y"), ("a", "x")]
+    layering = arrange_in_layers(("a", "b", "t", "x", "y", "z"), edges)
+    names = [["abtxyz"[v] for v in layer] for layer in layering.layers]
+    assert names == [["t"], ["b", "a"], ["z", "y", "x"]]
+
+
+def test_what_is_no_graph_of_layers_is_refused():
+    with pytest.raises(CycleError):
+        arrange_in_layers(("a", "b"), [("a", "b"), ("b", "a")])
+
+
+def test_a_shared_event_is_drawn_once_and_referred_to():
+    shared = graph([("t", "a"), ("t", "b"), ("a", "s"), ("b", "s"), ("s", "x"), ("s", "y")])
+    assert to_text([shared]).splitlines()[1:] == [
+        "t [or]", "├── a [or]", "│   └── s [or]", "│       ├── x", "│       └── y",
+        "└── b [or]", "    └── s ↑"]
+    assert len(rectangles(ET.fromstring(to_svg([shared])))) == 6
+    assert to_dot([shared]).count('-> "fault-tree/s";') == 2
+
+
+@settings(deadline=None)
+@given(st.integers(1, 9).flatmap(lambda n: st.sets(
+    st.tuples(st.integers(0, n - 1), st.integers(0, n - 1)).filter(lambda p: p[0] < p[1]))))
+def test_the_hasse_diagram_holds_neighbours_only_and_says_as_much_as_the_order(pairs):
+    names = [f"R{i}" for i in range(9)]
+    above = {}
+    for upper, lower in pairs:
+        above.setdefault(names[upper], []).append(names[lower])
+    order = PartialOrder(names, above)
+    expected = {(a, b) for a in names for b in names if order.is_above(a, b) and not any(
+        order.is_above(a, c) and order.is_above(c, b) for c in names)}
+    found = covers(order)
+    assert set(found) == expected
+    assert len(found) == len(expected)
+
+
+def test_the_box_of_a_mechanism_keeps_the_logic_of_its_gates(capsys):
+    assert main(["tree", "--what", "ftm-tree", "--system", "cell"]) == 0
+    shown = told(capsys)
+    assert "Part not where it should be and not Force at the wrist too high → Retract" in shown
+    assert "along the last path or Hold position under control" in shown
+    assert "2 of (Joint encoder A disagrees with the model, Joint encoder B" in shown
+    assert "too high and Part not where it should be → Hold position under control and Op" in shown
+
+
+HOSTILE = '</text><script>alert("1")</script> & "quoted" \\N \\" \x1b[31m \u202e \x00 ]]> -->\n|{}'
+
+
+def hostile_system(tmp_path):
+    text = systems.DEFAULT.read_text(encoding="utf-8")
+    for title in ("Erroneous graph", "Emergency stop", "Runway light inspection with a Summit XL"):
+        text = text.replace(f'"{title}"', json.dumps(HOSTILE))
+    text += f"\n[orders.{json.dumps(HOSTILE)}]\nRM1 = ['RM2', 'RM5']\n"
+    file = tmp_path / "hostile.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize("form", ["text", "svg", "dot", "json"])
+def test_hostile_titles_are_shown_and_obeyed_by_nobody(capsys, tmp_path, form):
+    assert main(["tree", "--system", str(hostile_system(tmp_path)), "--format", form,
+                 "--order", HOSTILE]) == 0
+    out = told(capsys)
+    assert not {"\x1b", "\x00", "\u202e"} & set(out)
+    if form == "svg":
+        root = ET.fromstring(out)
+        assert {e.tag.removeprefix(SVG) for e in root.iter()} <= {
+            "svg", "title", "desc", "style", "g", "text", "path", "rect", "circle"}
+        assert any("<script>" in (e.text or "") for e in root.iter(f"{SVG}title"))
+    elif form == "dot":
+        assert any("<script>" in t and "\\\\N" in t for t in tokens_of(out) if t[0] == '"')
+    elif form == "json":
+        assert len(json.loads(out)) == 3
+    else:
+        assert out.splitlines()[1:13] == [
+            line.replace("erroneous_graph", f"erroneous_graph  {clean(HOSTILE)}")
+            for line in OSMOSIS.splitlines()[1:13]]
+
+
+@settings(deadline=None)
+@given(st.text())
+def test_a_cleaned_text_is_one_line_that_xml_can_hold(text):
+    cleaned = clean(text)
+    assert len(cleaned.splitlines()) <= 1
+    svg = to_svg([graph([], a=Box("a", cleaned))])
+    assert ET.fromstring(svg) is not None
+    tokens_of(to_dot([graph([], a=Box("a", cleaned))]))
+
+
+@pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
+def test_graphviz_itself_reads_it(capsys, tmp_path):
+    main(["tree", "--system", str(hostile_system(tmp_path)), "--format", "dot",
+          "--order", HOSTILE])
+    done = subprocess.run(["dot", "-Tplain"], input=told(capsys), text=True, capture_output=True,
+                          timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def chain_of(count):
+    return [(f"e{i}", f"e{i + 1}") for i in range(count - 1)]
+
+
+def bush_of(count):
+    chance = random.Random(4)
+    return sorted({(f"e{chance.randrange(max(0, i - 40), i)}", f"e{i}")
+                   for i in range(1, count) for _ in range(1 + (i % 9 == 0))})
+
+
+@pytest.mark.parametrize("edges", [
+    chain_of(1000), [("e0", f"e{i}") for i in range(1, 1000)], bush_of(1000),
+    [*chain_of(600), *(("e0", f"e{i}") for i in range(2, 600))],
+], ids=["chain", "flat", "bush", "too many bends"])
+def test_a_thousand_events_are_drawn_by_every_renderer(edges):
+    diagram = graph(edges)
+    root = ET.fromstring(to_svg([diagram]))
+    assert len(rectangles(root)) == len(diagram.boxes)
+    rows = {}
+    for x, y, width, _ in rectangles(root):
+        rows.setdefault(y, []).append((x, x + width))
+    for row in rows.values():
+        assert all(a[1] <= b[0] for a, b in itertools.pairwise(sorted(row)))
+    assert to_text([diagram]).count("\n") == 1 + len(edges) + 1
+    assert to_dot([diagram]).count("->") == len(edges) + sum(bool(b.gate) for b in diagram.boxes)
+
+
+def test_the_same_system_always_gives_the_same_picture(capsys):
+    pictures = set()
+    for _ in range(2):
+        main(["tree", "--format", "svg"])
+        pictures.add(told(capsys))
+    assert len(pictures) == 1
+
+
+@pytest.mark.parametrize(("active", "decided"), [
+    (["FTM3", "FTM4"], ["FTM3"]),  # RM2 for FTM3; FTM2 has RM2 as well and is not active
+    (["FTM2", "FTM6", "FTM5"], ["FTM1"]),  # block 4: nobody active asks for RM1
+])
+def test_active_mechanisms_are_lit_and_the_decision_is_marked(capsys, active, decided):
+    assert main(["tree", "--what", "ftm-tree", "--json", "--active", *active]) == 0
+    (tree,) = json.loads(told(capsys))
+    assert {b["name"] for b in tree["boxes"] if b["active"]} == set(active)
+    assert [b["name"] for b in tree["boxes"] if b["decided"]] == decided
+    main(["tree", "--what", "ftm-tree", "--active", *active])
+    lines = told(capsys).splitlines()
+    assert f"{active[0]} and" in lines[1] or f"{active[0]}, " in lines[1]
+    assert sum("● active" in line for line in lines) == len(active)
+    assert sum("◀ decided" in line for line in lines) == 1
+
+
+def test_the_order_shows_what_was_asked_for_and_what_was_decided(capsys):
+    main(["tree", "--what", "order", "--active", "FTM3", "FTM4"])
+    lines = told(capsys).splitlines()
+    assert [line for line in lines if "asked for" in line] == [
+        "├── RM2  Controlled stop  ● asked for  ◀ decided",
+        "│   ├── RM3  Respawn control nodes  ● asked for"]
+
+
+def test_the_picture_tells_its_content_to_those_who_do_not_see_it(capsys):
+    main(["tree", "--what", "fault-tree", "--format", "svg", "--active", "FTM3"])
+    root = ET.fromstring(told(capsys))
+    assert root.get("role") == "img"
+    assert root.get("aria-labelledby") == "title desc"
+    description = root.find(f"{SVG}desc").text
+    assert "command_not_updated; Command not updated; gate: or; FTM2(DM2, RM2); above " \
+           "control_node_crash, non_control_node_crash." in description
+    assert "FTM3(DM3, RM2); active; decided" in description
+    assert "prefers-color-scheme: dark" in root.find(f"{SVG}style").text
+
+
+def test_the_picture_needs_nothing_from_outside(capsys):
+    main(["tree", "--format", "svg"])
+    out = told(capsys).replace('xmlns="http://www.w3.org/2000/svg"', "")
+    assert not re.search(r"https?:|url\(|@import|href|<image|<script", out)
+
+
+@pytest.mark.parametrize(("gate", "words", "qualifier"), [
+    ("or", "[or]", "≥1"), ("and", "[and]", "&"), ("at-least", "[2 of 3]", "≥2")])
+def test_each_kind_of_gate_has_its_symbol(gate, words, qualifier):
+    required = {"or": 1, "and": 3, "at-least": 2}[gate]
+    diagram = graph([("t", "a"), ("t", "b"), ("t", "c")], t=Box("t", "", gate, required, 3))
+    assert words in to_text([diagram])
+    texts = [t.text for t in ET.fromstring(to_svg([diagram])).iter(f"{SVG}text")]
+    assert qualifier in texts
+    assert quote(words.strip("[]")) in tokens_of(to_dot([diagram]))
+
+
+@pytest.mark.parametrize(("name", "start"), [
+    ("x.svg", "<svg "), ("x.gv", "digraph"), ("x.dot", "digraph"), ("x.json", "["), ("x", "Fault"),
+    ("x.txt", "Fault"),
+])
+def test_a_file_gets_the_format_of_its_ending(capsys, tmp_path, name, start):
+    file = tmp_path / name
+    assert main(["tree", "--output", str(file)]) == 0
+    assert file.read_text(encoding="utf-8").startswith(start)
+    assert f"{file}: fault-tree, 12 boxes" in told(capsys)
+
+
+@pytest.mark.parametrize(("detect", "title"), [
+    ("DM3", "Wrong command value"),
+    ("DM3 and not (DM1 or DM6)",
+     "Wrong command value and (not Prohibited area and not Localization not updated)"),
+    ("2 of (DM2, DM3, DM6)",
+     "2 of (Command not updated, Wrong command value, Localization not updated)"),
+])
+def test_a_mechanism_is_titled_with_the_logic_of_its_gate(detect, title):
+    spec = systems.load("paper")
+    mechanisms = tuple(msgspec.structs.replace(m, detect=detect) if m.name == "FTM3" else m
+                       for m in spec.mechanisms)
+    diagram = draw(msgspec.structs.replace(spec, mechanisms=mechanisms), "ftm-tree",
+                   spec.build_order(), spec.criteria, Situation())
+    assert next(b.title for b in diagram.boxes if b.name == "FTM3") == f"{title} → Controlled stop"
+
+
+def test_two_orders_are_refined_and_shown_by_name(capsys, tmp_path):
+    file = tmp_path / "two.toml"
+    text = systems.DEFAULT.read_text(encoding="utf-8")
+    file.write_text(f"{text}\n[orders.milder]\nRM5 = ['RM2']\n", encoding="utf-8")
+    main(["tree", "--what", "order", "--system", str(file), "--order", "safer",
+          "--order", "milder"])
+    assert told(capsys).splitlines()[:4] == [
+        "Order of recoveries (safer, then milder): Runway light inspection with a Summit XL",
+        "RM1  Emergency stop", "└── RM5  Switch to teleoperation", "    └── RM2  Controlled stop"]
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["--active", "FTM9"], ["'FTM9'", "known: FTM1"]),
+    (["--order", "bravest"], ["'bravest'", "known: safer"]),
+    (["--active", "FTM1", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
+    (["--strategy", "bravely"], ["'bravely'", "safety-first"]),
+    (["--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
+    (["--output", "x.pdf"], ["--output x.pdf: unknown ending", ".svg, .dot, .gv, .json, .txt"]),
+    (["--output", "/no/such/tree.svg"], ["--output /no/such/tree.svg", "No such file"]),
+])
+def test_nonsense_is_refused_in_one_line_that_names_it(capsys, arguments, words):
+    assert main(["tree", *arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    for word in words:
+        assert word in captured.err
+
+
+def test_the_picture_in_the_documents_is_the_one_that_the_verb_draws(capsys):
+    main(["tree", "--what", "fault-tree", "--format", "svg"])
+    shipped = ROOT / "docs/images/osmosis-fault-tree.svg"
+    assert shipped.read_text(encoding="utf-8") == told(capsys)  # else: rampart tree --output
+
+
+def test_a_terminal_without_these_characters_is_told_so(capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdout", TextIOWrapper(BytesIO(), encoding="ascii"))
+    assert main(["tree"]) == 2
+    assert "ascii" in capsys.readouterr().err
+
+
+def test_the_json_is_the_diagram(capsys):
+    main(["tree", "--json"])
+    diagrams = msgspec.json.decode(told(capsys), type=list[Diagram])
+    assert [d.what for d in diagrams] == ["fault-tree", "ftm-tree", "order"]
+    assert ("RM1", "RM2") in diagrams[2].edges
+    assert to_text(diagrams) == OSMOSIS

@@ -1,0 +1,231 @@
+"""Metrics and live views: what they make of a run, and one clear line if a library is missing."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import sys
+from types import SimpleNamespace
+
+import httpx
+import msgspec
+import pytest
+
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.envelope import Header
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.recording.views import Views
+from rampart.actors.run.run_info import RunInfo
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.process_usage import ProcessCount
+from rampart.actors.web.guests import ROOM
+from rampart.actors.web.server import WebServer
+from rampart.cli.look.live_verb import SHOWN, _watch
+from rampart.cli.main import main
+from tests import ROOT
+from tests.cli.look.test_top_view import busy
+
+RUN = RunInfo(1, 7450, 1.0, 0.0, "paper.toml", "", (), "run", 0, 'a "title"\\ and\nmore')
+
+
+@pytest.mark.parametrize(("module", "arguments", "extra"), [
+    ("prometheus_client.exposition", ["metrics"], "prometheus"),
+    ("foxglove", ["live", "foxglove"], "foxglove"), ("rerun", ["live", "rerun"], "rerun")])
+def test_a_missing_extra_is_one_line_that_says_what_to_install(
+        module, arguments, extra, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, module, None)
+    assert main(arguments) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1
+    assert f"pip install 'rampart[{extra}]'" in told[0]
+
+
+@pytest.mark.parametrize("arguments", [
+    ["metrics", "--port", "99999"], ["live", "foxglove", "--port", "-1"],
+    ["metrics", "--host", "nobody.invalid"], ["metrics", "--host", ".."],
+    ["metrics", "--host", "a" * 64]])
+def test_an_address_that_is_none_is_named(arguments, capsys):
+    pytest.importorskip("prometheus_client")
+    pytest.importorskip("foxglove")
+    assert main(arguments) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1
+    assert arguments[-1] in told[0]
+
+
+def test_what_is_listened_to_for_viewers_is_what_is_translated_for_them():
+    assert {t.key for t in SHOWN} == set(Views()._translators)
+
+
+def exposed(now):
+    exposition = pytest.importorskip("prometheus_client.exposition")
+    from rampart.cli.look.metrics_families import Collector
+
+    return exposition.generate_latest(Collector(lambda: now)).decode()
+
+
+def test_without_a_run_prometheus_is_told_so():
+    assert exposed(None).splitlines()[-1] == "rampart_up 0.0"
+
+
+def test_a_run_becomes_metrics_that_prometheus_reads_back():
+    parser = pytest.importorskip("prometheus_client.parser")
+    from rampart.cli.look.metrics_families import Exposition
+
+    text = exposed(Exposition(RUN, 10.5, busy(), {"hmi": ProcessCount(2.5, 4096, 1.0)}))
+    found = {s.name: s for f in parser.text_string_to_metric_families(text) for s in f.samples}
+    assert found["rampart_run_info"].labels["title"] == RUN.title
+    assert found["rampart_simulated_seconds"].value == 10.5
+    assert found["rampart_decisions_total"].labels == {"strategy": "safety-first"}
+    assert found["rampart_process_cpu_seconds_total"].value == 2.5
+    crashed = 'rampart_node_up{kind="control",node="localization"} 0.0'
+    assert crashed in text
+    assert 'rampart_node_restarts_total{node="localization"} 2.0' in text
+    assert 'rampart_detection_active{module="DM7"} 1.0' in text
+    assert 'rampart_detections_total{module="DM7"} 1.0' in text
+    assert 'rampart_mission_phase{rampart_mission_phase="running"} 1.0' in text
+
+
+def test_the_handbook_lists_every_metric_with_its_labels():
+    parser = pytest.importorskip("prometheus_client.parser")
+    from rampart.cli.look.metrics_families import Exposition
+
+    picture = busy()
+    for topic, body in (
+            (bus_topics.HEARTBEAT, bm.Heartbeat(1, 0, 0.1, 0, 0)),
+            (ftm_topics.PROCESS_EVENT, fm.ProcessEvent("hmi", "crashed", 1, 1, "", "")),
+            (ftm_topics.RECOVERY, fm.RecoveryReport(
+                fm.RecoveryState.ACTIVATED, fm.RecoveryPhase.ACTING, 1, ""))):
+        picture.heard(topic, Header("somebody", 1, 1, 1.0), body, 1.0)
+    for time_s in (0.0, 1.0):
+        picture.sample(time_s)
+    text = exposed(Exposition(RUN, 10.5, picture, {"hmi": ProcessCount(2.5, 4096, 1.0)}))
+    found = {s.name: set(s.labels) for f in parser.text_string_to_metric_families(text)
+             for s in f.samples}
+    listed = {}
+    for line in (ROOT / "docs" / "operations.md").read_text("utf-8").splitlines():
+        if line.startswith("| `rampart_"):
+            _, names, labels, _ = line.split("|")
+            for name in re.findall(r"`(?:rampart)?_(\w+)`", names):
+                listed[f"rampart_{name}"] = set(re.findall(r"\w+", labels))
+    assert listed == found
+
+
+def test_a_run_of_which_nothing_was_heard_yet_is_no_error():
+    from rampart.cli.run_picture import RunPicture
+
+    pytest.importorskip("prometheus_client")
+    from rampart.cli.look.metrics_families import Exposition
+
+    assert "rampart_up 1.0" in exposed(Exposition(RUN, 0.0, RunPicture()))
+
+
+@pytest.mark.parametrize("replay_of", ["", "run.mcap"])
+async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a_replay(
+        monkeypatch, replay_of):
+    pytest.importorskip("prometheus_client")
+    from rampart.cli.look import metrics_server
+
+    run = msgspec.structs.replace(RUN, pid=os.getpid(), replay_of=replay_of)
+    mine = fm.NodeTable((fm.NodeInfo("hmi", "operator", os.getpid(), fm.NodeState.RUNNING, 1, 0),))
+    looks = []
+
+    async def one(*_, **__):
+        yield SimpleNamespace(run=run, clock=Clock(0.0))
+
+    class Observer:
+        def __init__(self, *_) -> None:
+            pass
+
+        def look(self, table):
+            looks.append(table)
+            return {"guards": [{"name": f"guard_{len(looks)}", "pid": os.getpid()}]}
+
+    monkeypatch.setattr(metrics_server, "sessions", one)
+    monkeypatch.setattr(metrics_server, "ProcessObserver", Observer)
+    monkeypatch.setattr(metrics_server, "LOOK_S", 0.001)
+    monkeypatch.setattr(metrics_server, "draw", lambda _session, picture: picture.heard(
+        ftm_topics.NODES, Header("supervisor", 1, 1, 0.0), mine, 0.0))
+    exporter, stop = metrics_server.Exporter(), asyncio.Event()
+    following = asyncio.create_task(exporter.follow(None, stop))
+    await asyncio.sleep(0.2)
+    seen = len(looks)
+    assert (seen > 2) != bool(replay_of), "nobody has asked yet"
+    assert set(exporter.look().processes) == (set() if replay_of else {"hmi", f"guard_{seen}"})
+    assert len(looks) == seen
+    stop.set()
+    await following
+
+
+async def test_prometheus_is_answered_however_many_connections_idle_at_its_port():
+    pytest.importorskip("prometheus_client")
+    from rampart.cli.look import metrics_server
+
+    listening = metrics_server.listen("127.0.0.1", 0)
+    port = listening.getsockname()[1]
+    server = WebServer(metrics_server._app(metrics_server.Exporter()), listening)
+    await server.start()
+    idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(3 * ROOM)]
+    async with httpx.AsyncClient() as client:
+        answer = await client.get(f"http://127.0.0.1:{port}/metrics")
+    assert (answer.status_code, answer.text.splitlines()[-1]) == (200, "rampart_up 0.0")
+    assert len(server.reception) <= ROOM
+    for _, writer in idle:
+        writer.close()
+    server.stop()
+    while len(server.reception):
+        await asyncio.sleep(0.01)
+
+
+def test_live_views_show_the_robot_as_large_as_the_system_says(tmp_path):
+    system = tmp_path / "system.toml"
+    system.write_text("[robot]\nlength_m = 1.5\nwidth_m = 0.9\n")
+    for file, size in ((system, (1.5, 0.9)), (tmp_path / "none.toml", (0.72, 0.614))):
+        shown = {}
+        viewer = SimpleNamespace(begin=lambda _run: None,
+                                 show=lambda channel, record, _at, to=shown: to.update(
+                                     {channel: record}))
+        _watch(SimpleNamespace(run=msgspec.structs.replace(RUN, system_file=str(file)),
+                               clock=Clock(0.0), listen=lambda *_: None), viewer)
+        box = shown["view/robot"].entities[0].cubes[0].size
+        assert (box.x, box.y) == size
+
+
+@pytest.mark.parametrize(("option", "value"), [("--save", "/nowhere/run.rrd"), ("--connect", "http://x")])
+def test_a_place_for_rerun_that_is_none_is_named(option, value, capsys):
+    pytest.importorskip("rerun")
+    assert main(["live", "rerun", option, value]) == 2
+    assert f"{option} {value}: " in capsys.readouterr().err
+
+
+def test_rerun_writes_a_file_with_map_robot_laser_and_log(tmp_path):
+    pytest.importorskip("rerun")
+    from rampart.cli.look.live_rerun import RerunViewer
+
+    airport = load_airport("vallombre")
+    views = Views(airport)
+    file = tmp_path / "run.rrd"
+    viewer = RerunViewer(save=str(file))
+    viewer.begin(RUN)
+    header = Header("somebody", 1, 1, 1.0)
+    sweep = m.LaserScan(-1.0, 0.5, 10.0, b"\0\0\x80?" * 5)
+    found = [*views.start(0)]
+    for topic, body in (
+            (topics.POSE, m.Pose(1.0, 2.0, 0.5)), (topics.SCAN, sweep),
+            (topics.OBSTACLES, m.ObstacleList((m.ObstacleCommand("c", True, 1.0, 1.0, 0.4),))),
+            (topics.LIGHT_MEASURED, m.LightMeasurement(
+                airport.lights[0].name, 100.0, 0.4, m.LightVerdict.DIM)),
+            (ftm_topics.PROCESS_EVENT, fm.ProcessEvent("hmi", "crashed", 1, 1, "", ""))):
+        found += views.of(topic, f"rampart/{topic.key}", header, body, 1_000_000_000)
+    for channel, record in found:
+        viewer.show(channel, record, 1_000_000_000)
+    viewer.close()
+    data = file.read_bytes()
+    assert data.startswith(b"RRF2")
+    assert len(data) > 10_000

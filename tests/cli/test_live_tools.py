@@ -1,0 +1,309 @@
+"""`rampart top`, `joystick`, `metrics`, `live` on one real run, real terminals and real sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import os
+import re
+import socket
+import struct
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+
+import pytest
+import websockets
+
+from rampart.actors.osmosis.control.teleoperation.joystick_device import AXIS, BUTTON, EVENT
+from tests import ROOT
+from tests.cli.pseudo_terminal import PseudoTerminal
+from tests.real_run import RealRun
+
+parser = pytest.importorskip("prometheus_client.parser")
+pytest.importorskip("foxglove")
+
+pytestmark = pytest.mark.processes
+
+UP, LEFT = "\x1b[A", "\x1b[D"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("run")
+    os.mkfifo(directory / "stick")
+    with RealRun(directory, "--joystick", str(directory / "stick")) as it:
+        it.wait_for("mission AB running", 60)
+        yield it
+
+
+@contextlib.contextmanager
+def serving(*arguments: str, ready: str):
+    """Run a verb that serves; yields what it says after `ready`."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rampart.cli.main", *arguments], stdout=subprocess.PIPE, text=True,
+        cwd=ROOT)
+    try:
+        line = process.stdout.readline()
+        assert ready in line
+        yield line.split(ready)[1].strip(), process
+    finally:
+        process.terminate()
+        process.communicate(timeout=15)
+
+
+@contextlib.contextmanager
+def echo(run: RealRun, topic: str):
+    """Collect what is sent on a topic; yields a function that returns all of it so far."""
+    out = run.directory / "echo"
+    with out.open("w") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "rampart.cli.main", "topic", "echo", topic, "--json",
+             "--port", str(run.port)], stdout=file, cwd=ROOT)
+    try:
+        yield lambda: [json.loads(line) for line in out.read_text().splitlines(keepends=True)
+                       if line.endswith("\n")]
+    finally:
+        process.terminate()
+        process.wait(10)
+
+
+def twist(message: dict) -> tuple[float, float]:
+    return message["message"]["linear_mps"], message["message"]["angular_radps"]
+
+
+# -- top ----------------------------------------------------------------------------------------
+
+
+def test_top_tells_a_script_everything_once(run):
+    told = run.tool("top", "--json")
+    assert told.returncode == 0, told.stderr
+    data = json.loads(told.stdout)
+    assert data["mission"]["phase"] == "running"
+    assert "safe so far" in data["safety"]
+    processes = {row["name"]: row for row in data["processes"]}
+    assert {"simulator", "safety_pilot", "supervisor", "launch.py"} <= processes.keys()
+    assert processes["simulator"]["mb"] > 1
+    assert processes["simulator"]["pid"] == run.pid("simulator")
+    assert data["rates_hz"]["localization/pose"] > 5
+
+
+def test_top_into_a_pipe_is_one_picture_in_plain_text(run):
+    told = run.tool("top")
+    assert told.returncode == 0, told.stderr
+    assert "mission" in told.stdout
+    assert "osmosis_control" in told.stdout
+    assert "\x1b" not in told.stdout
+
+
+@pytest.mark.parametrize("keys", ["q", "\x03"], ids=["q", "ctrl-c"])
+def test_top_leaves_the_terminal_as_it_was(run, keys):
+    with PseudoTerminal("top", "--port", str(run.port), NO_COLOR="1") as it:
+        it.wait_for("simulator")
+        it.wait_for(lambda: it.text.count("rampart top") >= 3)  # it is refreshed
+        assert not it.is_as_before
+        it.press(keys)
+        assert it.end() == 0
+        assert it.is_as_before
+        assert it.raw.count("\x1b[?1049h") == it.raw.count("\x1b[?1049l") == 1
+        assert it.raw.rfind("\x1b[?25h") > it.raw.rfind("\x1b[?25l")
+        colours = re.findall(r"\x1b\[([0-9;]*)m", it.raw)
+        assert not [c for c in colours if re.search(r"(^|;)(3[0-8]|4[0-8]|9\d|10\d)(;|$)", c)]
+
+
+def test_top_shows_a_crash_in_words_and_the_new_life(run):
+    with PseudoTerminal("top", "--port", str(run.port), columns=120, rows=50) as it:
+        it.wait_for("teleoperation")
+        life = run.pid("hmi")
+        run.kill("hmi")
+        it.wait_for(": run RM4")  # in the words of the decision
+        run.wait_until(lambda: run.pid("hmi") not in {None, life}, 20, "hmi did not come back")
+        it.wait_for(lambda: re.search(r"hmi +running +[2-9] +[1-9]", it.text) is not None)
+        it.press("q")
+        assert it.end() == 0
+
+
+# -- joystick -----------------------------------------------------------------------------------
+
+
+def hold(it: PseudoTerminal, key: str, until, timeout_s: float = 40) -> None:
+    """Press a key again and again, as a keyboard does."""
+    deadline = time.monotonic() + timeout_s
+    while not until():
+        assert time.monotonic() < deadline, it.text
+        it.press(key)
+        time.sleep(0.04)
+
+
+def test_a_held_key_drives_and_without_its_repetition_the_robot_stops(run):
+    with echo(run, "teleoperation/command") as heard, \
+            PseudoTerminal("joystick", "--port", str(run.port), "--speed", "0.2") as it:
+        it.wait_for("hold a key")
+        hold(it, LEFT, lambda: len(heard()) > 8)
+        it.wait_for(lambda: twist(heard()[-1]) == (0.0, 0.0), 5)
+        assert all(linear == 0.0 and turn >= 0.0 for linear, turn in map(twist, heard()))
+        assert max(turn for _, turn in map(twist, heard())) > 0.0
+        it.press("q")
+        assert it.end() == 0
+        assert it.is_as_before
+
+
+def test_a_killed_keyboard_stops_the_robot(run):
+    with echo(run, "teleoperation/command") as heard, \
+            PseudoTerminal("joystick", "--port", str(run.port), "--speed", "0.2") as it:
+        it.wait_for("hold a key")
+        hold(it, LEFT, lambda: len(heard()) > 5)
+        it.process.kill()
+        it.wait_for(lambda: twist(heard()[-1]) == (0.0, 0.0), 5)
+
+
+def test_the_joystick_drives_and_the_keyboard_is_told_who_has_the_stick(run):
+    device = os.open(run.directory / "stick", os.O_WRONLY)
+    with echo(run, "teleoperation/command") as heard, \
+            PseudoTerminal("joystick", "--port", str(run.port)) as it:
+        it.wait_for("hold a key")
+        os.write(device, EVENT.pack(0, 1, BUTTON, 4) + EVENT.pack(0, 16384, AXIS, 0))
+        it.wait_for(lambda: len(heard()) > 5)
+        hold(it, UP, lambda: "stick has the stick" in it.text)
+        assert all(linear == 0.0 and turn < 0.0 for linear, turn in map(twist, heard()))
+        os.close(device)  # pulled out
+        it.wait_for(lambda: twist(heard()[-1]) == (0.0, 0.0), 5)
+        it.press("q")
+        assert it.end() == 0
+
+
+def test_the_keyboard_needs_a_terminal_and_a_speed(run):
+    told = run.tool("joystick")
+    assert (told.returncode, "no terminal" in told.stderr) == (2, True)
+    told = run.tool("joystick", "--speed", "7")
+    assert (told.returncode, "--speed 7: must be between" in told.stderr) == (2, True)
+    told = run.tool("joystick", "--device", "/nonexistent/js0")
+    assert (told.returncode, "No such file" in told.stderr) == (2, True)
+
+
+# -- metrics ------------------------------------------------------------------------------------
+
+
+def scrape(url: str) -> dict[str, list]:
+    with urllib.request.urlopen(url, timeout=10) as answer:
+        assert answer.headers["content-type"].startswith("text/plain; version=")
+        return {family.name: family.samples
+                for family in parser.text_string_to_metric_families(answer.read().decode())}
+
+
+def value(families: dict[str, list], family: str, name: str = "", **labels: str) -> float:
+    found = [s.value for s in families[f"rampart_{family}"]
+             if labels.items() <= s.labels.items() and s.name == f"rampart_{name or family}"]
+    assert len(found) == 1, (family, labels, families[f"rampart_{family}"])
+    return found[0]
+
+
+def test_prometheus_is_given_the_figures_of_the_run(run):
+    with serving("metrics", "--port", "0", "--run", str(run.port), ready="metrics at ") as (url, _):
+        def complete() -> bool:
+            found = scrape(url)
+            return (found["rampart_up"][0].value == 1 and bool(found.get("rampart_node_up"))
+                    and {"rampart_obstacle_clearance_meters",
+                         "rampart_mission_phase"} <= found.keys()
+                    and bool(found.get("rampart_message_rate_hertz")))
+
+        run.wait_until(complete, 20, "the figures did not come")
+        found = scrape(url)
+        assert value(found, "node_up", node="simulator") == 1
+        assert value(found, "node_incarnation", node="simulator") == 1
+        assert value(found, "heartbeat_age_seconds", node="safety_pilot") < 60
+        assert value(found, "mission_phase", rampart_mission_phase="running") == 1
+        assert value(found, "mission_steps", mission="AB") > 1
+        assert value(found, "obstacle_clearance_meters") > 0
+        assert value(found, "messages", "messages_total", topic="localization/pose") > 0
+        assert value(found, "process_cpu_seconds", "process_cpu_seconds_total",
+                     process="simulator") > 0
+        assert value(found, "process_resident_memory_bytes", process="launch.py") > 1e6
+        with urllib.request.urlopen(urllib.request.Request(
+                url, headers={"accept": "application/openmetrics-text"}), timeout=10) as answer:
+            assert answer.read().endswith(b"# EOF\n")
+        with pytest.raises(urllib.error.HTTPError) as caught:
+            urllib.request.urlopen(f"{url}/other", timeout=10)
+        caught.value.close()
+        assert caught.value.code == 404
+
+
+def test_a_port_that_is_taken_is_named():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        for verb in (("metrics",), ("live", "foxglove")):
+            told = subprocess.run(
+                [sys.executable, "-m", "rampart.cli.main", *verb, "--port", port], check=False,
+                capture_output=True, text=True, cwd=ROOT, timeout=60)
+            assert (told.returncode, port in told.stderr) == (2, True), told.stderr
+            assert len(told.stderr.splitlines()) == 1
+
+
+# -- live ---------------------------------------------------------------------------------------
+
+
+async def look(url: str, wanted: set[str]) -> tuple[dict[str, dict], dict[str, dict]]:
+    """Return what is advertised, and the first message of each channel wanted."""
+    async with asyncio.timeout(30), websockets.connect(
+            url, subprotocols=["foxglove.sdk.v1"]) as connection:
+        channels: dict[str, dict] = {}
+        while not wanted <= channels.keys():
+            message = await connection.recv()
+            if isinstance(message, str) and (told := json.loads(message))["op"] == "advertise":
+                channels |= {c["topic"]: c for c in told["channels"]}
+        numbers = dict(enumerate(sorted(wanted)))
+        await connection.send(json.dumps({"op": "subscribe", "subscriptions": [
+            {"id": i, "channelId": channels[topic]["id"]} for i, topic in numbers.items()]}))
+        found: dict[str, dict] = {}
+        while wanted - found.keys():
+            message = await connection.recv()
+            if isinstance(message, bytes) and message[0] == 1:
+                number, _time_ns = struct.unpack_from("<IQ", message, 1)
+                found.setdefault(numbers[number], json.loads(message[13:]))
+        return channels, found
+
+
+def test_a_viewer_of_foxglove_sees_map_robot_laser_and_pose(run):
+    wanted = {"/view/map", "/view/tf", "/view/pose", "/view/scan", "/view/lights", "/view/robot"}
+    with serving("live", "foxglove", "--port", "0", "--run", str(run.port),
+                 ready="Foxglove viewers: ") as (url, process):
+        assert "showing" in process.stdout.readline()
+        for _visitor in range(2):  # the second comes late, and sees the map all the same
+            channels, found = asyncio.run(look(url, wanted))
+            assert channels["/view/scan"]["schemaName"] == "foxglove.LaserScan"
+            assert {c["encoding"] for c in channels.values()} == {"json"}
+            assert {e["id"] for e in found["/view/map"]["entities"]} >= {"ground", "prohibited"}
+            assert [(t["parent_frame_id"], t["child_frame_id"])
+                    for t in found["/view/tf"]["transforms"]] == [
+                        ("map", "odom"), ("odom", "base_link")]
+            assert len(found["/view/scan"]["ranges"]) > 50
+            pose = found["/view/pose"]["pose"]["position"]
+            assert math.hypot(pose["x"], pose["y"]) < 100
+
+
+# -- the end ------------------------------------------------------------------------------------
+
+
+def test_when_the_run_ends_everybody_says_so(run):
+    with PseudoTerminal("top", "--port", str(run.port)) as top, \
+            PseudoTerminal("top", "--follow", "--port", str(run.port)) as staying, \
+            serving("metrics", "--port", "0", "--run", str(run.port), ready="metrics at ") as (
+                url, _):
+        for terminal in (top, staying):
+            terminal.wait_for("simulator")
+        run.wait_until(lambda: scrape(url)["rampart_up"][0].value == 1, 20, "no run is seen")
+        run.process.terminate()
+        run.process.wait(20)
+        assert top.end() == 0
+        assert "the run has ended" in top.text.rsplit("\n", 2)[-2]
+        assert top.is_as_before
+        staying.wait_for("waiting for the next one")
+        assert staying.process.poll() is None
+        assert staying.is_as_before
+        run.wait_until(lambda: scrape(url)["rampart_up"][0].value == 0, 10, "the run is still seen")
+        staying.press("\x03")
+        assert staying.end() == 0

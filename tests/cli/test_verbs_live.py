@@ -1,0 +1,426 @@
+"""The verbs of `rampart` against living actors over real Zenoh."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from contextlib import AsyncExitStack
+
+import msgspec
+import pytest
+
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.run.run_info import RunInfo
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.clock import Clock
+from rampart.cli import systems
+from rampart.cli.following import draw
+from rampart.cli.main import main
+from rampart.cli.run_picture import RunPicture
+from rampart.cli.session import connect
+from tests.porter_actors import AXLE, LOAD, Axle, Load, write_porter_system
+
+RATE = 5.0
+
+
+class Everything(Actor):
+    """Publishes what verbs look at; one node that plays them all."""
+
+    outputs = (topics.POSE, topics.ROUTE, topics.MISSION_STATUS, topics.PILOT_STATUS,
+               ftm_topics.MANAGER_STATUS, ftm_topics.NODES, topics.OBSTACLES,
+               ftm_topics.DETECTION, LOAD, AXLE, ftm_topics.HOLDS)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.latched: tuple[str, ...] = ("RM1",)
+        self.obstinate = False
+        self.holders: tuple[str, ...] = ()
+        self.obstacles: dict[str, m.ObstacleCommand] = {}
+        self.resets = 0
+        self.orders: list[bm.Injection] = []
+        self.time_s = 0.0
+
+    @every(0.1)
+    def states(self) -> None:
+        self.time_s += 0.1
+        self.publish(topics.POSE, m.Pose(1.0, self.time_s, 0.0))
+        self.publish(LOAD, Load(20.0))
+        for axle in ("simulator", "front"):  # one is the name of the node
+            self.publish(AXLE, Axle(3.0), name=axle)
+        self.publish(topics.MISSION_STATUS, m.MissionStatus(
+            "1", "AB", m.MissionPhase.RUNNING, 0, (m.Goal(0.0, 0.0, m.Mode.TAXI),), (), (), ""))
+        self.publish(topics.PILOT_STATUS, m.PilotStatus(m.PilotMode.STOP, True, "RM2", 0))
+        self.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus(
+            ("FTM1",), (), self.latched, self.latched, "safety-first", 1))
+        self.publish(ftm_topics.NODES, fm.NodeTable((
+            fm.NodeInfo("hmi", "non-control", 42, fm.NodeState.CRASHED, 3, 2),
+            fm.NodeInfo("DM1", "detection", 43, fm.NodeState.RUNNING, 1, 0))))
+        self.list_obstacles()
+        if self.holders:
+            self.publish(ftm_topics.HOLDS, fm.Holds("brake", self.holders))
+
+    def list_obstacles(self) -> None:
+        self.publish(topics.OBSTACLES, m.ObstacleList(tuple(self.obstacles.values())))
+
+    @on(ftm_topics.RESET)
+    def reset(self, message: fm.Reset, _header: Header) -> None:
+        self.resets += 1
+        if not self.obstinate:
+            self.latched = ()
+            self.holders = tuple(name for name in self.holders if name != message.recovery)
+            self.publish(ftm_topics.HOLDS, fm.Holds("brake", self.holders))
+
+    @on(topics.OBSTACLE)
+    def obstacle(self, message: m.ObstacleCommand, header: Header) -> None:
+        if message.radius_m > 5:
+            self.report_diagnostic("obstacle", "too big", header.source)
+        elif message.present:
+            self.obstacles[message.name] = message
+        else:
+            del self.obstacles[message.name]
+
+    def _on_injection(self, order: bm.Injection, _header: Header) -> None:
+        self.orders.append(order)
+        super()._on_injection(order, _header)
+
+
+class Bystander(Actor):
+    """Another node, so that commands have more than one receiver."""
+
+
+class Run:
+    """Calls the toolbox in a thread, as the shell would in a process."""
+
+    def __init__(self, node: Everything, bus: ZenohBus, info: RunInfo) -> None:
+        self.node = node
+        self.info = info
+        self.bus = bus
+
+    async def call(self, capsys, *arguments: str) -> tuple[int, str, str]:
+        code = await asyncio.to_thread(main, list(arguments))
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+
+@pytest.fixture
+async def run(monkeypatch, sockets):
+    loop = asyncio.get_running_loop()
+    clock = Clock(loop.time(), RATE, loop.time)
+    names = ("simulator", "DM1")
+    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), sockets, names,
+                   "r1", 0, "test run", plan={"mission": "AB"})
+    monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: info)
+    async with AsyncExitStack() as stack:
+        nodes = []
+        for name, cls in (("simulator", Everything), ("DM1", Bystander)):
+            bus = ZenohBus(name, 1, endpoint(sockets, name),
+                           [endpoint(sockets, n) for n in names if n != name])
+            node = cls(Context(name, 1, clock, bus))
+            task = asyncio.create_task(node.run())
+            stack.push_async_callback(asyncio.wait_for, task, 5)
+            stack.callback(node.stop)
+            nodes.append((node, bus))
+        await asyncio.sleep(0.1)
+        yield Run(*nodes[0], info)
+
+
+async def test_status_shows_the_run_at_a_glance(run, capsys):
+    code, out, _ = await run.call(capsys, "status")
+    assert code == 0
+    assert "test run" in out
+    assert "mission   AB running, step 1 of 1, 0 lights measured" in out
+    assert "pilot     stop, STOPPED: RM2" in out
+    assert "manager   safety-first, decision 1; ACTIVE FTM1; recovery RM1; latched RM1" in out
+    assert "nodes     1 of 2 running, 2 restarts; hmi crashed" in out
+
+
+async def test_status_shows_nothing_that_the_system_has_not(run, capsys, monkeypatch):
+    publish = run.node.publish
+    monkeypatch.setattr(run.node, "publish", lambda topic, *rest, **more: None if topic in (
+        topics.MISSION_STATUS, topics.PILOT_STATUS, ftm_topics.MANAGER_STATUS
+        ) else publish(topic, *rest, **more))
+    run.info.plan["mission"] = ""
+    _, out, _ = await run.call(capsys, "status")
+    assert "nodes     1 of 2 running" in out
+    for word in ("mission", "pilot", "manager", "silent"):
+        assert word not in out
+    run.info.plan["mission"] = "AB"
+    _, out, _ = await run.call(capsys, "status")
+    assert "mission   silent" in out
+
+
+async def test_status_as_json_holds_the_same(run, capsys):
+    code, out, _ = await run.call(capsys, "status", "--json")
+    status = json.loads(out)
+    assert code == 0
+    assert (status["mission"]["phase"], status["pilot"]["mode"]) == ("running", "stop")
+    assert status["manager"]["latched"] == ["RM1"]
+    assert status["time_s"] > 0
+
+
+async def test_the_node_list_has_the_promised_shape(run, capsys):
+    code, out, _ = await run.call(capsys, "node", "list", "--json")
+    assert code == 0
+    assert json.loads(out)[0] == {"name": "hmi", "kind": "non-control", "pid": 42,
+                                  "state": "crashed", "incarnation": 3, "restarts": 2}
+
+
+async def test_echo_prints_one_line_per_message(run, capsys):
+    code, out, _ = await run.call(capsys, "topic", "echo", "localization/pose", "-n", "3")
+    assert code == 0
+    lines = out.splitlines()
+    assert len(lines) == 3
+    assert all("simulator#1 localization/pose {\"x_m\":1.0," in line for line in lines)
+
+
+async def test_echo_shows_garbage_as_such_with_the_reason(run, capsys):
+    async def spoil() -> None:
+        while True:
+            run.bus.publish(topics.ROUTE, topics.ROUTE.at(), b"\xc1garbage")
+            await asyncio.sleep(0.02)
+
+    spoiler = asyncio.create_task(spoil())
+    _, out, _ = await run.call(capsys, "topic", "echo", "plan/route", "-n", "1")
+    assert out.startswith("garbage plan/route 8 bytes, not a Route: ")
+    _, out, _ = await run.call(capsys, "topic", "echo", "plan/route", "-n", "1", "--json")
+    spoiler.cancel()
+    assert json.loads(out)["garbage"] == b"\xc1garbage".hex()
+
+
+async def test_a_name_that_is_no_text_is_garbage_too(run, capsys):
+    no_text = b"\x95\xa1\xff\x01\x01\xcb" + bytes(8) + b"\x90"
+
+    async def spoil() -> None:
+        while True:
+            run.bus.publish(topics.ROUTE, topics.ROUTE.at(), no_text)
+            await asyncio.sleep(0.02)
+
+    spoiler = asyncio.create_task(spoil())
+    _, out, _ = await run.call(capsys, "topic", "echo", "plan/route", "-n", "1")
+    spoiler.cancel()
+    assert out.startswith(f"garbage plan/route {len(no_text)} bytes, not a Route: ")
+
+
+async def test_a_silent_topic_is_said_to_be_silent(run, capsys):
+    code, out, err = await run.call(capsys, "topic", "echo", "plan/route", "--duration", "0.2")
+    assert (code, out) == (1, "")
+    assert err == "rampart: nothing came on plan/route within 0.2 s\n"
+    code, _, _ = await run.call(capsys, "topic", "hz", "plan/route", "--duration", "0.2", "--json")
+    assert code == 1
+
+
+@pytest.mark.parametrize("verb", ["echo", "hz"])
+async def test_echo_and_hz_end_with_the_run(run, capsys, monkeypatch, verb):
+    looks = iter([False, False])
+    monkeypatch.setattr("rampart.cli.look.topic_verbs.is_over", lambda _run: next(looks, True))
+    code, out, err = await run.call(capsys, "topic", verb, "localization/pose")
+    assert code == 0
+    assert "localization/pose" in out
+    assert err == "rampart: the run has ended: test run (port 7450)\n"
+
+
+async def test_hz_measures_in_simulated_time(run, capsys):
+    code, out, _ = await run.call(
+        capsys, "topic", "hz", "localization/pose", "--duration", "1", "--json")
+    measured = json.loads(out)[0]
+    assert code == 0
+    assert measured["nominal_hz"] == 20
+    assert 5 < measured["rate_hz"] < 15
+    assert measured["window"] > 20
+
+
+async def test_a_member_of_a_family_that_is_no_node_is_unknown(run, capsys):
+    code, _, err = await run.call(capsys, "topic", "echo", "detection/DM9")
+    assert code == 2
+    assert err == "rampart: unknown node 'DM9'; known: simulator, DM1\n"
+
+
+async def test_topics_of_the_robot_s_own_are_heard_measured_and_disturbed(
+        run, capsys, monkeypatch, tmp_path):
+    own = RunInfo(1, 7450, RATE, 0.0, str(write_porter_system(tmp_path)), "", (),
+                  "r1", 0, "porter")
+    monkeypatch.setattr("rampart.cli.look.topic_catalogue.find_run", lambda _port: own)
+    code, out, _ = await run.call(capsys, "topic", "echo", "porter/axle/front", "-n", "1")
+    assert (code, out.split()[1:]) == (0, ["simulator#1", "porter/axle/front", "[3.0]"])
+    code, out, _ = await run.call(capsys, "topic", "echo", "porter/axle/*", "-n", "4")
+    assert (code, {line.split()[2] for line in out.splitlines()}) == (
+        0, {"porter/axle/front", "porter/axle/simulator"})
+    code, out, _ = await run.call(
+        capsys, "topic", "hz", "porter/load", "--duration", "0.5", "--json")
+    assert (code, json.loads(out)[0]["nominal_hz"]) == (0, 10)
+    for fault in (["corrupt:porter/load"], ["drop:porter/axle/simulator"],
+                  ["--topic", "porter/load", "--mode", "corrupt", "--set", "mass_kg=0"]):
+        code, out, _ = await run.call(capsys, "inject", *fault, "--duration", "1", "--json")
+        assert (code, json.loads(out)["effective"]) == (0, True)
+
+
+async def pictured(run, monkeypatch, system) -> RunPicture:
+    """What `rampart top` and `rampart metrics` have of a run of some system."""
+    of = msgspec.structs.replace(run.info, system_file=str(system))
+    monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: of)
+    picture = RunPicture()
+    async with connect() as session:
+        draw(session, picture)
+        for _ in range(8):
+            picture.sample(session.clock.now())
+            await asyncio.sleep(0.1)
+    return picture
+
+
+async def test_the_robot_s_own_topics_are_counted_like_all_others(
+        run, capsys, tmp_path, monkeypatch):
+    rates_hz = (await pictured(run, monkeypatch, write_porter_system(tmp_path))).rates()
+    assert rates_hz[LOAD.key] == pytest.approx(rates_hz[topics.POSE.key], rel=0.3)
+    assert rates_hz[AXLE.key] == pytest.approx(2 * rates_hz[LOAD.key], rel=0.3)
+    assert capsys.readouterr().err == ""
+
+
+async def test_a_run_whose_actors_are_not_here_is_shown_all_the_same(
+        run, capsys, tmp_path, monkeypatch):
+    spec = write_porter_system(tmp_path)
+    spec.write_text(spec.read_text().replace("tests.porter_actors:", "elsewhere.porter:"))
+    picture = await pictured(run, monkeypatch, spec)
+    assert picture.latest(topics.POSE) is not None
+    assert picture.rates()[topics.POSE.key] > 0
+    err = capsys.readouterr().err
+    assert "elsewhere.porter" in err
+    assert err.endswith("; topics of its own are not counted\n")
+    assert len(err.splitlines()) == 1
+
+
+async def test_an_injection_acts_and_tells_how_many_messages_it_affected(run, capsys):
+    code, out, _ = await run.call(
+        capsys, "inject", "localization-not-updated", "--duration", "2", "--json")
+    told = json.loads(out)
+    assert code == 0
+    assert told["effective"] is True
+    (injection,) = told["injections"]
+    assert injection["nodes"] == ["simulator"]
+    assert injection["finished"] is True
+    assert 10 < injection["affected"] < 30
+    assert len(run.node.orders) == 1, "copies of an order must not reach the actor"
+
+
+async def test_an_injection_at_once_returns_while_the_fault_lasts(run, capsys):
+    code, out, _ = await run.call(
+        capsys, "inject", "localization-not-updated", "--duration", "60", "--at-once")
+    assert code == 0
+    assert "in force at simulator for 60 s" in out
+    _, out, _ = await run.call(
+        capsys, "topic", "echo", "localization/pose", "-n", "3", "--json")
+    assert len({json.loads(line)["message"]["y_m"] for line in out.splitlines()}) == 1
+
+
+async def test_an_injection_that_no_node_publishes_says_so_and_fails(run, capsys):
+    code, _, err = await run.call(capsys, "inject", "command-not-updated", "--duration", "1")
+    assert code == 1
+    assert err == "rampart: no effect: no node publishes control/command in this run\n"
+
+
+async def test_an_injection_that_affected_nothing_says_so_and_fails(run, capsys):
+    code, out, err = await run.call(capsys, "inject", "wrong-graph", "--duration", "1")
+    assert code == 1
+    assert "in force at simulator" in out
+    assert err == ("rampart: no effect: simulator published nothing on plan/route within 1 s, "
+                   "or nothing that it changed\n")
+
+
+async def test_a_fault_that_changes_no_message_had_no_effect(run, capsys):
+    code, _, err = await run.call(
+        capsys, "inject", "--topic", "localization/pose", "--mode", "corrupt", "--set", "x_m=1",
+        "--duration", "1")
+    assert code == 1
+    assert "no effect: simulator" in err
+
+
+async def test_a_permanent_fault_is_waited_for_until_its_first_effect_and_goes_on(run, capsys):
+    code, out, _ = await run.call(
+        capsys, "inject", "stuck:localization/pose", "--duration", "inf")
+    assert code == 0
+    assert "in force at simulator until its process ends" in out
+    assert "affects localization/pose, and goes on" in out
+    _, out, _ = await run.call(
+        capsys, "topic", "echo", "localization/pose", "-n", "3", "--json")
+    assert len({json.loads(line)["message"]["y_m"] for line in out.splitlines()}) == 1
+
+
+async def test_a_permanent_fault_without_effect_is_ended_and_said_to_have_none(run, capsys):
+    code, _, err = await run.call(capsys, "inject", "drop:plan/route", "--duration", "inf")
+    assert code == 1
+    assert "no effect: simulator published nothing on plan/route within 10 s" in err
+    assert run.node.orders[-1].duration_s == 0.0
+
+
+async def test_a_fault_that_does_not_fit_its_messages_is_refused_by_the_node(
+        run, capsys, monkeypatch):
+    monkeypatch.setattr("rampart.cli.operate.inject_verbs.flaw", lambda *_: "")
+    code, _, err = await run.call(
+        capsys, "inject", "--topic", "localization/pose", "--mode", "corrupt",
+        "--noise", "x_m=-1", "--duration", "1")
+    assert code == 1
+    assert "no effect: refused by simulator: noise_fields 'x_m' = -1" in err
+
+
+async def test_an_injection_into_a_node_that_is_none_is_refused(run, capsys):
+    code, _, err = await run.call(
+        capsys, "inject", "--topic", "detection/DM9", "--mode", "drop", "--duration", "1")
+    assert code == 2
+    assert "unknown node 'DM9'" in err
+
+
+async def test_reset_releases_a_latched_recovery_once(run, capsys):
+    assert (await run.call(capsys, "reset", "RM1"))[:2] == (0, "RM1 released\n")
+    assert run.node.resets == 1
+    code, _, err = await run.call(capsys, "reset", "RM1")
+    assert code == 1
+    assert err == "rampart: no effect: RM1 is not latched; latched: none\n"
+    code, _, err = await run.call(capsys, "reset", "RM9")
+    assert code == 2
+    assert "unknown recovery 'RM9'; known: RM1, RM2" in err
+
+
+async def test_status_names_who_holds_the_brake_and_reset_lets_go_in_its_place(run, capsys):
+    run.node.holders = ("x\x1b", "y")
+    _, out, _ = await run.call(capsys, "status")
+    assert "held      brake by x\\u001b, no recovery module of this system" in out
+    _, out, _ = await run.call(capsys, "status", "--json")
+    assert json.loads(out)["holders"] == {"x\x1b": ["brake"], "y": ["brake"]}
+    code, _, err = await run.call(capsys, "reset", "z")
+    assert code == 2
+    assert err.endswith(", x\\u001b, y\n")
+    assert (await run.call(capsys, "reset", "y"))[:2] == (0, "y holds no longer: brake\n")
+    run.node.obstinate = True
+    code, _, err = await run.call(capsys, "reset", "x\x1b")
+    assert code == 1
+    assert "was not made to let go of brake" in err
+
+
+async def test_a_reset_while_the_cause_is_there_says_that_nothing_was_released(run, capsys):
+    run.node.obstinate = True
+    code, _, err = await run.call(capsys, "reset", "RM1")
+    assert code == 1
+    assert err == "rampart: RM1 was not released; active: FTM1\n"
+
+
+async def test_obstacles_come_move_and_go(run, capsys):
+    assert (await run.call(capsys, "obstacle", "add", "crate", "-1", "2.5"))[0] == 0
+    assert (await run.call(capsys, "obstacle", "add", "crate", "3", "2.5"))[0] == 0
+    _, out, _ = await run.call(capsys, "obstacle", "list", "--json")
+    assert json.loads(out) == [{"name": "crate", "x_m": 3.0, "y_m": 2.5, "radius_m": 0.4}]
+    wide = ("obstacle", "add", "crate", "3", "2.5", "--radius", "1")
+    assert (await run.call(capsys, *wide))[0] == 0
+    assert run.node.obstacles["crate"].radius_m == 1.0
+    code, _, err = await run.call(capsys, "obstacle", "remove", "box")
+    assert (code, err) == (2, "rampart: unknown obstacle 'box'; known: crate\n")
+    assert (await run.call(capsys, "obstacle", "remove", "crate"))[0] == 0
+    assert run.node.obstacles == {}
+
+
+async def test_an_obstacle_that_the_world_refuses_is_reported_with_its_reason(run, capsys):
+    code, _, err = await run.call(capsys, "obstacle", "add", "moon", "1", "2", "--radius", "9")
+    assert (code, err) == (1, "rampart: no effect: too big\n")

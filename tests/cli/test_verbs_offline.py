@@ -1,0 +1,368 @@
+"""The verbs of `rampart` that need no running system, and how it refuses nonsense."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import pytest
+
+from rampart import systems as shipped
+from rampart.actors.bus import messages as bm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.run.run_info import RunInfo
+from rampart.cli import systems
+from rampart.cli.look.topic_catalogue import resolve
+from rampart.cli.look.topic_verbs import in_line, rate_of
+from rampart.cli.main import build_parser, main
+from rampart.cli.operate.inject_verbs import choose
+from rampart.cli.output import UsageError
+from rampart.sim.campaign.job import _document
+from rampart.sim.faults.faults import find_fault
+from tests.porter_actors import write_porter_system
+
+
+@pytest.fixture(autouse=True)
+def _the_papers_system(monkeypatch):
+    """Its decisions are known by heart; the full system's are judged elsewhere."""
+    monkeypatch.setattr(systems, "DEFAULT", shipped.SHIPPED / "paper.toml")
+
+
+def told(capsys) -> str:
+    return capsys.readouterr().out
+
+
+def test_the_table_holds_every_non_empty_set_once_in_the_promised_shape(capsys):
+    assert main(["table", "--json"]) == 0
+    rows = json.loads(told(capsys))
+    assert len(rows) == 2**7 - 1
+    assert len({tuple(row["active"]) for row in rows}) == 127
+    assert all(set(row) == {"active", "block", "rm"} for row in rows)
+    assert {"active": ["FTM7"], "block": 1, "rm": ["RM4"]} in rows
+
+
+@pytest.mark.parametrize(("active", "block", "rm"), [
+    (["FTM7"], 1, ["RM4"]), (["FTM1", "FTM6"], 2, ["RM1"]), (["FTM3", "FTM4"], 3, ["RM2"]),
+    (["FTM2", "FTM6", "FTM5"], 4, ["RM1"]),
+])
+def test_a_decision_is_the_papers_with_path_and_rejected(capsys, active, block, rm):
+    assert main(["decide", *active, "--json"]) == 0
+    decision = json.loads(told(capsys))
+    assert sorted(decision["active"]) == sorted(active)
+    assert (decision["block"], decision["rm"]) == (block, rm)
+    assert decision["path"]
+    assert all(set(r) == {"name", "reason"} for r in decision["rejected"])
+
+
+def test_a_decision_is_told_in_words(capsys):
+    main(["decide", "FTM3", "FTM4"])
+    assert told(capsys).startswith("FTM3 and FTM4 are active: run RM2, because")
+
+
+def test_the_table_as_csv_is_the_table_as_json(capsys):
+    main(["table", "--json"])
+    rows = json.loads(told(capsys))
+    assert main(["table", "--format", "csv"]) == 0
+    table = list(csv.DictReader(io.StringIO(told(capsys))))
+    assert [{"active": r["active"].split(), "block": int(r["block"]), "rm": r["rm"].split()}
+            for r in table] == rows
+
+
+def compared(capsys, *more):
+    assert main(["table", "--strategy", "safety-first", "--strategy", "mission-first", *more]) == 0
+    return told(capsys)
+
+
+def test_strategies_are_compared_each_in_a_column_of_its_own(capsys):
+    table = compared(capsys).splitlines()
+    assert table[0].split() == ["active", "safety-first", "mission-first"]
+    assert len(table) == 1 + 127 + 1
+    rows = {row["active"]: row
+            for row in csv.DictReader(io.StringIO(compared(capsys, "--format", "csv")))}
+    for row in json.loads(compared(capsys, "--json")):
+        for strategy, decision in row["decisions"].items():
+            assert rows[" ".join(row["active"])][strategy] == " ".join(decision["rm"])
+            assert main(["decide", *row["active"], "--strategy", strategy, "--json"]) == 0
+            told_alone = json.loads(told(capsys))
+            assert (told_alone["block"], told_alone["rm"]) == (decision["block"], decision["rm"])
+
+
+def test_only_the_sets_in_which_strategies_differ_can_be_shown(capsys):
+    def differ(row):
+        return len({frozenset(d["rm"]) for d in row["decisions"].values()}) > 1
+
+    everything = json.loads(compared(capsys, "--json"))
+    some = json.loads(compared(capsys, "--differing", "--json"))
+    assert some == [row for row in everything if differ(row)]
+    assert 0 < len(some) < 127
+    assert compared(capsys, "--differing").endswith(f"\n{len(some)} of 127 sets differ\n")
+
+
+@pytest.mark.parametrize("verb", ["verify", "cut-sets", "table", "tree", "topic list"])
+def test_a_verb_takes_its_system_with_or_without_the_option(capsys, verb):
+    shown = []
+    for spec in (["cell"], ["--system", "cell"], []):
+        assert main([*verb.split(), *spec, "--json"]) == 0
+        shown.append(told(capsys))
+    assert shown[0] == shown[1] != shown[2]
+
+
+def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
+    text = systems.DEFAULT.read_text().replace('"FTM7"', '"FTM70"')
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    assert main(["table", "--system", str(file), "--json"]) == 0
+    assert {"active": ["FTM70"], "block": 1, "rm": ["RM4"]} in json.loads(told(capsys))
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["decide", "FTM9"], ["'FTM9'", "known: FTM1"]),
+    (["decide", "FTM1", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
+    (["table", "--strategy", "bravely"], ["'bravely'", "safety-first"]),
+    (["table", "--differing"], ["--differing", "--strategy"]),
+    (["table", "--strategy", "safety-first", "--strategy", "bravely"], ["'bravely'"]),
+    (["table", "--system", "/no/such.toml"], ["/no/such.toml", "No such file"]),
+    (["verify", "no.toml"], ["rampart: no.toml: No such file", "name of a shipped one: cell, os"]),
+    (["inject", "gremlins"], ["'gremlins'", "`rampart inject --list`"]),
+    (["inject", "laser-dropuot"], ["did you mean laser-dropout?"]),
+    (["inject", "laser-drift"], ["'laser-drift'", "quartz"]),
+    (["inject", "drop:no/such"], ["'drop:no/such'", "no topic"]),
+    (["inject", "melt:plan/route"], ["'melt:plan/route'", "drop, freeze"]),
+    (["inject", "corrupt:summit_xl/brake"], ["no number", "BrakeCommand"]),
+    (["inject", "drop:world/truth"], ["judge"]),
+    (["inject", "drop:inject/report"], ["injections themselves"]),
+    (["inject", "drop:detection/{name}"], ["no topic"]),
+    (["inject", "wrong-graph", "--add", "x_m=1"], ["--add", "--topic"]),
+    (["inject", "wrong-graph", "--system", "cell"], ["--system cell: goes with --list"]),
+    (["inject", "wrong-graph", "--share", "0"], ["--share 0"]),
+    (["inject", "wrong-graph", "--share", "1.5"], ["--share 1.5"]),
+    (["inject", "wrong-graph", "--share", "nan"], ["--share nan"]),
+    (["inject", "wrong-graph", "--on", "1"], ["--off"]),
+    (["inject", "wrong-graph", "--on", "1", "--off", "inf"], ["--off inf"]),
+    (["inject", "wrong-graph", "--on", "-1", "--off", "1"], ["--on -1"]),
+    (["inject"], ["--list"]),
+    (["inject", "wrong-graph", "--topic", "plan/route"], ["either"]),
+    (["inject", "wrong-graph", "--mode", "drop"], ["--mode"]),
+    (["inject", "wrong-graph", "--duration", "-1"], ["--duration -1"]),
+    (["inject", "wrong-graph", "--duration", "nan"], ["--duration nan"]),
+    (["inject", "--topic", "no/such", "--mode", "drop"], ["'no/such'", "localization/pose"]),
+    (["inject", "--topic", "detection/*", "--mode", "drop"], ["detection/DM1"]),
+    (["inject", "--topic", "localization/pose", "--mode", "melt"], ["melt", "freeze"]),
+    (["inject", "--topic", "localization/pose", "--mode", "delay"], ["--delay"]),
+    (["inject", "--topic", "localization/pose", "--mode", "restamp"], ["--stamp"]),
+    (["inject", "--topic", "localization/pose", "--mode", "drop", "--stamp", "1"], ["--stamp"]),
+    (["inject", "--topic", "localization/pose", "--mode", "restamp", "--stamp", "nan"],
+     ["stamp_s = nan"]),
+    (["inject", "--topic", "localization/pose", "--mode", "drop", "--set", "x_m=1"], ["corrupt"]),
+    (["inject", "--topic", "localization/pose", "--mode", "corrupt"], ["--set"]),
+    (["inject", "--topic", "localization/pose", "--mode", "corrupt", "--set", "z_m=1"],
+     ["'z_m'", "x_m, y_m, yaw_rad"]),
+    (["inject", "--topic", "localization/pose", "--mode", "corrupt", "--set", "x_m=east"],
+     ["x_m=east", "float"]),
+    (["inject", "--topic", "localization/pose", "--mode", "corrupt", "--set", "x_m"],
+     ["FIELD=VALUE"]),
+    (["inject", "--topic", "plan/route", "--mode", "corrupt", "--ramp", "step=1"], ["float"]),
+    (["inject", "--topic", "plan/route", "--mode", "corrupt", "--add", "reason=1"], ["number"]),
+    (["inject", "--topic", "plan/route", "--mode", "corrupt", "--add", "step=lots"], ["step=lots"]),
+    (["inject", "--topic", "localization/pose", "--mode", "corrupt", "--noise", "x_m=-1"],
+     ["'x_m' = -1", "0 or more"]),
+    (["inject", "--topic", "plan/route", "--mode", "corrupt", "--keep-ends", "step"], ["list"]),
+    (["topic", "info", "no/such"], ["'no/such'", "localization/pose"]),
+    (["topic", "echo", "localization/pose/x"], ["'localization/pose/x'"]),
+    (["topic", "echo", "localization/pose", "--duration", "0"], ["--duration 0"]),
+])
+def test_nonsense_is_refused_in_one_line_that_names_it(capsys, monkeypatch, arguments, words):
+    monkeypatch.setattr("rampart.cli.session.find_run",
+                        lambda _port: pytest.fail("looked for a run"))
+    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    for word in words:
+        assert word in captured.err
+
+
+@pytest.mark.parametrize("arguments", [
+    ["status"], ["node", "list"], ["topic", "hz", "plan/route"], ["inject", "wrong-graph"],
+    ["topic", "echo", "plan/route"], ["reset", "RM1"], ["obstacle", "list"],
+    ["obstacle", "add", "crate", "1", "2"], ["obstacle", "remove", "crate"],
+])
+def test_without_a_run_each_verb_says_so_and_exits_2(capsys, monkeypatch, arguments):
+    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)
+    assert main(arguments) == 2
+    assert capsys.readouterr().err == (
+        "rampart: no run found; start one with `python launch.py`\n")
+
+
+def test_the_catalogue_is_listed_with_who_should_see_each_fault(capsys):
+    assert main(["inject", "--list", "--json"]) == 0
+    listed = {f["name"]: f["detected_by"] for f in json.loads(told(capsys))
+              if f["group"] == "paper"}
+    assert listed == {
+        "command-not-updated": ["DM2"], "command-out-of-bounds": ["DM3"],
+        "localization-not-updated": ["DM6"], "prohibited-area": ["DM1"], "wrong-graph": ["DM1"]}
+
+
+def test_the_list_has_a_part_for_each_group_and_a_line_for_each_topic(capsys):
+    assert main(["inject", "--list"]) == 0
+    text = told(capsys)
+    lines = {line.split()[0]: line for line in text.splitlines() if line}
+    assert {"command-not-updated", "laser-dropout", "localization/pose"} <= set(lines)
+    assert lines["summit_xl/brake"].endswith("all but corrupt")
+    assert "world/truth" not in lines
+    assert "inject/report" not in lines
+
+
+def test_a_fault_with_a_name_can_be_made_rarer_intermittent_and_random_in_another_way():
+    options = build_parser().parse_args([
+        "inject", "gps-noise", "--share", "0.3", "--on", "1", "--off", "4", "--seed", "7"])
+    (order,) = choose(options).orders("i")
+    assert (order.share, order.on_s, order.off_s, order.seed) == (0.3, 1.0, 4.0, 7)
+    assert order.noise_fields == find_fault("gps-noise").disturbances[0].noise_fields
+
+
+def test_another_seed_corrupts_a_topic_with_other_numbers():
+    first, again, other = (
+        choose(build_parser().parse_args(["inject", "corrupt:plan/route", "--seed", seed]))
+        .disturbances[0].add_fields for seed in ("1", "1", "2"))
+    assert first == again != other
+
+
+def test_biases_and_noise_are_put_together_from_options_also_for_arrays():
+    options = build_parser().parse_args([
+        "inject", "--topic", "summit_xl/scan", "--mode", "corrupt", "--add", "ranges_f32=0.4",
+        "--noise", "ranges_f32=0.2", "--set", "range_max_m=9", "--seed", "3"])
+    (order,) = choose(options).orders("i1", 4.0)
+    assert order == bm.Injection(
+        "i1", "summit_xl/scan", "corrupt", 4.0, set_fields={"range_max_m": 9.0},
+        add_fields={"ranges_f32": 0.4}, noise_fields={"ranges_f32": 0.2}, seed=3)
+
+
+def test_a_fault_of_ones_own_is_put_together_from_options():
+    options = build_parser().parse_args([
+        "inject", "--topic", "rampart/plan/route", "--mode", "corrupt", "--set", "reason=why not",
+        "--set", "step=3", "--keep-ends", "waypoints"])
+    (order,) = choose(options).orders("i1", 4.0)
+    assert order == bm.Injection("i1", "plan/route", "corrupt", 4.0,
+                                set_fields={"reason": "why not", "step": 3},
+                                keep_ends=("waypoints",))
+
+
+def test_a_nested_field_can_be_ramped():
+    options = build_parser().parse_args([
+        "inject", "--topic", "summit_xl/odom", "--mode", "corrupt", "--ramp", "pose.x_m=0.5"])
+    (order,) = choose(options).orders("i1")
+    assert order.ramp_fields == {"pose.x_m": 0.5}
+
+
+@pytest.mark.parametrize(("key", "topic", "full"), [
+    ("plan/route", topics.ROUTE, "rampart/plan/route"),
+    ("/rampart/plan/route", topics.ROUTE, "rampart/plan/route"),
+    ("detection/DM1", ftm_topics.DETECTION, "rampart/detection/DM1"),
+    ("detection/*", ftm_topics.DETECTION, "rampart/detection/*"),
+    ("recovery/RM2/state", ftm_topics.RECOVERY, "rampart/recovery/RM2/state"),
+    ("recovery/{name}/command", ftm_topics.RECOVERY_COMMAND, "rampart/recovery/*/command"),
+])
+def test_a_key_is_found_however_it_is_written(key, topic, full):
+    assert resolve(key) == (topic, full)
+
+
+@pytest.mark.parametrize("key", ["", "detection", "detection/", "detection/a/b", "rampart", "x/y"])
+def test_a_key_of_no_topic_is_refused(key):
+    with pytest.raises(UsageError, match="unknown topic"):
+        resolve(key)
+
+
+def test_rates_are_measured_like_ros2_does():
+    rate = rate_of([0.0, 0.1, 0.2, 0.4])
+    assert rate["rate_hz"] == pytest.approx(7.5)
+    assert (rate["min_s"], rate["max_s"]) == (pytest.approx(0.1), pytest.approx(0.2))
+    assert rate["window"] == 4
+    assert rate_of([1.0])["rate_hz"] is None
+
+
+def test_long_bytes_are_counted_not_printed():
+    scan = m.LaserScan(0.0, 0.1, 5.0, bytes(1440))
+    assert in_line(scan).endswith('"ranges_f32":"<1440 bytes>","reference_m":-1.0}')
+
+
+def test_topic_info_names_publishers_and_readers(capsys):
+    assert main(["topic", "info", "localization/pose", "--json"]) == 0
+    info = json.loads(told(capsys))
+    assert info["publishers"] == ["localization"]
+    assert {"hmi", "DM6", "osmosis_control"} <= set(info["readers"])
+
+
+def test_topics_of_a_robot_s_own_actors_are_listed_and_described(capsys, tmp_path):
+    own = ["--system", str(write_porter_system(tmp_path))]
+    assert main(["topic", "list", "--json", *own]) == 0
+    assert [topic["key"] for topic in json.loads(told(capsys))][-2:] == [
+        "porter/load", "porter/axle/{name}"]
+    assert main(["topic", "list", "--markdown", *own]) == 0
+    assert "### Axle" in told(capsys)
+    assert main(["topic", "info", "porter/axle/front", "--json", *own]) == 0
+    info = json.loads(told(capsys))
+    assert (info["publishers"], info["readers"]) == (["platform"], ["display"])
+    assert main(["inject", "--list", *own]) == 0
+    lines = {line.split()[0]: line for line in told(capsys).splitlines() if line}
+    assert lines["porter/load"].endswith("all")
+    assert lines["porter/axle/{name}"].endswith("all but corrupt")
+
+
+def test_an_actor_that_cannot_be_loaded_is_one_line_and_needed_for_its_own_topics_only(
+        capsys, monkeypatch, tmp_path):
+    file = write_porter_system(tmp_path)
+    file.write_text(file.read_text().replace("tests.porter_actors:", "no_actors:"))
+    run = RunInfo(1, 7450, 1.0, 0.0, str(file), "", (), "r1", 0, "test run")
+    monkeypatch.setattr("rampart.cli.look.topic_catalogue.find_run", lambda _port: run)
+    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)
+    for arguments in (["topic", "list", "--system", str(file)],
+                      ["topic", "echo", "porter/load"], ["inject", "drop:porter/load"],
+                      ["campaign", "--list", "--system", str(file)],
+                      ["campaign", "--fault", "drop:porter/load", "--system", str(file)]):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert "No module named 'no_actors'" in error
+        assert error.count("\n") == 1
+    assert main(["topic", "echo", "plan/route"]) == 2
+    assert "no run found" in capsys.readouterr().err
+
+
+def verbs(parser, path=()):
+    for action in parser._actions:
+        if hasattr(action, "choices") and isinstance(action.choices, dict):
+            for name, sub in action.choices.items():
+                yield (*path, name), sub
+                yield from verbs(sub, (*path, name))
+
+
+@pytest.mark.parametrize(("path", "parser"), list(verbs(build_parser())),
+                         ids=lambda v: " ".join(v) if isinstance(v, tuple) else "")
+def test_the_help_of_each_verb_teaches_with_examples(path, parser):
+    text = parser.format_help()
+    assert f"rampart {path[0]}" in text.partition("examples:")[2]
+    assert parser.description
+
+
+def test_a_file_comes_before_a_system_that_ships_for_all_who_look_for_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cell").mkdir()
+    (tmp_path / "osmosis").write_text("")
+    asked = ("paper", "cell", "osmosis", "nowhere", "x" * 300)
+    assert [shipped.find(name) for name in asked] == [
+        shipped.SHIPPED / "paper.toml", shipped.SHIPPED / "cell.toml", Path("osmosis"),
+        Path("nowhere"), Path("x" * 300)]
+    with pytest.raises(UsageError, match="name too long; a spec is right"):
+        systems.load("x" * 300)
+    assert systems.load("cell").name == "cell"
+    (tmp_path / "cell").rmdir()
+    (tmp_path / "cell").write_bytes(shipped.DEFAULT.read_bytes())
+    assert systems.load("cell").name == "osmosis"
+    _document.cache_clear()  # what a campaign's job runs is what was checked
+    assert _document("cell")[1]["name"] == "osmosis"
+    _document.cache_clear()

@@ -1,0 +1,162 @@
+"""docs/specification.md: every field is in it, and its worked example works."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import re
+import subprocess
+import sys
+
+import msgspec
+import pytest
+
+from rampart.actors.ftm.messages import DetectionState
+from rampart.actors.layout.system_topics import system_topics
+from rampart.actors.layout.wiring import load_class
+from rampart.actors.osmosis import topics
+from rampart.manager.model.gates import GateError, detection_gate
+from rampart.manager.spec.schema import (
+    DetectionSpec,
+    EventSpec,
+    Layers,
+    MechanismSpec,
+    NodeSpec,
+    RecoverySpec,
+    Robot,
+    SystemSpec,
+    Timing,
+    Within,
+)
+from rampart.manager.spec.specification import (
+    SpecificationError,
+    parse_specification,
+    read_document,
+)
+from rampart.manager.strategies.registry import STRATEGIES
+from tests import ROOT
+from tests.virtual_loop import System, run
+
+DOCUMENT = (ROOT / "docs" / "specification.md").read_text(encoding="utf-8")
+EXAMPLE = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)[0]
+MODULES = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)[0]
+
+
+@pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, NodeSpec, DetectionSpec,
+                                   RecoverySpec, MechanismSpec, EventSpec, Within])
+def test_every_field_is_described(table):
+    missing = [f.encode_name for f in msgspec.structs.fields(table)
+               if not re.search(rf"[`\[ ]{f.encode_name}\b", DOCUMENT)]
+    assert missing == []
+
+
+def toml(value: object) -> str:
+    """A default as the document writes it; "" if it is none, or derived."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:g}"
+    if isinstance(value, str):
+        return json.dumps(value)
+    return "" if value is None else "{}" if value == {} else "[]"
+
+
+@pytest.mark.parametrize(("heading", "table", "also"), [
+    ("Top level", SystemSpec, set()), ("`[robot]`", Robot, set()),
+    ("`[timing]`", Timing, {f.name for f in msgspec.structs.fields(Timing)
+                            if f.name.endswith("timeout_s")}),
+    ("`[layers]`", Layers, set()), ("`[[node]]`", NodeSpec, set()),
+    ("`[[detection]]`", DetectionSpec, {"within_s"}), ("`[[recovery]]`", RecoverySpec, set()),
+    ("`[[mechanism]]`", MechanismSpec, set()), ("`[[event]]`", EventSpec, {"gate"})])
+def test_what_is_required_and_what_is_the_default_are_as_in_the_code(heading, table, also):
+    section = DOCUMENT.partition("### What has to be there\n")[2].partition("\n### ")[0]
+    text = " ".join(re.findall(rf"^- {re.escape(heading)}: (.*?)(?=^- |\Z)", section,
+                               re.DOTALL | re.MULTILINE)[0].split())
+    required, _, other = text.partition(" Else: ")
+    fields = {f.encode_name: f for f in msgspec.structs.fields(table)}
+    assert set(re.findall(r"`(\w+)`", required)) - {"of"} == {
+        name for name, field in fields.items() if field.required} | also
+    for name in fields.keys() - also:
+        field = fields[name]
+        if field.required:
+            continue
+        default = field.default_factory() if field.default is msgspec.NODEFAULT else field.default
+        written = "" if isinstance(default, msgspec.Struct) else toml(default)
+        listed = isinstance(default, tuple | dict) and table is SystemSpec  # arrays of tables
+        assert (f"`{name}`" if listed or not written else f"`{name} = {written}`") in other
+
+
+def test_the_least_that_is_a_system_is_what_the_document_says():
+    timeouts = "".join(f"{f.name} = 1.0\n" for f in msgspec.structs.fields(Timing)
+                       if f.name.endswith("timeout_s"))
+    text = f"""name = "x"\ntitle = "x"\n[timing]\n{timeouts}
+[[node]]\nname = "m"\nactor = "rampart.manager.actor:FtmManager"\nkind = "manager"
+[[detection]]\nname = "D"\ntitle = "D"\nactor = "a.b:C"\nwithin_s = 0.1
+[[recovery]]\nname = "R"\ntitle = "R"\nactor = "a.b:C"\nkind = "forward"
+[[mechanism]]\nname = "M"\ndetect = "D"\nrecover = "R"\nevent = "e"
+against = {{ within_s = 5.0, hazard = "h" }}
+[[event]]\nname = "e"
+[orders.safer]\n"""
+    parse_specification(text, "x.toml")
+    for table in ("node", "event"):
+        without = re.sub(rf"(?m)^\[\[{table}\]\]\n(\w.*\n)*", "", text)
+        with pytest.raises(SpecificationError):
+            parse_specification(without, "x.toml")
+    with pytest.raises(SpecificationError, match="unknown order"):
+        parse_specification(text.replace("[orders.safer]\n", ""), "x.toml")
+
+
+def test_every_strategy_is_named():
+    assert all(f"`{name}`" in DOCUMENT for name in STRATEGIES)
+
+
+def test_the_worked_example_is_a_sound_system(tmp_path):
+    spec = parse_specification(EXAMPLE, "tank.toml")
+    assert spec.build_ftm_tree().parents == {"M_LEVEL": None, "M_CRASH": "M_LEVEL"}
+    file = tmp_path / "tank.toml"
+    file.write_text(EXAMPLE, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "rampart.cli.main", "table", "--system", str(file), "--json"],
+        cwd=ROOT,
+        capture_output=True, text=True, check=True, timeout=30)
+    assert [row["rm"] for row in json.loads(done.stdout)] == [
+        ["R_SHUT"], ["R_RESTART"], ["R_SHUT", "R_RESTART"]]
+
+
+def test_the_modules_of_one_s_own_that_it_shows_work(tmp_path, monkeypatch):
+    (tmp_path / "tank_actors.py").write_text(MODULES, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    text = EXAMPLE.replace(
+        "rampart.actors.runtime.stub_node:StubNode", "tank_actors:Gauge").replace(
+        "rampart.actors.detection.stub:StubDetection", "tank_actors:LevelTooHigh")
+    spec = parse_specification(text, "tank.toml")
+    assert [topic.key for topic in system_topics(spec)][len(topics.ALL):] == ["tank/level"]
+
+    async def scenario():
+        async with System() as system:
+            gauge = system.start("gauge", load_class("tank_actors:Gauge"))
+            module = system.start("D_LEVEL", load_class("tank_actors:LevelTooHigh"))
+            (level,) = gauge.outputs
+            await system.settle()
+            gauge.publish(level, level.type(2.5))
+            await system.settle()
+            assert module.state is DetectionState.ACTIVE
+            await asyncio.sleep(0.2)
+            assert module.state is DetectionState.IDLE
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("text", ["DM1 and DM3", "DM1 or (DM2 and not DM3)",
+                                  "2 of (DM1, DM2, DM3)"])
+def test_the_gates_it_shows_are_gates(text):
+    assert f"`{text}`" in DOCUMENT
+    assert str(detection_gate(text)) == text
+
+
+def test_nesting_without_end_is_one_line_and_no_traceback():
+    with pytest.raises(SpecificationError, match=r"^x.toml: \$: nested more than 32 deep"):
+        read_document("a = " + "[" * 100_000 + "]" * 100_000, "x.toml")
+    with pytest.raises(GateError, match="nested more than 50 deep"):
+        detection_gate("(" * 100_000 + "DM1" + ")" * 100_000)

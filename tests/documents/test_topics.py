@@ -1,0 +1,70 @@
+"""`topics.md` says what the code says."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from rampart.actors.layout.system_topics import own_topics, published_keys, system_topics
+from rampart.actors.layout.wiring import load_class
+from rampart.actors.osmosis import topics
+from rampart.cli import systems
+from rampart.cli.look.topic_catalogue import markdown, uses
+from tests import ROOT, porter_actors
+from tests.porter_actors import AXLE, LOAD, write_porter_system
+
+DOCUMENT = ROOT / "topics.md"
+
+
+def test_topics_md_is_up_to_date():
+    expected = markdown(systems.load(None))
+    assert DOCUMENT.read_text(encoding="utf-8") == expected, (
+        "topics.md is out of date; write it again: rampart topic list --markdown > topics.md")
+
+
+def test_every_topic_that_a_node_reads_is_published_by_somebody():
+    lonely = [use.topic.key for use in uses(systems.load(None))
+              if use.readers and use.publishers == ("tools",)]
+    assert lonely == [topics.OBSTACLE.key]
+
+
+def test_ground_truth_is_read_by_no_node_of_the_controller():
+    truth = next(u for u in uses(systems.load(None)) if u.topic is topics.TRUTH)
+    assert truth.readers == ("observer",)
+
+
+@pytest.mark.parametrize("name", ["paper", "osmosis", "cell"])
+def test_the_shipped_systems_have_the_common_topics_and_no_other(name):
+    assert system_topics(systems.load(name)) == topics.ALL
+
+
+def test_who_asks_only_for_a_robot_s_own_topics_loads_no_actor_that_ships(tmp_path, monkeypatch):
+    loaded = []
+    monkeypatch.setattr("rampart.actors.layout.system_topics.load_class",
+                        lambda path: loaded.append(path) or load_class(path))
+    assert [own_topics(systems.load(name)) for name in ("paper", "osmosis", "cell")] == [()] * 3
+    assert loaded == []
+    assert own_topics(systems.load(str(write_porter_system(tmp_path)))) == (LOAD, AXLE)
+
+
+def test_the_topics_of_a_robot_s_own_actors_follow_the_common_ones(tmp_path):
+    spec = systems.load(str(write_porter_system(tmp_path)))
+    assert system_topics(spec) == (*topics.ALL, LOAD, AXLE)
+    assert set(published_keys(spec)) >= {"porter/load", "porter/axle/front", "porter/axle/rear"}
+    used = {use.topic.key: (use.publishers, use.readers) for use in uses(spec)}
+    assert used["porter/load"] == (("platform",), ())
+    assert used["porter/axle/{name}"] == (("platform",), ("display",))
+
+
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"type": dict}, "topic 'porter/load': type = <class 'dict'>: must be derived from "),
+    ({"key": "a/{name}/{name}"}, "topic 'a/{name}/{name}': one {name} at most is right"),
+])
+def test_a_topic_that_makes_no_sense_is_refused_by_actor_and_key(tmp_path, monkeypatch, changes,
+                                                                 words):
+    spec = systems.load(str(write_porter_system(tmp_path)))
+    monkeypatch.setattr(porter_actors.Platform, "outputs", (dataclasses.replace(LOAD, **changes),))
+    with pytest.raises(ValueError, match=r"^actor = 'tests.porter_actors:Platform': ") as caught:
+        system_topics(spec)
+    assert words in str(caught.value)

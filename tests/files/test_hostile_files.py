@@ -1,0 +1,472 @@
+"""Files that were made to do harm: each is refused in one line, before the work is done.
+
+A file that a regression lets through takes minutes or all memory; the suite's time limit and the
+kernel speak up then. No time is asserted here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import random
+import sqlite3
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import zstandard
+from mcap.writer import CompressionType, Writer
+from PIL import Image
+
+from rampart.actors.osmosis.airport import limits, mask
+from rampart.actors.osmosis.airport.errors import AirportError
+from rampart.actors.recording.bag_reader import BagReader, Summary
+from rampart.actors.recording.bag_repair import repair
+from rampart.actors.recording.bag_writer import BagError
+from rampart.actors.supervision.process_title import parse_title
+from rampart.cli import run as launch
+from rampart.cli.main import main as rampart
+from rampart.files import toml
+from rampart.files.reading import FileError, plain_line, read_bytes
+from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa
+from rampart.manager.model.gates import GateError, detection_gate, recovery_gate
+from rampart.manager.spec.adaptation import ChangeError, parse_value
+from rampart.sim.campaign.store import Store, StoreError
+from tests import ROOT
+from tests.actors.osmosis.airport.test_formats import GRAPH, TOML
+
+SPEC = (ROOT / "systems" / "paper.toml").read_text("utf-8")
+DOTTED = "a" + ".a" * 50_000 + " = 1"
+
+
+def one_line(capsys: pytest.CaptureFixture[str], program: Callable[[list[str]], int],
+             *arguments: str) -> str:
+    """Run a program that has to refuse, and return what it says."""
+    assert program(list(arguments)) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].isprintable()
+    assert len(lines[0]) < 1000
+    return lines[0]
+
+
+def edited(old: str, new: str) -> str:
+    assert old in TOML
+    return TOML.replace(old, new, 1)
+
+
+def crossing_combs(teeth: int) -> str:
+    """Two outlines that cross each other as often as the square of their teeth."""
+    points = [p for i in range(teeth) for p in ((i, 0), (i, teeth), (i + .5, teeth), (i + .5, 0))]
+    points += [(teeth, -10), (0, -10)]
+    return "".join(
+        f'[[surface]]\nname = "comb{n}"\nkind = "area"\n'
+        f'polygon = {[[p[n], p[1 - n]] for p in points]}\n'
+        for n in (0, 1))
+
+
+def scribble(count: int) -> str:
+    draw = random.Random(1)
+    points = [[draw.random(), draw.random()] for _ in range(count)]
+    return (f'[[surface]]\nname = "scribble"\nkind = "taxiway"\ncentre_line = {points}\n'
+            'half_width_m = 100.0\n')
+
+
+AIRPORTS = {
+    "nested 100,000 deep": (TOML + "x = " + "[" * 100_000 + "]" * 100_000, "more than 32 deep"),
+    "tables nested without end": ("x = " + "{a=" * 100_000, "more than 32 deep"),
+    "100 kB of dotted keys": (DOTTED, "a key of more than 6 dotted parts"),
+    "a header of dotted parts": (f"[{'.'.join('a' * 50_000)}]", "more than 6 dotted parts"),
+    "dots behind a string that looks closed": ('x = "\\""\n' + DOTTED, "more than 6 dotted"),
+    "a key that is long": (f'["{"k" * 5000}"]\nx = 1', "a key of more than 200 characters"),
+    "longer than any airport": (TOML + "#" * (1 << 20), "longer than 512 kB"),
+    "a coordinate of 400 digits": (edited("T = [30.0", f"T = [1{'0' * 400}"),
+                                   "nodes.T[0]: 1000000000"),
+    "a coordinate of 5,000 digits": (edited("T = [30.0", f"T = [1{'0' * 5000}"),
+                                     "an integer with thousands of digits"),
+    "a coordinate beyond the earth": (edited("T = [30.0", "T = [3e7"), "nodes.T[0]: 30000000.0"),
+    "half a width that no float squares": (edited("half_width_m = 3.0", "half_width_m = 1e308"),
+                                           "surface[0].half_width_m: 1e+308: must be between"),
+    "a fillet beyond all measure": ("fillet_radius_m = 1e300\n" + TOML, "fillet_radius_m: 1e+300"),
+    "a thousand million lights": (edited("count = 3", "count = 1000000000"), "row[0].count"),
+    "a million lights": (edited("count = 3", "count = 1000000"),
+                         "lights of all rows: 1000000: at most 100000"),
+    "two thousand areas": (TOML + "".join(
+        f'[[prohibited]]\nname="p{i}"\npolygon=[[0,10],[1,10],[0,11]]\n' for i in range(2000)),
+        "prohibited: 2000: at most 1000"),
+    "two combs": (TOML + crossing_combs(150), "too many of them lie within 0 m of each other"),
+    "a scribble as wide as a runway": (TOML + scribble(400), "lie within 200 m of each other"),
+    "more corners than airports have": (TOML + scribble(12_000), "points of all outlines: 12002"),
+    "a mission with more goals than are searched": (edited(
+        "goals = [", "goals = [" + "{x_m=1,y_m=0,mode='taxi'}," * 1500), "goals of all missions"),
+    "a name that steers the terminal": (edited(
+        'name = "R"', 'name = "\\u001b[2J\\nlaunch.py: all is well"'
+        ).split("[world")[0].replace("10.0, 0.0", "10.0, 9.0"), "off the pavement"),
+    "a fault that lies deeper than the next node has values": (
+        edited("S = [0.0, 0.0]\nT = [30.0, 0.0]", "S = [0.0, []]\nT = [0.0]"), "nodes.S[1]: []"),
+    "a number where a table belongs": (edited("[missions.M]", "[missions]\nM = 3\n[world]"),
+                                       "missions.M: 3"),
+}
+
+
+@pytest.mark.parametrize(("text", "words"), AIRPORTS.values(), ids=AIRPORTS)
+def test_an_airport_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, text, words):
+    path = tmp_path / "field.toml"
+    path.write_text(text)
+    assert words in one_line(capsys, launch.main, "--virtual", "--airport", str(path))
+
+
+@pytest.mark.parametrize("text", [AIRPORTS["nested 100,000 deep"][0], DOTTED])
+def test_a_mission_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, text):
+    path = tmp_path / "mission.toml"
+    path.write_text(text)
+    one_line(capsys, launch.main, "--virtual", "--mission", str(path))
+
+
+SPECS = {
+    "nested": ("x = " + "[" * 100_000, "more than 32 deep"),
+    "dotted": (DOTTED, "a key of more than 6 dotted parts"),
+    "long": (SPEC + "#" * (1 << 20), "longer than 512 kB"),
+    "many events": (SPEC + "".join(f'[[event]]\nname = "X{i}"\n' for i in range(6000)),
+                    "$.event: 6"),
+    "many orders": (SPEC + "".join(f"[orders.x{i}]\n" for i in range(20)), "$.orders: 2"),
+    "a long name": (SPEC.replace('name = "DM1"', f'name = "D{"1" * 200}"', 1), "expected a name"),
+    "a gate of a thousand names": (
+        SPEC.replace('detect = "DM1"', f'detect = "{" and ".join(["DM1"] * 1000)}"', 1),
+        "1999 names, words and parentheses"),
+    "ways that no number holds": (
+        SPEC.replace('recover = "RM2"',
+                     f'recover = "{" and ".join(["(RM1 or RM2)"] * 20_000)}"', 1),
+        "names, words and parentheses"),
+}
+
+
+@pytest.mark.parametrize(("text", "words"), SPECS.values(), ids=SPECS)
+def test_a_system_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, text, words):
+    assert text != SPEC
+    path = tmp_path / "system.toml"
+    path.write_text(text)
+    assert words in one_line(capsys, launch.main, "--virtual", "--system", str(path))
+    assert words in one_line(capsys, rampart, "table", "--system", str(path))
+
+
+@pytest.mark.parametrize("read", [launch.main, rampart])
+def test_a_device_without_end_is_read_no_further_than_a_spec_is_long(tmp_path, capsys, read):
+    path = tmp_path / "zero.toml"
+    path.symlink_to("/dev/zero")
+    arguments = ["--virtual", "--system"] if read is launch.main else ["verify", "--system"]
+    one_line(capsys, read, *arguments, str(path))
+
+
+def test_a_table_to_be_replaced_is_read_within_the_same_bounds(tmp_path, capsys):
+    path = tmp_path / "table.toml"
+    path.write_text(DOTTED)
+    assert "6 dotted parts" in one_line(capsys, rampart, "adapt", "replace", "FTM7", str(path))
+    with pytest.raises(ChangeError, match="expected a TOML value"):
+        parse_value("{" + DOTTED + "}")
+
+
+def test_a_gate_as_large_as_may_be_is_read_and_a_larger_one_is_not():
+    names = [f"DM{i}" for i in range(16)]
+    assert detection_gate(" and ".join(names * 12)).names == tuple(names)
+    with pytest.raises(GateError, match="at most 64"):
+        detection_gate(f"2 of ({', '.join(['DM1'] * 65)})")
+    with pytest.raises(GateError, match="at most 400"):
+        recovery_gate(" or ".join(["RM1"] * 300))
+
+
+# -- graphs and masks ------------------------------------------------------------------------------
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return (struct.pack(">I", len(data)) + kind + data
+            + struct.pack(">I", zlib.crc32(kind + data)))
+
+
+def png_of(columns: int, rows: int, data: bytes = b"") -> bytes:
+    head = struct.pack(">IIBBBBB", columns, rows, 8, 2, 0, 0, 0)
+    return (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(data))
+            + chunk(b"IEND", b""))
+
+
+def png_noise(side: int) -> bytes:
+    red = np.random.default_rng(1).integers(0, 2, (side, side)).astype(np.uint8)
+    image = Image.fromarray(red, "P")
+    image.putpalette([0, 255, 0, 255, 0, 0])
+    out = io.BytesIO()
+    image.save(out, "PNG", bits=1)
+    return out.getvalue()
+
+
+def png_good() -> bytes:
+    pixels = np.zeros((120, 120, 3), dtype=np.uint8)
+    pixels[..., 0] = 255
+    pixels[40:80, 10:110] = (0, 255, 0)
+    out = io.BytesIO()
+    Image.fromarray(pixels).save(out, "PNG")
+    return out.getvalue()
+
+
+def foreign(folder: Path, image: bytes | None = None, graph: str = json.dumps(GRAPH),
+            mission: str = "x=9.5,y=6,taxi=1\n") -> str:
+    (folder / "field_area.png").write_bytes(image or png_good())
+    (folder / "field.graph").write_text(graph)
+    (folder / "MISSION_A.miss").write_text(mission)
+    return str(folder / "field.graph")
+
+
+FOREIGN = {
+    "50,000 x 50,000 pixels": ({"image": png_of(50_000, 50_000)}, "at most 16777216"),
+    "13,000 x 13,000 pixels": ({"image": png_of(13_000, 13_000)}, "13000 x 13000 pixels"),
+    "no rows": ({"image": png_of(100, 0)}, "unreadable"),
+    "noise": ({"image": png_noise(1000)}, "more than 20000 rectangles"),
+    "another kind of image by the name of a PNG": ({"image": b"GIF89a" + b"\0" * 100},
+                                                   "unreadable"),
+    "a graph nested without end": ({"graph": '{"nodes":' + "[" * 100_000}, "not JSON"),
+    "a node of 400 digits": ({"graph": '{"nodes":[{"id":"N","x":1' + "0" * 400 + ',"y":0}],'
+                              '"edges":[]}'}, "must be a finite number of metres"),
+    "a node of 5,000 digits": ({"graph": '{"nodes":[{"id":"N","x":1' + "0" * 5000 + ',"y":0}],'
+                                '"edges":[]}'}, "not JSON"),
+    "a node far away": ({"graph": '{"nodes":[{"id":"N","x":1e9,"y":0}],"edges":[]}'},
+                        "must be within 1,000,000 m"),
+    "half a character as a name": ({"graph": '{"nodes":[{"id":"\\ud800","x":1,"y":0}],'
+                                    '"edges":[]}'}, "'\\ud800': must be a name"),
+    "100,000 nodes": ({"graph": json.dumps({"nodes": [0] * 100_000, "edges": []})},
+                      "nodes: 100000: at most 5000"),
+    "a graph of a megabyte and more": ({"graph": " " * (2 << 20)}, "longer than 1 MB"),
+    "2,000 goals": ({"mission": "x=9.5,y=6,taxi=1\n" * 2000}, "goals: 1001: at most 1000"),
+    "a line of a megabyte": ({"mission": "x=" + "1" * 1_000_000}, "must be like"),
+}
+
+
+@pytest.mark.parametrize(("parts", "words"), FOREIGN.values(), ids=FOREIGN)
+def test_a_foreign_airport_made_to_do_harm_is_refused_in_one_line(tmp_path, capsys, parts, words):
+    path = foreign(tmp_path, **parts)
+    assert words in one_line(capsys, launch.main, "--virtual", "--airport", path, "--mission", "A")
+
+
+def test_a_damaged_mask_is_read_or_refused_and_nothing_else_happens(tmp_path):
+    """Every byte of a small image is damaged in two ways."""
+    good = png_good()
+    for at in range(len(good)):
+        for value in (good[at] ^ 1 << at % 8, 255 - good[at]):
+            path = tmp_path / "mask.png"
+            path.write_bytes(good[:at] + bytes([value]) + good[at + 1:])
+            with contextlib.suppress(AirportError):
+                mask.allowed_area(path, mask.MaskScale())
+
+
+def test_many_warnings_about_a_foreign_airport_are_cut_short(tmp_path):
+    from rampart.actors.osmosis.airport.formats import load_airport
+    nodes = [{"id": f"N{i}", "x": -70 + i / 10, "y": 0} for i in range(300)]
+    path = foreign(tmp_path, graph=json.dumps({"nodes": nodes, "edges": [
+        [f"N{i}", f"N{i + 1}"] for i in range(299)]}), mission="x=-65,y=0,taxi=1")
+    warnings = load_airport(path).warnings
+    assert len(warnings) == limits.MAX_WARNINGS + 2
+    assert "more: mend these first" in warnings[limits.MAX_WARNINGS]
+
+
+# -- recordings ------------------------------------------------------------------------------------
+
+
+def bag(path: Path, kind: CompressionType, size: int, count: int = 1, empty: int = 0) -> Path:
+    """A recording of messages of nothing but zeros, one in a chunk, then empty ones."""
+    with path.open("wb") as file:
+        writer = Writer(file, compression=kind, chunk_size=1 << 10)
+        writer.start("", "others")
+        channel = writer.register_channel("zeros", "json", 0)
+        for number in range(count):
+            writer.add_message(channel, number, bytes(size), number)
+        for number in range(empty):
+            writer.add_message(channel, number, b"", number)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("kind", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_a_chunk_that_is_too_large_unpacked_is_refused(tmp_path, capsys, kind):
+    path = bag(tmp_path / "bomb.mcap", kind, 80 << 20)
+    assert path.stat().st_size < 500_000
+    for verb in (("bag", "info", str(path)), ("bag", "repair", str(path), str(tmp_path / "out")),
+                 ("replay", str(path))):
+        assert "bytes, unpacked; at most 67108864" in one_line(capsys, rampart, *verb)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_chunk_that_denies_its_size_is_unpacked_no_further_than_it_may_be(tmp_path):
+    path = bag(tmp_path / "liar.mcap", CompressionType.LZ4, 80 << 20)
+    data = path.read_bytes()
+    size = struct.Struct("<Q")
+    at = data.index(b"lz4") - 4 - 4 - size.size  # behind it: checksum, length of the name
+    assert size.unpack_from(data, at)[0] > 80 << 20
+    path.write_bytes(data[:at] + size.pack(100) + data[at + size.size:])
+    with pytest.raises(BagError, match="unpacks to more than 67108864 bytes, and says 100"):
+        Summary(BagReader(path))
+
+
+def test_a_file_of_many_chunks_that_unpack_to_gigabytes_is_refused_early(tmp_path, capsys):
+    path = bag(tmp_path / "bomb.mcap", CompressionType.ZSTD, 8 << 20, count=40)
+    assert path.stat().st_size < 50_000
+    assert "more than 64 times its size" in one_line(capsys, rampart, "bag", "info", str(path))
+
+
+def test_a_recording_that_is_dense_but_honest_is_read(tmp_path):
+    path = bag(tmp_path / "dense.mcap", CompressionType.ZSTD, 4 << 20, count=3, empty=1000)
+    assert Summary(BagReader(path)).messages == 1003
+    assert repair(BagReader(path), tmp_path / "copy.mcap") == 1003
+
+
+def test_schemas_and_metadata_without_end_are_not_kept(tmp_path):
+    path = tmp_path / "schemas.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, use_chunking=False)
+        writer.start("", "others")
+        for number in range(70):
+            writer.register_schema(f"s{number}", "jsonschema", bytes(1 << 20))
+        writer.finish()
+    with pytest.raises(BagError, match="more than 64 MB of schemas"):
+        Summary(BagReader(path))
+
+
+def test_an_attachment_beyond_what_is_held_is_stepped_over_and_the_rest_is_read(tmp_path):
+    path = tmp_path / "large.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start("", "others")
+        writer.add_attachment(0, 0, "film", "video/mp4", bytes(70 << 20))
+        writer.add_message(writer.register_channel("c", "json", 0), 1, b"{}", 1)
+        writer.finish()
+    summary = Summary(BagReader(path))
+    assert (summary.messages, summary.files) == (1, [])
+    assert "a record of 7" in summary.reader.damage
+
+
+def test_words_of_a_recording_steer_no_terminal(tmp_path, capsys):
+    path = tmp_path / "escape.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("\x1b]0;x\x07", "\x1b[2J\nrampart: all is well")
+        writer.add_metadata("rampart.run", {"title": "\x1b[31m", "time_zero_s": "nan",
+                                            "nodes": "[" * 5000})
+        writer.add_metadata("rampart.end", {"lost": "[" * 5000})
+        writer.add_message(writer.register_channel("\x1b[5m", "json", 0, {"key": "k"}), 1, b"{}", 1)
+        writer.finish()
+    assert rampart(["bag", "info", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "\x1b" not in out
+    assert "\nrampart: all is well" not in out
+    assert "lost       unknown" in out
+    assert Summary(BagReader(path)).time_zero_s == 0.0
+
+
+def test_a_frame_of_zstandard_with_a_window_of_gigabytes_is_damage(tmp_path):
+    made = zstandard.ZstdCompressor(compression_params=zstandard.ZstdCompressionParameters(
+        window_log=30, enable_ldm=True, write_content_size=False))
+    stream = made.compressobj()
+    data = stream.compress(bytes(1000)) + stream.flush()
+    assert zstandard.get_frame_parameters(data).window_size > 128 << 20
+    body = struct.pack("<QQQII", 0, 0, 1000, 0, 4) + b"zstd" + struct.pack("<Q", len(data)) + data
+    path = tmp_path / "window.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", 1, 8) + bytes(8)
+                     + struct.pack("<BQ", 6, len(body)) + body)
+    summary = Summary(BagReader(path))
+    assert "a chunk (ZstdError)" in summary.reader.damage
+
+
+# -- the rest --------------------------------------------------------------------------------------
+
+
+def test_an_open_psa_file_is_bounded_in_bytes_elements_and_components(tmp_path, capsys):
+    tree = '<opsa-mef><define-fault-tree name="t">{}</define-fault-tree></opsa-mef>'
+    for text, words in (
+            ("<opsa-mef>" + "<a/>" * 300_000, "more than 200000 elements"),
+            ("<a>" * 50_000, "more than 10000 deep"),
+            (" " * (17 << 20), "longer than 16 MB"),
+            (tree.format('<define-component name="c">' * 60 + "</define-component>" * 60),
+             "more than 50 fault trees and components in each other"),
+            (tree.format(f'<define-gate name="{"n" * 2000}"/>'), "at most 1000 characters")):
+        path = tmp_path / "tree.xml"
+        path.write_text(text)
+        assert words in one_line(capsys, rampart, "cut-sets", str(path))
+    with pytest.raises(OpenPsaError):
+        read_open_psa('<!DOCTYPE x [<!ENTITY a "b">]><opsa-mef>&a;</opsa-mef>', "f.xml")
+
+
+@pytest.mark.parametrize("damage", [
+    "update runs set job = x'c1'", "update runs set result = null", "update runs set job = 5",
+    "drop table runs", "create view v as select 1", "delete from about",
+    "update about set value = x'00'",
+    f"update runs set job = x'{'91' * 5000}'", "update runs set job = zeroblob(20000000)",
+])
+def test_a_damaged_store_of_results_is_refused_in_one_line(tmp_path, capsys, damage):
+    from rampart.sim.campaign.job import Job
+    store = Store(tmp_path)
+    job = msgspec.msgpack.encode(Job(row="r"))
+    store.close()
+    with sqlite3.connect(tmp_path / "runs.sqlite") as database:
+        database.execute("pragma writable_schema = on")
+        if damage.endswith("about"):
+            database.execute("alter table about rename to gone")
+            damage = "create table about (name text, value text)"
+        database.execute("insert into runs (key, job, result) values ('abc', ?, ?)", (job, b""))
+        try:
+            database.execute(damage)
+        except sqlite3.IntegrityError:  # of a column that must not be null
+            database.execute("update runs set result = ''")
+    database.close()
+    if damage == "drop table runs":
+        assert "no run" in one_line(capsys, rampart, "campaign", "--replay", "abc", "--out",
+                                    str(tmp_path))
+        return
+    one_line(capsys, rampart, "campaign", "--replay", "abc", "--out", str(tmp_path))
+
+
+def test_a_store_with_a_damaged_row_says_so_when_it_is_read(tmp_path):
+    store = Store(tmp_path)
+    with sqlite3.connect(tmp_path / "runs.sqlite") as database:
+        database.execute("insert into runs (key, job, result) values ('abc', x'c1', x'c1')")
+    database.close()
+    with pytest.raises(StoreError, match="cannot be used"):
+        list(store.runs())
+    store.close()
+
+
+def test_the_title_of_a_process_may_hold_numbers_without_end():
+    assert parse_title(1, f"rampart[{'9' * 5000}/1] a #1") is None
+    assert parse_title(1, f"rampart[1/1] a #{'9' * 5000}") is None
+    found = parse_title(1, "rampart[7400/123] a+b #18446744073709551615")
+    assert found is not None
+    assert found.names == ("a", "b")
+
+
+def test_a_document_at_the_limits_is_read_and_strings_and_comments_hold_anything():
+    dots, brackets = ".".join("a" * 100), "[" * 100
+    text = f'''
+    a.b.c.d.e.f = 1.5  # {dots} {brackets}
+    x = "{dots} {brackets} \\" {dots}"
+    y = \'{dots} {brackets}\'
+    z = """{dots} {brackets} "" \\""" {dots}"""
+    w = \'\'\'{dots} '' {brackets}\'\'\'
+    n = {"[" * 30}{"]" * 30}
+    '''
+    assert toml.parse(text)["w"] == f"{dots} '' {brackets}"
+    with pytest.raises(FileError, match="6 dotted"):
+        toml.parse("a.b.c.d.e.f.g = 1")
+    with pytest.raises(FileError, match="32 deep"):
+        toml.parse("n = " + "[" * 33 + "]" * 33)
+
+
+def test_what_is_said_of_a_file_is_one_printable_line_of_bounded_length():
+    assert plain_line("a\n\tb\x1b[31m\ud800") == "a b\\x1b[31m\\ud800"
+    assert len(plain_line("x" * 10_000_000)) < 1000
+    assert plain_line("Flughafen Zürich: 滑走路") == "Flughafen Zürich: 滑走路"
+
+
+def test_a_file_is_read_no_further_than_it_may_be_long():
+    with pytest.raises(FileError, match="longer than 64 kB"):
+        read_bytes(Path("/dev/zero"), 1 << 16)

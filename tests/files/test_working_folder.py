@@ -1,0 +1,58 @@
+"""Modules are imported from the working folder only if nobody else can put them there."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from rampart.files import working_folder
+from tests import ROOT
+
+LOOK = ("from rampart.actors.layout import wiring\n"
+        "from rampart.files import working_folder\n"
+        "working_folder.admit()\n"
+        "wiring.load_class('intruder:Node')\n")
+
+
+@pytest.mark.parametrize(("mode", "words"), [
+    (0o755, "no such actor class"), (0o700, "no such actor class"),
+    (0o757, "others can write"), (0o777, "others can write"), (0o1777, "others can write")])
+def test_a_folder_that_others_can_write_is_not_searched(tmp_path, mode, words):
+    (tmp_path / "intruder.py").write_text("print('intruder imported')\n")
+    tmp_path.chmod(mode)
+    done = subprocess.run([sys.executable, "-P", "-c", LOOK], cwd=tmp_path, text=True, check=False,
+                          env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True)
+    assert words in done.stderr
+    assert ("intruder imported" in done.stdout) == (words == "no such actor class")
+
+
+def test_a_folder_of_another_user_is_not_searched(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert working_folder.why_not() == ""
+    monkeypatch.setattr(os, "getuid", lambda: tmp_path.stat().st_uid + 1)
+    assert working_folder.why_not() == f"{tmp_path} belongs to another user"
+
+
+def test_a_group_of_the_user_s_own_is_nobody_else(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tmp_path.chmod(0o775)
+    found = tmp_path.stat()
+    monkeypatch.setattr(os, "getgid", lambda: found.st_uid)
+    os.chown(tmp_path, -1, found.st_uid)
+    assert working_folder.why_not() == ""
+    monkeypatch.setattr(os, "getgid", lambda: found.st_uid + 1)
+    assert "others can write" in working_folder.why_not()
+
+
+def test_a_folder_that_is_gone_is_not_searched(tmp_path, monkeypatch):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    before = list(sys.path)
+    working_folder.admit()
+    assert sys.path == before
+    assert working_folder.why_not() == "the working folder is gone (No such file or directory)"

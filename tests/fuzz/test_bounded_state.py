@@ -1,0 +1,359 @@
+"""No flood of names makes an actor, or what shows a run, remember more than it has room for."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import types
+from collections import deque
+from itertools import count
+
+import msgspec
+import pytest
+from msgspec import inspect
+
+import rampart.sim.osmosis.report_record
+import rampart.sim.runs.console
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Header, encode
+from rampart.actors.bus.limits import REPORTS_PER_S, RateLimit, Remembered, ReportLimit
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.recording.views import Views
+from rampart.actors.run.run_plan import SUPERVISOR
+from rampart.actors.runtime.actor import Actor, Context, on
+from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Shelf
+from rampart.actors.runtime.injection_desk import MAX_DELAYED, MAX_IN_FORCE
+from rampart.actors.runtime.mailbox import Mailbox
+from rampart.cli.run_picture import DECODED, RunPicture
+from rampart.sim.osmosis.actuator_faults import ActuatorFaults, Motor
+from rampart.sim.osmosis.scene import WorldError
+from rampart.sim.runs.console import Console
+from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
+from tests.fuzz.handler_fuzz import Machine, cases, system
+from tests.fuzz.message_extremes import all_topics
+
+FLOOD = 700
+"""Messages of each topic, each about other names and half of them from another source."""
+
+ROOM = 600
+"""More than this nothing may hold after it."""
+
+_FOREIGN = (Context, VirtualBus, Hub, VirtualClock, type, types.ModuleType, types.FunctionType,
+            types.MethodType, asyncio.AbstractEventLoop, asyncio.Future, Machine)
+
+
+# -- every actor --------------------------------------------------------------------------------
+
+
+def told(kind, number):
+    """Return a message of a type in which every name is another one for each number."""
+    return _TOLD.get(type(kind), lambda *_: b"")(kind, number)
+
+
+_TOLD = {
+    inspect.StrType: lambda _kind, number: f"n{number}",
+    inspect.IntType: lambda kind, number: min(number, number if kind.le is None else kind.le),
+    inspect.FloatType: lambda _kind, number: float(number % 40),
+    inspect.BoolType: lambda _kind, _number: True,
+    inspect.EnumType: lambda kind, number: list(kind.cls)[number % len(kind.cls)].value,
+    inspect.VarTupleType: lambda kind, number: [told(kind.item_type, number)],
+    inspect.TupleType: lambda kind, number: [told(part, number) for part in kind.item_types],
+    inspect.DictType: lambda _kind, number: {f"n{number}": 1.0},
+    inspect.StructType: lambda kind, number: {
+        field.encode_name: told(field.type, number) for field in kind.fields}}
+
+
+def holdings(root):
+    """Yield path and size of every collection that can be reached from an object."""
+    seen, todo = set(), deque([("", root)])
+    while todo:
+        path, held = todo.popleft()
+        if id(held) in seen or isinstance(held, _FOREIGN):
+            continue
+        seen.add(id(held))
+        if isinstance(held, dict):
+            yield path, len(held)
+            todo.extend((f"{path}[]", part) for part in held.values())
+        elif isinstance(held, list | set | frozenset | tuple | deque):
+            yield path, len(held)
+            todo.extend((f"{path}[]", part) for part in held)
+        elif isinstance(held, msgspec.Struct):
+            todo.extend((f"{path}.{name}", getattr(held, name)) for name in held.__struct_fields__)
+        else:
+            names = [*getattr(held, "__dict__", ()), *(
+                name for kind in type(held).__mro__ for name in getattr(kind, "__slots__", ()))]
+            todo.extend((f"{path}.{name}", getattr(held, name)) for name in names
+                        if hasattr(held, name))
+
+
+def flooded(of, name):
+    """Return an actor of a system that was told of `FLOOD` names on each of its topics."""
+
+    async def run():
+        loop = asyncio.get_running_loop()
+        hub, member = Hub(), of.layout.members[name]
+        clock = VirtualClock(loop, 0.0)
+        actor = member.actor(Context(
+            name, 1, clock, VirtualBus(hub, name), member.parameters,
+            of.run, pid=1, checkpoints=MemoryCheckpoints(Shelf(), 1),
+            members=frozenset(of.layout.members)), *([Machine()] if name == SUPERVISOR else []))
+        task = asyncio.create_task(actor.run())
+        stranger = VirtualBus(hub, "stranger")
+        await stranger.open()
+        await asyncio.sleep(1.0)
+        sequence = count(1)
+        for topic in actor.inputs():
+            kind = inspect.type_info(topic.type)
+            names = actor.names(topic, name, actor.parameters) or ()
+            for number in range(FLOOD):
+                source = f"s{number}" if number % 2 else "osmosis_control"
+                member_of = names[number % len(names)] if names else f"n{number}"
+                stranger.publish(
+                    topic, topic.at(member_of) if topic.is_family else topic.at(),
+                    msgspec.msgpack.encode((source, 1, next(sequence), 0.9, told(kind, number))))
+                if number % 100 == 0:
+                    await asyncio.sleep(0.02)
+        await asyncio.sleep(0.1)
+        sizes = [(path, size) for path, size in holdings(actor) if size > ROOM]
+        actor.stop()
+        await task
+        return sizes
+
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        return runner.run(run())
+
+
+def kinds():
+    found = {}
+    for of, name in cases():
+        if of == "osmosis":
+            found.setdefault(system(of).layout.members[name].actor, name)
+    return sorted(found.values())
+
+
+@pytest.mark.parametrize("name", kinds())
+def test_no_actor_remembers_more_names_than_it_has_room_for(name):
+    assert flooded(system("osmosis"), name) == []
+
+
+def test_what_remembers_without_bound_is_found(monkeypatch):
+    class Hoarder(Actor):
+        def __init__(self, context):
+            super().__init__(context)
+            self.heard = {}
+
+        @on(ftm_topics.RESET)
+        def reset(self, message, _header):
+            self.heard[message.by] = message
+
+    of = system("osmosis")
+    monkeypatch.setattr(of.layout, "members", {
+        **of.layout.members, "DM1": type(of.layout.members["DM1"])("DM1", Hoarder, {})})
+    assert flooded(of, "DM1") == [(".heard", FLOOD)]
+
+
+# -- what shows and records ---------------------------------------------------------------------
+
+
+def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkeypatch):
+    monkeypatch.setattr(rampart.sim.osmosis.report_record, "KEPT", 500)
+    monkeypatch.setattr(rampart.sim.osmosis.report_record, "TRACK_KEPT", 500)
+    monkeypatch.setattr(rampart.sim.runs.console, "MANY", 500)
+    monkeypatch.setattr(rampart.sim.runs.console, "MOST", 500)
+    of = system("osmosis")
+    run = MissionRun(of.plan, of.run.application.airport, of.run.application.mission, strategy="x",
+                     patience_s=60.0, console=Console(io.StringIO()))
+    picture, views = RunPicture(), Views()
+    clock = type("Clock", (), {"now": staticmethod(lambda: 0.0)})()
+    for topic in all_topics():
+        kind = inspect.type_info(topic.type)
+        for number in range(5000):
+            header = Header(f"s{number}", 1, 1, 0.0)
+            body = msgspec.convert(told(kind, number), topic.type, builtin_types=(bytes,))
+            for sink in run.sinks(clock) if number < FLOOD else ():
+                sink(topic, body, header)
+            if topic in DECODED:
+                picture.heard(topic, header, body, 0.0)
+            views.of(topic, topic.at(f"n{number}") if topic.is_family else topic.at(), header,
+                     body, 0)
+    assert [found for found in holdings(run) if found[1] > ROOM
+            and "airport" not in found[0] and "_known_lights" not in found[0]] == []
+    assert [found for found in holdings(picture) if found[1] > 1025] == []
+    assert [found for found in holdings(views) if found[1] > 4096] == []
+    record = run.conclude(0.0, "the end")
+    assert "were not kept" in record.events[-1].text
+
+
+# -- the parts ----------------------------------------------------------------------------------
+
+
+def test_a_flood_of_strangers_does_not_bring_a_superseded_node_back():
+    taken, refused, crowded = [], [], []
+    guard = ArrivalGuard(lambda: 0.0, {"localization"}, lambda: crowded.append(1))
+    receive = guard.receiver(ftm_topics.RESET, lambda _key, message: taken.append(message.source),
+                             lambda _key, reason: refused.append(reason))
+
+    def say(source, incarnation, sequence):
+        receive("k", encode(Header(source, incarnation, sequence, 0.0), fm.Reset("RM1", "")))
+
+    say("localization", 2, 1)
+    for number in range(3 * STRANGERS):
+        say(f"s{number}", 1, 1)
+    say("localization", 1, 9)
+    say("localization", 2, 1)
+    assert refused == ["incarnation 1 of localization was superseded by 2"]
+    assert len(taken) == 1 + 3 * STRANGERS
+    assert len(crowded) == 2 * STRANGERS
+
+
+def test_strangers_in_the_mailbox_leave_room_for_the_nodes_of_the_system():
+    refused = []
+    mailbox = Mailbox(capacity=8, slots=8, on_overflow=refused.append)
+    assert [mailbox.put(n, reserved=False) for n in range(6)] == [True] * 4 + [False] * 2
+    assert [mailbox.put(n) for n in range(6)] == [True] * 4 + [False] * 2
+    assert [mailbox.put_message(f"{n}", n, reserved=False) for n in range(6)] == (
+        [True] * 4 + [False] * 2)
+    assert [mailbox.put_message(f"node {n}", n) for n in range(6)] == [True] * 4 + [False] * 2
+    assert mailbox.put_message("0", "the newest", reserved=False)
+    assert mailbox.overflowed == len(refused) == 8
+    mailbox.put_latest("timer", "an item of its own always has room")
+    assert len(mailbox) == 17
+
+
+def test_remembered_forgets_what_was_put_in_first_and_counts():
+    kept = Remembered(2)
+    for name in ("a", "b", "a", "c", "d"):
+        kept[name] = name
+    assert (list(kept), kept.forgotten) == (["c", "d"], 2)
+
+
+def test_a_rate_limit_counts_what_does_not_pass_and_tells_it_when_its_second_is_over():
+    limit = RateLimit(2)
+    assert [limit.allows(0.1 * n) for n in range(5)] == [True, True, False, False, False]
+    assert limit.left_out(0.9) == 0
+    assert [limit.left_out(1.0), limit.left_out(1.0)] == [3, 0]
+    assert limit.allows(1.0)
+
+
+def test_error_reports_are_one_a_second_of_a_kind_and_few_in_all():
+    reports = ReportLimit()
+    assert [reports.stands_for("a", t) for t in (0.0, 0.5, 0.9, 1.0, 2.5)] == [1, 0, 0, 3, 1]
+    passed = sum(bool(reports.stands_for(f"{n}", 5.0)) for n in range(10_000))
+    assert passed == REPORTS_PER_S
+    assert reports.left_out(6.0) == 10_000 - REPORTS_PER_S
+
+
+def during(kind, act, seconds=1.5):
+    """Let an actor live while `act(actor, stranger)` is done to it; return what it reported."""
+    reports = []
+
+    async def run():
+        loop = asyncio.get_running_loop()
+        hub = Hub()
+        hub.taps.append(lambda _now, source, key, payload: reports.append(
+            msgspec.msgpack.decode(payload)[4])
+            if (source, key) == ("node", "rampart/diagnostic/node") else None)
+        actor = kind(Context("node", 1, VirtualClock(loop, 0.0), VirtualBus(hub, "node"), pid=1,
+                             members=frozenset({"node", "friend"})))
+        task = asyncio.create_task(actor.run())
+        stranger = VirtualBus(hub, "stranger")
+        await stranger.open()
+        await asyncio.sleep(0.1)
+        act(actor, stranger)
+        await asyncio.sleep(seconds)
+        actor.stop()
+        await task
+
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        runner.run(run())
+    return reports
+
+
+class Quiet(Actor):
+    """Publishes when it is told to."""
+
+    outputs = (topics.POSE,)
+
+
+def test_a_node_with_too_much_to_report_says_how_much_it_left_out():
+    reports = during(Quiet, lambda actor, _: [
+        actor.report_diagnostic("c", "r", f"o{n}") for n in range(1000)])
+    assert len(reports) == REPORTS_PER_S + 1
+    assert reports[-1]["reason"] == f"{1000 - REPORTS_PER_S} more reports were left out"
+
+
+def test_a_crowd_of_sources_is_reported_once_a_second():
+    def crowd(_actor, stranger):
+        for number in range(2 * STRANGERS):
+            stranger.publish(bus_topics.HELLO, bus_topics.HELLO.at("x"),
+                             encode(Header(f"s{number}", 1, 1, 0.0), bm.Hello()))
+
+    reports = during(Quiet, crowd)
+    assert [(report["context"], report["count"]) for report in reports] == [("many sources", 1)]
+
+
+def order(number):
+    return bm.Injection(f"i{number}", topics.POSE.key, "delay", 1e6, delay_s=1e6)
+
+
+def test_injections_of_one_node_are_bounded_and_so_is_what_they_hold_back():
+    def act(actor, _):
+        for number in range(MAX_IN_FORCE + 5):
+            actor._injections.order(order(number))
+        assert len(actor._injections.gate.in_force) == MAX_IN_FORCE
+        for _ in range(MAX_DELAYED + 100):
+            actor.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
+        assert len(actor._timers) <= MAX_DELAYED + MAX_IN_FORCE
+
+    reports = during(Quiet, act, seconds=0.1)
+    assert any("one was dropped" in report["reason"] for report in reports)
+
+
+def test_actuator_faults_at_a_time_are_bounded():
+    faults = ActuatorFaults(Motor(1.0, 1.0, 1.0, 1.0))
+
+    def fault(number):
+        return m.ActuatorFault(f"{number}", m.ActuatorFaultKind.BRAKE_FAILURE, "", 0.5, 1.0)
+
+    for number in range(64):
+        faults.order(fault(number), 0.0)
+    with pytest.raises(WorldError, match="64 faults are in force"):
+        faults.order(fault(64), 0.0)
+    faults.order(fault(63), 0.0)  # known already
+
+
+def test_the_supervisor_passes_on_a_bounded_number_of_reports_and_says_what_it_left_out():
+    of = system("paper")
+    sent = []
+
+    async def run():
+        hub, loop = Hub(), asyncio.get_running_loop()
+        hub.taps.append(lambda _now, source, key, payload: sent.append(
+            (key, msgspec.msgpack.decode(payload)[4])) if source == SUPERVISOR else None)
+        member = of.layout.members[SUPERVISOR]
+        actor = member.actor(Context(
+            SUPERVISOR, 1, VirtualClock(loop, 0.0), VirtualBus(hub, SUPERVISOR), member.parameters,
+            of.run, pid=1), Machine())
+        task = asyncio.create_task(actor.run())
+        stranger = VirtualBus(hub, "stranger")
+        await stranger.open()
+        await asyncio.sleep(0.1)
+        for number in range(1000):
+            stranger.publish(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.at("x"), encode(
+                Header("x", 1, number, 0.0), bm.Diagnostic("x", "c", "r", f"{number}", 1)))
+        await asyncio.sleep(2.0)
+        actor.stop()
+        await task
+
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        runner.run(run())
+    told = [body["node"] for key, body in sent if key == ftm_topics.ERROR_REPORT.at()]
+    assert told.count("x") == 200
+    assert [body["reason"] for key, body in sent if key == "rampart/diagnostic/supervisor"] == [
+        "800 more messages were not passed on"]

@@ -1,0 +1,48 @@
+"""Which mechanisms stand between causes and the top event."""
+
+from rampart.manager.analysis.barriers import guard, occurs_without, outlook
+from rampart.manager.model.fault_tree import Event, FaultTree
+from tests.manager.bench import paper
+
+
+def test_on_the_paper_s_tree_each_cause_has_the_barriers_above_it():
+    found = {g.events: g.barriers for g in guard(paper(), [
+        ("control_node_crash",), ("localization_node_crash",), ("command_calculation_error",),
+        ("actuator_failure",)])}
+    assert found == {
+        ("control_node_crash",): ("FTM1", "FTM2", "FTM4"),
+        ("localization_node_crash",): ("FTM1", "FTM6", "FTM7"),
+        ("command_calculation_error",): ("FTM1", "FTM3"),
+        ("actuator_failure",): ("FTM1",)}
+
+
+def test_a_set_that_reaches_the_top_by_two_ways_is_not_barred_on_one_of_them():
+    found = guard(paper(), [("control_node_crash", "command_calculation_error")])
+    assert found[0].barriers == ("FTM1",)
+
+
+def test_an_event_that_is_kept_from_occurring_does_not_spread():
+    tree = FaultTree([Event("top", ("a", "g"), 2), Event("a"), Event("g", ("b", "c", "d"), 2),
+                      Event("b"), Event("c"), Event("d")])
+    assert occurs_without(tree, ["a", "b", "c"])
+    assert not occurs_without(tree, ["a", "b", "c"], "g")
+    assert not occurs_without(tree, ["a", "b", "c"], "b")
+    assert occurs_without(tree, ["a", "b", "c", "d"], "b")
+
+
+def test_when_nothing_is_active_every_single_cause_has_all_its_barriers():
+    view = outlook(paper(), ())
+    assert view.occurred == ()
+    assert view.left == {}
+    barriers = {g.events[0]: g.barriers for g in view.next_events}
+    assert barriers["control_node_crash"] == ("FTM1", "FTM2", "FTM4")
+    assert [len(g.barriers) for g in view.next_events] == [1, 1, 1, 2, 3, 3, 3]
+
+
+def test_an_active_mechanism_is_a_barrier_no_more_and_its_event_has_occurred():
+    view = outlook(paper(), ["FTM2", "FTM4"])
+    assert view.occurred == ("command_not_updated", "control_node_crash")
+    assert view.left == {"FTM2": ("FTM1",), "FTM4": ("FTM1",)}
+    barriers = {g.events[0]: g.barriers for g in view.next_events}
+    assert "control_node_crash" not in barriers
+    assert barriers["non_control_node_crash"] == ("FTM1", "FTM5")

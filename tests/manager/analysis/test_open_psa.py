@@ -1,0 +1,267 @@
+"""Open-PSA files: what other tools write, and what nobody should."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.manager.analysis.cut_sets import CutSets
+from rampart.manager.analysis.formula import formula_of
+from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa, write_open_psa
+from rampart.manager.spec.specification import parse_specification
+from tests import ROOT
+from tests.manager.bench import paper
+
+
+def mef(*definitions: str, data: str = "") -> str:
+    return ('<?xml version="1.0"?><opsa-mef><define-fault-tree name="ft">'
+            + "".join(definitions) + f"</define-fault-tree>{data}</opsa-mef>")
+
+
+def gate(name: str, body: str, attributes: str = "") -> str:
+    return f'<define-gate name="{name}"{attributes}>{body}</define-gate>'
+
+
+def events(*names: str) -> str:
+    return "".join(f'<basic-event name="{name}"/>' for name in names)
+
+
+def cut_sets(text: str, top: str = "") -> set[frozenset[str]]:
+    return {frozenset(s) for s in CutSets(read_open_psa(text, "f.xml", top)).sets()}
+
+
+def sets(*texts: str) -> set[frozenset[str]]:
+    return {frozenset(text.split()) for text in texts}
+
+
+@pytest.mark.parametrize(("body", "expected"), [
+    (f"<and>{events('a', 'b')}</and>", sets("a b")),
+    (f"<or>{events('a', 'b')}</or>", sets("a", "b")),
+    (f'<atleast min="2">{events("a", "b", "c")}</atleast>', sets("a b", "a c", "b c")),
+    (f'<cardinality min="1" max="1">{events("a", "b")}</cardinality>', sets("a", "b")),
+    (f"<xor>{events('a', 'b')}</xor>", sets("a", "b")),
+    (f"<not>{events('a')}</not>", sets("")),
+    (f"<nand>{events('a', 'b')}</nand>", sets("")),
+    (f"<nor>{events('a', 'b')}</nor>", sets("")),
+    (f"<iff>{events('a', 'b')}</iff>", sets("")),
+    (f"<imply>{events('a', 'b')}</imply>", sets("")),
+    (f"<and>{events('a')}<not>{events('b')}</not></and>", sets("a")),
+    (f"<and>{events('c')}<imply>{events('a', 'b')}</imply></and>", sets("c")),
+    (f"<and>{events('a', 'b')}<iff>{events('a', 'b')}</iff></and>", sets("a b")),
+    (f'<or>{events("a")}<constant value="true"/></or>', sets("")),
+    (f'<or>{events("a")}<constant value="false"/></or>', sets("a")),
+    (f"<or><and>{events('a', 'b')}</and><and>{events('b', 'c')}</and></or>", sets("a b", "b c")),
+    ('<event name="a"/>', sets("a")),
+    ('<event name="a" type="basic-event"/>', sets("a")),
+])
+def test_every_connective_has_its_meaning(body, expected):
+    assert cut_sets(mef(gate("top", body))) == expected
+
+
+def test_what_does_not_decide_cut_sets_is_read_over():
+    text = mef("<label>a tree</label>",
+               gate("top", "<label>it</label><attributes><attribute name='x' value='y'/>"
+                           f"</attributes><or>{events('a', 'b')}</or>"),
+               data="<model-data><define-basic-event name='a'><float value='0.1'/>"
+                    "</define-basic-event><define-parameter name='p'><float value='1'/>"
+                    "</define-parameter></model-data>")
+    assert cut_sets(text) == sets("a", "b")
+
+
+def test_house_events_are_constants_wherever_they_are_defined():
+    text = mef(gate("top", '<and><house-event name="h"/><basic-event name="a"/></and>'),
+               data='<model-data><define-house-event name="h"><constant value="true"/>'
+                    "</define-house-event></model-data>")
+    assert cut_sets(text) == sets("a")
+
+
+def test_private_names_of_components_do_not_meet():
+    inner = gate("g", f"<or>{events('e')}</or>", ' role="private"') + \
+        '<define-basic-event name="e" role="private"/>'
+    text = mef(gate("top", '<and><gate name="left.g"/><gate name="right.g"/></and>'),
+               f'<define-component name="left">{inner}</define-component>',
+               f'<define-component name="right">{inner}</define-component>')
+    assert cut_sets(text) == sets("ft.left.e ft.right.e")
+
+
+def test_the_top_may_be_chosen():
+    text = mef(gate("one", f"<or>{events('a')}</or>"), gate("two", f"<or>{events('b')}</or>"))
+    assert cut_sets(text, "two") == sets("b")
+
+
+def test_formulas_nested_by_the_thousand_are_read():
+    body = "<or>" * 4000 + events("a") + "</or>" * 4000
+    assert cut_sets(mef(gate("top", body))) == sets("a")
+
+
+def test_formulas_nested_side_by_side_are_not_taken_for_each_other():
+    def pair(x: str, y: str, z: str) -> str:
+        return f"<and><or>{events(x, y)}</or>{events(z)}</and>"
+
+    body = f"<or>{pair('a', 'b', 'c')}{pair('d', 'e', 'f')}{pair('g', 'h', 'i')}</or>"
+    assert cut_sets(mef(gate("top", body))) == sets("a c", "b c", "d f", "e f", "g i", "h i")
+
+
+@pytest.mark.parametrize(("definitions", "expected"), [
+    ([gate("top", f'<or><gate name="top/lone"/>{events("a", "b")}<gate name="g"/></or>'),
+      gate("g", f'<and><gate name="top/lone"/>{events("z")}</and>'),
+      gate("top/lone", f"<and>{events('p', 'q')}</and>")], sets("a", "b", "p q")),
+    ([gate("g/not", f"<and>{events('p', 'q')}</and>"),
+      gate("top", '<and><gate name="g/not"/><gate name="g"/></and>'),
+      gate("g", f"<imply>{events('x', 'y')}</imply>")], sets("p q")),
+    ([gate("top", f'<and><gate name="g"/>{events("g/constant")}</and>'),
+      gate("g", '<constant value="true"/>')], sets("g/constant")),
+])
+def test_a_name_keeps_its_meaning_whatever_it_looks_like(definitions, expected):
+    assert cut_sets(mef(*definitions)) == expected
+
+
+HOLDS = {
+    "and": lambda inputs, _: all(inputs), "or": lambda inputs, _: any(inputs),
+    "nand": lambda inputs, _: not all(inputs), "nor": lambda inputs, _: not any(inputs),
+    "not": lambda inputs, _: not inputs[0], "xor": lambda inputs, _: inputs[0] != inputs[1],
+    "iff": lambda inputs, _: inputs[0] == inputs[1],
+    "imply": lambda inputs, _: not inputs[0] or inputs[1],
+    "atleast": lambda inputs, k: sum(inputs) >= k,
+}
+"""What each connective means, said once more."""
+
+LEAVES = st.sampled_from([*"abcde", "top/lone", "top/1", "top/not"])
+
+
+def inner(parts: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    """Return formulas (connective, inputs, k) over parts."""
+    return st.one_of(
+        st.tuples(st.sampled_from(["and", "or", "nand", "nor"]),
+                  st.lists(parts, min_size=1, max_size=4), st.just(0)),
+        st.tuples(st.just("not"), st.lists(parts, min_size=1, max_size=1), st.just(0)),
+        st.tuples(st.sampled_from(["xor", "iff", "imply"]),
+                  st.lists(parts, min_size=2, max_size=2), st.just(0)),
+        st.tuples(st.just("atleast"), st.lists(parts, min_size=2, max_size=4),
+                  st.integers(1, 2)))
+
+
+FORMULAS = inner(st.recursive(LEAVES, inner, max_leaves=12))
+
+
+def written(formula: Any, gates: dict[str, Any]) -> str:
+    if isinstance(formula, str):
+        return f'<{"gate" if formula in gates else "basic-event"} name="{formula}"/>'
+    tag, parts, k = formula
+    least = f' min="{k}"' if k else ""
+    return f"<{tag}{least}>{''.join(written(part, gates) for part in parts)}</{tag}>"
+
+
+def holds(formula: Any, gates: dict[str, Any], occurred: frozenset[str]) -> bool:
+    if isinstance(formula, str):
+        return holds(gates[formula], gates, occurred) if formula in gates else formula in occurred
+    tag, parts, k = formula
+    return HOLDS[tag]([holds(part, gates, occurred) for part in parts], k)
+
+
+@settings(max_examples=150, deadline=None)
+@given(FORMULAS, inner(st.sampled_from("abcde")), inner(st.sampled_from("abcde")))
+def test_nested_formulas_have_the_minimal_sets_that_brute_force_finds(top, lone, negation):
+    gates = {"top/lone": lone, "top/not": negation}  # names that a reader might make up as well
+    text = mef(gate("top", written(top, gates)),
+               *(gate(name, written(body, gates)) for name, body in gates.items()))
+    minimal: list[frozenset[str]] = []
+    for size in range(7):
+        for chosen in map(frozenset, combinations([*"abcde", "top/1"], size)):
+            if holds(top, gates, chosen) and not any(smaller <= chosen for smaller in minimal):
+                minimal.append(chosen)
+    assert cut_sets(text, "top") == set(minimal)
+
+
+@pytest.mark.parametrize("system", ["osmosis", "cell"])
+def test_what_is_exported_comes_back_the_same(system):
+    path = ROOT / "systems" / f"{system}.toml"
+    spec = parse_specification(path.read_text(encoding="utf-8"), path.name)
+    back = read_open_psa(write_open_psa(spec), "out.xml")
+    there = formula_of(spec.build_fault_tree())
+    assert set(CutSets(back).sets()) == set(CutSets(there).sets())
+    assert back.top == there.top
+
+
+def test_titles_and_barriers_are_exported_as_labels_and_attributes():
+    text = write_open_psa(paper())
+    assert "<label>Moving inside a prohibited area</label>" in text
+    assert '<attribute name="barrier" value="FTM1" />' in text
+
+
+BOMB = ('<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
+        "<opsa-mef>&b;</opsa-mef>")
+EXTERNAL = ('<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
+            "<opsa-mef>&a;</opsa-mef>")
+TREE = "f.xml: /opsa-mef/define-fault-tree[@name='ft']/"
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    (BOMB, "f.xml: /: DTDForbidden: document type definitions and entities are not read; leave "
+           "them out"),
+    (EXTERNAL, "f.xml: /: DTDForbidden: document type definitions and entities are not read; "
+               "leave them out"),
+    ("<opsa-mef>", "f.xml: /: not well-formed XML: no element found: line 1, column 10"),
+    ("", "f.xml: /: not well-formed XML: no element found: line 1, column 0"),
+    ("<html/>", "f.xml: /html: expected the root element 'opsa-mef'"),
+    (mef(gate("top", "<or></or>")), TREE + "define-gate[@name='top']/or: empty gate; it needs "
+                                           "inputs"),
+    (mef(gate("top", "")), TREE + "define-gate[@name='top']: 0 formulas; a gate has exactly one"),
+    (mef(gate("top", f"<or>{events('a')}</or>"), gate("top", f"<or>{events('b')}</or>")),
+     TREE + "define-gate[@name='top']: duplicate name 'top', already defined at "
+     + TREE.removeprefix("f.xml: ") + "define-gate[@name='top']"),
+    (mef(gate("top", '<or><gate name="g7"/></or>')),
+     TREE + "define-gate[@name='top']/or/gate[@name='g7']: there is no gate 'g7'"),
+    (mef(gate("top", '<or><house-event name="a"/></or>'), '<define-basic-event name="a"/>'),
+     TREE + "define-gate[@name='top']/or/house-event[@name='a']: 'a' is a basic-event, not a "
+            "house-event"),
+    (mef(gate("top", '<or><gate name="g"/></or>'), gate("g", '<or><gate name="h"/></or>'),
+         gate("h", '<or><gate name="g"/></or>')),
+     "f.xml: /opsa-mef: cycle g > h > g; an event cannot be its own cause"),
+    (mef(gate("top", f'<atleast min="4">{events("a", "b", "c")}</atleast>')),
+     TREE + "define-gate[@name='top']/atleast: min = '4': expected a number from 1 to 3, the "
+            "inputs"),
+    (mef(gate("top", f'<atleast>{events("a")}</atleast>')),
+     TREE + "define-gate[@name='top']/atleast: min = '': expected a number from 1 to 1, the "
+            "inputs"),
+    (mef(gate("top", f'<cardinality min="2" max="1">{events("a", "b")}</cardinality>')),
+     TREE + "define-gate[@name='top']/cardinality: min = 2 is more than max = 1"),
+    (mef(gate("top", f"<xor>{events('a')}</xor>")),
+     TREE + "define-gate[@name='top']/xor: 1 inputs; 'xor' takes 2"),
+    (mef(gate("top", f"<maybe>{events('a')}</maybe>")),
+     TREE + "define-gate[@name='top']/maybe: unknown connective; known: and, or, not, xor, nand, "
+            "nor, iff, imply, atleast, cardinality"),
+    (mef(gate("top", '<or><constant value="maybe"/></or>')),
+     TREE + "define-gate[@name='top']/or/constant: value 'maybe': expected 'true' or 'false'"),
+    (mef(gate("a", f"<or>{events('x')}</or>"), gate("b", f"<or>{events('x')}</or>")),
+     "f.xml: /opsa-mef: 2 gates are no input of another: a, b; say which is the top"),
+    (mef(), "f.xml: /opsa-mef: no gates; a top is needed"),
+    (mef(gate("", f"<or>{events('x')}</or>")),
+     TREE + "define-gate[1]: name '': expected a name without dots"),
+    (mef('<define-CCF-group name="c"/>'),
+     TREE + "define-CCF-group[@name='c']: not supported: common-cause groups would change the cut "
+            "sets"),
+    (mef(gate("top", "<or>" * 10_001 + events("a") + "</or>" * 10_001)),
+     "f.xml: /: elements are nested more than 10000 deep; name the inner formulas as "
+     "gates"),
+])
+def test_refused(text, message):
+    with pytest.raises(OpenPsaError) as caught:
+        read_open_psa(text, "f.xml")
+    assert str(caught.value) == message
+
+
+def test_an_unknown_top_is_refused_with_those_that_are_known():
+    with pytest.raises(OpenPsaError, match="unknown top gate 'x'; known: top"):
+        read_open_psa(mef(gate("top", f"<or>{events('a')}</or>")), "f.xml", "x")
+
+
+@pytest.mark.parametrize(
+    "junk", [b"\xff\xfe", b"\x00", b"<a", b"<?xml version='1.0' encoding='x'?>"])
+def test_bytes_that_are_no_xml_are_refused_too(junk):
+    with pytest.raises(OpenPsaError, match="not well-formed"):
+        read_open_psa(junk, "f.xml")

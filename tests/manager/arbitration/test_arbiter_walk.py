@@ -1,0 +1,165 @@
+"""Random walks over the arbiter: modules report, obey, finish, fail and die in any sequence."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.manager.arbitration.arbiter import Command, DecisionMade, Phase
+from tests.manager.bench import DMS, RMS, Bench, paper
+
+MECHANISMS = paper().build_mechanisms()
+ORDER = paper().build_order()
+FINISHED = (Phase.DONE, Phase.DEGRADED)
+
+
+class Modules:
+    """Recovery modules that keep their contract, with the bus between them and the arbiter.
+
+    Commands lie in `inbox` until the walk delivers them; a module reports on every change.
+    """
+
+    def __init__(self) -> None:
+        self.inbox = {rm: [] for rm in RMS}
+        self.phase = dict.fromkeys(RMS, Phase.IDLE)
+        self.decision = dict.fromkeys(RMS, 0)
+
+    def deliver(self, rm: str) -> bool:
+        """Obey the oldest command. Returns whether the module was cut off half-way by it."""
+        if not self.inbox[rm]:
+            return False
+        command = self.inbox[rm].pop(0)
+        if command.activate and command.decision != self.decision[rm]:
+            self.phase[rm], self.decision[rm] = Phase.ACTING, command.decision
+        elif not command.activate:
+            cut_off = self.phase[rm] is Phase.ACTING
+            self.phase[rm] = Phase.IDLE
+            return cut_off
+        return False
+
+
+ACTIONS = st.one_of(
+    st.tuples(st.just("rise"), st.sampled_from(DMS)),
+    st.tuples(st.just("fall"), st.sampled_from(DMS)),
+    st.tuples(st.just("deliver"), st.sampled_from(RMS)),
+    st.tuples(st.just("report"), st.sampled_from(RMS)),
+    st.tuples(st.just("finish"), st.sampled_from(RMS)),
+    st.tuples(st.just("fail"), st.sampled_from(RMS)),
+    st.tuples(st.just("crash"), st.sampled_from(RMS)),
+    st.tuples(st.just("reset"), st.sampled_from(RMS)),
+    st.tuples(st.just("wait"), st.sampled_from([0.05, 0.3, 1.0])),
+)
+
+
+class Walk:
+    def __init__(self) -> None:
+        self.bench, self.modules = Bench(), Modules()
+        self.crashed = self.failed = False
+
+    def take(self, action: str, subject) -> None:
+        bench, modules = self.bench, self.modules
+        before, start, latched = bench.state, len(bench.log), set(bench.state.latched)
+        granted = set()
+        if action == "rise":
+            bench.active(subject, "hmi")
+        elif action == "fall":
+            bench.idle(subject)
+        elif action == "deliver":
+            cut_off = modules.deliver(subject)
+            track = before.recoveries[RMS.index(subject)]
+            assert not cut_off or self.crashed or track.failure or self.failed, \
+                f"{subject} was cut off"
+        elif action == "finish" and modules.phase[subject] is Phase.ACTING:
+            modules.phase[subject] = Phase.DONE
+        elif action == "fail" and modules.phase[subject] is Phase.ACTING:
+            modules.phase[subject], self.failed = Phase.FAILED, True
+        elif action == "crash":
+            modules.phase[subject], modules.decision[subject] = Phase.IDLE, 0
+            self.crashed = True
+        elif action == "reset" and bench.reset(subject).granted:
+            granted = {subject}
+        elif action == "wait":
+            bench.wait(subject)
+            self.failed |= any(t.failure for t in bench.state.recoveries)
+        if action in {"report", "finish", "fail", "crash"}:
+            bench.report(subject, modules.phase[subject], modules.decision[subject])
+        outputs = bench.log[start:]
+        for output in outputs:
+            if isinstance(output, Command):
+                modules.inbox[output.recovery].append(output)
+        self.check(before, outputs, latched - granted, one_step=action != "wait")
+        if (action, subject) == ("rise", "DM1"):
+            assert bench.state.desired["RM1"].activate  # in this very step
+
+    def check(self, before, outputs, latched, *, one_step: bool) -> None:
+        state = self.bench.state
+        in_force = [t for t in state.recoveries if t.wanted and not t.draining]
+        assert len(in_force) <= 1
+        assert len(state.decision.recoveries) <= 1
+        assert [t.name for t in in_force] in ([], list(state.decision.recoveries))
+        for other in state.recoveries:
+            if other.draining and in_force:
+                assert not MECHANISMS.overlap(other.name, in_force[0].name)
+                assert ORDER.is_above(in_force[0].name, other.name) or other.failure \
+                    or before.recoveries[RMS.index(in_force[0].name)].wanted
+        assert latched <= set(state.latched)
+        assert not latched or state.decision.recoveries
+        made = [o.number for o in outputs if isinstance(o, DecisionMade)]
+        assert made == sorted(set(made))
+        assert all(number > before.number for number in made)
+        released = [i for i, o in enumerate(outputs) if isinstance(o, Command) and not o.activate]
+        activated = [i for i, o in enumerate(outputs) if isinstance(o, Command) and o.activate]
+        if one_step:
+            assert not released or not activated or max(released) < min(activated)
+
+    def calm_down(self) -> None:
+        """Everybody goes on and does what they are told; the actor repeats what it wants."""
+        for _ in range(200):
+            for rm in RMS:
+                self.modules.inbox[rm] = [self.bench.state.desired[rm]]
+                self.take("deliver", rm)
+                self.take("finish", rm)
+                self.take("report", rm)
+            self.take("wait", 0.05)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(ACTIONS, min_size=20, max_size=80))
+def test_invariants_hold_in_every_step(actions):
+    walk = Walk()
+    for action, subject in actions:
+        walk.take(action, subject)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(ACTIONS, max_size=40), st.sets(st.sampled_from(DMS)))
+def test_in_the_end_there_is_one_decision_and_it_is_carried_out(actions, remaining):
+    walk = Walk()
+    for action, subject in actions:
+        walk.take(action, subject)
+    walk.crashed = True  # the inbox is overwritten below, which is no fault of the arbiter
+    for dm in DMS:
+        walk.take("rise" if dm in remaining else "fall", dm)
+    walk.calm_down()
+    state = walk.bench.state
+    assert {dm for name in state.active for dm in MECHANISMS.detect[name]} == remaining
+    assert list(state.activated) == list(state.decision.recoveries)
+    assert state.draining == ()
+    assert bool(state.activated) == bool(remaining or state.latched)
+    for rm in RMS:
+        assert (walk.modules.phase[rm] in FINISHED) == (rm in state.activated)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(ACTIONS, max_size=40))
+def test_when_all_is_well_and_reset_nothing_is_left_activated(actions):
+    walk = Walk()
+    for action, subject in actions:
+        walk.take(action, subject)
+    walk.crashed = True
+    for dm in DMS:
+        walk.take("fall", dm)
+    walk.calm_down()
+    for rm in walk.bench.state.latched:
+        assert walk.bench.reset(rm).granted
+    walk.calm_down()
+    assert walk.bench.orders == ""
+    assert walk.bench.state.decision.rule == 0

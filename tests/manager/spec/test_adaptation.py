@@ -1,0 +1,327 @@
+"""Changes while running: what is made of a document, and what the manager does with it."""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
+from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.manager.spec.adaptation import (
+    Action,
+    Change,
+    ChangeError,
+    adapt,
+    changed_actors,
+    describe,
+    parse_value,
+)
+from rampart.manager.spec.checks import find_nonsense
+from rampart.manager.spec.specification import SpecificationError, SystemSpec, read_document
+from tests.manager.bench import PAPER, paper
+from tests.manager.test_actor import Whole
+from tests.virtual_loop import run, turns
+
+DOCUMENT = read_document(PAPER, "paper.toml")
+
+
+def change(action: str, name: str, /, **values: Any) -> SystemSpec:
+    before = copy.deepcopy(DOCUMENT)
+    _, spec = adapt(DOCUMENT, Change(Action(action), name, values), "paper.toml")
+    assert before == DOCUMENT
+    return spec
+
+
+def names(spec: SystemSpec) -> list[str]:
+    return [mechanism.name for mechanism in spec.mechanisms]
+
+
+@pytest.mark.parametrize(("name", "left_out"), [
+    ("FTM7", {"FTM7"}), ("DM4", {"FTM4"}), ("FTM3", {"FTM3"})])
+def test_what_is_disabled_is_left_out_with_all_that_uses_it(name, left_out):
+    assert set(names(paper())) - set(names(change("disable", name))) == left_out
+
+
+def test_enabling_again_gives_back_the_same_system():
+    after, _ = adapt(DOCUMENT, Change(Action.DISABLE, "FTM7"), "f")
+    _, spec = adapt(after, Change(Action.ENABLE, "FTM7"), "f")
+    assert names(spec) == names(paper())
+    assert spec.build_ftm_tree().parents == paper().build_ftm_tree().parents
+
+
+def test_what_the_tree_closes_over_has_to_be_in_time_for_the_barrier_above():
+    """Without FTM2, FTM4 would have to be faster than DM1: the budget says no."""
+    with pytest.raises(SpecificationError, match=r"FTM4 needs 0.990 s .* of 0.100 s before DM1"):
+        change("disable", "DM2")
+
+
+def test_a_parameter_is_retuned_and_only_that_module_has_to_be_started_anew():
+    spec = change("retune", "DM1", margin_m=0.7)
+    assert next(d for d in spec.detections if d.name == "DM1").parameters["margin_m"] == 0.7
+    assert changed_actors(paper(), spec) == ("DM1",)
+    assert changed_actors(paper(), change("retune", "RM3", deadline_s=2.5)) == ()
+    assert changed_actors(paper(), change(
+        "retune", "DM3", actor="rampart.actors.detection.stub:StubDetection")) == ("DM3",)
+
+
+def test_a_gate_and_an_order_and_a_strategy_are_changed():
+    assert change("retune", "FTM2", detect="DM2 or DM6").mechanisms[1].detections == ("DM2", "DM6")
+    assert change("set", "strategy", value="mission-first").strategy == "mission-first"
+    assert change("set", "shadow", value="mission-first").shadow == "mission-first"
+
+
+@pytest.mark.parametrize(("action", "name", "values", "message"), [
+    ("disable", "FTM9", {}, "unknown detection module, recovery module or mechanism 'FTM9'; known: "
+                            "DM1, DM2, DM3, DM4, DM5, DM6, DM7, RM1, RM2, RM3, RM4, RM5, FTM1, "
+                            "FTM2, FTM3, FTM4, FTM5, FTM6, FTM7"),
+    ("retune", "FTM3", {}, "retune FTM3: nothing to change; name fields and values"),
+    ("retune", "FTM3", {"name": "X"}, "name = 'X': a name cannot be changed"),
+    ("retune", "FTM3", {"margin_m": 1}, "margin_m = 1: unknown field of a mechanism; known: detect,"
+                                        " recover, event, against, enabled"),
+    ("replace", "FTM3", {"name": "X"}, "name = 'X': a replacement keeps the name, 'FTM3'"),
+    ("set", "airport", {"value": "x"}, "unknown setting 'airport'; known: strategy, shadow, order"),
+    ("set", "strategy", {}, "set strategy: the value is missing"),
+    ("set", "strategy", {"value": "bold"},
+     "paper.toml: $.strategy = 'bold': unknown strategy; known: guarded-repair, mission-first, "
+     "safety-first, simultaneous"),
+    ("set", "order", {"value": "comfort"},
+     "paper.toml: $.order = 'comfort': unknown order; known: safer"),
+    ("disable", "RM1", {}, "paper.toml: $.recovery[1].escalate_to = 'RM1': RM2 escalates to it, "
+                           "and it is disabled"),
+    ("disable", "FTM1", {}, "paper.toml: $.mechanism[1].event = 'command_calculation_error': "
+                            "FTM3: the FTMTree has 3 roots: FTM2, FTM3, FTM6; exactly one mechanism"
+                            " may have no other above it, e.g. one on the top event"),
+    ("retune", "DM2", {"timeout_s": 5.0},
+     "paper.toml: $.timing: the time budget does not fit: FTM2 needs 5.150 s (detection 5.000 + "
+     "arbitration 0.050 + actuation 0.100) of 1.250 s before the robot drifts out of the corridor"),
+    ("retune", "FTM3", {"against": {"within_s": 5.0, "hazard": "x", "typo": 1}},
+     "paper.toml: $.mechanism[2].against.typo = 1: unknown field; known: within_s, hazard"),
+    ("retune", "FTM3", {"detect": "DM3 and not DM3"},
+     "paper.toml: $.mechanism[2].detect = 'DM3 and not DM3': it can never be active"),
+    ("retune", "RM3", {"deadline_s": "soon"},
+     "paper.toml: $.recovery[2].deadline_s = 'soon': Expected float, got str"),
+    ("replace", "DM1", {"parameters": 3},
+     "paper.toml: $.detection[0].parameters = 3: Expected object, got int"),
+])
+def test_refused_in_one_line(action, name, values, message):
+    with pytest.raises((ChangeError, SpecificationError)) as caught:
+        change(action, name, **values)
+    assert str(caught.value) == message
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-10 ** 30, 10 ** 30) | st.text(max_size=8)
+    | st.floats(allow_nan=True),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner,
+                                                                max_size=3), max_leaves=6)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(list(Action)),
+       st.sampled_from(["DM2", "RM3", "FTM4", "FTM1", "strategy", "order", "shadow", "x"]),
+       st.dictionaries(st.sampled_from(
+           ["value", "parameters", "enabled", "detect", "recover", "event", "kind", "claims",
+            "deadline_s", "within_s", "timeout_s", "watch", "escalate_to", "actor", "title",
+            "against", "needs"]), JSON, max_size=3))
+@example(Action.RETUNE, "DM2", {"parameters": None, "value": None})
+def test_whatever_is_asked_for_gives_a_sound_system_or_a_refusal(action, name, values):
+    try:
+        _, spec = adapt(DOCUMENT, Change(action, name, values), "f")
+    except (ChangeError, SpecificationError) as error:
+        refusal = str(error)
+    else:
+        refusal = ""
+        assert find_nonsense(spec) is None or names(spec) != names(paper())
+    assert "\n" not in refusal
+
+
+@pytest.mark.parametrize(("text", "value"), [
+    ("0.5", 0.5), ("true", True), ("[1, 2]", [1, 2]), ("'a b'", "a b"),
+    ("DM3 or DM2", "DM3 or DM2"),
+    ("2 of (DM1, DM2)", "2 of (DM1, DM2)"), ("guarded-repair", "guarded-repair")])
+def test_values_are_read_as_toml_and_words_as_text(text, value):
+    assert parse_value(text) == value
+
+
+@pytest.mark.parametrize("text", ["{;}", "+" + "9" * 5000, "[" * 5000])
+def test_a_value_that_is_neither_is_refused(text):
+    with pytest.raises(ChangeError, match="expected a TOML value"):
+        parse_value(text)
+
+
+def test_a_change_is_described_in_a_few_words():
+    assert describe(Change(Action.RETUNE, "DM1", {"margin_m": 0.7})) == "retune DM1: margin_m = 0.7"
+    assert describe(Change(Action.SET, "order", {"value": ["a", "b"]})) == "set order to ['a', 'b']"
+
+
+# -- the manager ---------------------------------------------------------------------------------
+
+
+class Engineer(Actor):
+    """Asks for changes and hears what comes of it."""
+
+    outputs = (topics.ADAPT,)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.answers: list[m.AdaptationAnswer] = []
+        self.systems: list[m.AdaptedSystem] = []
+        self.shadows: list[m.ShadowRecord] = []
+        self.commands: list[m.RecoveryCommand] = []
+
+    @on(topics.ADAPTATION)
+    def answer(self, message: m.AdaptationAnswer, _header: Header) -> None:
+        self.answers.append(message)
+
+    @on(topics.ADAPTED_SYSTEM)
+    def system(self, message: m.AdaptedSystem, _header: Header) -> None:
+        self.systems.append(message)
+
+    @on(topics.SHADOW)
+    def shadow(self, message: m.ShadowRecord, _header: Header) -> None:
+        self.shadows.append(message)
+
+    async def ask(self, action: str, name: str, values: str = "{}") -> m.AdaptationAnswer:
+        count = len(self.answers)
+        self.publish(topics.ADAPT, m.AdaptationRequest("r", action, name, values, "test"))
+        await turns()
+        assert len(self.answers) == count + 1
+        return self.answers[-1]
+
+
+def in_adaptable_system(scenario: Any) -> None:
+    async def begin() -> None:
+        async with Whole() as system:
+            system.run = replace(system.run, document=copy.deepcopy(DOCUMENT))
+            await system.begin()
+            engineer = system.start("engineer", Engineer)
+            await asyncio.sleep(0.1)
+            await scenario(system, engineer)
+
+    run(begin)
+
+
+def test_a_change_is_applied_at_once_told_whole_and_repeated_and_nothing_else_happens():
+    async def scenario(system: Whole, engineer: Engineer) -> None:
+        answer = await engineer.ask("set", "strategy", '{"value": "guarded-repair"}')
+        assert (answer.accepted, answer.reason, answer.version) == (True, "", 1)
+        told = engineer.systems[-1]
+        assert (told.version, told.change) == (1, "set strategy to 'guarded-repair'")
+        assert msgspec.json.decode(told.document)["strategy"] == "guarded-repair"
+        assert system.status.strategy == "guarded-repair"
+        count = len(engineer.systems)
+        await asyncio.sleep(5.0)
+        assert len(engineer.systems) >= count + 4
+        assert system.recorder.decisions == []  # belief in all modules was kept
+        assert system.pilot.heard == 0
+
+    in_adaptable_system(scenario)
+
+
+def test_the_new_strategy_decides_from_then_on():
+    async def scenario(system: Whole, engineer: Engineer) -> None:
+        await engineer.ask("set", "strategy", '{"value": "guarded-repair"}')
+        await engineer.ask("set", "shadow", '{"value": "safety-first"}')
+        system.robot.silent.add("command")
+        await asyncio.sleep(1.2)
+        await system.kill("osmosis_control")
+        await asyncio.sleep(0.3)
+        assert (("FTM2", "FTM4"), 2, ("RM2", "RM3")) in system.recorder.taken
+        assert any(s.strategy == "safety-first" and s.recoveries == ("RM2",)
+                   for s in engineer.shadows)
+        assert system.incarnations["osmosis_control"] == 2
+
+    in_adaptable_system(scenario)
+
+
+@pytest.mark.parametrize("values", [
+    '{"against": {"within_s": 5.0, "hazard": "x", "typo": 1}}',
+    '{"timeout_s": 1' + 400 * "0" + "}",
+    '{"value": ' + 5000 * "[" + 5000 * "]" + "}",
+    '{"value": NaN}', "[]", "\xff", ""])
+def test_whatever_is_typed_the_manager_refuses_it_and_lives(values):
+    async def scenario(system: Whole, engineer: Engineer) -> None:
+        for action, name in (("retune", "FTM2"), ("set", "strategy")):
+            answer = await engineer.ask(action, name, values)
+            assert not answer.accepted
+            assert answer.reason
+            assert "\n" not in answer.reason
+        assert (await engineer.ask("set", "strategy", '{"value": "guarded-repair"}')).accepted
+
+    in_adaptable_system(scenario)
+
+
+def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
+    async def scenario(system: Whole, engineer: Engineer) -> None:
+        system.robot.silent.add("command")
+        await asyncio.sleep(1.5)
+        answer = await engineer.ask("disable", "FTM7")
+        assert not answer.accepted
+        assert answer.reason == ("not in the middle of a recovery: RM2; try again when it is over")
+        answer = await engineer.ask("retune", "DM99", '{"margin_m": 0.7}')
+        assert answer.reason.startswith("unknown detection module, recovery module or mechanism")
+        answer = await engineer.ask("retune", "DM4", '{"timeout_s": 0.01}')
+        assert "would raise false alarms" in answer.reason
+        system.robot.silent.clear()
+        await asyncio.sleep(2.0)
+        assert (await engineer.ask("disable", "FTM7")).accepted
+
+    in_adaptable_system(scenario)
+
+
+@pytest.mark.parametrize(("action", "name", "values", "words"), [
+    ("explode", "FTM7", "{}", "'explode' is not a valid Action"),
+    ("disable", "FTM7", "[]", "Expected `object`"),
+    ("disable", "FTM7", "{", "Input data was truncated"),
+    ("disable", "FTM1", "{}", "the FTMTree has 3 roots"),
+    ("retune", "DM1", '{"actor": "rampart.actors.osmosis.detection.bounds:Nobody"}',
+     "no such actor class"),
+    ("retune", "DM3", '{"actor": "rampart.actors.osmosis.recovery.emergency_stop:EmergencyStop"}',
+     "it does not publish detection/{name}, as the modules of this table do"),
+    ("retune", "DM3", '{"actor": "rampart.actors.detection.stub:StubDetection"}',
+     "no actor of the system that was started is in that module"),
+    ("retune", "RM5",
+     '{"actor": "rampart.actors.osmosis.control.localization.localization:Localization"}',
+     "it does not publish recovery/{name}/state, as the modules of this table do"),
+    ("retune", "DM4", '{"timeout_s": 0.01}',
+     "paper.toml: $.detection[3].parameters.timeout_s = 0.01: would raise false alarms; at least "
+     "0.420 s, 3 periods of heartbeat_period_s = 0.140 s, is right"),
+    ("retune", "DM1", '{"hold_s": -1}',
+     "paper.toml: $.detection[0].parameters.hold_s = -1: expected a number, 0 or more"),
+    ("retune", "DM3", '{"hold": 1}',
+     "paper.toml: $.detection[2].parameters.hold = 1: unknown parameter; known: hold_s, suspects"),
+])
+def test_what_is_refused_changes_nothing(action, name, values, words):
+    async def scenario(system: Whole, engineer: Engineer) -> None:
+        answer = await engineer.ask(action, name, values)
+        assert not answer.accepted
+        assert words in answer.reason
+        assert "\n" not in answer.reason
+        assert engineer.systems == []
+        system.robot.silent.add("command")
+        await asyncio.sleep(1.5)
+        assert system.recorder.taken == [(("FTM2",), 1, ("RM2",))]
+
+    in_adaptable_system(scenario)
+
+
+def test_a_mechanism_that_is_disabled_does_not_recover():
+    async def scenario(system: Whole, engineer: Engineer) -> None:
+        assert (await engineer.ask("disable", "FTM5")).accepted
+        await system.kill("hmi")
+        await asyncio.sleep(2.0)
+        assert system.recorder.decisions == []
+        assert (await engineer.ask("enable", "FTM5")).accepted
+        await asyncio.sleep(1.0)
+        assert system.recorder.taken[0] == (("FTM5",), 1, ("RM4",))
+        assert system.incarnations["hmi"] == 2
+
+    in_adaptable_system(scenario)

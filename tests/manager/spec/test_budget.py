@@ -1,0 +1,173 @@
+"""The time budget: formulas against a simulated drive, derivation, what does not fit."""
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.manager.spec.budget import (
+    check,
+    derive_timeouts,
+    find_false_alarms,
+    time_to_drift_s,
+    time_to_intrusion_s,
+    time_to_obstacle_s,
+    time_to_runaway_s,
+)
+from rampart.manager.spec.schema import Timing, Within
+from tests.manager.bench import full_system, paper
+
+SPEC = paper()
+ROBOT = SPEC.robot
+
+
+def changed(table, **values):
+    return msgspec.structs.replace(table, **values)
+
+
+def with_timing(**values):
+    return changed(SPEC, timing=changed(SPEC.timing, **values))
+
+
+def drive_m(robot, waiting_s: float, acceleration_mps2: float) -> float:
+    """Distance driven until standstill, step by step: wait with the error, then brake."""
+    step_s, distance_m, speed_mps, time_s = 1e-4, 0.0, robot.top_speed_mps, 0.0
+    fastest = max(robot.top_speed_mps, robot.hardware_speed_mps)
+    while speed_mps > 0:
+        rate = acceleration_mps2 if time_s < waiting_s else -robot.braking_mps2
+        after = min(max(speed_mps + rate * step_s, 0.0), fastest)
+        distance_m += (speed_mps + after) / 2 * step_s
+        speed_mps, time_s = after, time_s + step_s
+    return distance_m
+
+
+@pytest.mark.parametrize("clearance_m", [0.6, 1.5, 4.0, 12.0])
+def test_a_robot_that_waits_as_long_as_it_may_stops_right_at_the_edge(clearance_m):
+    robot = changed(ROBOT, corridor_clearance_m=clearance_m)
+    assert drive_m(robot, time_to_drift_s(robot), 0.0) == pytest.approx(clearance_m, abs=2e-3)
+    assert drive_m(robot, time_to_runaway_s(robot), robot.acceleration_mps2) == pytest.approx(
+        clearance_m, abs=2e-3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(0.3, 2.0), st.floats(0.5, 4.0), st.floats(0.5, 4.0), st.floats(3.0, 12.0))
+def test_the_runaway_formula_agrees_with_the_drive_for_any_robot(speed, accel, brake, clearance):
+    robot = changed(ROBOT, top_speed_mps=speed, acceleration_mps2=accel, braking_mps2=brake,
+                    corridor_clearance_m=clearance + speed ** 2 / (2 * brake))
+    assert drive_m(robot, time_to_runaway_s(robot), accel) == pytest.approx(
+        robot.corridor_clearance_m, abs=5e-3)
+
+
+def test_a_robot_that_cannot_even_brake_in_its_corridor_has_no_time():
+    robot = changed(ROBOT, corridor_clearance_m=0.2)
+    assert time_to_runaway_s(robot) == pytest.approx(time_to_drift_s(robot))
+    assert time_to_runaway_s(robot) < 0
+
+
+def test_the_numbers_of_the_shipped_robot():
+    assert time_to_drift_s(ROBOT) == pytest.approx(1.25)
+    assert time_to_obstacle_s(ROBOT) == pytest.approx(0.55)
+    assert time_to_intrusion_s(ROBOT, 0.6) == pytest.approx(0.3)
+    timing = SPEC.timing
+    assert (timing.command_timeout_s, timing.localization_timeout_s, timing.manager_timeout_s,
+            timing.detection_silence_timeout_s, timing.scan_timeout_s, timing.dead_man_timeout_s,
+            timing.heartbeat_timeout_s) == (0.99, 0.99, 0.99, 0.99, 0.36, 0.405, 0.44)
+
+
+def test_everything_in_the_shipped_system_fits():
+    budgets = {budget.name: budget for budget in check(SPEC)}
+    assert {"FTM1", "FTM2", "FTM3", "FTM4", "FTM5", "FTM6", "FTM7", "safety_pilot",
+            "blind_pilot", "dead_man", "manager_watch", "silent_detection"} == set(budgets)
+    assert all(budget.fits for budget in budgets.values())
+    assert not list(find_false_alarms(SPEC))
+
+
+def test_everything_in_the_full_system_fits_and_what_races_no_distance_says_what_it_races():
+    spec = full_system()
+    budgets = {budget.name: budget for budget in check(spec)}
+    assert len(budgets) == len(spec.mechanisms) + 5
+    assert all(budget.fits for budget in budgets.values())
+    assert not list(find_false_alarms(spec))
+    stated = {m.name for m in spec.mechanisms if isinstance(m.against, Within)}
+    assert stated == {"FTM2", "FTM3", "FTM6", "FTM9", "FTM10", "FTM11", "FTM13"}
+    assert all(budgets[name].hazard for name in stated)
+
+
+def test_a_crash_is_masked_before_its_consequence_is_detected():
+    timing = SPEC.timing
+    masked_s = (timing.heartbeat_timeout_s + timing.arbitration_s + timing.actuation_s
+                + timing.respawn_s)
+    assert masked_s <= timing.command_timeout_s + 1e-9
+    assert masked_s <= timing.localization_timeout_s + 1e-9
+
+
+def test_only_a_recovery_that_brings_a_node_back_pays_for_the_respawn():
+    respawn_s = {budget.name: budget.respawn_s for budget in check(SPEC) if budget.respawn_s}
+    assert respawn_s == {"FTM4": 0.4, "FTM5": 0.4, "FTM7": 0.4}
+
+
+def test_the_heartbeat_follows_a_command_timeout_that_is_given():
+    timing = derive_timeouts(ROBOT, changed(Timing(), command_timeout_s=0.9))
+    assert timing.command_timeout_s == 0.9
+    assert timing.heartbeat_timeout_s == pytest.approx(0.35)
+
+
+def test_the_heartbeat_timeout_is_at_most_five_periods():
+    timing = derive_timeouts(changed(ROBOT, corridor_clearance_m=20.0), Timing())
+    assert timing.heartbeat_timeout_s == 0.5
+
+
+@settings(max_examples=100, deadline=None)
+@given(speed=st.floats(0.2, 3.0), brake=st.floats(0.5, 5.0), clearance=st.floats(0.5, 10.0),
+       stop=st.floats(0.3, 5.0))
+def test_derived_timeouts_always_fit_whatever_the_robot(speed, brake, clearance, stop):
+    """If there is time at all; otherwise they are so short that they are refused."""
+    robot = changed(ROBOT, top_speed_mps=speed, braking_mps2=brake, stop_distance_m=stop,
+                    corridor_clearance_m=clearance)
+    spec = changed(SPEC, mobile=robot, timing=derive_timeouts(robot, Timing()))
+    detections = tuple(
+        changed(d, within_s=timeout_s, parameters=d.parameters | {"timeout_s": timeout_s})
+        if "timeout_s" in d.parameters else d
+        for d in SPEC.detections
+        for timeout_s in [getattr(spec.timing, {
+            "DM2": "command_timeout_s", "DM6": "localization_timeout_s"}.get(
+                d.name, "heartbeat_timeout_s"))])
+    spec = changed(spec, detections=detections)
+    if list(find_false_alarms(spec)):
+        return
+    late = {b.name for b in check(spec) if not b.fits}
+    assert late <= {"FTM1", "FTM3", "safety_pilot"}  # these have no timeout that could be derived
+
+
+@pytest.mark.parametrize(("change", "late"), [
+    ({"respawn_s": 0.401}, {"FTM4", "FTM5", "FTM7"}),
+    ({"scan_timeout_s": 0.401}, {"blind_pilot"}),
+    ({"dead_man_timeout_s": 0.451}, {"dead_man"}),
+    ({"manager_timeout_s": 1.101}, {"manager_watch"}),
+    ({"detection_silence_timeout_s": 1.101}, {"silent_detection"}),
+    ({"actuation_s": 0.151}, {"FTM1", "FTM4", "FTM5", "FTM7", "blind_pilot", "dead_man"}),
+])
+def test_what_comes_too_late_is_named(change, late):
+    assert late == {budget.name for budget in check(with_timing(**change)) if not budget.fits}
+
+
+def test_a_guard_that_is_switched_off_needs_no_time():
+    layers = changed(SPEC.layers, safety_pilot_checks=False, dead_man=False, manager_watch=False,
+                     ftm=False)
+    assert [b.name for b in check(changed(SPEC, layers=layers))] == ["safety_pilot"]
+
+
+def test_a_budget_explains_itself():
+    assert str(check(SPEC)[3]) == (
+        "FTM4 needs 0.990 s (detection 0.440 + arbitration 0.050 + actuation 0.100 + respawn "
+        "0.400) of 0.990 s before DM2 of FTM2 detects the consequence")
+
+
+def test_all_timeouts_are_guarded_against_false_alarms():
+    for field, least in {"heartbeat_timeout_s": 0.42, "command_timeout_s": 0.15,
+                         "localization_timeout_s": 0.15, "scan_timeout_s": 0.15,
+                         "dead_man_timeout_s": 0.15,
+                         "manager_timeout_s": 0.3, "detection_silence_timeout_s": 0.6}.items():
+        assert not list(find_false_alarms(with_timing(**{field: least})))
+        path, value, _ = next(find_false_alarms(with_timing(**{field: least - 0.01})))
+        assert (f"$.timing.{field}", least - 0.01) == (path, value)

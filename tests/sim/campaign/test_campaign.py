@@ -1,0 +1,668 @@
+"""Campaigns: which runs are made, that each is made once whatever happens, and what is counted."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections import Counter
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.cli import systems
+from rampart.cli.analyse import campaigning
+from rampart.cli.analyse.campaigning import ProgressLog
+from rampart.cli.main import main as rampart
+from rampart.sim.campaign import execute as execution
+from rampart.sim.campaign.execute import BackendError, JobError, execute
+from rampart.sim.campaign.job import Job, RunResult, run_job
+from rampart.sim.campaign.paper_tables import (
+    AS_THE_PAPER,
+    CONDITIONS,
+    FAULTS,
+    FULL,
+    WITH_FTM,
+    cells,
+    condition_of,
+    full_jobs,
+    paper_jobs,
+    table_iii,
+)
+from rampart.sim.campaign.plan import cross, fault_groups, sample
+from rampart.sim.campaign.search import Space, margin, search, shrink
+from rampart.sim.campaign.statistics import badness, rate, spread, table, total, worst
+from rampart.sim.campaign.store import Run, Store, StoreError
+from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
+from rampart.systems import SHIPPED
+from tests import ROOT
+from tests.porter_actors import write_porter_system
+
+PAPER = systems.load("paper")
+GROUPS = fault_groups(PAPER)
+BASES = [Job(row="", system="paper", mission="A", obstacles=n) for n in (0, 2)]
+SHORT = PlannedFault("kill:mission_manager", 3.0)
+"""Over after seven simulated seconds of the paper's system, a fifth of a second of work."""
+
+
+def result(**changes) -> RunResult:
+    values = {
+        "success": True, "safe": True, "reasons": (), "duration_s": 10.0, "collisions": 0,
+        "prohibited_s": 0.0, "obstacle_m": 0.8, "prohibited_m": 0.9, "unsafe_s": None,
+        "injected_s": 5.0, "detected_after_s": 0.1, "recovered_after_s": 0.3, "false_alarms": 0,
+        "decisions": (), "outcomes": (FaultOutcome("x@5", 5.0, 3),), "failures": (),
+        "trace": "00", "wall_s": 0.1}
+    return RunResult(**{**values, **changes})
+
+
+def runs_of(*results: RunResult, **job) -> list[Run]:
+    return [Run(Job(**{"row": "x", "seed": i, **job}), r) for i, r in enumerate(results, 1)]
+
+
+# ---- which runs ------------------------------------------------------------------------------
+
+
+def test_the_cross_product_has_every_run_once():
+    faults = [None, PlannedFault("gps-bias"), PlannedFault("kill:DM1")]
+    jobs = cross(BASES, faults, range(1, 4))
+    assert len(jobs) == len({job.key for job in jobs}) == 2 * 3 * 3
+    assert Counter(job.row for job in jobs) == {"none": 6, "gps-bias": 6, "kill:DM1": 6}
+
+
+def test_a_longer_sample_begins_with_the_shorter_one_and_another_seed_is_another_sample():
+    assert sample(BASES, GROUPS, 30, seed=1)[:10] == sample(BASES, GROUPS, 10, seed=1)
+    assert sample(BASES, GROUPS, 10, seed=1) != sample(BASES, GROUPS, 10, seed=2)
+
+
+def test_a_sample_draws_all_kinds_patterns_and_conditions_alike():
+    jobs = sample(BASES, GROUPS, 3000, seed=1)
+    kind_of = {name: kind for kind, names in GROUPS.items() for name in names}
+    kinds = Counter(kind_of[job.faults[0].fault] for job in jobs)
+    assert set(kinds) == set(GROUPS)
+    assert min(kinds.values()) > 3000 / 6 * 0.8
+    assert 0.4 < sum(job.obstacles == 2 for job in jobs) / 3000 < 0.6
+    messages = [j.faults[0] for j in jobs
+                if kind_of[j.faults[0].fault] in {"paper", "sensor", "topic"}]
+    permanent = sum(f.duration_s == math.inf and not f.on_s for f in messages)
+    intermittent = sum(f.on_s > 0 for f in messages)
+    assert permanent / len(messages) == pytest.approx(1 / 3, abs=0.05)
+    assert intermittent / len(messages) == pytest.approx(1 / 3, abs=0.05)
+    assert {len(job.faults) for job in jobs} == {1}
+    assert len({job.seed for job in jobs}) > 2990
+
+
+def test_faults_come_in_pairs_and_triples_when_asked_for():
+    for together in (2, 3):
+        assert {len(j.faults) for j in sample(BASES, GROUPS, 20, seed=1, together=together)} == {
+            together}
+
+
+def test_there_is_nothing_to_draw_from_nothing():
+    with pytest.raises(ValueError, match="nothing to choose from"):
+        sample(BASES, {"paper": ()}, 3, seed=1)
+
+
+# ---- each run once ---------------------------------------------------------------------------
+
+
+def test_a_store_keeps_a_run_as_it_was_infinity_included(tmp_path):
+    store = Store(tmp_path)
+    job = Job(row="x", faults=(PlannedFault("gps-bias", 3.0, duration_s=math.inf),))
+    store.add(job, result())
+    store.add(job, result(safe=False))  # the first one stays
+    store.close()
+    again = Store(tmp_path)
+    assert list(again.runs()) == [Run(job, result())]
+    assert again.keys() == {job.key}
+    assert again.find(job.key[:4]) == Run(job, result())
+    assert again.find("zz") is None
+    again.close()
+
+
+def test_a_file_that_is_no_store_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "runs.sqlite").write_text("my shopping list\n" * 100)
+    with pytest.raises(StoreError, match="no store of campaign results"):
+        Store(tmp_path)
+    assert "shopping" in (tmp_path / "runs.sqlite").read_text()
+
+
+def test_a_store_of_another_format_is_refused(tmp_path):
+    Store(tmp_path).close()
+    with sqlite3.connect(tmp_path / "runs.sqlite") as database:
+        database.execute("update about set value = '99'")
+    database.close()
+    with pytest.raises(StoreError, match="format '99', this program reads 1"):
+        Store(tmp_path)
+
+
+def test_what_is_done_is_not_done_again(tmp_path):
+    store = Store(tmp_path)
+    jobs = cross(BASES[:1], [SHORT], range(1, 4))
+    made = []
+    assert execute(jobs[:2], store, workers=1, progress=lambda j, r: made.append(j.key)) == 2
+    assert execute(jobs, store, workers=1, progress=lambda j, r: made.append(j.key)) == 1
+    assert execute(jobs, store, workers=1) == 0
+    assert Counter(made) == {job.key: 1 for job in jobs}
+    store.close()
+
+
+def test_results_do_not_depend_on_how_many_workers_there_are(tmp_path):
+    jobs = cross(BASES[:1], [SHORT], range(1, 5))
+    traces = []
+    for workers in (1, 2):
+        store = Store(tmp_path / str(workers))
+        execute(jobs, store, workers=workers)
+        traces.append({r.job.key: r.result.trace for r in store.runs()})
+        store.close()
+    assert traces[0] == traces[1] == {job.key: run_job(job).trace for job in jobs}
+
+
+def test_a_job_that_makes_no_sense_is_named_and_what_was_finished_is_kept(tmp_path):
+    store = Store(tmp_path)
+    good, bad = cross(BASES[:1], [SHORT, PlannedFault("gremlins")], [1])
+    with pytest.raises(JobError, match=f"run {bad.key} .gremlins@10.: UnknownFaultError"):
+        execute([good, bad], store, workers=1)
+    assert store.keys() <= {good.key}
+    store.close()
+
+
+def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
+    command = [sys.executable, "-m", "rampart.cli.main", "campaign", "--system", "paper", "--fault",
+               "kill:mission_manager@3", "--seeds", "12", "--obstacles", "0", "--jobs", "1",
+               "--out", str(tmp_path), "--json"]
+
+    def stored() -> int:
+        if not (tmp_path / "runs.sqlite").exists():
+            return 0
+        database = sqlite3.connect(tmp_path / "runs.sqlite", timeout=10)
+        try:
+            return database.execute("select count(*) from runs").fetchone()[0]
+        except sqlite3.OperationalError:  # the table is not there yet
+            return 0
+        finally:
+            database.close()
+
+    first = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL,
+                             stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        deadline = time.monotonic() + 60
+        while stored() < 2 and time.monotonic() < deadline:
+            time.sleep(0.02)
+    finally:
+        os.killpg(first.pid, signal.SIGKILL)
+        first.wait()
+    kept = stored()
+    assert 2 <= kept < 12, "it was not killed in the middle"
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert stored() == 12
+    row, = json.loads(done.stdout)
+    assert (row["fault"], row["runs"], row["safe"], row["success"]) == (
+        "kill:mission_manager", 12, 12, 0)
+    assert row["ineffective"] == 0
+    assert (tmp_path / "report.html").read_text().startswith("<!")
+
+
+FULL_DISK = """
+import msgspec, resource, sys
+from pathlib import Path
+from rampart.sim.campaign.job import Job, RunResult
+from rampart.sim.campaign.store import Store, StoreError
+result = msgspec.json.decode(sys.argv[2], type=RunResult)
+store = Store(Path(sys.argv[1]))
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
+added = []
+try:
+    for seed in range(10_000):
+        job = Job(row="x", seed=seed)
+        store.add(job, result)
+        added.append(job.key)
+except StoreError as error:
+    print(error)
+assert store.keys() == set(added), "what was kept is there"
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+store.add(job, result)
+store.close()
+print(len(added))
+"""
+
+
+def test_a_disk_that_fills_up_costs_none_of_the_runs_before(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, str(tmp_path), msgspec.json.encode(result())], cwd=ROOT,
+        capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    error, added = done.stdout.splitlines()
+    assert error.startswith(f"{tmp_path / 'runs.sqlite'}: ")
+    store = Store(tmp_path)
+    assert 10 < int(added) == len(store.keys()) - 1
+    store.close()
+
+
+def test_a_campaign_whose_disk_fills_up_says_so_in_one_line_and_goes_on_from_there(tmp_path):
+    command = [sys.executable, "-m", "rampart.cli.main", "campaign", "--system", "paper", "--fault",
+               "kill:mission_manager@3", "--seeds", "6", "--obstacles", "0", "--jobs", "1",
+               "--out", str(tmp_path), "--json"]
+    code = ("import resource, sys; from rampart.sim.campaign.store import Store; kept = Store.add\n"
+            "def add(self, *run):\n"
+            "    kept(self, *run)\n"
+            "    if len(self.keys()) == 2: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, -1))\n"
+            "Store.add = add\n"
+            "from rampart.cli.main import main; sys.exit(main(sys.argv[1:]))")
+    full = subprocess.run([sys.executable, "-c", code, *command[3:]], cwd=ROOT,
+                          capture_output=True, text=True, check=False)
+    assert (full.returncode, full.stdout) == (2, "")
+    told = [line for line in full.stderr.splitlines() if line.startswith("rampart: ")]
+    assert len(told) == 1
+    assert told[0].startswith(f"rampart: {tmp_path / 'runs.sqlite'}: ")
+    assert told[0].endswith("and the same command goes on from there")
+    assert "Traceback" not in full.stderr
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    row, = json.loads(done.stdout)
+    assert row["runs"] == 6
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), ValueError("a chart")])
+def test_a_campaign_keeps_its_verdict_though_its_report_cannot_be_written(
+        tmp_path, made_up, monkeypatch, capsys, error):
+    def broken(*_):
+        raise error
+
+    monkeypatch.setattr(campaigning, "write_campaign_report", broken)
+    lost = full_jobs()[0]
+    made_up[lost.key] = result(safe=False)
+    assert rampart(["campaign", "--paper", "--full", "--json", "--out", str(tmp_path)]) == 1
+    told = capsys.readouterr()
+    assert len(json.loads(told.out)) == 12
+    assert told.err.splitlines()[-1].startswith(f"rampart: report: {tmp_path}: ")
+
+
+def test_a_campaign_without_a_place_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert rampart(["campaign", "--paper", "--out", str(tmp_path / "file" / "out")]) == 2
+    assert capsys.readouterr().err == (
+        f"rampart: {tmp_path / 'file' / 'out'}: no directory that can be written "
+        "(Not a directory)\n")
+
+
+def test_the_same_jobs_run_on_a_dask_cluster(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    jobs = cross(BASES[:1], [SHORT], range(1, 4))
+    store = Store(tmp_path)
+    with distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+        assert execute(jobs, store, backend="dask", address=cluster.scheduler_address) == 3
+    traces = {r.job.key: r.result.trace for r in store.runs()}
+    store.close()
+    assert traces == {job.key: run_job(job).trace for job in jobs}
+
+
+@pytest.mark.parametrize(("backend", "address", "words"), [
+    ("dask", "", "--address is missing"), ("dask", "tcp://127.0.0.1:9", "no dask scheduler"),
+    ("ray", "", "--address is missing|not installed"), ("slurm", "", "unknown; known: loky")])
+def test_a_cluster_that_is_not_there_is_refused_in_one_line(
+        tmp_path, monkeypatch, backend, address, words):
+    monkeypatch.setattr(execution, "CONNECT_TIMEOUT_S", 0.5)
+    store = Store(tmp_path)
+    with pytest.raises(BackendError, match=words) as caught:
+        execute(cross(BASES[:1], [SHORT], [1]), store, backend=backend, address=address)
+    assert "\n" not in str(caught.value)
+    store.close()
+
+
+# ---- what is counted -------------------------------------------------------------------------
+
+
+@settings(max_examples=100)
+@given(st.integers(1, 3000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_the_interval_holds_the_share_and_narrows_with_more_runs(pair):
+    count, of = pair
+    found = rate(count, of)
+    assert 0 <= found.low <= found.share <= found.high <= 1
+    more = rate(count * 4, of * 4)
+    assert more.high - more.low < found.high - found.low
+
+
+def test_the_interval_is_wilsons():
+    # Brown, Cai, DasGupta (2001), table of examples; 0 of 10 and 5 of 10.
+    assert rate(0, 10).high == pytest.approx(0.2775, abs=1e-4)
+    assert (rate(5, 10).low, rate(5, 10).high) == pytest.approx((0.2366, 0.7634), abs=1e-4)
+    assert (rate(0, 0).low, rate(0, 0).high) == (0.0, 1.0)
+    assert (rate(2000, 2000).low, rate(2000, 2000).high) == pytest.approx((0.99808, 1.0), abs=1e-5)
+
+
+def test_a_spread_leaves_out_what_there_is_not():
+    assert spread([None, math.inf]) is None
+    found = spread([3.0, None, 1.0, 2.0])
+    assert (found.n, found.least, found.median, found.p95, found.most) == (3, 1.0, 2.0, 3.0, 3.0)
+    assert spread(range(1, 101)).p95 == 95
+
+
+def test_a_run_without_effect_is_not_counted_as_survived():
+    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
+    row, = table(runs_of(result(), result(outcomes=nothing), result(safe=False, success=False)))
+    assert (row.runs, row.ineffective) == (3, 1)
+    assert (row.safe.count, row.safe.of, row.success.count) == (1, 2, 1)
+    assert row.worst == "fail, unsafe"
+
+
+def test_a_row_of_nothing_but_ineffective_runs_says_so():
+    nothing = (FaultOutcome("x@5", None, 0, "its moment never came"),)
+    row, = table(runs_of(result(outcomes=nothing)))
+    assert (row.worst, row.safe.of, row.ineffective) == ("no effect", 0, 1)
+
+
+@pytest.mark.parametrize(("ended", "success", "safe", "words"), [
+    ({"safe": False, "collisions": 1}, 2, 1, "success, unsafe"),
+    ({"success": False}, 1, 2, "fail, safe")])
+def test_a_run_that_ends_badly_is_counted_though_its_fault_is_said_to_have_changed_nothing(
+        ended, success, safe, words):
+    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
+    row, = table(runs_of(result(), result(outcomes=nothing, detected_after_s=None, **ended)))
+    assert (row.runs, row.ineffective, row.worst) == (2, 0, words)
+    assert (row.success.count, row.success.of, row.safe.count, row.safe.of) == (
+        success, 2, safe, 2)
+    assert row.undetected == 0, "nothing to detect"
+
+
+def test_the_worst_run_is_unsafe_before_failed_before_close():
+    close, failed, unsafe = (
+        result(obstacle_m=0.1), result(success=False), result(safe=False))
+    runs = runs_of(result(), close, failed, unsafe)
+    assert sorted(runs, key=badness) == runs
+    assert worst(runs).result is unsafe
+
+
+def test_conditions_are_rows_of_their_own():
+    runs = [run for condition in (
+        {"obstacles": 0}, {"obstacles": 2}, {"ftm": False}, {"strategy": "mission-first"},
+        {"retuned": AS_THE_PAPER})
+        for run in runs_of(result(), **condition)]
+    assert [(r.obstacles, r.ftm, r.strategy, r.retuned) for r in table([*runs, *runs])] == [
+        (0, True, "", {}), (2, True, "", {}), (0, False, "", {}), (0, True, "mission-first", {}),
+        (0, True, "", AS_THE_PAPER)]
+    assert total(runs, "all").runs == 5
+
+
+def test_undetected_and_stopped_for_good_are_counted():
+    row, = table(runs_of(result(detected_after_s=None), result(success=False)))
+    assert (row.undetected, row.stopped_for_good) == (1, 1)
+
+
+# ---- the paper -------------------------------------------------------------------------------
+
+
+def test_table_iii_is_the_papers():
+    assert [row.agrees for row in table_iii(PAPER)] == [True] * 4
+
+
+def test_every_row_of_the_papers_tables_is_run_under_every_condition():
+    jobs = paper_jobs()
+    assert len(jobs) == len({job.key for job in jobs})
+    assert {job.system for job in jobs} == {"paper"}
+    assert {(j.row, j.obstacles) for j in jobs} == {(f, n) for f in FAULTS for n in (0, 2)}
+    found = cells([Run(job, result()) for job in jobs])
+    assert len(found) == len(CONDITIONS) * len(FAULTS) * 2
+    assert {cell.ours for cell in found} == {"success, safe"}
+    assert [c.agrees for c in found if c.fault == "none"] == [True] * 6
+    assert not any(c.agrees for c in found if c.fault == "command not updated")
+
+
+@pytest.mark.parametrize(("ended", "ours", "counts"), [
+    ({}, "success, safe", (1, 3, 3)), ({"safe": False}, "success, unsafe", (0, 4, 3))])
+def test_in_the_papers_tables_a_run_without_effect_has_not_survived_but_an_unsafe_one_counts(
+        ended, ours, counts):
+    jobs = [job for job in full_jobs() if job.row == "command not updated" and job.obstacles == 0]
+    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
+    cell, = cells([Run(job, result(outcomes=nothing, **ended) if job is jobs[2] else result())
+                   for job in jobs])
+    assert (cell.runs, cell.ours) == (len(jobs), ours)
+    assert (cell.ineffective, cell.success, cell.safe) == counts
+    cell, = cells([Run(job, result(outcomes=nothing)) for job in jobs])
+    assert (cell.ineffective, cell.success, cell.safe, cell.ours, cell.agrees) == (
+        4, 0, 0, "no effect", False)
+
+
+def test_the_full_system_is_given_the_runs_of_table_v_and_keeps_its_own_strategy():
+    def what_goes_wrong(job: Job) -> tuple[object, ...]:
+        return job.row, job.faults, job.obstacles, job.seed, job.mission, job.network
+
+    jobs = full_jobs("B", seed=5)
+    assert {(j.system, j.strategy, j.ftm) for j in jobs} == {("osmosis", "", True)}
+    assert {condition_of(j) for j in jobs} == {FULL}
+    assert not any(j.retuned for j in jobs)
+    for condition in CONDITIONS[1:]:
+        assert [what_goes_wrong(j) for j in jobs] == [
+            what_goes_wrong(j) for j in paper_jobs("B", seed=5) if condition_of(j) == condition]
+    assert {j.system for j in full_jobs(system="other.toml")} == {"other.toml"}
+
+
+def test_of_the_full_system_success_and_safety_are_expected_where_the_paper_has_failure():
+    runs = [Run(job, result(success=job.row != "control node crash" or job.seed != 3,
+                            safe=job.faults[:1] != (PlannedFault("kill:hmi", 8.0),)))
+            for job in full_jobs()]
+    found = cells(runs)
+    assert [(c.fault, c.obstacles) for c in found] == [(f, n) for f in FAULTS for n in (0, 2)]
+    assert [c.paper for c in found] == [v for verdicts in WITH_FTM.values() for v in verdicts]
+    assert {c.expected for c in found} == {"success, safe"}
+    assert {(c.fault, c.ours) for c in found if not c.agrees} == {
+        ("control node crash", "fail, safe"), ("non-control node crash", "success, unsafe")}
+
+
+# ---- the search for the unsafe ---------------------------------------------------------------
+
+
+def test_the_search_goes_where_the_margin_is_small():
+    def fake(jobs):  # the nearer to 100 s and to gps-drift, the smaller the margin
+        return [result(obstacle_m=abs(j.faults[0].at_s - 100) / 100
+                       + (0.0 if j.faults[0].fault == "gps-drift" else 1.0)) for j in jobs]
+
+    pytest.importorskip("optuna")
+    space = Space(tuple(BASES), {"sensor": ("gps-bias", "gps-drift", "gps-noise")},
+                  sudden_obstacle=False)
+    made = search(space, 120, fake, seed=1, at_once=2)
+    assert len(made) == 120
+    assert [margin(r) for _, r in made] == sorted(margin(r) for _, r in made)
+    best = made[0][0].faults[0]
+    assert best.fault == "gps-drift"
+    assert abs(best.at_s - 100) < 10
+
+
+def test_the_search_is_told_of_an_unsafe_run_though_its_fault_had_no_effect(monkeypatch):
+    optuna = pytest.importorskip("optuna")
+    told = []
+    monkeypatch.setattr(optuna.Study, "tell", lambda _self, _trial, value: told.append(value))
+    nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
+    results = iter([result(outcomes=nothing),
+                    result(outcomes=nothing, safe=False, collisions=1)])
+    search(Space(tuple(BASES), {"sensor": ("gps-bias",)}, sudden_obstacle=False), 2,
+           lambda _jobs: [next(results)], seed=1)
+    assert told == [2.0, -1.0]
+
+
+def test_what_is_unsafe_for_longer_is_further_down():
+    assert margin(result(safe=False, prohibited_s=3.0)) < margin(
+        result(safe=False, collisions=1)) < 0 < margin(result())
+
+
+def test_a_counterexample_is_shrunk_to_what_it_needs():
+    needed = PlannedFault("laser-stuck", 37.42, duration_s=31.7, on_s=1.0, off_s=0.5, seed=77)
+    job = Job(row="x", obstacles=2, seed=99, faults=(
+        PlannedFault("gps-bias", 12.0), needed, PlannedFault("kill:DM3", 50.0)))
+
+    def run(candidate: Job) -> RunResult:
+        bad = any(f.fault == "laser-stuck" and (f.duration_s or 0) >= 5 and f.at_s > 30
+                  for f in candidate.faults)
+        return result(safe=not bad)
+
+    small = shrink(job, run)
+    assert (len(small.faults), small.obstacles, small.seed) == (1, 0, 1)
+    fault, = small.faults
+    assert (fault.fault, fault.at_s, fault.on_s, fault.seed) == ("laser-stuck", 40.0, 0.0, 0)
+    assert 5 <= fault.duration_s < 10
+    with pytest.raises(ValueError, match="is safe: there is nothing to shrink"):
+        shrink(job, lambda _job: result())
+
+
+# ---- the verb --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    ((), "give one of --paper, --runs N"),
+    (("--paper", "--runs", "3"), "give one of"),
+    (("--full",), "--full: goes with --paper only"),
+    (("--full", "--runs", "3"), "--full: goes with --paper only"),
+    (("--runs", "0"), "--runs 0: must be 1 or more"),
+    (("--runs", "3", "--kinds", "gremlin"), "unknown kind 'gremlin'; known: paper, sensor"),
+    (("--fault", "gremlins"), "unknown fault 'gremlins'"),
+    (("--fault", "kill:nobody"), "no node 'nobody'"),
+    (("--fault", "gps-bias@soon"), "WHEN 'soon'"),
+    (("--runs", "3", "--obstacles", "many"), "--obstacles many: must be numbers"),
+    (("--runs", "3", "--obstacles", "99"), "--obstacles 99: Vallombre has places for 5"),
+    (("--runs", "3", "--mission", "Z"), "Z"),
+    (("--runs", "3", "--strategy", "hope"), "unknown strategy 'hope'"),
+    (("--runs", "3", "--network", "wet"), "unknown network 'wet'"),
+    (("--runs", "3", "--patience", "0"), "--patience 0"),
+    (("--replay", "ab"), "--out DIR is missing"),
+    (("--replay", "ab", "--out", "/nowhere"), "no such directory"),
+    (("--system", "cell", "--paper"), "--system cell: it has no .robot."),
+    (("--system", "cell", "--paper", "--full"), "--system cell: it has no .robot."),
+])
+def test_bad_usage_is_one_line_and_exit_code_2(capsys, arguments, words):
+    assert rampart(["campaign", *arguments]) == 2
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    assert re.search(words, text), text
+
+
+def test_a_campaign_takes_a_mission(tmp_path, capsys):
+    text = (SHIPPED / "paper.toml").read_text(encoding="utf-8")
+    robot = tmp_path / "robot.toml"
+    robot.write_text(text.replace('airport = "vallombre"\n', ""))
+    assert rampart(["campaign", "--system", str(robot), "--fault", "none"]) == 2
+    assert capsys.readouterr().err == (
+        f"rampart: {robot}: $.application: Object missing required field `airport`\n")
+
+
+def test_a_run_is_replayed_by_its_key_and_recognised(tmp_path, capsys):
+    arguments = ["campaign", "--system", "paper", "--fault", "kill:mission_manager@3",
+                 "--obstacles", "0", "--out", str(tmp_path), "--jobs", "1"]
+    assert rampart([*arguments, "--json"]) == 0
+    key = json.loads(capsys.readouterr().out)[0]["worst_key"]
+    assert rampart(["campaign", "--replay", key[:6], "--out", str(tmp_path), "--json"]) == 0
+    replayed = json.loads(capsys.readouterr().out)
+    assert (replayed["run"], replayed["same_trace"]) == (key, True)
+    assert rampart(["campaign", "--replay", "0000", "--out", str(tmp_path)]) == 2
+    assert "no run, or several" in capsys.readouterr().err
+
+
+def test_patterns_choose_faults_by_name(capsys):
+    for chosen, groups in ((["--system", "paper"], GROUPS),
+                           ([], fault_groups(systems.load("osmosis")))):
+        assert rampart(["campaign", "--list", "--json", *chosen]) == 0
+        assert json.loads(capsys.readouterr().out) == {k: list(v) for k, v in groups.items()}
+
+
+def test_a_robot_s_own_topics_can_fail_like_all_others(tmp_path, capsys):
+    own = ["campaign", "--system", str(write_porter_system(tmp_path))]
+    assert rampart([*own, "--list", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)["topic"]
+    assert {"drop:porter/load", "stuck:porter/axle/rear"} <= set(listed)
+    assert rampart([*own, "--fault", "drop:porter/*@2+1", "--obstacles", "0", "--jobs", "1",
+                    "--out", str(tmp_path / "out"), "--json"]) == 0
+    assert {row["fault"]: row["ineffective"] for row in json.loads(capsys.readouterr().out)} == {
+        "drop:porter/load": 0, "drop:porter/axle/front": 1, "drop:porter/axle/rear": 1}
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    """Make results up instead of running jobs; all are good but those of the key given here."""
+    bad: dict[str, RunResult] = {}
+
+    def fake(jobs, store, **_):
+        for job in jobs:
+            store.add(job, bad.get(job.key, result()))
+        return len(jobs)
+
+    monkeypatch.setattr(campaigning, "execute", fake)
+    monkeypatch.setattr(campaigning, "worth_showing", lambda _runs: [])
+    return bad
+
+
+def jobs_in(directory) -> list[Job]:
+    store = Store(directory)
+    found = [run.job for run in store.runs()]
+    store.close()
+    return found
+
+
+@pytest.mark.parametrize(("chosen", "jobs"), [
+    ((), paper_jobs()), (("--system", "osmosis"), paper_jobs(system="osmosis")),
+    (("--full",), full_jobs()), (("--full", "--system", "paper"), full_jobs(system="paper"))])
+def test_the_papers_tables_are_of_its_system_and_full_of_the_full_one_unless_one_is_named(
+        tmp_path, made_up, capsys, chosen, jobs):
+    assert rampart(["campaign", "--paper", *chosen, "--out", str(tmp_path)]) == 0
+    assert jobs_in(tmp_path) == jobs
+    assert ("Table III" in capsys.readouterr().out) == ("--full" not in chosen)
+
+
+def test_the_papers_conditions_are_rows_of_their_own_for_scripts_too(tmp_path, made_up, capsys):
+    assert rampart(["campaign", "--paper", "--json", "--out", str(tmp_path)]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert len(rows) == len(CONDITIONS) * len(FAULTS) * 2
+    assert sum(row["runs"] for row in rows) == len(paper_jobs())
+    assert [(r["runs"], r["ftm"], r["retuned"]) for r in rows
+            if (r["fault"], r["obstacles"]) == ("command not updated", 0)] == [
+        (4, False, {}), (4, True, AS_THE_PAPER), (4, True, {})]
+
+
+def test_runs_without_a_fault_are_not_counted_as_survived_with_fault_tolerance(
+        tmp_path, made_up, capsys):
+    assert rampart(["campaign", "--fault", "none", "--fault", "gps-bias", "--seeds", "3",
+                    "--obstacles", "0", "--out", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "6 runs, 6 of them made now" in text
+    assert "with fault tolerance: 3 of 3 (" in text
+
+
+def test_a_row_of_the_full_system_that_is_not_as_expected_is_told_and_is_exit_code_1(
+        tmp_path, made_up, capsys):
+    arguments = ["campaign", "--paper", "--full", "--json", "--out"]
+    assert rampart([*arguments, str(tmp_path / "good")]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert len(rows) == 12
+    assert {(r["expected"], r["ours"]) for r in rows} == {("success, safe",) * 2}
+    assert {r["fault"]: r["paper"] for r in rows} == {f: v[0] for f, v in WITH_FTM.items()}
+
+    lost = next(job for job in full_jobs() if job.row == "command not updated" and job.obstacles)
+    made_up[lost.key] = result(success=False, reasons=("goal 2 of 9 not reached",))
+    assert rampart([*arguments, str(tmp_path / "bad")]) == 1
+    rows = {(r["fault"], r["obstacles"]): r for r in json.loads(capsys.readouterr().out)}
+    assert {where for where, r in rows.items() if r["ours"] != r["expected"]} == {
+        ("command not updated", 2)}
+    assert rows["command not updated", 2]["success"] == 3
+
+    assert rampart(["campaign", "--paper", "--full", "--out", str(tmp_path / "bad")]) == 1
+    text = capsys.readouterr().out
+    assert text.count("  as expected") == 11
+    assert f"NOT as expected: run {lost.key}" in text
+    assert "goal 2 of 9 not reached" in text
+    page = (tmp_path / "bad" / "report.html").read_text()
+    assert "<h1>The paper&#39;s rows on the full system</h1>" in page
+
+
+def test_a_log_gets_a_line_a_minute_with_the_time_left_and_one_at_the_end():
+    log = ProgressLog(total=30, done=10)
+    lines = [log.made_one(now_s, unsafe=0) for now_s in range(100, 300, 10)]
+    assert lines[:6] == [""] * 6
+    assert lines[6] == "17 of 30 runs, 0 unsafe with FTM, 2 min left"  # 13 left, 10 s each
+    assert [i for i, line in enumerate(lines) if line] == [6, 12, 18, 19]
+    assert lines[-1] == "30 of 30 runs, 0 unsafe with FTM"
+    assert ProgressLog(total=1, done=0).made_one(5.0, unsafe=1) == "1 of 1 runs, 1 unsafe with FTM"

@@ -1,0 +1,368 @@
+"""The catalogue of faults: each does what its name says to a real message of its topic."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.bounds import bare
+from rampart.actors.bus.envelope import Header, decode, encode
+from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.layout.system_topics import published_keys
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.injection import MODES, FaultGate, flaw
+from rampart.cli.look.topic_catalogue import resolve, uses
+from rampart.sim.faults.faults import (
+    CATALOGUE,
+    PAPER_FAULTS,
+    SENSOR_FAULTS,
+    Disturbance,
+    Fault,
+    UnknownFaultError,
+    find_fault,
+)
+from rampart.sim.faults.topic_faults import DELAY_S, modes_of, systematic_faults, topic_fault
+from rampart.sim.osmosis.sensor_faults import LEFT_OUT, SENSORS
+from rampart.sim.osmosis.sensors import Gps
+from tests.porter_actors import AXLE, LOAD
+from tests.virtual_loop import shipped_system
+
+KEYS = published_keys(shipped_system())
+SYSTEMATIC = {fault.name: fault for fault in systematic_faults(KEYS)}
+
+
+SIMPLE = {
+    float: lambda n: 0.25 * n,
+    int: lambda n: 10 + n,
+    bool: lambda n: n % 2 == 0,
+    str: lambda n: f"text {n}",
+    bytes: lambda n: np.array([1.0 + n, 2.0 + n, 3.0 + n], dtype="<f4").tobytes(),
+}
+
+
+def sample(kind: Any, n: int) -> Any:
+    """Return a value of a type; another one for each n, as a node that lives would publish."""
+    kind = bare(kind)
+    if kind in SIMPLE:
+        return SIMPLE[kind](n)
+    if getattr(kind, "__origin__", None) is tuple:
+        count = 3 if kind.__args__[-1] is Ellipsis else len(kind.__args__)
+        return tuple(sample(kind.__args__[0], n + i) for i in range(count))
+    if issubclass(kind, msgspec.Struct):
+        return kind(*(sample(f.type, n) for f in msgspec.structs.fields(kind)))
+    return list(kind)[n % len(kind)]
+
+
+class Publisher:
+    """Publishes sample after sample on the topic of a disturbance, four times a second."""
+
+    def __init__(self, disturbance: Disturbance) -> None:
+        self.topic, self.key = resolve(disturbance.topic)
+        self.gate = FaultGate()
+        self.now_s = 0.0
+        self.n = 0
+        self.next()
+        self.next()
+        self.order = disturbance.order("i", math.inf)
+        assert self.gate.order(self.order, self.now_s, self.topic.type) == ""
+
+    def next(self) -> tuple[Any, Any]:
+        """Return (what the node said, what left it)."""
+        self.n += 1
+        self.now_s += 0.25
+        body = sample(self.topic.type, self.n)
+        out = self.gate.apply(self.key, body, self.now_s, self.now_s)
+        if out is not None:
+            self.gate.last[self.key] = (out.body, out.stamp)
+        return body, out
+
+
+def travels(topic: Topic[Any], body: Any) -> bool:
+    """Whether a reader would admit the body."""
+    payload = encode(Header("n", 1, 1, 0.0), body)
+    return type(decode(topic, payload)[1]) is topic.type
+
+
+@pytest.mark.parametrize("name", [*CATALOGUE, *SYSTEMATIC])
+def test_every_fault_changes_real_messages_of_its_topic_and_leaves_them_readable(name):
+    for disturbance in find_fault(name).disturbances:
+        publisher = Publisher(disturbance)
+        pairs = [publisher.next() for _ in range(8)]
+        assert publisher.gate.expire("i") > 0
+        for body, out in pairs:
+            if disturbance.mode == "drop":
+                assert out is None
+                continue
+            assert travels(publisher.topic, out.body)
+            if disturbance.mode in ("delay", "duplicate", "restamp"):
+                assert out.body == body
+        assert all(not news.reason for news in publisher.gate.take_news())
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_every_published_topic_has_all_modes_that_make_sense(key):
+    mine = [name for name in SYSTEMATIC if name.endswith(f":{key}")]
+    assert mine == [f"{mode}:{key}" for mode in modes_of(key)]
+    if key.startswith(("world/", "inject/")):
+        assert modes_of(key) == ()
+    elif key.startswith("hello/"):
+        assert modes_of(key) == ("drop", "freeze", "delay", "duplicate", "restamp")
+    else:
+        assert set(MODES) - set(modes_of(key)) <= {"corrupt"}
+
+
+def test_the_published_keys_are_those_of_the_topic_list_with_families_spelt_out():
+    nodes = {node.name for node in shipped_system().actors()} | {"supervisor"}
+    by_topic: dict[str, set[str]] = {}
+    for key in KEYS:
+        topic, _ = resolve(key)
+        head, _, tail = topic.key.partition("{name}")
+        by_topic.setdefault(topic.key, set()).add(
+            key[len(head):len(key) - len(tail)] if topic.is_family else "")
+    expected = {u.topic.key for u in uses(shipped_system())
+                if set(u.publishers) - {"tools", "observer"}}
+    assert set(by_topic) == expected
+    assert by_topic["heartbeat/{name}"] == nodes
+    assert by_topic["recovery/{name}/command"] == {"RM1", "RM2", "RM3", "RM4", "RM5"}
+    assert by_topic["detection/{name}"] == {f"DM{i}" for i in range(1, 8)}
+
+
+# -- generic corruption --------------------------------------------------------------------------
+
+
+def numbers_of(value: Any, path: str = "") -> dict[str, float]:
+    """Return every number in a message by its place, that of a process id apart."""
+    if isinstance(value, bool) or path.endswith(".pid"):
+        return {}
+    if isinstance(value, int | float):
+        return {path: float(value)}
+    if isinstance(value, bytes):
+        return {f"{path}[{i}]": float(x) for i, x in enumerate(np.frombuffer(value, "<f4"))}
+    if isinstance(value, dict):
+        return {k: v for name, inner in value.items()
+                for k, v in numbers_of(inner, f"{path}.{name}").items()}
+    if isinstance(value, tuple | list):
+        return {k: v for i, inner in enumerate(value)
+                for k, v in numbers_of(inner, f"{path}[{i}]").items()}
+    return {}
+
+
+CORRUPT = [name for name in SYSTEMATIC if name.startswith("corrupt:")]
+
+
+@pytest.mark.parametrize("name", CORRUPT)
+def test_a_corrupted_message_is_wrong_in_every_number_and_in_nothing_else(name):
+    publisher = Publisher(SYSTEMATIC[name].disturbances[0])
+    body, out = publisher.next()
+    said = msgspec.to_builtins(body, builtin_types=(bytes,))
+    left = msgspec.to_builtins(out.body, builtin_types=(bytes,))
+    before, after = numbers_of(said), numbers_of(left)
+    assert before.keys() == after.keys() != set()
+    wrong_by = {place: after[place] - before[place] for place in before}
+    assert all(abs(by) >= 0.1 for by in wrong_by.values())
+    assert words_of(said) == words_of(left)
+
+
+def words_of(value: Any) -> Any:
+    """Return a message in plain data with every number blanked, process ids apart."""
+    if isinstance(value, dict):
+        return {k: v if k == "pid" else words_of(v) for k, v in value.items()}
+    if isinstance(value, tuple | list):
+        return [words_of(v) for v in value]
+    return value if isinstance(value, str | bool) else None
+
+
+def test_the_numbers_of_a_corruption_come_from_its_seed():
+    first = find_fault("corrupt:plan/route", seed=3)
+    assert first == find_fault("corrupt:plan/route", seed=3)
+    assert (first.disturbances[0].add_fields
+            != find_fault("corrupt:plan/route", seed=4).disturbances[0].add_fields)
+
+
+def test_an_odd_seed_corrupts_one_number_and_all_have_their_turn():
+    every = set(topic_fault("corrupt", "summit_xl/scan").disturbances[0].add_fields)
+    alone = [topic_fault("corrupt", "summit_xl/scan", seed) for seed in range(1, 200, 2)]
+    assert every == {path for fault in alone for path in fault.disturbances[0].add_fields}
+    assert "ranges_f32" in every
+    for fault in alone:
+        (path,) = fault.disturbances[0].add_fields
+        assert fault.title == f"{path} on summit_xl/scan is wrong by a constant"
+
+
+@pytest.mark.parametrize("seed", range(0, 40, 2))
+def test_offsets_stay_within_what_their_unit_makes_plausible(seed):
+    offsets = topic_fault("corrupt", "mission/status", seed).disturbances[0].add_fields
+    assert offsets["step"] in (1, 2, 3)
+    assert 0.5 <= abs(offsets["goals.x_m"]) <= 3.0
+    assert 50.0 <= offsets["lights.intensity_cd"] <= 150.0
+    assert 1.0 <= offsets["step_times_s"] <= 10.0
+    assert 0.1 <= abs(offsets["lights.ratio"]) <= 0.5
+
+
+def test_a_wrong_stamp_comes_from_its_seed_ahead_as_often_as_behind_small_as_often_as_large():
+    errors_s = [topic_fault("restamp", "summit_xl/scan", seed).disturbances[0].stamp_s
+                for seed in range(400)]
+    assert errors_s == [topic_fault("restamp", "summit_xl/scan", seed).disturbances[0].stamp_s
+                        for seed in range(400)]
+    assert all(0.02 <= abs(error_s) <= 5.0 for error_s in errors_s)
+    assert 150 < sum(error_s > 0 for error_s in errors_s) < 250
+    assert 150 < sum(abs(error_s) < 0.316 for error_s in errors_s) < 250
+
+
+# -- sensors ---------------------------------------------------------------------------------------
+
+
+def test_every_sensor_fails_in_every_way_but_those_left_out_for_a_reason():
+    everything = {f"{sensor.name}-{way}" for sensor in SENSORS
+                  for way in ("bias", "drift", "noise", "dropout", "stuck")}
+    assert set(SENSOR_FAULTS) | set(LEFT_OUT) == everything
+    assert not set(SENSOR_FAULTS) & set(LEFT_OUT)
+    assert len(everything) == 30
+
+
+def published(name: str, body: Any, count: int) -> list[Any]:
+    """Return what leaves a gate when the same reading is published each second of a fault."""
+    (disturbance,) = find_fault(name, seed=1).disturbances
+    gate = FaultGate()
+    assert gate.order(disturbance.order("i", 10.0), 0.0, type(body)) == ""
+    return [gate.apply(f"{ROOT}/{disturbance.topic}", body, float(t), float(t))
+            for t in range(count)]
+
+
+FIX = m.GpsFix(10.0, 20.0, 0.5, 0.0, 0.02)
+
+
+def test_a_biased_receiver_is_off_by_the_same_at_once_and_does_not_know_it():
+    assert {out.body for out in published("gps-bias", FIX, 9)} == {
+        m.GpsFix(11.5, 21.5, 0.5, 0.0, 0.02)}
+
+
+def test_a_drifting_receiver_is_right_at_first_and_worse_each_second():
+    drift = [out.body.x_m - FIX.x_m for out in published("gps-drift", FIX, 11)]
+    assert drift == pytest.approx([0.1 * t for t in range(11)])
+
+
+def test_a_noisy_receiver_is_much_noisier_than_a_healthy_one_and_right_on_average():
+    errors = [out.body.y_m - FIX.y_m for out in published("gps-noise", FIX, 2000)]
+    assert np.std(errors) > 10 * Gps.POSITION_SIGMA_M
+    assert np.mean(errors) == pytest.approx(0.0, abs=4 * 1.5 / math.sqrt(2000))
+
+
+def test_a_stuck_sensor_has_fresh_stamps_and_a_frozen_one_has_not():
+    for name, stamps in (("gps-stuck", [0.75, 1.0]), ("freeze:summit_xl/gps", [0.5, 0.5])):
+        publisher = Publisher(find_fault(name).disturbances[0])
+        outs = [publisher.next()[1] for _ in range(2)]
+        assert [out.body for out in outs] == [sample(m.GpsFix, 2)] * 2
+        assert [out.stamp for out in outs] == stamps
+
+
+def test_a_biased_laser_sees_obstacles_farther_away_and_still_no_echo_where_there_is_none():
+    body = m.LaserScan(-1.0, 0.1, 8.0, np.array([0.4, 3.0, 8.0], dtype="<f4").tobytes())
+    (out,) = published("laser-bias", body, 1)
+    ranges = np.frombuffer(out.body.ranges_f32, dtype="<f4")
+    assert ranges == pytest.approx([0.9, 3.5, 8.5])
+    assert ranges[2] >= body.range_max_m
+
+
+def test_a_noisy_heading_stays_an_angle():
+    outs = published("absolute-pose-noise", m.Pose(0.0, 0.0, math.pi), 200)
+    assert all(-math.pi < out.body.yaw_rad <= math.pi for out in outs)
+    assert min(out.body.yaw_rad for out in outs) < 0 < max(out.body.yaw_rad for out in outs)
+
+
+# -- finding and varying ---------------------------------------------------------------------------
+
+
+def test_the_names_of_the_papers_faults_are_a_contract():
+    assert list(PAPER_FAULTS) == [
+        "command-not-updated", "command-out-of-bounds", "localization-not-updated",
+        "prohibited-area", "wrong-graph"]
+
+
+@pytest.mark.parametrize("name", [*CATALOGUE, *SYSTEMATIC])
+def test_a_fault_is_found_by_its_name_and_makes_sense(name):
+    fault = find_fault(name)
+    assert fault.name == name
+    assert "\n" not in fault.title
+    assert fault.title
+    assert fault.group in ("paper", "sensor", "topic")
+    for order in fault.orders("i"):
+        assert order.duration_s > 0
+        assert flaw(order, resolve(order.topic)[0].type) == ""
+
+
+def test_catalogue_names_detection_modules_that_exist():
+    modules = {f"DM{i}" for i in range(1, 8)}
+    assert {dm for fault in CATALOGUE.values() for dm in fault.detected_by} <= modules
+
+
+@pytest.mark.parametrize(("name", "words"), [
+    ("gremlins", "`rampart inject --list`"), ("", "`rampart inject --list`"),
+    ("gps-biass", "did you mean gps-bias?"), ("laser-drift", "quartz"),
+    ("melt:plan/route", "the mode must be one of drop"), ("drop:", "no topic has this key"),
+    ("drop:no/such", "no topic has this key"), ("drop:detection/*", "no topic has this key"),
+    ("drop:detection/", "no topic has this key"), (":plan/route", "the mode must be"),
+    ("corrupt:hello/DM1", "no number to corrupt in a Hello"),
+    ("stuck:hello/DM1", "a Hello has no content"), ("drop:world/truth", "the judge"),
+    ("drop:inject/order", "injections themselves"),
+])
+def test_a_fault_that_is_none_is_refused_in_one_line_that_says_why(name, words):
+    with pytest.raises(UnknownFaultError, match=r"^[^\n]*$") as caught:
+        find_fault(name)
+    assert words in str(caught.value)
+    assert repr(name) in str(caught.value)
+    assert len(str(caught.value)) < 200
+
+
+def test_a_topic_may_be_written_with_the_root_of_all_keys():
+    assert find_fault("drop:rampart/plan/route") == find_fault("drop:plan/route")
+
+
+def test_a_delay_is_longer_than_any_freshness_timeout_of_the_shipped_system():
+    timing = shipped_system().timing
+    assert timing.command_timeout_s < DELAY_S
+    assert timing.localization_timeout_s < DELAY_S
+
+
+def test_a_varied_fault_differs_in_what_was_said_and_each_disturbance_has_a_seed_of_its_own():
+    fault = Fault("both", "t", (Disturbance("a", "drop"), Disturbance("b", "drop", share=0.5)),
+                  (), 5.0)
+    varied = fault.varied(on_s=1.0, off_s=2.0, seed=7)
+    first, second = varied.orders("i", math.inf)
+    assert (first.injection, second.injection) == ("i.1", "i.2")
+    assert (first.share, first.on_s, first.off_s, first.seed) == (1.0, 1.0, 2.0, 7)
+    assert (second.share, second.on_s, second.off_s, second.seed) == (0.5, 1.0, 2.0, 8)
+    assert first.duration_s == math.inf
+    assert fault.varied() == fault
+
+
+def test_an_order_survives_the_wire_also_a_permanent_one():
+    for fault in CATALOGUE.values():
+        for order in fault.orders("i", math.inf):
+            payload = encode(Header("tool", 1, 1, 0.0), order)
+            assert decode(bus_topics.INJECT, payload)[1] == order
+
+
+def test_a_topic_of_the_robot_s_own_fails_like_any_other():
+    known = (*topics.ALL, LOAD, AXLE)
+    assert modes_of("porter/load", known) == MODES
+    assert find_fault("drop:porter/axle/front", known=known).disturbances[0].topic == (
+        "porter/axle/front")
+    (disturbance,) = find_fault("corrupt:porter/load", 3, known).disturbances
+    assert set(disturbance.add_fields) == {"mass_kg"}
+    with pytest.raises(UnknownFaultError, match="no topic has this key"):
+        find_fault("drop:porter/load")
+
+
+def test_numbers_that_travel_without_their_names_cannot_be_corrupted():
+    known = (*topics.ALL, AXLE)
+    assert modes_of("porter/axle/front", known) == tuple(
+        mode for mode in MODES if mode != "corrupt")
+    with pytest.raises(UnknownFaultError, match="Axle is array_like"):
+        find_fault("corrupt:porter/axle/front", known=known)

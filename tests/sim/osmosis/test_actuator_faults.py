@@ -1,0 +1,547 @@
+"""Stuck wheels, weak wheels and failed brakes: what they do, what they count, how they end."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport, StartPose
+from rampart.actors.runtime.actor import Context, Header
+from rampart.actors.runtime.clock import Clock
+from rampart.sim.osmosis.actuator_faults import ActuatorFaults, FaultNews, Motor
+from rampart.sim.osmosis.robot import WHEEL_NAMES, Drive, DriveLimits
+from rampart.sim.osmosis.scene import WorldError
+from rampart.sim.osmosis.simulator import Simulator
+from rampart.sim.osmosis.world import World
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from tests.virtual_loop import run_context
+
+STUCK = m.ActuatorFaultKind.STUCK_WHEEL
+WEAK = m.ActuatorFaultKind.WEAK_WHEEL
+BRAKE = m.ActuatorFaultKind.BRAKE_FAILURE
+LEFT = ("front left", "rear left")
+
+FIELD = Airport(
+    "Field", {"a": (0.0, 0.0), "b": (1.0, 0.0)}, (("a", "b"),), shapely.box(-90, -90, 90, 90),
+    StartPose(0, 0, 0),
+)  # fmt: skip
+
+
+def fault(kind, wheel="front left", strength=0.0, duration_s=100.0, injection="f"):
+    return m.ActuatorFault(injection, kind, wheel, strength, duration_s)
+
+
+def world(**changes) -> World:
+    return World(FIELD, **{"dead_man_timeout_s": None, "max_catch_up_s": 100.0, **changes})
+
+
+def driving(linear: float = 1.0, angular: float = 0.0) -> World:
+    """A world whose robot has driven for three seconds."""
+    sim = world()
+    sim.command(linear, angular)
+    sim.step_to(3.0)
+    return sim
+
+
+def after(sim: World, seconds: float) -> World:
+    sim.step_to(sim.time_s + seconds)
+    return sim
+
+
+def turned(sim: World, seconds: float) -> float:
+    """Angle turned, rad, over less than half a turn."""
+    before = sim.pose[2]
+    return math.remainder(after(sim, seconds).pose[2] - before, math.tau)
+
+
+def way_to_stop(sim: World) -> float:
+    """Way, m, from ordering the brake to standstill."""
+    start = sim.pose
+    sim.brake(True)
+    after(sim, 30.0)
+    assert abs(sim.truth().linear_mps) < 0.005
+    return math.dist(start[:2], sim.pose[:2])
+
+
+def model_of(sim: World) -> tuple[bytes, ...]:
+    """All of the model that a fault may change."""
+    model = sim._model
+    return tuple(a.tobytes() for a in (
+        model.dof_damping, model.actuator_forcerange, model.actuator_gainprm,
+        model.actuator_biasprm, model.dof_frictionloss, model.geom_friction))  # fmt: skip
+
+
+def affected(sim: World, injection: str = "f") -> int:
+    """End a fault and return in how many ticks it changed something."""
+    sim.order_fault(fault(STUCK, duration_s=0.0, injection=injection))
+    last = sim.fault_news()[-1]
+    assert (last.injection, last.finished) == (injection, True)
+    return last.affected_ticks
+
+
+# ---- stuck wheel --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wheel", WHEEL_NAMES)
+def test_a_stuck_wheel_stands_and_pulls_the_robot_to_its_side(wheel):
+    sim = driving()
+    sim.order_fault(fault(STUCK, wheel))
+    angle = turned(sim, 2.0)
+    side = 1 if wheel in LEFT else -1  # REP-103: counter-clockwise is positive, to the left
+    assert angle * side > 0.5
+    speeds = dict(zip(WHEEL_NAMES, sim.base_state().wheel_speeds_radps, strict=True))
+    assert abs(speeds.pop(wheel)) < 0.2
+    assert min(speeds.values()) > 7.5  # the others turn on at 1 m/s: 8.5 rad/s
+    assert 0.4 < sim.truth().linear_mps < 0.9
+
+
+def test_one_stuck_wheel_on_each_side_slows_the_robot_and_turns_it_little():
+    sim = driving()
+    sim.order_fault(fault(STUCK, "front left", injection="a"))
+    sim.order_fault(fault(STUCK, "rear right", injection="b"))
+    assert abs(turned(sim, 2.0)) < 0.3
+    assert 0.4 < sim.truth().linear_mps < 0.6
+    assert affected(sim, "a") == affected(sim, "b") == 200
+
+
+def test_two_stuck_wheels_on_one_side_pull_harder_than_one():
+    one, two = driving(), driving()
+    one.order_fault(fault(STUCK))
+    for wheel in LEFT:
+        two.order_fault(fault(STUCK, wheel, injection=wheel))
+    assert turned(two, 1.5) > 1.4 * turned(one, 1.5) > 0.5
+
+
+# ---- weak wheel ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wheel", WHEEL_NAMES)
+def test_a_weak_wheel_pulls_to_its_side_and_less_than_a_stuck_one(wheel):
+    weak, stuck = driving(), driving()
+    weak.order_fault(fault(WEAK, wheel, 0.2))
+    stuck.order_fault(fault(STUCK, wheel))
+    side = 1 if wheel in LEFT else -1
+    assert 0.1 < side * turned(weak, 2.0) < 0.6 * side * turned(stuck, 2.0)
+
+
+def test_a_weak_motor_slows_the_turning_of_the_robot_the_more_the_weaker_it_is():
+    rates = []
+    for strength in (1.0, 0.3, 0.1, 0.0):
+        sim = world()
+        sim.order_fault(fault(WEAK, strength=strength))
+        sim.command(0.0, 1.5)
+        after(sim, 2.0)
+        rates.append(turned(sim, 1.0))
+    assert rates == sorted(rates, reverse=True)
+    assert rates[0] - rates[-1] > 0.2
+
+
+def test_the_speed_loop_masks_a_weak_motor_of_which_nothing_more_is_asked():
+    weak, healthy = driving(0.5), driving(0.5)
+    weak.order_fault(fault(WEAK, strength=0.5))
+    after(weak, 2.0), after(healthy, 2.0)
+    assert weak.truth() == healthy.truth()
+    assert affected(weak) == 0
+
+
+def test_a_dead_motor_rolls_along():
+    sim = driving()
+    sim.order_fault(fault(WEAK, strength=0.0))
+    after(sim, 1.0)
+    assert sim.base_state().wheel_speeds_radps[0] * 0.1175 == pytest.approx(1.0, abs=0.05)
+
+
+# ---- brake failure ------------------------------------------------------------------
+
+
+def test_with_a_failed_brake_the_robot_coasts_many_times_as_far():
+    healthy, failed = driving(), driving()
+    failed.order_fault(fault(BRAKE, wheel=""))
+    shortest, way = way_to_stop(healthy), way_to_stop(failed)
+    assert way > 10 * shortest
+    # Bearings only: 0.1 N m s/rad a wheel on 84 kg, wheels' inertia included, at 1 m/s.
+    assert way == pytest.approx(84 * 0.1175**2 / (4 * 0.1), rel=0.1)
+
+
+def test_the_less_of_the_brake_is_left_the_longer_the_way():
+    ways = []
+    for strength in (0.75, 0.5, 0.25, 0.1, 0.02, 0.0):
+        sim = driving()
+        sim.order_fault(fault(BRAKE, strength=strength))
+        ways.append(way_to_stop(sim))
+    healthy = way_to_stop(driving())
+    assert [healthy, *ways] == sorted([healthy, *ways])
+    assert ways[1] > 1.4 * healthy
+
+
+def test_a_failed_brake_does_not_lock_the_wheels_and_a_healthy_one_does():
+    sim = world()
+    sim.brake(True)
+    locked = model_of(after(sim, 0.1))
+    sim.order_fault(fault(BRAKE, duration_s=1.0))
+    assert model_of(after(sim, 0.5))[0] == model_of(world())[0] != locked[0]
+    assert model_of(after(sim, 1.0)) == locked
+
+
+def test_the_dead_man_brakes_in_vain_as_well_but_a_controlled_stop_does_not_need_the_brake():
+    sim = world(dead_man_timeout_s=0.4)
+    sim.order_fault(fault(BRAKE))
+    while sim.time_s < 3.0:
+        sim.command(1.0, 0.0)
+        after(sim, 0.1)
+    after(sim, 1.5)
+    assert sim.base_state().dead_man_tripped
+    assert sim.truth().linear_mps > 0.5
+    for _ in range(10):
+        sim.command(0.0, 0.0)
+        after(sim, 0.1)
+    assert abs(sim.truth().linear_mps) < 0.01
+
+
+def test_when_the_brake_comes_back_it_brakes_from_the_speed_that_is_left():
+    sim = driving()
+    sim.order_fault(fault(BRAKE, duration_s=1.0))
+    sim.brake(True)
+    speed = after(sim, 1.0).truth().linear_mps
+    assert 0.6 < speed < 0.8
+    start = sim.pose[0]
+    after(sim, 1.0)
+    assert abs(sim.truth().linear_mps) < 0.005
+    assert sim.pose[0] - start < 0.15
+
+
+def test_when_the_brake_is_released_the_drive_goes_on_from_the_speed_that_is_left():
+    sim = driving()
+    sim.order_fault(fault(BRAKE))
+    sim.brake(True)
+    speed = after(sim, 2.0).truth().linear_mps
+    assert 0.4 < speed < 0.6
+    sim.brake(False)
+    assert after(sim, 0.1).truth().linear_mps < speed + 0.2  # 1.5 m/s^2, and no jerk to 1 m/s
+    assert after(sim, 2.0).truth().linear_mps == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_ramps_give_way_to_the_measured_speed_and_never_change_sign():
+    drive = Drive(DriveLimits(), None)
+    drive.command(1.0, -1.0, 0.0)
+    for _ in range(200):
+        drive.update(0.0, 0.01)
+    drive.give_way(2.0, -2.0)
+    assert (drive._linear, drive._angular) == (1.0, -1.0)
+    drive.give_way(0.5, 0.3)
+    assert (drive._linear, drive._angular) == (0.5, 0.0)
+
+
+# ---- several, and their ends --------------------------------------------------------
+
+
+@pytest.mark.parametrize("orders", [
+    [fault(STUCK, duration_s=1.0)],
+    [fault(WEAK, strength=0.1, duration_s=1.0)],
+    [fault(STUCK, "rear right", duration_s=1.0, injection="a"),
+     fault(WEAK, "front left", 0.2, 0.7, "b"), fault(BRAKE, "", 0.3, 0.4, "c")],
+])  # fmt: skip
+def test_a_fault_ends_by_its_duration_and_the_robot_drives_straight_again(orders):
+    sim = driving()
+    for order in orders:
+        sim.order_fault(order)
+    assert model_of(after(sim, 0.3)) != model_of(world())
+    after(sim, 2.0)
+    assert model_of(sim) == model_of(world())
+    assert not sim._faulty  # and the ticks cost what they did before
+    assert abs(turned(sim, 3.0)) < 0.002
+    assert sim.truth().linear_mps == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_fault_lasts_to_the_tick():
+    sim = driving()
+    sim.order_fault(fault(STUCK, duration_s=0.5))
+    after(sim, 2.0)
+    assert sim.fault_news() == [
+        FaultNews("f", 0, finished=False), FaultNews("f", 1, finished=False),
+        FaultNews("f", 50, finished=True)]  # fmt: skip
+
+
+def test_a_duration_of_0_ends_one_fault_and_leaves_the_other():
+    sim = driving()
+    sim.order_fault(fault(STUCK, "front left", injection="a"))
+    sim.order_fault(fault(STUCK, "rear left", injection="b"))
+    after(sim, 0.2)
+    assert affected(sim, "a") == 20
+    after(sim, 0.3)
+    speeds = sim.base_state().wheel_speeds_radps
+    assert speeds[0] > 7.5
+    assert abs(speeds[2]) < 0.2
+    assert affected(sim, "b") == 50
+    assert model_of(after(sim, 0.01)) == model_of(world())
+
+
+def test_to_end_a_fault_twice_repeats_the_news_of_its_end():
+    sim = driving()
+    sim.order_fault(fault(STUCK))
+    after(sim, 0.1)
+    assert affected(sim) == affected(sim) == 10
+
+
+def test_a_fault_ordered_again_is_replaced_lasts_anew_and_goes_on_counting():
+    sim = driving()
+    sim.order_fault(fault(STUCK, "front left", duration_s=0.5))
+    after(sim, 0.3)
+    sim.order_fault(fault(STUCK, "rear right", duration_s=0.5))
+    after(sim, 0.4)
+    assert sim.base_state().wheel_speeds_radps[0] > 7.5
+    assert abs(sim.base_state().wheel_speeds_radps[3]) < 0.2
+    after(sim, 1.0)
+    assert sim.fault_news()[-1] == FaultNews("f", 80, finished=True)
+
+
+def test_the_worst_of_several_faults_on_an_actuator_acts_and_counts():
+    sim = driving()
+    for injection, order in {
+        "stuck": fault(STUCK), "hidden": fault(WEAK, strength=0.1),
+        "weakest": fault(WEAK, "rear right", 0.1), "weaker": fault(WEAK, "rear right", 0.2),
+    }.items():  # fmt: skip
+        sim.order_fault(m.ActuatorFault(injection, order.kind, order.wheel, order.strength, 9.0))
+    after(sim, 0.5)
+    counts = {name: affected(sim, name) for name in ("stuck", "hidden", "weakest", "weaker")}
+    assert counts == {"stuck": 50, "hidden": 0, "weakest": 50, "weaker": 0}
+
+
+# ---- what changes nothing -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [
+    fault(STUCK), fault(WEAK), fault(BRAKE), fault(BRAKE, strength=0.5)])
+def test_on_a_robot_that_stands_braked_no_fault_has_an_effect(order):
+    sim = world()
+    sim.brake(True)
+    after(sim, 0.5)
+    sim.order_fault(order)
+    after(sim, 1.0)
+    assert affected(sim) == 0
+
+
+def test_a_failed_brake_that_nobody_uses_has_no_effect():
+    failed, healthy = driving(), driving()
+    failed.order_fault(fault(BRAKE))
+    after(failed, 1.0), after(healthy, 1.0)
+    assert failed.truth() == healthy.truth()
+    assert affected(failed) == 0
+
+
+@pytest.mark.parametrize("kind", [WEAK, BRAKE])
+def test_a_fault_that_leaves_everything_changes_no_bit(kind):
+    def states(*orders: m.ActuatorFault) -> list[bytes]:
+        sim = driving(1.0, 0.5)
+        for order in orders:
+            sim.order_fault(order)
+        seen = []
+        for step in range(30):
+            sim.command(1.0 - step % 3, step % 5 - 2.0)
+            sim.brake(step > 20)
+            seen.append(after(sim, 0.1)._data.qpos.tobytes())
+        return seen
+
+    assert states() == states(fault(kind, strength=1.0))
+
+
+def test_the_same_faults_give_the_same_world_bit_for_bit():
+    def states() -> list[bytes]:
+        sim = driving(1.0, 0.2)
+        sim.order_fault(fault(WEAK, "rear left", 0.15, 1.0, "a"))
+        sim.order_fault(fault(STUCK, "front right", 0.0, 0.5, "b"))
+        sim.order_fault(fault(BRAKE, "", 0.3, 2.0, "c"))
+        seen = []
+        for step in range(30):
+            sim.brake(step > 7)
+            seen.append(after(sim, 0.1)._data.qpos.tobytes())
+        return seen
+
+    assert states() == states()
+
+
+# ---- bad input ----------------------------------------------------------------------
+
+BAD = [
+    (fault(STUCK, "middle left"), "wheel = 'middle left': must be one of front left"),
+    (fault(WEAK, ""), "wheel = '': must be one of"),
+    (fault(WEAK, strength=-0.1), "strength = -0.1: must be a share from 0 to 1"),
+    (fault(BRAKE, strength=1.01), "strength = 1.01: must be a share"),
+    (fault(BRAKE, strength=math.nan), "strength = nan: must be a share"),
+    (fault(STUCK, duration_s=math.nan), "duration_s = nan: must be seconds"),
+    (fault(STUCK, duration_s=-math.inf), "duration_s = -inf: must be seconds"),
+    (fault(STUCK, duration_s=-1.0), "duration_s = -1.0: must be seconds"),
+    (fault(STUCK, duration_s=0.0), "injection = 'f': no such fault in force to end"),
+]
+
+
+@pytest.mark.parametrize(("order", "reason"), BAD)
+def test_an_impossible_fault_is_refused_in_one_line_and_changes_nothing(order, reason):
+    sim = driving()
+    with pytest.raises(WorldError) as refusal:
+        sim.order_fault(order)
+    assert reason in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+    assert sim.fault_news() == []
+    assert sim.truth() == driving().truth()
+    assert after(sim, 0.1).truth() == after(driving(), 0.1).truth()
+
+
+# ---- the pure part ------------------------------------------------------------------
+
+MOTOR = Motor(torque_nm=30.0, servo_gain=100.0, rated_radps=25.0, brake_torque_nm=12.0)
+radps = st.floats(-40, 40)
+wheels4 = st.tuples(radps, radps, radps, radps)
+orders = st.builds(
+    m.ActuatorFault, st.sampled_from("abcd"), st.sampled_from(m.ActuatorFaultKind),
+    st.sampled_from(WHEEL_NAMES), st.floats(0, 1),
+    st.integers(1, 100).map(lambda ticks: ticks / 100))  # fmt: skip
+
+
+@settings(deadline=None)
+@given(st.lists(orders, max_size=4), wheels4, wheels4, st.booleans())
+def test_no_wheel_gets_more_than_a_healthy_one_and_only_faulty_wheels_get_less(
+    faults, targets, speeds, braking
+):
+    subject = ActuatorFaults(MOTOR)
+    in_force = {order.injection: order for order in faults}
+    for order in faults:
+        subject.order(order, 0.0)
+    actuation = subject.actuate(targets, speeds, braking)
+    kept = [o.strength for o in in_force.values() if o.kind == BRAKE]
+    fails = braking and min(kept, default=1.0) < 1
+    for i, wheel in enumerate(WHEEL_NAMES):
+        own = [o for o in in_force.values() if o.kind != BRAKE and o.wheel == wheel]
+        stuck = any(o.kind == STUCK for o in own)
+        share = min((o.strength for o in own if o.kind == WEAK), default=1.0)
+        assert actuation.blocked[i] == stuck
+        least, most = actuation.torques_nm[i]
+        assert -30.0 <= least <= 0.0 <= most <= 30.0
+        assert abs(actuation.targets_radps[i]) <= abs(targets[i])
+        if fails:  # absorbs only
+            assert (least if speeds[i] <= 0 else most) == 0.0
+            assert max(-least, most) <= min(kept) * 12.0
+        elif not stuck:
+            assert (-least, most) == (share * 30.0, share * 30.0)
+            if share == 1 or abs(targets[i]) <= share * 25.0:
+                assert actuation.targets_radps[i] == targets[i]
+
+
+def test_a_stuck_wheels_motor_does_not_strain_against_the_seizure():
+    subject = ActuatorFaults(MOTOR)
+    subject.order(fault(STUCK, "rear left"), 0.0)
+    actuation = subject.actuate((8.0,) * 4, (8.0, 8.0, 0.0, 8.0), braking=False)
+    assert actuation.targets_radps == (8.0, 8.0, 0.0, 8.0)
+
+
+def test_a_weak_motor_under_a_failed_brake_keeps_to_the_ramp_with_the_lesser_torque():
+    subject = ActuatorFaults(MOTOR)
+    subject.order(fault(WEAK, "front left", 0.2, injection="motor"), 0.0)
+    subject.order(fault(BRAKE, "", 0.75, injection="brake"), 0.0)
+    actuation = subject.actuate((8.0,) * 4, (9.0,) * 4, braking=True)
+    assert actuation.targets_radps == (8.0,) * 4  # and not the 5.0 that it could be driven to
+    assert actuation.torques_nm == ((-6.0, 0.0), *((-9.0, 0.0),) * 3)
+
+
+@settings(deadline=None)
+@given(st.lists(orders, max_size=4))
+def test_every_fault_ends_in_time_and_with_the_last_one_all_is_healthy(faults):
+    subject = ActuatorFaults(MOTOR)
+    until = {}
+    for order in faults:
+        subject.order(order, 5.0)
+        until[order.injection] = 5.0 + order.duration_s
+    for now_s in sorted(set(until.values())):
+        assert bool(subject)
+        subject.expire(now_s)
+    assert not subject
+    ended = [news.injection for news in subject.take_news() if news.finished]
+    assert sorted(ended) == sorted(until)
+    healthy = subject.actuate((9.0,) * 4, (1.0,) * 4, braking=False)
+    assert healthy.torques_nm == ((-30.0, 30.0),) * 4
+    assert healthy.targets_radps == (9.0,) * 4
+    assert not any(healthy.blocked)
+
+
+# ---- the actor ----------------------------------------------------------------------
+
+
+class Bench:
+    """A simulator whose clock is moved by hand; its reports and complaints are kept."""
+
+    def __init__(self):
+        self.now_s = 10.0
+        clock = Clock(0.0, 1.0, lambda: self.now_s)
+        self.actor = Simulator(Context(
+            "simulator", 1, clock, VirtualBus(Hub(), "simulator"), run=run_context(airport=FIELD)))
+        self.reports, self.complaints = [], []
+        self.actor.publish = lambda topic, body, **_: (
+            self.reports.append((body.injection, body.affected, body.finished, body.reason))
+            if topic is bus_topics.INJECTION_REPORT else None)  # fmt: skip
+        self.actor.report_diagnostic = lambda *complaint: self.complaints.append(complaint)
+        self.actor.on_start()
+
+    def header(self) -> Header:
+        return Header("tester", 1, 1, self.now_s)
+
+    def run(self, seconds: float, linear: float = 1.0) -> None:
+        for _ in range(round(seconds / 0.02)):
+            self.now_s += 0.02
+            self.actor.command(m.BaseCommand(linear, 0.0), self.header())
+            self.actor.tick()
+
+    def order(self, order: m.ActuatorFault) -> None:
+        self.actor.actuator_fault(order, self.header())
+
+
+def test_the_simulator_reports_when_a_fault_is_taken_when_it_bites_and_when_it_is_over():
+    bench = Bench()
+    bench.run(1.0)
+    bench.order(fault(STUCK, duration_s=0.5))
+    assert bench.reports == [("f", 0, False, "")]
+    bench.run(0.1)
+    assert bench.reports[1:] == [("f", 1, False, "")]
+    bench.run(1.0)
+    assert bench.reports[2:] == [("f", 50, True, "")]
+    assert bench.complaints == []
+
+
+def test_the_simulator_reports_a_fault_without_effect_as_such():
+    bench = Bench()
+    bench.run(1.0, linear=0.0)
+    bench.order(fault(STUCK, duration_s=0.5))
+    bench.run(1.0, linear=0.0)
+    assert bench.reports == [("f", 0, False, ""), ("f", 0, True, "")]
+
+
+def test_a_fault_that_is_over_while_the_simulator_is_held_up_is_reported_all_the_same():
+    bench = Bench()
+    bench.run(1.0)
+    bench.order(fault(STUCK, duration_s=20.0))
+    bench.run(0.1)
+    bench.now_s += 60.0
+    bench.actor.tick()
+    assert bench.reports[-1][0::2] == ("f", True)
+
+
+@pytest.mark.parametrize(("order", "reason"), BAD)
+def test_the_simulator_refuses_what_is_impossible_and_says_why(order, reason):
+    bench = Bench()
+    bench.run(0.1)
+    bench.order(order)
+    ((injection, count, finished, why),) = bench.reports
+    assert (injection, count, finished) == ("f", 0, True)
+    assert reason in why
+    assert bench.complaints == [("actuator fault", why, "tester")]
+
+
+def test_the_topic_carries_what_the_simulator_hears():
+    assert topics.ACTUATOR_FAULT.type is m.ActuatorFault
+    assert topics.ACTUATOR_FAULT in Simulator.inputs()

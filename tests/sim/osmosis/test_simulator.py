@@ -1,0 +1,187 @@
+"""The simulator actor: topics, rates, stamps, and what it does with its inputs."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.runtime.actor import Context, Header
+from rampart.actors.runtime.clock import Clock
+from rampart.sim.osmosis.schedule import Schedule
+from rampart.sim.osmosis.simulator import Simulator
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from tests.virtual_loop import run_context
+
+AIRPORT = load_airport("vallombre")
+
+
+class Bench:
+    """A simulator whose clock is moved by hand and whose messages are kept."""
+
+    def __init__(self, **parameters):
+        self.now_s = 100.0
+        clock = Clock(0.0, 1.0, lambda: self.now_s)
+        context = Context("simulator", 1, clock, VirtualBus(Hub(), "simulator"), parameters,
+                          run_context(airport=AIRPORT))
+        self.actor = Simulator(context)
+        self.sent = []
+        self.actor.has_readers = lambda topic: True
+        self.actor.publish = lambda topic, body, stamp=None, name=None: self.sent.append(
+            (topic.key, body, self.now_s if stamp is None else stamp))  # fmt: skip
+        self.actor.on_start()
+
+    def run(self, seconds: float, command: m.BaseCommand | None = None) -> None:
+        for _ in range(round(seconds / 0.02)):
+            self.now_s += 0.02
+            if command is not None:
+                self.actor.command(command, self.header())
+            self.actor.tick()
+
+    def header(self, age_s: float = 0.0) -> Header:
+        return Header("safety_pilot", 1, 1, self.now_s - age_s)
+
+    def last(self, topic):
+        return [body for key, body, _ in self.sent if key == topic.key][-1]
+
+
+def test_every_topic_of_the_summit_xl_layer_and_the_world_comes_at_its_rate():
+    bench = Bench(upper_laser=True)
+    bench.run(2.0)
+    counts = Counter(key for key, _, _ in bench.sent)
+    readings = [topic for topic in Simulator.outputs if topic is not ftm_topics.HOLDS]
+    assert set(counts) == {topic.key for topic in readings}
+    for topic in readings:
+        assert counts[topic.key] == pytest.approx(2 * topic.rate_hz, abs=1)
+
+
+def test_a_robot_with_one_laser_has_one_and_with_two_both_see_the_same_with_noise_of_their_own():
+    one, two = Bench(), Bench(upper_laser=True)
+    for bench in (one, two):
+        bench.run(1.0)
+    assert topics.UPPER_SCAN.key not in {key for key, _, _ in one.sent}
+    assert one.last(topics.SCAN) == two.last(topics.SCAN)  # the second disturbs nothing
+    lower, upper = (np.frombuffer(two.last(topic).ranges_f32, "<f4")
+                    for topic in (topics.SCAN, topics.UPPER_SCAN))
+    assert two.last(topics.SCAN).reference_m != two.last(topics.UPPER_SCAN).reference_m
+    assert upper == pytest.approx(lower, abs=0.15)
+    assert np.array_equal(upper >= 8.0, lower >= 8.0)
+
+
+def test_each_message_is_of_its_topics_type_and_stamped_with_its_own_due_time():
+    bench = Bench()
+    bench.run(0.5)
+    types = {topic.key: topic.type for topic in Simulator.outputs}
+    assert all(type(body) is types[key] for key, body, _ in bench.sent)
+    stamps = [stamp for key, _, stamp in bench.sent if key == topics.IMU.key]
+    assert np.diff(stamps) == pytest.approx(0.02)
+
+
+def test_commands_move_the_robot_and_the_brake_holds_it():
+    bench = Bench()
+    start = bench.actor._world.pose
+    bench.run(2.0, m.BaseCommand(0.5, 0.0))
+    assert bench.last(topics.TRUTH).twist.linear_mps == pytest.approx(0.5, abs=0.02)
+    assert bench.last(topics.ABSOLUTE_POSE).y_m < start[1] - 0.5  # it faces south
+    bench.actor.brake(m.BrakeCommand(True, "test"), bench.header())
+    bench.run(1.0, m.BaseCommand(0.5, 0.0))
+    assert bench.last(topics.TRUTH).twist.linear_mps == pytest.approx(0.0, abs=0.01)
+    assert bench.last(topics.BASE_STATUS).brake_engaged
+    bench.actor.brake(m.BrakeCommand(False, "test"), bench.header())
+    bench.run(1.0, m.BaseCommand(0.5, 0.0))
+    assert bench.last(topics.TRUTH).twist.linear_mps > 0.4
+
+
+def test_the_brake_is_released_when_the_last_who_holds_it_lets_go():
+    bench = Bench()
+    for source, engaged, brakes in (
+            ("RM1", True, True), ("RM7", False, True), ("RM7", True, True), ("RM1", False, True),
+            ("RM1", False, True), ("RM7", False, False)):
+        bench.actor.brake(m.BrakeCommand(engaged, "test"), Header(source, 1, 1, bench.now_s))
+        bench.run(0.2, m.BaseCommand(0.0, 0.0))
+        assert bench.last(topics.BASE_STATUS).brake_engaged is brakes
+
+
+@pytest.mark.parametrize(("parameters", "stands"), [({}, True), ({"dead_man": False}, False)])
+def test_the_dead_man_can_be_switched_off(parameters, stands):
+    bench = Bench(**parameters)
+    bench.run(1.0, m.BaseCommand(0.5, 0.0))
+    bench.run(2.0)
+    assert bench.last(topics.BASE_STATUS).dead_man_tripped is stands
+    assert (abs(bench.last(topics.TRUTH).twist.linear_mps) < 0.01) is stands
+
+
+def test_an_old_command_does_not_keep_the_dead_man_quiet():
+    bench = Bench()
+    for _ in range(50):
+        bench.run(0.02)
+        bench.actor.command(m.BaseCommand(0.5, 0.0), bench.header(age_s=2.0))
+    assert bench.last(topics.BASE_STATUS).dead_man_tripped
+
+
+def test_obstacles_come_and_go_by_message_and_are_published_at_once():
+    bench = Bench(obstacles=2)
+    bench.run(1.0)
+    assert {o.name for o in bench.last(topics.OBSTACLES).obstacles} == {"crate", "drum"}
+    order = m.ObstacleCommand("box", True, -27.0, 8.0, 0.3)
+    bench.actor.obstacle(order, bench.header())
+    assert order in bench.last(topics.OBSTACLES).obstacles
+    bench.run(0.2)
+    ranges = np.frombuffer(bench.last(topics.SCAN).ranges_f32, dtype="<f4")
+    assert ranges.min() == pytest.approx(2.7, abs=0.1)
+    bench.actor.obstacle(m.ObstacleCommand("box", False, 0, 0, 0), bench.header())
+    assert "box" not in {o.name for o in bench.last(topics.OBSTACLES).obstacles}
+
+
+def test_an_impossible_order_is_reported_and_changes_nothing():
+    bench = Bench()
+    reports = []
+    bench.actor.report_diagnostic = lambda *report: reports.append(report)
+    bench.actor.obstacle(m.ObstacleCommand("x", True, -27.0, 11.0, 0.3), bench.header())
+    bench.actor.command(m.BaseCommand(float("nan"), 0.0), bench.header())
+    assert [report[0] for report in reports] == ["obstacle", "velocity command"]
+    assert "on the robot" in reports[0][1]
+    assert bench.actor._world.obstacles == ()
+
+
+def test_the_scan_message_describes_itself():
+    bench = Bench(laser_rays=91, laser_range_m=6.0)
+    bench.run(0.2)
+    scan = bench.last(topics.SCAN)
+    ranges = np.frombuffer(scan.ranges_f32, dtype="<f4")
+    assert len(ranges) == 91
+    assert ranges.max() <= scan.range_max_m == 6.0
+    assert scan.angle_min_rad == pytest.approx(-scan.angle_increment_rad * 45)
+
+
+def test_held_up_it_publishes_fresh_readings_and_owns_up_to_the_loss():
+    bench = Bench()
+    bench.run(1.1)
+    assert bench.last(topics.TRUTH).real_time_factor == 1.0
+    bench.sent.clear()
+    bench.now_s += 30.0
+    bench.actor.tick()
+    assert min(stamp for _, _, stamp in bench.sent) > bench.now_s - 1.1
+    bench.run(1.1)
+    assert bench.last(topics.TRUTH).real_time_factor < 1.0 + 1e-9
+    assert any(b.real_time_factor < 0.2 for k, b, _ in bench.sent if k == topics.TRUTH.key)
+
+
+def test_a_schedule_keeps_its_grid_and_drops_what_is_too_old():
+    schedule = Schedule({"a": 10, "b": 5}, start_s=0.0, keep_s=1.0)
+    assert list(schedule.due(0.2)) == [
+        (0.0, "a"), (0.0, "b"), (pytest.approx(0.1), "a"), (pytest.approx(0.2), "a"),
+        (pytest.approx(0.2), "b")]  # fmt: skip
+    assert list(schedule.due(0.25)) == []
+    late = [name for _, name in schedule.due(10.0)]
+    assert Counter(late) == pytest.approx({"a": 10, "b": 5}, abs=1)
+
+
+def test_a_schedule_without_a_positive_rate_is_refused():
+    with pytest.raises(ValueError, match="a rate must be positive"):
+        Schedule({"a": 0}, 0.0, 1.0)

@@ -1,0 +1,50 @@
+"""What a run tells on the terminal."""
+
+from __future__ import annotations
+
+from io import StringIO
+
+import msgspec
+import pytest
+
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.actor import Header
+from rampart.manager.spec.specification import parse_specification
+from rampart.sim.runs.console import Console
+from tests import ROOT
+
+PLAN = RunPlan("r")
+MISSION = load_airport("vallombre").mission("AB")
+CALM = m.ManagerStatus((), (), (), (), "guarded-repair", 0)
+
+
+def system(name: str):
+    return parse_specification((ROOT / "systems" / f"{name}.toml").read_text("utf-8"), name)
+
+
+def test_a_module_that_falls_silent_and_is_heard_again_is_told_once_each():
+    stream = StringIO()
+    console = Console(stream)
+    for second, silent in enumerate([(), ("D_FAST",), ("D_FAST",), ()]):
+        console.take(topics.MANAGER_STATUS, msgspec.structs.replace(CALM, silent=silent),
+                     Header("manager", 1, second, float(second)))
+    assert stream.getvalue().splitlines() == [
+        "[   1.00 s] D_FAST silent: it counts as active", "[   3.00 s] D_FAST: no longer silent"]
+
+
+@pytest.mark.parametrize(("name", "node"), [
+    ("paper", "osmosis_control"), ("osmosis", "osmosis_control"), ("cell", "camera")])
+def test_the_banner_offers_to_kill_a_node_that_the_system_has(name, node):
+    stream = StringIO()
+    Console(stream).banner("Vallombre", MISSION, PLAN, system(name))
+    assert stream.getvalue().endswith(f"Try from another shell: kill-node {node}\n")
+
+
+def test_where_no_recovery_brings_a_node_back_none_is_offered():
+    stream = StringIO()
+    alone = msgspec.structs.replace(system("cell"), nodes=())
+    Console(stream).banner("Vallombre", MISSION, PLAN, alone)
+    assert "kill-node" not in stream.getvalue()

@@ -1,0 +1,84 @@
+"""The short chaos test: what every change has to survive. `make chaos` runs the long one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from rampart.manager.spec.specification import check_document, read_document
+from tests import ROOT
+from tests.real_run import RealRun
+from tests.whole.chaos import WAYS, Chaos, Targets, complaints, each_in_every_way, so_many, targets
+from tests.whole.leak_counts import Counts, leaks
+
+SHIPPED = ROOT / "systems" / "osmosis.toml"
+PAUSE_S = (0.8, 2.0)
+ALL_FOUR = ("mission_manager", "osmosis_control", "safety_pilot", "ftm_manager", "supervisor")
+
+
+def write_row(directory: Path) -> Path:
+    """Write mission A without its way home."""
+    file = directory / "ROW.miss"
+    file.write_text("x=-22,y=-18.5,taxi=1\nx=23.5,y=-18.5,taxi=0\n")
+    return file
+
+
+def test_everybody_is_hit_in_every_way_and_the_world_is_only_stopped():
+    everybody = targets(check_document(
+        read_document(SHIPPED.read_text(encoding="utf-8"), SHIPPED.name), SHIPPED.name))
+    hits = each_in_every_way(everybody, 1, PAUSE_S)
+    assert {"hmi", "safety_pilot", "ftm_manager", "supervisor", "spawner_a", "spawner_b", "DM13",
+            "RM8", "standby_control"} <= set(everybody.mortal)
+    assert sorted((h.name, h.way) for h in hits) == sorted(
+        [*[("simulator", "STOP")] * 4, *((name, way) for name in everybody.mortal for way in WAYS)])
+
+
+@pytest.mark.parametrize("hits", [
+    lambda seed: each_in_every_way(Targets(("a", "b", "c"), ("w",)), seed, PAUSE_S),
+    lambda seed: so_many(("a", "b", "c"), 40, seed, PAUSE_S)], ids=["each", "many"])
+def test_the_plan_follows_from_its_seed_and_gives_everybody_a_moment(hits):
+    plans = [hits(seed) for seed in range(50)]
+    assert plans == [hits(seed) for seed in range(50)]
+    assert len(set(map(tuple, plans))) == 50
+    for plan in plans:
+        assert all(PAUSE_S[0] <= hit.pause_s <= PAUSE_S[1] for hit in plan)
+        assert all(a.name != b.name for a, b in pairwise(plan))
+
+
+COUNTS = Counts({"supervisor": 60, "spawner_a": 10}, {"supervisor": 90.0, "spawner_a": 50.0},
+                34, 0, 99, frozenset({"a"}))
+
+
+def test_the_same_or_less_is_no_leak_nor_are_spare_connections_and_a_little_memory():
+    assert leaks(COUNTS, COUNTS) == []
+    assert leaks(COUNTS, replace(
+        COUNTS, processes=33, descriptors={"supervisor": 94, "spawner_a": 9},
+        memory_mb={"supervisor": 100.0, "spawner_a": 50.0})) == []
+
+
+@pytest.mark.parametrize("after", [
+    {"descriptors": {"supervisor": 95, "spawner_a": 10}},
+    {"descriptors": {"supervisor": 60, "spawner_a": 11}},
+    {"memory_mb": {"supervisor": 110.0, "spawner_a": 50.0}},
+    {"processes": 35}, {"zombies": 1}, {"files": 100},
+    {"shared_memory": frozenset("ab")}], ids=" ".join)
+def test_whatever_becomes_more_is_one_leak(after):
+    assert len(leaks(COUNTS, replace(COUNTS, **after))) == 1
+
+
+@pytest.mark.processes
+@pytest.mark.timeout(240)
+def test_a_mission_survives_whatever_is_done_to_its_processes(tmp_path):
+    hits = each_in_every_way(Targets(ALL_FOUR, ("simulator",)), 5, PAUSE_S)
+    with RealRun(tmp_path, "--mission", str(write_row(tmp_path)), "--rate", "2",
+                 system="osmosis") as run:
+        run.wait_for("goal 1/2")
+        chaos = Chaos(run, world=("simulator",))
+        left = chaos.carry_out(hits)
+        code, result = run.result()
+    done = "\n".join(map(str, chaos.struck))
+    assert complaints(run, code, result, "A", chaos.struck) == [], f"{done}\n{run.story}"
+    assert left == [], "the mission was over before everybody was hit"

@@ -1,0 +1,431 @@
+"""Nodes that hold data come back with it: same mission, same step, each light exactly once."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import random
+import signal
+import sqlite3
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.control.following.control_checkpoint import (
+    CONTROL_STATE,
+    ControlKept,
+    whole_row,
+)
+from rampart.actors.osmosis.control.following.light_ledger import LightsKept
+from rampart.actors.osmosis.control.following.light_row import LightRow
+from rampart.actors.osmosis.control.following.path_follower import PathFollower
+from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE, catch_up
+from rampart.actors.osmosis.control.mission.mission_state import MissionState
+from rampart.actors.osmosis.control.polyline import NO_POINTS, Polyline
+from rampart.actors.runtime.checkpoint import Loaded, MemoryCheckpoints, Record, StateError
+from rampart.manager.arbitration.arbiter import (
+    DetectionHeard,
+    Phase,
+    RecoveryHeard,
+    ResetAsked,
+    Tick,
+    build_arbiter,
+)
+from rampart.manager.arbitration.arbiter_memory import Latch, Memory, objection, recall, remember
+from rampart.manager.arbitration.recovery_track import Command
+from rampart.manager.spec.specification import parse_specification
+from tests import ROOT
+from tests.actors.osmosis.control.world import World, drive
+from tests.real_run import RealRun
+from tests.whole.checkpoint_runs import (
+    CONTROL,
+    SHORT_LIGHTS,
+    assert_nothing_lost_or_doubled,
+    fly,
+    with_checkpoints,
+    write_short_mission,
+)
+
+P = m.MissionPhase
+GOALS = tuple(m.Goal(float(i), 0.0, m.Mode.TAXI) for i in range(4))
+SPEC = parse_specification((ROOT / "systems" / "paper.toml").read_text(), "paper.toml")
+
+
+def mission(step: int = 1, phase: m.MissionPhase = P.RUNNING, **changes) -> MissionState:
+    times = changes.pop("step_times_s", (5.0,) * step)
+    return MissionState("x", "X", phase, GOALS, step, 10.0, times, **changes)
+
+
+# -- the Mission Manager's state -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("state", "heard", "step", "times"), [
+    (mission(1), 2, 2, (5.0, 20.0)),  # the newest checkpoint was lost
+    (mission(0), 3, 3, (20.0, 0.0, 0.0)),
+    (mission(2), 2, 2, (5.0, 5.0)),
+    (mission(2), 1, 2, (5.0, 5.0)),  # control has not heard of the new goal yet
+    (mission(2), 4, 2, (5.0, 5.0)),  # the number of goals: on the way home
+    (mission(2), 99, 2, (5.0, 5.0)),
+    (mission(1, P.CANCELLED), 3, 1, (5.0,)),
+    (mission(1, P.PAUSED), 2, 2, (5.0, 20.0)),
+])
+def test_a_mission_catches_up_with_the_step_that_others_were_given(state, heard, step, times):
+    after = catch_up(state, heard, 30.0)
+    assert (after.step, after.step_times_s, after.phase) == (step, times, state.phase)
+    assert MISSION_STATE.objection(after) == ""
+
+
+@pytest.mark.parametrize(("state", "why"), [
+    (mission(9), "step 9 of 4 goals"),
+    (mission(-1, step_times_s=()), "step -1 of 4 goals"),
+    (mission(4), "running after the last goal"),
+    (mission(2, step_times_s=(1.0,)), "1 step times at step 2"),
+    (msgspec.structs.replace(mission(), mission_id=""), "running without a mission"),
+    (mission(lights=(m.LightMeasurement("A", 1.0, 1.0, m.LightVerdict.OK),) * 2),
+     "a light is in it twice"),
+    (msgspec.structs.replace(mission(), goals=(m.Goal(float("nan"), 0.0, m.Mode.TAXI),) * 4),
+     "a number is not finite"),
+])
+def test_a_mission_that_makes_no_sense_is_refused(state, why):
+    with pytest.raises(StateError, match=why):
+        MISSION_STATE.decode(1, MISSION_STATE.encode(state))
+    assert MISSION_STATE.decode(1, MISSION_STATE.encode(mission())) == mission()
+
+
+@pytest.mark.parametrize(("kept", "why"), [
+    (ControlKept(LightsKept("x", (m.LightMeasurement("A", 1.0, 1.0, m.LightVerdict.OK),) * 2)),
+     "measured twice"),
+    (ControlKept(progress_m=float("nan")), "not finite"),
+    (ControlKept(row_start=(0.0, float("inf"))), "not finite"),
+    (ControlKept(LightsKept("x"), m.Route("y", 0, m.Mode.TAXI, True, (), "")), "mission 'x'"),
+])
+def test_a_state_of_osmosis_control_that_makes_no_sense_is_refused(kept, why):
+    with pytest.raises(StateError, match=why):
+        CONTROL_STATE.decode(1, CONTROL_STATE.encode(kept))
+    assert CONTROL_STATE.decode(1, CONTROL_STATE.encode(ControlKept())) == ControlKept()
+
+
+# -- rows, again ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("start", "waypoints", "whole"), [
+    ((0.0, 0.0), ((5.0, 0.1), (20.0, 0.0)), ((0.0, 0.0), (5.0, 0.1), (20.0, 0.0))),
+    ((0.0, 3.0), ((5.0, 0.0), (20.0, 0.0)), ((5.0, 0.0), (20.0, 0.0))),  # beside it
+    ((9.0, 0.0), ((5.0, 0.0), (20.0, 0.0)), ((5.0, 0.0), (20.0, 0.0))),  # on it
+    (None, ((5.0, 0.0), (20.0, 0.0)), ((5.0, 0.0), (20.0, 0.0))),
+    ((0.0, 0.0), ((5.0, 0.0),), ((5.0, 0.0),)),
+])
+def test_a_row_that_is_joined_in_the_middle_begins_where_it_began(start, waypoints, whole):
+    assert whole_row(start, waypoints) == whole
+
+
+def test_a_part_of_a_line_runs_either_way():
+    line = Polyline([(0.0, 0.0), (4.0, 0.0), (4.0, 4.0)])
+    assert line.part(1.0, 6.0) == ((1.0, 0.0), (4.0, 0.0), (4.0, 2.0))
+    assert line.part(6.0, 1.0) == ((4.0, 2.0), (4.0, 0.0), (1.0, 0.0))
+
+
+def test_going_back_turns_round_passes_the_stretch_again_and_arrives():
+    world, row = World(), LightRow(((0.0, 0.0), (14.0, 0.0)))
+    turned = []
+
+    def each(now_s: float) -> None:
+        if world.x_m > 10.0 and not turned:
+            row.go_back(5.0)
+            turned.append(now_s)
+
+    motion = drive(world, row, 80.0, each=each)
+    assert motion.arrived
+    assert row.back_to is None
+    xs = [x for x, _ in world.track]
+    turned_at = next(i for i, x in enumerate(xs) if x > 10.0)
+    assert min(xs[turned_at:]) == pytest.approx(5.0, abs=0.3)
+    assert xs[-1] == pytest.approx(14.0, abs=0.2)
+    assert world.deviation([(0.0, 0.0), (14.0, 0.0)]) < 0.3
+    assert min(b - a for a, b in itertools.pairwise(xs)) > -0.06  # never faster than it may
+
+
+def test_a_way_back_that_is_blocked_is_given_up():
+    from tests.actors.osmosis.control.world import Circle
+
+    world, row = World(x_m=10.0), LightRow(((0.0, 0.0), (14.0, 0.0)))
+    world.circles.append(Circle(7.0, 0.0, 0.4))
+    row.step(10.0, 0.0, 0.0, NO_POINTS, 0.05)
+    row.go_back(3.0)
+    motion = drive(world, row, 60.0)
+    assert motion.arrived
+    assert world.least_clearance_m > 0.5
+
+
+@pytest.mark.parametrize("kind", [PathFollower, LightRow])
+def test_a_follower_that_resumes_stays_on_its_leg_where_the_route_comes_near_itself(kind):
+    there_and_back = ((0.0, 0.0), (20.0, 0.0), (20.0, 1.0), (0.0, 1.0))
+    place = (10.0, 0.6)  # nearer to the way back
+    resumed, anew = kind(there_and_back, near_s_m=9.5), kind(there_and_back)
+    astray = kind(there_and_back, near_s_m=20.5)  # the robot was moved meanwhile
+    for follower in (resumed, anew):
+        follower.step(*place, 0.0, NO_POINTS, 0.05)
+    astray.step(2.0, 0.0, 0.0, NO_POINTS, 0.05)
+    assert resumed.progress_m == pytest.approx(10.0)
+    assert anew.progress_m == pytest.approx(31.0)
+    assert astray.progress_m == pytest.approx(2.0)
+
+
+# -- the arbiter's memory ------------------------------------------------------------------------
+
+
+def heard_all(arbiter, state, now, active=(), braking=False):
+    for name in arbiter.mechanisms.detections:
+        state, _ = arbiter.step(state, DetectionHeard(name, name in active), now)
+    for name in arbiter.mechanisms.recoveries:
+        on = braking and name == "RM1"
+        state, _ = arbiter.step(state, RecoveryHeard(
+            name, on, Phase.DEGRADED if on else Phase.IDLE, state.desired[name].decision), now)
+    return state
+
+
+def braked(arbiter):
+    state = heard_all(arbiter, arbiter.initial(0.0), 0.1)
+    state = heard_all(arbiter, state, 0.2, active=("DM1",), braking=True)
+    return heard_all(arbiter, state, 0.3, braking=True)
+
+
+def test_a_latch_survives_the_manager_and_its_recovery_module_together():
+    arbiter = build_arbiter(SPEC)
+    memory = remember(braked(arbiter))
+    assert [latch.command.recovery for latch in memory.latches] == ["RM1"]
+    without = heard_all(arbiter, arbiter.initial(1.0, 10_000), 1.1)
+    assert without.activated == ()  # nobody knows of it any more
+    state = recall(arbiter, memory, 1.0, 10_000)
+    assert state.desired["RM1"].activate
+    for tick in range(200):
+        state = heard_all(arbiter, state, 1.1 + tick / 10, braking=tick > 3)
+        state, _ = arbiter.step(state, Tick(), 1.15 + tick / 10)
+        assert (state.activated, state.latched) == (("RM1",), ("RM1",))
+    state, _ = arbiter.step(state, ResetAsked("RM1", "operator"), 21.2)
+    assert state.latched == state.activated == ()
+    assert remember(state).latches == ()
+
+
+def test_decisions_are_numbered_on_and_flapping_is_not_forgotten():
+    arbiter = build_arbiter(SPEC)
+    state = heard_all(arbiter, arbiter.initial(0.0), 0.1)
+    for flap in range(6):
+        state = heard_all(arbiter, state, 1.0 + flap, active=("DM6",))
+        state = heard_all(arbiter, state, 1.5 + flap)
+    memory = remember(state)
+    back = recall(arbiter, memory, 8.0, 10)
+    assert back.number == max(state.number, 10)
+    buckets = {t.name: t.bucket_s for t in back.detections if t.bucket_s}
+    assert list(buckets) == ["DM6"]
+    assert buckets["DM6"] > 2.0
+    assert recall(arbiter, memory, 8.0, 70_000).number == 70_000
+
+
+def test_modules_that_there_are_no_more_are_left_out_of_a_memory():
+    arbiter = build_arbiter(SPEC)
+    memory = Memory(5, (Latch(Command("RM9", True, 5), ()),), (("DM9", 1.0, 1.0),))
+    assert recall(arbiter, memory, 1.0, 0) == arbiter.initial(1.0, 5)
+
+
+@pytest.mark.parametrize(("memory", "why"), [
+    (Memory(-1), "decision number -1"),
+    (Memory(2**60), "decision number 1152921504606846976"),
+    (Memory(1, (Latch(Command("RM2", False, 1), ()),)), ""),  # beneath a safer one
+    (Memory(1, (), (("DM1", float("nan"), 0.0),)), "bucket of DM1"),
+    (Memory(1), ""),
+])
+def test_a_memory_that_makes_no_sense_is_refused(memory, why):
+    assert objection(memory).startswith(why)
+    assert bool(objection(memory)) == bool(why)
+
+
+# -- whole missions in virtual time --------------------------------------------------------------
+
+
+@pytest.fixture
+def short(tmp_path) -> str:
+    return str(write_short_mission(tmp_path))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_control_nodes_die_at_random_moments_and_nothing_is_lost_or_doubled(short, seed):
+    dice = random.Random(seed)
+    faults = [f"{dice.choice(('kill', 'kill', 'stop', 'wedge'))}:{node}@{dice.uniform(1, 54):.3f}"
+              for node in CONTROL]
+    assert_nothing_lost_or_doubled(fly(short, faults, seed=seed), SHORT_LIGHTS)
+
+
+def test_all_control_nodes_may_die_at_once(short):
+    run = fly(short, [f"kill:{node}@{t}" for t in (20.0, 43.0) for node in CONTROL])
+    assert_nothing_lost_or_doubled(run, SHORT_LIGHTS)
+    assert run.result.record.restarts == dict.fromkeys(CONTROL, 2)
+
+
+@pytest.mark.parametrize("faults", [
+    ["kill:mission_manager@goal1:0.0", "kill:mission_manager@goal2:0.0"],
+    ["kill:graph_planner@goal1:0.0", "kill:osmosis_control@goal2:0.0"]])
+def test_a_death_in_the_very_step_from_one_goal_to_the_next_skips_and_repeats_none(short, faults):
+    assert_nothing_lost_or_doubled(fly(short, faults), SHORT_LIGHTS)
+
+
+def test_a_light_whose_pass_was_cut_is_gone_back_for(short):
+    run = fly(short, ["stop:osmosis_control@42"])
+    assert_nothing_lost_or_doubled(run, SHORT_LIGHTS)
+    assert ("light inspection", "passed without a measurement, going back") in {
+        (d.context, d.reason) for d in run.diagnostics}
+    assert run.result.record.duration_s > 62  # 57 s without
+
+
+def test_the_papers_system_loses_its_mission(short):
+    run = fly(short, ["kill:mission_manager@8"], system=ROOT / "systems" / "paper.toml")
+    assert (run.result.record.mission, run.result.record.safety) == ("fail", "safe")
+    assert {name for name, shelf in run.shelves.items() if shelf.records} == set()
+
+
+def test_the_same_seed_gives_the_same_run_with_checkpoints(short):
+    faults = ["kill:osmosis_control@42", "kill:mission_manager@30"]
+    assert fly(short, faults).result.trace == fly(short, faults).result.trace
+
+
+def newest_corrupt(loaded: Loaded) -> Loaded:
+    first, *others = loaded.records
+    torn = Record(first.generation, first.incarnation, first.version, first.state[:-3])
+    return Loaded((torn, *others), loaded.problems, loaded.failures)
+
+
+@pytest.fixture
+def tampering(monkeypatch):
+    """Change what the second and later lives of a node load: `tampering(node, change)`."""
+    load, changes = MemoryCheckpoints.load, {}
+    from rampart.sim.virtual.virtual_processes import VirtualMachine
+
+    store = VirtualMachine._store
+
+    def naming(self, name, incarnation):
+        made = store(self, name, incarnation)
+        made.name = name
+        return made
+
+    def tampered(self) -> Loaded:
+        loaded, change = load(self), changes.get(getattr(self, "name", ""))
+        return change(loaded) if change and self._incarnation > 1 else loaded
+
+    monkeypatch.setattr(VirtualMachine, "_store", naming)
+    monkeypatch.setattr(MemoryCheckpoints, "load", tampered)
+    return changes.__setitem__
+
+
+def test_a_newest_checkpoint_that_is_torn_gives_way_to_the_one_before(short, tampering):
+    for node in CONTROL:
+        tampering(node, newest_corrupt)
+    # Just after the step: the one before is of the goal that is reached.
+    run = fly(short, ["kill:mission_manager@goal2:0.02", "kill:graph_planner@goal1:0.1",
+                      "kill:osmosis_control@45", "kill:mission_manager@47"])
+    assert_nothing_lost_or_doubled(run, SHORT_LIGHTS)
+    assert sorted(d.node for d in run.diagnostics if "taking the newest sound one" in d.reason) == [
+        "graph_planner", "mission_manager", "mission_manager", "osmosis_control"]
+
+
+@pytest.mark.parametrize("change", [
+    lambda _: Loaded(),
+    lambda loaded: Loaded(tuple(Record(r.generation, 1, 99, r.state) for r in loaded.records)),
+    lambda loaded: Loaded(tuple(Record(r.generation, 1, 1, b"\xc1") for r in loaded.records)),
+], ids=["missing", "newer", "senseless"])
+def test_without_any_sound_checkpoint_the_mission_ends_safely_and_says_so(
+        short, tampering, change):
+    tampering("mission_manager", change)
+    run = fly(short, ["kill:mission_manager@12"])
+    assert (run.result.record.mission, run.result.record.safety) == ("fail", "safe")
+    assert run.result.record.restarts == {"mission_manager": 1}, "a crash loop"
+    assert any("starting without a checkpoint" in d.reason for d in run.diagnostics)
+
+
+def test_planner_and_control_go_on_without_any_checkpoint(short, tampering):
+    for node in ("graph_planner", "osmosis_control"):
+        tampering(node, lambda _: Loaded())
+    run = fly(short, ["kill:graph_planner@20", "kill:osmosis_control@25",
+                      "kill:osmosis_control@45", "kill:graph_planner@46"])
+    assert_nothing_lost_or_doubled(run, SHORT_LIGHTS)
+
+
+def test_an_emergency_stop_outlives_recovery_module_and_manager(short):
+    record = fly(short, ["gps-dropout@3+3", "kill:RM1@8", "kill:ftm_manager@8"]).result.record
+    assert (record.mission, record.safety) == ("fail", "safe")
+    assert record.restarts == {"RM1": 1, "ftm_manager": 1}
+    assert record.decisions[-1].recoveries == ("RM1",)
+
+
+# -- real processes ------------------------------------------------------------------------------
+
+
+def nulls(file: Path) -> None:
+    """Have an owner of nothing but NULLs, which the table's definition forbids."""
+    change = "UPDATE sqlite_schema SET sql = ? WHERE name = 'owner'"
+    connection = sqlite3.connect(file, isolation_level=None, timeout=5.0)
+    (sql,) = connection.execute("SELECT sql FROM sqlite_schema WHERE name = 'owner'").fetchone()
+    connection.execute("PRAGMA writable_schema = ON")
+    connection.execute(change, (sql.replace("NOT NULL", ""),))
+    connection.close()
+    connection = sqlite3.connect(file, isolation_level=None, timeout=5.0)
+    connection.execute("UPDATE owner SET run = NULL, incarnation = NULL, failures = NULL")
+    connection.execute("PRAGMA writable_schema = ON")
+    connection.execute(change, (sql,))
+    connection.close()
+
+
+def fifo(file: Path) -> None:
+    file.unlink()
+    os.mkfifo(file)
+
+
+def noise(file: Path) -> None:
+    file.write_bytes(random.Random(16).randbytes(4000))
+
+
+@pytest.mark.processes
+@pytest.mark.timeout(180)
+def test_real_nodes_come_back_on_damaged_checkpoints_and_keep_new_ones(tmp_path):
+    files = tmp_path / "report" / "checkpoints"
+    nodes = {"mission_manager": nulls, "graph_planner": fifo, "osmosis_control": noise,
+             "ftm_manager": nulls}
+    with RealRun(tmp_path, "--system", str(with_checkpoints(tmp_path)), "--mission",
+                 str(write_short_mission(tmp_path)), "--rate", "2") as run:
+        for index, (node, damage) in enumerate(nodes.items()):
+            run.sleep_until(10.0 + 5 * index)
+            damage(files / f"{node}.sqlite")
+            run.kill(node)
+        code, result = run.result(120)
+    assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), run.story
+    assert {node: result["restarts"].get(node) for node in nodes} == dict.fromkeys(nodes, 1)
+    assert "kept as graph_planner.damaged, begun anew" in run.story
+    for node in nodes:
+        with sqlite3.connect(files / f"{node}.sqlite") as connection:
+            assert connection.execute("SELECT count(*) FROM checkpoint").fetchone()[0] > 0
+        connection.close()
+
+
+@pytest.mark.slow
+@pytest.mark.processes
+@pytest.mark.timeout(180)
+def test_real_control_nodes_are_killed_and_nothing_is_lost_or_doubled(tmp_path):
+    dice = random.Random(os.getpid())
+    moments = sorted(dice.uniform(2, 50) for _ in range(6))
+    with RealRun(tmp_path, "--system", str(with_checkpoints(tmp_path)), "--mission",
+                 str(write_short_mission(tmp_path)), "--rate", "2") as run:
+        for index, moment in enumerate(moments):
+            run.sleep_until(moment)
+            run.kill(CONTROL[index % 3], dice.choice((signal.SIGKILL, signal.SIGSTOP)))
+        code, result = run.result(120)
+    assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), run.story
+    seen = {light["name"]: light["verdict"] for light in result["lights"]}
+    assert {name: seen[name] for name in SHORT_LIGHTS} == SHORT_LIGHTS, moments
+    assert sum(result["restarts"].get(node, 0) for node in CONTROL) >= 5, moments
+    files = tmp_path / "report" / "checkpoints"
+    for node in (*CONTROL, "ftm_manager"):
+        with sqlite3.connect(files / f"{node}.sqlite") as connection:
+            assert connection.execute("SELECT count(*) FROM checkpoint").fetchone()[0] > 0
+            assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        connection.close()

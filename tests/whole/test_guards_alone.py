@@ -1,0 +1,120 @@
+"""Each layer of guards alone: the layers above it are off, and it stops the robot, or mends it.
+
+Where a layer can be switched off there is the contrast: without it as well, the same fault is
+unsafe. So what is shown is the layer's doing and not the fault's harmlessness. Whole missions in
+virtual time, on the paper's system and on the full one.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+
+from rampart.sim.campaign.job import RunResult, run_job, run_virtually
+from tests.whole.layer_runs import LAYERS, layered_job
+
+STALE = "command-not-updated@14+inf"
+"""The robot drives on with its last command: straight off the pavement, unless somebody acts."""
+
+NO_STANDBY = "kill:standby_control@13"
+"""In the full system a stale command is masked by the standby, unless that is gone too."""
+
+
+@pytest.fixture
+def job(tmp_path):
+    """Return a maker of runs of a system in which only the layers named are on."""
+    return partial(layered_job, tmp_path)
+
+
+def both(made, system: str, layers: tuple[str, ...], without: tuple[str, ...], *faults: str
+         ) -> tuple[RunResult, RunResult]:
+    """Run with and without a layer."""
+    guarded = run_job(made(system, layers, *faults))
+    bare = run_job(made(system, without, *faults))
+    for result in (guarded, bare):
+        assert all(o.effective for o in result.outcomes), result.outcomes
+        assert result.failures == ()
+    return guarded, bare
+
+
+@pytest.mark.parametrize(("system", "fault"), [
+    ("paper", "kill:safety_pilot@14"),
+    ("osmosis", "wedge:safety_pilot@14"),
+])
+def test_the_dead_man_alone_stops_a_robot_whose_safety_pilot_is_gone(job, system, fault):
+    guarded, bare = both(job, system, ("dead_man",), (), fault)
+    assert (guarded.safe, guarded.success) == (True, False)
+    assert guarded.prohibited_m > 0.9  # it stands on the centre line, where it was
+    assert not bare.safe
+
+
+@pytest.mark.parametrize(("system", "faults"), [
+    ("paper", ("command-out-of-bounds@14+inf",)), ("osmosis", (STALE, NO_STANDBY))])
+def test_the_safety_pilots_checks_alone_stop_a_robot_that_is_commanded_wrongly(
+        job, system, faults):
+    guarded, bare = both(job, system, ("safety_pilot_checks",), (), *faults)
+    assert (guarded.safe, guarded.success, guarded.decisions) == (True, False, ())
+    assert guarded.prohibited_m > 0.9
+    assert not bare.safe
+
+
+END = "kill:mission_manager@20"
+"""The mission is lost, and so the run is over soon."""
+
+
+def test_the_obstacle_stop_needs_no_other_layer(job):
+    result = run_job(job("paper", (), "obstacle-ahead:2@14", END))
+    assert [o.effective for o in result.outcomes] == [True, True]
+    assert result.safe
+    assert 0 < result.obstacle_m < 1
+
+
+def test_the_safety_pilots_check_of_the_laser_alone_keeps_a_blind_robot_from_driving(job):
+    faults = ("laser-stuck@14+inf", "obstacle-ahead:4@14.1", END)
+    guarded, bare = both(job, "paper", ("safety_pilot_checks",), (), *faults)
+    assert (guarded.safe, bare.safe) == (True, False)
+
+
+def test_the_watch_on_the_manager_alone_stops_a_robot_that_nobody_looks_after(job):
+    guarded, bare = both(job, "osmosis", ("ftm", "manager_watch"), ("ftm",),
+                         "kill:ftm_manager@12", NO_STANDBY, STALE)
+    assert (guarded.safe, guarded.success) == (True, False)
+    assert not bare.safe
+
+
+def test_the_manager_alone_stops_what_the_layers_below_would_let_pass(job):
+    guarded, bare = both(job, "paper", ("ftm",), (), STALE)
+    assert (guarded.safe, guarded.success) == (True, False)
+    assert [(d.active, d.recoveries) for d in guarded.decisions] == [(("FTM2",), ("RM2",))]
+    assert not bare.safe
+
+
+@pytest.mark.parametrize(("module", "recovery"), [("DM1", "RM1"), ("DM6", "RM5")])
+def test_the_manager_takes_a_dead_detection_module_for_an_active_one(job, module, recovery):
+    result = run_job(job("paper", ("ftm",), f"kill:{module}@14"))
+    assert (result.safe, result.success) == (True, False)
+    assert result.decisions[0].recoveries == (recovery,)
+
+
+def test_the_supervisor_alone_brings_a_safety_pilot_back_before_anything_happens(job):
+    faults = ("kill:safety_pilot@14", END)
+    guarded = run_virtually(job("osmosis", ("supervisor_respawn",), *faults)).record
+    bare = run_virtually(job("osmosis", (), *faults)).record
+    assert (guarded.safety, guarded.restarts) == ("safe", {"safety_pilot": 1})
+    assert (bare.safety, bare.restarts) == ("unsafe", {})
+
+
+def test_what_brings_the_supervisor_back_needs_nobody_else(job):
+    faults = ("kill:supervisor@4", "wedge:supervisor@6", "kill:mission_manager@10")
+    record = run_virtually(job("paper", (), *faults)).record
+    assert (record.safety, record.restarts) == ("safe", {"supervisor": 2})
+
+
+def test_all_guards_killed_at_once_are_back_before_anything_happens(job):
+    dead = ("supervisor", "ftm_manager", "safety_pilot")
+    record = run_virtually(job("paper", LAYERS[:-1], *(f"kill:{name}@14" for name in dead),
+                               "command-out-of-bounds@16+inf")).record
+    assert record.safety == "safe"
+    assert record.restarts == dict.fromkeys(dead, 1)
+    assert [d.recoveries for d in record.decisions] == [("RM2",)]  # they work again

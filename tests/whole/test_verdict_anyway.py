@@ -1,0 +1,281 @@
+"""Verdict, result and exit code of a run depend on no disk, no terminal and no reader."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import jinja2
+import pytest
+
+import rampart.sim.osmosis.report
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.recording.virtual import VirtualRecording
+from rampart.cli import run as launch
+from rampart.sim.osmosis.report import RunRecorder, try_report
+from tests import ROOT
+from tests.actors.recording.samples import pose
+from tests.real_run import HEEDS_SIGNALS, RealRun
+from tests.stub_actors import free_base_port
+from tests.whole.checkpoint_runs import with_checkpoints, write_short_mission
+
+UNSAFE = 3
+
+UNSAFE_RUN = ("--virtual", "--system", "paper", "--no-ftm", "--fault", "command-out-of-bounds@5")
+
+
+def unsafe(tmp_path: Path, *more: str) -> list[str]:
+    """Return the command of a run that takes a second and ends unsafe."""
+    return [sys.executable, str(ROOT / "launch.py"), *UNSAFE_RUN, "--mission",
+            str(write_short_mission(tmp_path)), "--json", "--report", str(tmp_path / "report"),
+            *more]
+
+
+def result_of(text: str) -> dict:
+    return json.loads(text.splitlines()[-1])
+
+
+# -- streams -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("redirected", "complaint"), [
+    (">/dev/full", "launch.py: stdout: No space left on device: the result is lost"),
+    (">&-", ""), ("2>/dev/full", ""), ("2>&-", ""), (">&- 2>&- <&-", ""),
+    (">/dev/full 2>/dev/full", ""), ("1</dev/null", "Bad file descriptor: the result is lost")])
+def test_an_unsafe_run_is_unsafe_though_nobody_can_be_told(tmp_path, redirected, complaint):
+    done = subprocess.run(
+        ["/bin/sh", "-c", f'"$@" {redirected}', "sh", *unsafe(tmp_path)], cwd=tmp_path,
+        capture_output=True, text=True, check=False, timeout=100)
+    assert done.returncode == UNSAFE, done.stderr
+    assert "Traceback" not in done.stderr
+    assert complaint in done.stderr
+    if ">&-" not in redirected.split() and "1<" not in redirected and ">/dev/full" not in \
+            redirected.split():
+        assert result_of(done.stdout)["safety"] == "unsafe"
+    page, = (tmp_path / "report").glob("*.html")
+    assert "not safe" in page.read_text()
+
+
+def test_an_unsafe_run_is_unsafe_though_its_reader_has_seen_enough(tmp_path):
+    run = subprocess.Popen(unsafe(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert run.stdout is not None
+    assert run.stderr is not None
+    assert run.stderr.readline()
+    run.stderr.close()
+    run.stdout.close()
+    assert run.wait(100) == UNSAFE
+
+
+STUCK = """
+import sys
+from rampart.files import streams
+streams.PATIENCE_S = 0.05
+streams.secure()
+for number in range(20_000):
+    print("a line that is not read", number, file=sys.stderr)
+print("the end", flush=True)
+sys.exit(5)
+"""
+
+
+def test_who_does_not_read_stderr_stops_nobody():
+    with subprocess.Popen([sys.executable, "-c", STUCK], cwd=ROOT, stdout=subprocess.PIPE,
+                          stderr=subprocess.PIPE, text=True) as run:
+        assert run.stdout is not None
+        assert run.stderr is not None
+        assert run.stdout.readline() == "the end\n"
+        assert run.wait(10) == 5
+        assert run.stderr.read().startswith("a line that is not read 0\n")
+
+
+CLOSED = """
+import os, sys
+from rampart.files import streams
+streams.secure()
+opened = os.open("/dev/null", os.O_RDONLY)
+print("to nobody", file=sys.stderr)
+print("to nobody")
+os._exit(opened)
+"""
+
+
+def test_no_file_gets_the_number_of_a_closed_stream():
+    done = subprocess.run(
+        ["/bin/sh", "-c", '"$@" >&- 2>&- <&-', "sh", sys.executable, "-c", CLOSED], cwd=ROOT,
+        check=False, timeout=20)
+    assert done.returncode > 2
+
+
+@pytest.mark.parametrize(("arguments", "redirected", "code"), [
+    (("verify", "paper", "--strict", "--strategy", "safety-first"), "| true", 1),
+    (("verify", "paper", "--strict", "--strategy", "safety-first"), ">/dev/full", 1),
+    (("verify", "paper", "--strict", "--strategy", "safety-first"), ">&- 2>&-", 1),
+    (("table", "--json"), "| true", 0),
+    (("table", "--json"), ">/dev/full", 2),
+    (("node", "list", "--port", "1024"), "2>&-", 2),
+])
+def test_the_toolbox_keeps_its_exit_code_too(tmp_path, arguments, redirected, code):
+    script = f'{{ "$@"; echo $? >{tmp_path}/code; }} {redirected}'
+    done = subprocess.run(
+        ["/bin/sh", "-c", script, "sh", sys.executable, "-m", "rampart.cli.main", *arguments],
+        cwd=ROOT, capture_output=True, text=True, check=False, timeout=100)
+    assert (tmp_path / "code").read_text() == f"{code}\n", done.stderr
+    assert "Traceback" not in done.stderr
+    if code == 2 and "full" in redirected:
+        assert done.stderr == "rampart: stdout: No space left on device\n"
+
+
+# -- the report ----------------------------------------------------------------------------------
+
+
+def small_files(size: int) -> Callable[[], None]:
+    """Have no file of a process be larger: as on a full disk, writing fails."""
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+@pytest.mark.parametrize("size", [0, 5000])
+def test_an_unsafe_run_is_unsafe_though_its_report_does_not_fit(tmp_path, size):
+    done = subprocess.run(
+        unsafe(tmp_path), capture_output=True, text=True, check=False, timeout=100,
+        preexec_fn=small_files(size))
+    assert done.returncode == UNSAFE, done.stderr
+    result = result_of(done.stdout)
+    assert (result["safety"], result["report"], result["record"]) == ("unsafe", None, None)
+    assert "File too large" in result["report_error"]
+    told = [line for line in done.stderr.splitlines() if "cannot be written" in line]
+    assert told == [f"launch.py: report: {result['report_error']}"]
+    assert not (tmp_path / "report").exists(), "an empty folder, or half a report"
+
+
+def in_the_way(folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.write_text("something else")
+
+
+def test_a_folder_that_is_none_any_more_is_one_line(tmp_path):
+    airport = load_airport("vallombre")
+    record = RunRecorder("r", airport, airport.mission("A")).record("fail", "unsafe", (), 9.0)
+    in_the_way(tmp_path / "report")
+    html, data, problem = try_report(record, tmp_path / "report")
+    assert (html, data) == (None, None)
+    assert problem.endswith(f"cannot be written to {tmp_path / 'report'}: File exists")
+    assert problem.count("cannot be written") == 1
+
+
+@pytest.mark.parametrize("error", [
+    jinja2.TemplateError("the page\nis broken"), ZeroDivisionError("a chart"), MemoryError()])
+def test_a_page_that_cannot_be_made_costs_neither_record_nor_verdict(
+        tmp_path, monkeypatch, capsys, error):
+    def broken(_run):
+        raise error
+
+    monkeypatch.setattr(rampart.sim.osmosis.report, "render", broken)
+    assert launch.main(unsafe(tmp_path)[2:]) == UNSAFE
+    told = capsys.readouterr()
+    result = result_of(told.out)
+    assert result["report"] is None
+    assert type(error).__name__ in result["report_error"]
+    assert json.loads(Path(result["record"]).read_text())["safety"] == "unsafe"
+    assert f"launch.py: report: {result['report_error']}\n" in told.err
+
+
+def test_tracebacks_that_cannot_be_kept_cost_no_verdict(tmp_path, monkeypatch, capsys):
+    class Failing(launch.VirtualRun):
+        def run(self):
+            in_the_way(tmp_path / "report")
+            return replace(super().run(), tracebacks="a traceback")
+
+    monkeypatch.setattr(launch, "VirtualRun", Failing)
+    assert launch.main(unsafe(tmp_path)[2:]) == UNSAFE
+    told = capsys.readouterr()
+    assert result_of(told.out)["safety"] == "unsafe"
+    assert "errors.log: tracebacks are lost: Not a directory" in told.err
+
+
+# -- recordings ----------------------------------------------------------------------------------
+
+
+def test_an_unsafe_run_is_unsafe_though_its_recording_does_not_fit(tmp_path):
+    done = subprocess.run(
+        unsafe(tmp_path, "--record", str(tmp_path / "run.mcap")), capture_output=True, text=True,
+        check=False, timeout=100, preexec_fn=small_files(400_000))
+    assert done.returncode == UNSAFE, done.stderr
+    assert result_of(done.stdout)["safety"] == "unsafe"
+    assert "run.mcap: File too large: the recording ends after" in done.stderr
+
+
+def test_a_recording_that_is_taken_away_is_not_said_to_be_there(tmp_path):
+    path = tmp_path / "run.mcap"
+    recording = VirtualRecording(path, {}, "title", nodes=(), lead_s=1.0, overwrite=False)
+    recording.take(*pose(1, 0.5))
+    path.unlink()
+    assert recording.close() == f"{path}: was taken away while it was written: nothing is recorded"
+
+
+# -- real processes ------------------------------------------------------------------------------
+
+
+@pytest.mark.processes
+def test_a_real_unsafe_run_is_unsafe_though_its_folder_is_gone_and_nobody_listens(tmp_path):
+    with RealRun(tmp_path, "--mission", "A", "--rate", "3", "--patience", "35",
+                 "--no-ftm") as run:
+        run.wait_for("goal 1/3")
+        run.sleep_until(9)
+        injected = run.tool("inject", "command-out-of-bounds", "--duration", "60", "--at-once")
+        assert injected.returncode == 0, injected.stderr
+        in_the_way(tmp_path / "report")
+        run.wait_until(lambda: "UNSAFE" in run.story or run.process.poll() is not None, 100,
+                       "the run did not end")
+        run.process.terminate()
+        code, result = run.result()
+    assert (code, result["safety"], result["report"]) == (UNSAFE, "unsafe", None), run.story
+    assert result["report_error"] in run.story
+    assert "Traceback" not in run.story
+
+
+@pytest.mark.processes
+@pytest.mark.timeout(180)
+def test_a_real_mission_succeeds_though_its_folder_goes_and_its_recording_stops(tmp_path):
+    with RealRun(tmp_path, "--system", str(with_checkpoints(tmp_path)), "--mission",
+                 str(write_short_mission(tmp_path)), "--rate", "2", "--record", "/dev/full",
+                 "--overwrite") as run:
+        run.sleep_until(8.0)
+        in_the_way(tmp_path / "report")
+        run.sleep_until(12.0)
+        run.kill("graph_planner")
+        code, result = run.result(120)
+    assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), run.story
+    assert (result["report"], result["record"]) == (None, None)
+    assert result["restarts"]["graph_planner"] == 1, run.story
+    assert "going on without checkpoints" in run.story
+    assert "/dev/full: No space left on device: the recording ends" in run.story
+    assert "Traceback" not in run.story
+
+
+@pytest.mark.processes
+def test_a_terminal_that_goes_away_ends_a_run_with_its_verdict(tmp_path):
+    """All of its processes get the SIGHUP, and stderr takes nothing any more."""
+    with (tmp_path / "out").open("w") as out:
+        run = subprocess.Popen(
+            [*HEEDS_SIGNALS, sys.executable, str(ROOT / "launch.py"), "--mission", "A", "--no-hmi",
+             "--system", "paper", "--json", "--report", str(tmp_path / "report"), "--port",
+             str(free_base_port())], stdout=out, stderr=subprocess.PIPE, text=True,
+            start_new_session=True)
+    assert run.stderr is not None
+    while "goal 1/3" not in (line := run.stderr.readline()):
+        assert line, "it ended"
+    run.stderr.close()
+    os.killpg(run.pid, signal.SIGHUP)
+    assert run.wait(30) == 1
+    result = result_of((tmp_path / "out").read_text())
+    assert (result["mission"], result["safety"]) == ("fail", "safe")
+    assert "ended: interrupted by SIGHUP" in result["reasons"]
+    assert Path(result["report"]).is_file()

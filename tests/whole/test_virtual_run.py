@@ -1,0 +1,259 @@
+"""Whole missions in virtual time: deterministic to the byte, and the same as on processes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from rampart.actors.recording.bag_reader import BagReader, Summary
+from rampart.cli import run as launch
+from rampart.sim.campaign.job import Job, run_job, run_virtually
+from rampart.sim.faults.scenario import PlannedFault, parse_fault
+from rampart.sim.runs.virtual_run import LEAD_S
+from tests import ROOT
+from tests.actors.recording.samples import pose
+from tests.real_run import HEEDS_SIGNALS, RealRun
+from tests.whole.checkpoint_runs import write_short_mission
+
+SHORT = parse_fault("kill:mission_manager@6")
+"""Loses the mission, so the run is over after ten simulated seconds."""
+
+
+def job(*faults: str, **changes) -> Job:
+    """A job on the paper's system: what it does under a fault is known, and it is the quicker."""
+    return Job(row="test", mission="A", faults=tuple(map(parse_fault, faults)),
+               **{"system": "paper", **changes})
+
+
+def decisions(result):
+    return [(d.active, d.recoveries) for d in result.decisions]
+
+
+def test_a_mission_without_a_fault_succeeds_without_a_decision():
+    result = run_job(job())
+    assert (result.success, result.safe, result.decisions) == (True, True, ())
+    assert (result.false_alarms, result.failures) == (0, ())
+    assert result.detected_after_s is None
+    assert result.obstacle_m > 0.3
+    assert result.prohibited_m > 0.3
+
+
+@pytest.mark.parametrize("network", ["measured", "lossy"])
+def test_the_same_seed_gives_the_same_run_to_the_byte_and_another_seed_another(network):
+    first = run_job(job(SHORT.text(), "gps-noise@1", network=network))
+    again = run_job(job(SHORT.text(), "gps-noise@1", network=network))
+    other = run_job(job(SHORT.text(), "gps-noise@1", network=network, seed=2))
+    assert first.trace == again.trace != other.trace
+    assert len(first.trace) == 64
+
+
+@pytest.mark.parametrize(("system", "code"), [("paper", 1), ("osmosis", 0)])
+def test_the_trace_does_not_depend_on_the_process_it_is_made_in(tmp_path, system, code):
+    traces = set()
+    mission = write_short_mission(tmp_path)
+    for seed in ("0", "4711"):
+        done = subprocess.run(
+            [sys.executable, "launch.py", "--virtual", "--system", system,
+             "--mission", str(mission), "--seed", "5", "--fault", "kill:mission_manager@6",
+             "--fault", "wedge:DM2@3", "--json", "--report", str(tmp_path / seed)],
+            cwd=ROOT, env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True,
+            check=False)
+        assert done.returncode == code, done.stderr
+        result = json.loads(done.stdout.splitlines()[-1])
+        assert [fault["effective"] for fault in result["faults"]] == [True, True]
+        traces.add(result["trace"])
+    assert len(traces) == 1
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_a_run_that_is_broken_off_has_a_recording_with_all_that_was_sent(
+        tmp_path, monkeypatch, error):
+    class BrokenOff(launch.VirtualRun):
+        def run(self):
+            self._taps[0](*pose(1, 0.5))
+            raise error
+
+    monkeypatch.setattr(launch, "VirtualRun", BrokenOff)
+    path = tmp_path / "run.mcap"
+    with contextlib.suppress(RuntimeError):
+        assert launch.main(["--virtual", "--record", str(path), "--report", str(tmp_path)]) == 1
+    summary = Summary(BagReader(path))
+    assert (summary.reader.closed, summary.end["messages"]) == (True, "1")
+    assert {"osmosis_control", "supervisor"} <= set(json.loads(summary.run["nodes"]))
+    assert summary.time_zero_s == -LEAD_S
+
+
+def recorded_run(tmp_path) -> subprocess.Popen[str]:
+    """Start a run in virtual time and return it once its recording has begun."""
+    path = tmp_path / "run.mcap"
+    launched = subprocess.Popen(
+        [*HEEDS_SIGNALS, sys.executable, "launch.py", "--virtual", "--record", str(path),
+         "--report", str(tmp_path / "report"), "--json"], cwd=ROOT, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True)
+    while not (path.exists() and path.stat().st_size > 1_000_000):
+        assert launched.poll() is None, launched.communicate()
+        time.sleep(0.01)
+    return launched
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_run_in_order_with_its_report_and_its_recording(tmp_path, number):
+    launched = recorded_run(tmp_path)
+    launched.send_signal(number)
+    out, errors = launched.communicate(timeout=30)
+    assert launched.returncode == 1, errors
+    result = json.loads(out.splitlines()[-1])
+    assert f"ended: interrupted by {number.name}" in result["reasons"]
+    assert list((tmp_path / "report").glob("*.html"))
+    summary = Summary(BagReader(tmp_path / "run.mcap"))
+    assert summary.reader.closed
+    assert int(summary.end["messages"]) > 1000
+
+
+def test_a_second_signal_ends_a_run_at_once_and_what_was_recorded_can_be_read(tmp_path):
+    launched = recorded_run(tmp_path)
+    for number in (signal.SIGSTOP, signal.SIGINT, signal.SIGTERM, signal.SIGCONT):
+        launched.send_signal(number)  # so that both are there when it goes on
+    out, errors = launched.communicate(timeout=30)
+    assert (launched.returncode, out) == (1, "")
+    assert "Traceback" not in errors
+    assert not list(tmp_path.glob("report/*.html"))
+    # Wherever it hit, in the middle of a write perhaps.
+    assert sum(1 for _ in BagReader(tmp_path / "run.mcap").messages()) > 1000
+
+
+@pytest.mark.parametrize("fault", [
+    "drop:detection/DM1@20+inf", "freeze:detection/DM1@20+inf", "slow:DM1@20",
+    "delay:detection/DM2@20+inf", "drop:manager/status@20+inf", "freeze:manager/status@20+inf"])
+def test_a_detection_module_or_manager_that_lives_and_is_not_heard_costs_nothing(fault):
+    result = run_job(job(fault))
+    assert (result.success, result.safe, result.decisions) == (True, True, ())
+    assert result.effective
+
+
+def test_a_frozen_report_hides_no_fault():
+    result = run_job(job("freeze:detection/DM2@10+inf", "command-not-updated@14+inf"))
+    assert result.safe
+    assert (("FTM2",), ("RM2",)) in decisions(result)
+
+
+def test_without_fault_tolerance_a_stale_command_is_unsafe_and_with_it_safe():
+    stale = "command-not-updated@8+inf"
+    bare, guarded = run_job(job(stale, ftm=False)), run_job(job(stale))
+    assert (bare.safe, guarded.safe) == (False, True)
+    assert bare.unsafe_s > 8
+    assert decisions(guarded)[0] == (("FTM2",), ("RM2",))
+    assert guarded.stopped_for_good
+    assert 0.9 < guarded.detected_after_s < 1.1
+
+
+@pytest.mark.parametrize("fault", [
+    "command-out-of-bounds@9+60", "localization-not-updated@9+60", "prohibited-area@9+60",
+    "wrong-graph@3+60"])
+def test_without_fault_tolerance_the_papers_faults_are_unsafe(fault):
+    assert not run_job(job(fault, ftm=False, patience_s=35.0)).safe
+
+
+def test_a_killed_process_is_detected_respawned_and_the_mission_goes_on():
+    result = run_job(job("kill:osmosis_control@20"))
+    assert (result.success, result.safe) == (True, True)
+    assert decisions(result) == [(("FTM4",), ("RM3",)), ((), ())]
+    assert 0 < result.detected_after_s < 0.1
+    assert result.detected_after_s < result.recovered_after_s < 0.5
+
+
+@pytest.mark.parametrize("what", ["stop", "wedge"])
+def test_a_stopped_or_wedged_process_is_detected_by_its_silence(what):
+    result = run_job(job(f"{what}:graph_planner@12", SHORT.text().replace("@6", "@20")))
+    assert decisions(result)[0] == (("FTM4",), ("RM3",))
+    assert 0.3 < result.detected_after_s < 0.6
+
+
+def test_a_slow_process_is_slow():
+    usual = run_job(job(SHORT.text()))
+    slow = run_job(job(SHORT.text(), "slow:osmosis_control:0.3@2"))
+    assert slow.outcomes[1].effective
+    assert slow.trace != usual.trace
+    assert len(slow.decisions) > len(usual.decisions)  # its heart beats too seldom
+
+
+def test_killed_guards_come_back_and_the_mission_goes_on():
+    record = run_virtually(job("kill:supervisor@12", "kill:ftm_manager@14", "kill:safety_pilot@16",
+                               "kill:supervisor@18", "kill:graph_planner@18.01")).record
+    assert (record.mission, record.safety) == ("success", "safe")
+    assert record.restarts == {"supervisor": 2, "ftm_manager": 1, "safety_pilot": 1,
+                               "graph_planner": 1}
+
+
+def test_a_wedged_supervisor_is_replaced():
+    record = run_virtually(job("wedge:supervisor@8", SHORT.text().replace("@6", "@12"))).record
+    assert record.restarts == {"supervisor": 1, "mission_manager": 1}
+
+
+def test_a_fault_without_effect_says_so():
+    result = run_job(job("imu-bias@2", "kill:DM1@900", SHORT.text()))
+    assert [o.effective for o in result.outcomes] == [False, False, True]
+    assert [o.reason for o in result.outcomes] == [
+        "it changed nothing", "its moment never came", ""]
+
+
+def test_an_obstacle_appears_ahead_and_is_passed_or_waited_for():
+    result = run_job(job("obstacle-ahead:3@15"))
+    assert result.outcomes[0].effective
+    assert result.safe
+    assert 0 < result.obstacle_m < 1
+
+
+def test_a_fault_can_be_planned_for_a_goal():
+    result = run_job(job("kill:mission_manager@goal2:1"))
+    assert 25 < result.injected_s < 50
+    assert not result.success
+
+
+def test_the_baseline_has_no_fault_tolerance_at_all():
+    result = run_job(job("kill:localization@8", ftm=False))
+    assert result.decisions == ()
+    assert not result.success
+
+
+def test_a_fault_of_a_node_that_the_baseline_lacks_has_no_effect():
+    result = run_job(job("wedge:ftm_manager@2", SHORT.text(), ftm=False))
+    assert [o.effective for o in result.outcomes] == [False, True]
+    assert result.outcomes[0].reason == "ftm_manager had no running process"
+
+
+def test_a_job_survives_the_way_to_another_process_and_back():
+    import pickle
+
+    first = Job(row="x", faults=(PlannedFault("gps-bias", 3.0, duration_s=float("inf")),))
+    assert pickle.loads(pickle.dumps(first)).key == first.key
+    assert Job(row="other", faults=first.faults).key == first.key
+    assert Job(row="x", faults=first.faults, seed=2).key != first.key
+
+
+@pytest.mark.processes
+@pytest.mark.timeout(180)
+def test_virtual_and_real_runs_take_the_same_decisions_and_come_to_the_same_verdict(tmp_path):
+    faults = ("kill:osmosis_control@6", "command-out-of-bounds@10+2", "wedge:graph_planner@16",
+              "localization-not-updated@21+3", "kill:localization@28", "stop:hmi@31+5",
+              "kill:mission_manager@36")
+    virtual = run_job(job(*faults))
+    arguments = [x for fault in faults for x in ("--fault", fault)]
+    with RealRun(tmp_path, "--mission", "A", "--rate", "1", *arguments) as run:
+        code, real = run.result(120)
+    assert code == 1
+    assert (real["mission"], real["safety"]) == ("fail", "safe")
+    assert (virtual.success, virtual.safe) == (False, True)
+    assert all(fault["effective"] for fault in real["faults"]), real["faults"]
+    assert all(o.effective for o in virtual.outcomes), virtual.outcomes
+    seen = [(tuple(d["active"]), tuple(d["recoveries"])) for d in real["decisions"]]
+    assert seen == decisions(virtual), run.story
+    for one, other in zip(real["decisions"], virtual.decisions, strict=True):
+        assert one["t_s"] == pytest.approx(other.t_s, abs=0.35)
