@@ -51,6 +51,7 @@ class RunPlan(msgspec.Struct, frozen=True):
         hmi_token_is_new: it was made for this run, so that nobody has it yet who needs it.
         faults: what the page offers to inject by name.
         waits: True has the mission wait until the operator starts it from the page.
+        virtual: whether time is virtual: nothing outside of the process is used.
         options: of the system's application, in place of what the spec says.
     """
 
@@ -73,6 +74,7 @@ class RunPlan(msgspec.Struct, frozen=True):
     hmi_token_is_new: bool = False
     faults: tuple[NamedFault, ...] = ()
     waits: bool = False
+    virtual: bool = False
     options: dict[str, Any] = {}
 
     @property

@@ -23,6 +23,7 @@ from rampart.actors.ftm.holders import Holders
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.schema import Positive
@@ -78,7 +79,8 @@ class Simulator(Actor):
         self._asked_s = self._skipped_s = 0.0
         self._real_time_factor = 1.0
         self._brakes: Holders[bool] = Holders(
-            [recovery.name for recovery in context.run.system.recoveries], True)
+            None if context.run.system is NO_SYSTEM
+            else [recovery.name for recovery in context.run.system.recoveries], True)
         self._holds_timer: Timer | None = None
 
     def on_start(self) -> None:

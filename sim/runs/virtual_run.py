@@ -136,7 +136,8 @@ class VirtualRun:
                  run: RunContext | None = None) -> None:
         # Nothing that differs from run to run may get into a message.
         self.plan = msgspec.structs.replace(
-            plan, run_id=f"virtual-{plan.seed}", rate=1.0, hmi_port=0, launcher_pid=1)
+            plan, run_id=f"virtual-{plan.seed}", rate=1.0, hmi_port=0, launcher_pid=1,
+            virtual=True)
         self.mission = mission
         self.interrupted: str | None = None
         self._context = replace(run or load_run(self.plan, spec), plan=self.plan, system=spec)

@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.adaptation import GIVE_UP_S, ChoiceError, StrategyChoice
@@ -37,7 +38,7 @@ KEYS = places(topics.ALL, ["localization"], ["DM1"], ["RM1"])
 
 
 def injections() -> Injections:
-    return Injections("r1/hmi.1", OFFERED, KEYS)
+    return Injections("r1/hmi.1", OFFERED, KEYS, topics.ROBOT)
 
 
 def report(order, affected: int = 0, *, finished: bool = False, reason: str = "",
@@ -49,7 +50,9 @@ def test_a_fault_is_sent_until_its_publisher_reports_and_its_effect_is_told_once
     faults = injections()
     ordered = faults.order("localization-not-updated", 0.0, None, 5.0)
     (order,) = faults.due(5.0)
-    assert (order.topic, order.mode, order.duration_s) == ("localization/pose", "freeze", 10.0)
+    assert order.topic is bus_topics.INJECTION_REQUEST
+    assert (order.message.topic, order.message.mode, order.message.duration_s) == (
+        "localization/pose", "freeze", 10.0)
     assert faults.due(5.5) == [order]
     assert faults.hear(report(order)) == ""
     assert faults.due(6.0) == []
@@ -102,11 +105,11 @@ def test_a_planned_fault_waits_for_its_time_and_can_be_withdrawn():
     assert faults.due(24.9) == []
     assert faults.view(10.0)[0]["state"] == "begins at 25 s"
     withdrawn = faults.order("gps-bias", 20.0, None, 5.0)
-    assert faults.end(withdrawn.injection, 6.0)[0].duration_s == 0.0
+    assert faults.end(withdrawn.injection, 6.0)[0].message.duration_s == 0.0
     with pytest.raises(FaultError, match=r"no fault .* is under way"):
         faults.end(withdrawn.injection, 7.0)
     (order,) = faults.due(25.0)
-    assert order.topic == "summit_xl/gps"
+    assert order.place == "summit_xl/gps"
     assert order.injection.startswith(ordered.injection)
 
 
@@ -117,7 +120,7 @@ def test_a_fault_ended_before_its_first_report_is_over_only_when_its_publisher_s
     faults.end(ordered.injection, 1.0)
     assert not faults.view(1.0)[0]["ended"]
     (again,) = faults.due(1.5)
-    assert again.duration_s == 0.0
+    assert again.message.duration_s == 0.0
     assert "over, 4 messages" in faults.hear(report(order, 4, finished=True))
 
 
@@ -125,13 +128,13 @@ def test_a_permanent_fault_is_ended_on_request_and_the_order_repeated_until_that
     faults = injections()
     ordered = faults.order("drop:localization/pose", 0.0, math.inf, 0.0)
     (order,) = faults.due(0.0)
-    assert math.isinf(order.duration_s)
+    assert math.isinf(order.message.duration_s)
     faults.hear(report(order, 9))
     faults.expire(1e6)
     assert not faults.view(1e6)[0]["ended"]
     faults.end(ordered.injection, 50.0)
     (again,) = faults.due(50.5)
-    assert (again.injection, again.duration_s) == (order.injection, 0.0)
+    assert (again.injection, again.message.duration_s) == (order.injection, 0.0)
     assert "over, 12 messages" in faults.hear(report(again, 12, finished=True))
 
 
@@ -149,10 +152,11 @@ def test_a_fault_of_the_base_counts_its_ticks():
     faults = injections()
     faults.order("stuck-wheel:rear-left", 0.0, 4.0, 0.0)
     (order,) = faults.due(0.0)
-    assert isinstance(order, m.ActuatorFault)
-    assert (order.wheel, order.duration_s) == ("rear left", 4.0)
+    assert order.topic is topics.ACTUATOR_FAULT
+    assert isinstance(order.message, m.ActuatorFault)
+    assert (order.message.wheel, order.message.duration_s) == ("rear left", 4.0)
     told = faults.hear(report(order, 400, finished=True, node="simulator"))
-    assert told == "fault stuck-wheel:rear-left: over, 400 ticks of the base changed"
+    assert told == "fault stuck-wheel:rear-left: over, 400 ticks changed"
 
 
 @pytest.mark.parametrize(("fault", "why"), [
@@ -179,7 +183,7 @@ def test_only_so_many_faults_wait_at_once_and_the_list_stays_short():
 
 
 def test_all_that_is_offered_survives_the_plan_and_is_sound():
-    assert msgspec.json.decode(msgspec.json.encode(OFFERED), type=tuple[m.NamedFault, ...]) == (
+    assert msgspec.json.decode(msgspec.json.encode(OFFERED), type=tuple[fm.NamedFault, ...]) == (
         OFFERED)
     faults = injections()
     assert {f.group for f in OFFERED} == {"paper", "sensor", "actuator"}
@@ -187,8 +191,8 @@ def test_all_that_is_offered_survives_the_plan_and_is_sound():
         ordered = faults.order(offered.name, 0.0, None, 0.0)
         for order in ordered.orders:
             assert ordered.injection in order.injection
-            if isinstance(order, bm.Injection):
-                assert flaw(order) == ""
+            if isinstance(order.message, bm.Injection):
+                assert flaw(order.message) == ""
         faults.end(ordered.injection, 0.0)
 
 
@@ -212,7 +216,8 @@ def test_every_mode_that_is_offered_can_be_ordered_as_it_stands():
     faults = injections()
     for mode in faults.choice()["modes"]:
         (order,) = faults.order(f"{mode}:localization/pose", 0.0, None, 0.0).orders
-        assert (order.mode, order.delay_s > 0, order.stamp_s > AHEAD_S) == (
+        sent = order.message
+        assert (sent.mode, sent.delay_s > 0, sent.stamp_s > AHEAD_S) == (
             mode, mode == "delay", mode == "restamp")
 
 

@@ -20,6 +20,7 @@ from rampart.actors.supervision.kill_node import SignalError
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.faults.offered_faults import offered_faults
 from tests.actors.operator.world import eventually, free_port, hear, repeated, served
+from tests.virtual_loop import shipped_system
 
 TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
@@ -207,16 +208,19 @@ async def test_a_strategy_is_asked_for_from_the_page_and_the_answer_shown(world)
                 "strategy mission-first refused: not in the middle of a recovery: RM2")
 
 
-async def test_a_signal_is_sent_to_a_node_and_to_the_hmi_itself_after_its_answer(world):
+async def test_a_signal_is_sent_to_a_node_and_to_the_hmi_itself_after_its_answer(
+        world, monkeypatch):
     sent = []
 
-    def signal_node(node: str, name: str) -> RunProcess:
+    def signal_node(node: str, name: str, _port: int) -> RunProcess:
         if node not in ("localization", "hmi"):
             raise SignalError(f"unknown node {node!r}")
         sent.append((node, name))
         return RunProcess(77, 7450, 1, (node,), 1)
 
-    async with world.hmi(hmi_port=free_port(), signal_node=signal_node) as hmi:
+    monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
+
+    async with world.hmi(hmi_port=free_port(), launcher_pid=1) as hmi:
         async with open_page(await served(hmi)) as page:
             told = await ask(page, type="signal", node="localization", signal="KILL")
             assert told == {"type": "done", "text": "localization (pid 77): KILL"}
@@ -259,7 +263,7 @@ async def test_a_fault_is_injected_from_the_page_and_its_effect_shown(world):
 
 
 async def test_a_fault_that_nobody_takes_is_shown_to_have_no_effect(world):
-    async with world.hmi(hmi_port=free_port()) as hmi:
+    async with world.hmi(hmi_port=free_port(), system=shipped_system()) as hmi:
         async with open_page(await served(hmi)) as page:
             told = await ask(page, type="inject", fault="drop:world/truth")
             assert told["type"] == "error"

@@ -292,12 +292,14 @@ async def test_the_second_operator_sees_who_drives(world):
     assert {s.forward for s in world.others.stick} == {0.25, 0.0, -0.5}
 
 
-async def test_a_node_is_signalled_from_its_row_after_a_second_press(world):
+async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, monkeypatch):
     sent = []
 
-    def signal_node(node: str, name: str) -> RunProcess:
+    def signal_node(node: str, name: str, _port: int) -> RunProcess:
         sent.append((node, name))
         return RunProcess(77, 7450, 1, (node,), 1)
+
+    monkeypatch.setattr("rampart.actors.operator.operating.signal_node", signal_node)
 
     def table(state: fm.NodeState, restarts: int) -> None:
         world.others.publish(ftm_topics.NODES, fm.NodeTable(tuple(
@@ -306,7 +308,7 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world):
 
     row = "document.querySelector('tr[data-node=osmosis_control]')"
     async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), signal_node=signal_node) as hmi):
+                world.hmi(hmi_port=free_port(), launcher_pid=1) as hmi):
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until(LIVE)
         async with repeated(lambda: table(fm.NodeState.RUNNING, 0)):

@@ -19,6 +19,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem, ManagerStatus, NodeState, RespawnRequest
 from rampart.actors.layout.layout import Layout
+from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import SUPERVISOR, RunPlan, load_document, load_system
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
@@ -167,8 +168,8 @@ class World:
         parameters = Layout(PLAN, self.spec).members[SUPERVISOR].parameters
         self.supervisor = Supervisor(Context(
             SUPERVISOR, self.lives, self.clock, VirtualBus(self.hub, SUPERVISOR, self.lives),
-            parameters, {"plan": PLAN, "system": self.spec, "processes": self.machine,
-                         "known_incarnations": known or {}}, register=self.machine.issued.get))
+            parameters, RunContext(PLAN, self.spec, known_incarnations=known or {}),
+            register=self.machine.issued.get), self.machine)
         self.task = asyncio.create_task(self.supervisor.run())
         return self.supervisor, self.task
 

@@ -525,7 +525,7 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
     (("--fault", "kill:nobody"), "no node 'nobody'"),
     (("--fault", "gps-bias@soon"), "WHEN 'soon'"),
     (("--runs", "3", "--obstacles", "many"), "--obstacles many: must be numbers"),
-    (("--runs", "3", "--obstacles", "99"), "--obstacles 99: Vallombre has places for 5"),
+    (("--runs", "3", "--obstacles", "99"), "obstacles = 99: Vallombre has places for 5"),
     (("--runs", "3", "--mission", "Z"), "Z"),
     (("--runs", "3", "--strategy", "hope"), "unknown strategy 'hope'"),
     (("--runs", "3", "--network", "wet"), "unknown network 'wet'"),

@@ -52,9 +52,6 @@ class Teleoperation(Actor):
 
     A device tells changes only, so while its dead man is held its position is repeated; messages
     are repeated by whoever sends them. A device that vanishes has let go, and is looked for again.
-
-    Shared objects: "joystick" (device that has precedence over the parameter, or ""; None: devices
-    are not to be opened).
     """
 
     class Parameters(Actor.Parameters, StickMapping, frozen=True):
@@ -87,11 +84,10 @@ class Teleoperation(Actor):
 
     def on_start(self) -> None:
         """Open the joystick, if there is to be one."""
-        asked = Osmosis.of(self.context).joystick
-        name = asked or self.parameters.device
-        if not name or asked is None:
+        name = Osmosis.of(self.context).joystick or self.parameters.device
+        if not name or self.context.run.plan.virtual:
             return
-        self._device = JoystickDevice(str(name), self.parameters, self._moved, self._gone)
+        self._device = JoystickDevice(name, self.parameters, self._moved, self._gone)
         self._plug()
 
     def on_stop(self) -> None:

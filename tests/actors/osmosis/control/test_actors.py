@@ -40,7 +40,7 @@ def system(**layers: bool) -> SystemSpec:
         lateral_distance_m=0.3, sensing_range_m=5.0, gps_accuracy_m=0.05,
         corridor_clearance_m=1.5)
     timing = Timing(command_timeout_s=0.9, manager_timeout_s=0.9, scan_timeout_s=0.5)
-    return SystemSpec("test", "test", "vallombre", "AB", robot, timing=timing,
+    return SystemSpec("test", "test", mobile=robot, timing=timing,
                       layers=Layers(**layers))
 
 

@@ -207,7 +207,7 @@ class Planner(Actor):
 
 def replanning(scenario, *, mission=True):
     async def scene():
-        async with System() as system:
+        async with System(airport=AIRPORT) as system:
             boss, planner = system.start("boss", Boss), system.start("planner", Planner)
             manager = system.start("mission_manager", MissionManager)
             system.start("RM6", Replan)

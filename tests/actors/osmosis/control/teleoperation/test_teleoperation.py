@@ -16,6 +16,8 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     AXIS,
     BUTTON,
@@ -23,6 +25,8 @@ from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     INITIAL,
 )
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.cli import run as launch
@@ -103,6 +107,12 @@ class Desk:
         return any(words in d.reason for d in self.page.diagnostics)
 
 
+def with_joystick(name: str) -> Osmosis:
+    application = Osmosis.on_map(load_airport("vallombre"))
+    application.options = Osmosis.Options(airport="", mission="", joystick=name)
+    return application
+
+
 @asynccontextmanager
 async def desk(tmp_path, device="stick", **parameters):
     fifo = tmp_path / "stick"
@@ -112,7 +122,7 @@ async def desk(tmp_path, device="stick", **parameters):
     page = Page(Context("page", 1, clock, VirtualBus(hub, "page")))
     node = Teleoperation(Context(
         "teleoperation", 1, clock, VirtualBus(hub, "teleoperation"), parameters,
-        {"system": SPEC, "joystick": str(tmp_path / device)}))
+        RunContext(RunPlan(), SPEC, application=with_joystick(str(tmp_path / device)))))
     tasks = [asyncio.create_task(actor.run()) for actor in (page, node)]
     it = Desk(page, fifo)
     while not {"page", "teleoperation"} <= hub.alive.keys():
@@ -220,7 +230,8 @@ async def test_a_device_that_is_not_there_is_waited_for_and_the_page_drives_mean
 async def test_in_virtual_time_no_device_is_opened(tmp_path):
     os.mkfifo(tmp_path / "stick")
     context = Context("teleoperation", 1, Clock(0.0), VirtualBus(Hub(), "teleoperation"),
-                      {"device": str(tmp_path / "stick")}, {"system": SPEC, "joystick": None})
+                      {"device": str(tmp_path / "stick")},
+                      RunContext(RunPlan(virtual=True), SPEC, application=with_joystick("")))
     task = asyncio.create_task((node := Teleoperation(context)).run())
     await asyncio.sleep(0.01)
     with pytest.raises(OSError, match="No such device"):
