@@ -8,9 +8,8 @@ from typing import Any
 
 from rampart import systems
 from rampart.actors.bus.topic import Topic
-from rampart.actors.ftm.topics import REPORTS_ON
 from rampart.actors.layout.system_topics import own_topics, system_topics
-from rampart.actors.layout.wiring import load_member
+from rampart.actors.layout.wiring import REPORTS_ON, load_member
 from rampart.cli.output import UsageError
 from rampart.files import toml
 from rampart.files.reading import FileError, read_text

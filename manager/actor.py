@@ -22,7 +22,7 @@ from rampart.actors.bus.bounds import DOCUMENT_CHARS, clip
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.actors.layout.wiring import load_member
+from rampart.actors.layout.wiring import REPORTS_ON, load_member
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.manager.arbitration.arbiter import (
@@ -170,7 +170,7 @@ class FtmManager(Actor):
         document, system = adapt(self._document, change, file)
         check_modules(self._system, system)
         for node in system.actors():
-            if node.kind in topics.REPORTS_ON:
+            if node.kind in REPORTS_ON:
                 load_member(node, system, file)
         busy = self.arbiter_state.busy
         if busy:

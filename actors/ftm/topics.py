@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from rampart.actors.bus import messages as bus_messages
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.ftm import messages as m
-from rampart.manager.spec.schema import Kind
 
 # Detection, recovery, manager.
 HOLDS = Topic("holds/{name}", m.Holds, Qos.STATE, 5, "",
@@ -51,6 +49,3 @@ STUB_TRIGGER = Topic("stub/trigger", m.StubTrigger, Qos.COMMAND, 0, "",
 ALL: tuple[Topic[Any], ...] = (
     *bus_topics.ALL, *(v for v in globals().values() if isinstance(v, Topic)))
 """Those of the bus as well."""
-
-REPORTS_ON: Mapping[Kind, Topic[Any]] = {Kind.DETECTION: DETECTION, Kind.RECOVERY: RECOVERY}
-"""What modules of the tables `[[detection]]` and `[[recovery]]` publish."""

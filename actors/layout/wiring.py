@@ -15,9 +15,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
 
+import msgspec
+
 import rampart
 from rampart.actors.bus.topic import Topic
-from rampart.actors.ftm.topics import REPORTS_ON
+from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.files import working_folder
@@ -25,6 +27,10 @@ from rampart.manager.spec.checks import modules
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
 T = TypeVar("T")
+
+REPORTS_ON: Mapping[Kind, Topic[Any]] = {
+    Kind.DETECTION: topics.DETECTION, Kind.RECOVERY: topics.RECOVERY}
+"""What modules of the tables `[[detection]]` and `[[recovery]]` publish."""
 
 _ROOMS_OF_0_6 = ("actors", "manager", "sim")
 
@@ -104,14 +110,15 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
     """
     path = next(path for path, name, *_ in modules(spec) if name == node.name)
     own = tuple(n.name for n in spec.nodes if n.respawn == node.name)
-    if node.kind is Kind.RECOVERY and own:
-        derived = {"nodes": own, **derived}
+    derived = {"nodes": own} if own else derived
     try:
         actor = load_class(node.actor, REPORTS_ON.get(node.kind))
+        takes = {field.name for field in msgspec.structs.fields(actor.Parameters)}
     except ValueError as error:
         raise ValueError(f"{file}: {path}.{error}") from None
-    takes = actor.Parameters.__struct_fields__
-    given = {**{name: derived[name] for name in takes if name in derived}, **node.parameters}
+    except (TypeError, NameError) as error:
+        raise ValueError(f"{file}: {path}.actor = {node.actor!r}: Parameters: {error}") from None
+    given = {name: derived[name] for name in takes & derived.keys()} | node.parameters
     return Member(node.name, actor, read_parameters(
         actor.Parameters, given, file, f"{path}.parameters", spec))
 

@@ -55,28 +55,30 @@ def read_parameters(kind: type[P], given: Mapping[str, Any] | msgspec.Struct, fi
     except msgspec.ValidationError as error:
         name, problem = _explain(kind, given, str(error))
     else:
-        name, problem = next(_misfits(kind, given, spec), ("", "")) if spec else ("", "")
-        if not problem:
+        misfit = next(_misfits(kind, given, spec), None) if spec else None
+        if misfit is None:
             return read
-    raise SpecificationError(file, f"{path}.{name}", problem,
-                             *([given[name]] if name in given else []))
+        name, problem = misfit
+    value = [given[name]] if name in given else []
+    raise SpecificationError(file, f"{path}.{name}", problem, *value)
 
 
 def _explain(kind: type[msgspec.Struct], given: Mapping[str, Any], error: str) -> tuple[str, str]:
     """Return which parameter msgspec refuses, and what would be right."""
-    fields = {field.name: field for field in msgspec.structs.fields(kind)}
-    for name, value in given.items():
-        if name not in fields:
-            known = ", ".join(fields) or "none, its class declares no Parameters"
-            return name, f"unknown parameter; known: {known}"
-        try:
-            msgspec.convert(value, fields[name].type)
-        except msgspec.ValidationError as wrong:
-            words = _expected(inspect.type_info(fields[name].type))
-            return name, f"expected {words}" if words else str(wrong).replace("`", "")
-    for name, field in fields.items():
-        if field.required and name not in given:
-            return name, "missing; without it the node does not start"
+    known = kind.__struct_fields__
+    for name in given:
+        if name not in known:
+            listed = ", ".join(known) or "none, its class declares no Parameters"
+            return name, f"unknown parameter; known: {listed}"
+    for field in msgspec.structs.fields(kind):
+        if field.name in given:
+            try:
+                msgspec.convert(given[field.name], field.type)
+            except msgspec.ValidationError as wrong:
+                words = _expected(inspect.type_info(field.type))
+                return field.name, f"expected {words}" if words else str(wrong).replace("`", "")
+        elif field.required:
+            return field.name, "missing; without it the node does not start"
     name, _, problem = error.partition(": ")  # of its `__post_init__`
     return name, problem
 

@@ -137,7 +137,7 @@ def _processes(spec: SystemSpec) -> Iterator[Finding]:
                           (lives_in[name],))
     managers = {lives_in[node.name] for node in spec.nodes if node.kind is Kind.MANAGER}
     for index, recovery in enumerate(spec.recoveries):
-        for place, name in enumerate(recovery.nodes):
+        for place, name in enumerate(recovery.parameters.get("nodes", ())):
             if lives_in[name] in managers:
                 yield Finding(f"$.recovery[{index}].parameters.nodes[{place}]", "the manager lives "
                               "in its process, and cannot command its own recovery", (name,))

@@ -268,11 +268,6 @@ class RecoverySpec(Table, frozen=True):
     parameters: dict[str, Any] = {}
     enabled: bool = True
 
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        """Names of the nodes that it may respawn besides those that name it."""
-        return tuple(self.parameters.get("nodes", ()))
-
 
 class Hazard(StrEnum):
     """What a mechanism races against; `rampart.manager.spec.budget` has the physics."""

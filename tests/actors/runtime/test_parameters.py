@@ -11,9 +11,8 @@ import pytest
 
 from rampart import systems
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.ftm.topics import REPORTS_ON
 from rampart.actors.layout.layout import Layout
-from rampart.actors.layout.wiring import load_class, load_member
+from rampart.actors.layout.wiring import REPORTS_ON, load_class, load_member
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.recovery.stub import StubRecovery
 from rampart.actors.run.run_plan import RunPlan
