@@ -41,9 +41,6 @@ EXCUSE_S = 0.1
 NEXT_EXCUSE_S = 1.0
 """Not sooner does another absence count: a module that is always late is not excused for ever."""
 
-DEFAULT_GRACE_S = 5.0
-"""How long a starting system may take, if no spec says."""
-
 _SHORTEST_SLEEP_S = 1e-4
 """Rounding must not make a timer that is due now come again now, for ever."""
 

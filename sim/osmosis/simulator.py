@@ -33,7 +33,6 @@ from rampart.sim.osmosis.sensors import LaserSpec
 from rampart.sim.osmosis.world import World
 
 WAKE_UP_S = 0.02
-DEAD_MAN_TIMEOUT_S = 0.4
 MAX_CATCH_UP_S = 1.0
 
 _JOBS = (
@@ -61,7 +60,7 @@ class Simulator(Actor):
         seed: int = 0
         obstacles: int = 0
         dead_man: bool = True
-        dead_man_timeout_s: Positive = DEAD_MAN_TIMEOUT_S
+        dead_man_timeout_s: Positive = 0.4
         laser_range_m: Positive = 8.0
         laser_rays: Annotated[int, msgspec.Meta(ge=2)] = 181
         upper_laser: bool = False
@@ -71,11 +70,9 @@ class Simulator(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        parameters = self.parameters
         self._airport = Osmosis.of(context).airport
         self._laser = LaserSpec(
-            rays=parameters.laser_rays, range_max_m=parameters.laser_range_m)
-        self._dead_man_s = parameters.dead_man_timeout_s if parameters.dead_man else None
+            rays=self.parameters.laser_rays, range_max_m=self.parameters.laser_range_m)
         self._asked_s = self._skipped_s = 0.0
         self._real_time_factor = 1.0
         self._brakes: Holders[bool] = Holders(
@@ -85,13 +82,13 @@ class Simulator(Actor):
 
     def on_start(self) -> None:
         """Build the world at the present time."""
-        now_s = self.clock.now()
+        now_s, parameters = self.clock.now(), self.parameters
         self._world = World(
             self._airport,
             Osmosis.of(self.context).world,
-            seed=self.parameters.seed,
-            obstacles=self.parameters.obstacles,
-            dead_man_timeout_s=self._dead_man_s,
+            seed=parameters.seed,
+            obstacles=parameters.obstacles,
+            dead_man_timeout_s=parameters.dead_man_timeout_s if parameters.dead_man else None,
             laser=self._laser,
             start_s=now_s,
             max_catch_up_s=MAX_CATCH_UP_S,
@@ -108,7 +105,7 @@ class Simulator(Actor):
             topics.TRUTH: self._truth,
             topics.OBSTACLES: self._obstacles,
         }
-        if self.parameters.upper_laser:
+        if parameters.upper_laser:
             readings[topics.UPPER_SCAN] = lambda: self._scan(1)
         self._readings = {topic.key: (topic, read) for topic, read in readings.items()}
         self._schedule = Schedule(

@@ -14,8 +14,6 @@ from rampart.manager.spec.schema import NonNegative
 _FIRST_STATUS_S = 0.3
 """A respawned module waits this long for a first status of the base before it says idle."""
 
-_USUAL = MotionLimits()
-
 
 class ActuatorFailure(DetectionModule):
     """Active while wheels do not turn, or brakes do not brake, as the base was told."""
@@ -28,8 +26,8 @@ class ActuatorFailure(DetectionModule):
             hold_s: how long a finding stays without new evidence, s.
         """
 
-        wheel_radius_m: NonNegative = _USUAL.wheel_radius_m
-        hold_s: NonNegative = _USUAL.hold_s
+        wheel_radius_m: NonNegative = MotionLimits().wheel_radius_m
+        hold_s: NonNegative = MotionLimits().hold_s
 
     parameters: Parameters
 

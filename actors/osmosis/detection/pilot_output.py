@@ -12,8 +12,6 @@ from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import ControlTimeout, NodeName
 from rampart.manager.spec.schema import NonNegative
 
-_USUAL = PilotLimits()
-
 
 class PilotOutput(DetectionModule):
     """Compares what the base gets with what the Safety Pilot was asked for and says it does.
@@ -33,9 +31,9 @@ class PilotOutput(DetectionModule):
         """
 
         pilot: NodeName = "safety_pilot"
-        timeout_s: ControlTimeout = _USUAL.timeout_s
-        wrong_s: NonNegative = _USUAL.wrong_s
-        hold_s: NonNegative = _USUAL.hold_s
+        timeout_s: ControlTimeout = PilotLimits().timeout_s
+        wrong_s: NonNegative = PilotLimits().wrong_s
+        hold_s: NonNegative = PilotLimits().hold_s
 
     parameters: Parameters
 

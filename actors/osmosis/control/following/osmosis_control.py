@@ -102,7 +102,6 @@ class OsmosisControl(Actor):
         self._route: Route | None = None
         self._follower: PathFollower | LightRow | None = None
         self._status = ControlStatus("", 0, ControlPhase.IDLE, 0, 0.0)
-        self._tells_aside = self.parameters.has_standby
         self._loop = MotionLoop(self._motion.max_angular_radps) \
             if self.parameters.yaw_loop else None
         self._ticked_s = context.clock.now()
@@ -353,7 +352,8 @@ class OsmosisControl(Actor):
         before, self._status = self._status, status
         if (before.mission_id, before.step, before.phase, before.back_to, before.passing) != (
                 mission_id, step, phase, status.back_to, status.passing) or (
-                self._tells_aside and abs(before.aside_m - status.aside_m) > _ASIDE_M):
+                self.parameters.has_standby
+                and abs(before.aside_m - status.aside_m) > _ASIDE_M):
             self.publish(topics.CONTROL_STATUS, status)
 
     def _intent(self) -> tuple[tuple[tuple[float, float], ...], bool]:

@@ -8,7 +8,6 @@ absolute pose and fix.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
@@ -18,7 +17,6 @@ from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.manager.spec.schema import NonNegative
 
 _PERIOD_S = 0.05
-_LIMITS = FilterLimits()
 
 
 class FusedLocalization(Actor):
@@ -34,14 +32,14 @@ class FusedLocalization(Actor):
             bridge_m: how far the robot may go on dead reckoning alone, m.
         """
 
-        bridge_m: NonNegative = _LIMITS.bridge_m
+        bridge_m: NonNegative = FilterLimits().bridge_m
 
     parameters: Parameters
     outputs = (topics.POSE, topics.LOCALIZATION_STATUS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._filter = PoseFilter(replace(_LIMITS, bridge_m=self.parameters.bridge_m))
+        self._filter = PoseFilter(FilterLimits(self.parameters.bridge_m))
         self._told_s = -math.inf
 
     @on(topics.IMU)

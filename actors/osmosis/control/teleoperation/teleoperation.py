@@ -72,11 +72,10 @@ class Teleoperation(Actor):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        robot = context.run.system.robot
-        linear_mps, angular_radps = self.parameters.linear_mps, self.parameters.angular_radps
-        self._linear_mps = robot.top_speed_mps if linear_mps is None else linear_mps
+        robot, own = context.run.system.robot, self.parameters
+        self._linear_mps = robot.top_speed_mps if own.linear_mps is None else own.linear_mps
         self._angular_radps = (
-            robot.top_turn_rate_radps if angular_radps is None else angular_radps)
+            robot.top_turn_rate_radps if own.angular_radps is None else own.angular_radps)
         self._arbiter = StickArbiter(TIMEOUT_S)
         self._look: Timer | None = None
         self._device: JoystickDevice | None = None
