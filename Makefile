@@ -8,6 +8,7 @@ run: setup
 	$(BIN)/python launch.py
 
 # What runs the real system against the clock needs the machine for itself, and comes last.
+# Without Chromium the operator's page is not tested, which the last line says.
 test: setup
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy

@@ -7,6 +7,34 @@ import os
 import pytest
 
 from rampart.actors.bus import run_folder
+from tests.actors.operator.browser import CHROMIUM
+
+HOW_TO_GET_CHROMIUM = "no Chromium: `apt-get install chromium` brings it"
+
+
+def pytest_runtest_setup(item):
+    """Skip a test of the page without a browser; where RAMPART_TEST_PAGE is set, fail it."""
+    if CHROMIUM is None and item.get_closest_marker("page"):
+        (pytest.fail if os.environ.get("RAMPART_TEST_PAGE") else pytest.skip)(HOW_TO_GET_CHROMIUM)
+
+
+class LastLine:
+    """Says in the last line what was not tested for want of a browser."""
+
+    def __init__(self):
+        self.told = ""
+
+    def pytest_runtest_logreport(self, report):
+        if report.skipped and "page" in report.keywords:
+            self.told = f"not tested: the operator's page in a browser; {HOW_TO_GET_CHROMIUM}"
+
+    def pytest_unconfigure(self, config):
+        if self.told and not hasattr(config, "workerinput"):
+            print(self.told)
+
+
+def pytest_configure(config):
+    config.pluginmanager.register(LastLine())
 
 
 @pytest.fixture

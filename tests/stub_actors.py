@@ -4,37 +4,19 @@ from __future__ import annotations
 
 import os
 import re
-import socket
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from itertools import cycle, islice
 from pathlib import Path
 
 import msgspec
 
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import topics
-from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.supervision.launcher import Launcher
+from rampart.testing import free_base_port
 from tests import ROOT
-
-
-def bases() -> Iterator[int]:
-    """Yield bases that no other worker of this test run takes, below the ephemeral ports.
-
-    Two workers with the same bases meet between the look for a free one and its use.
-    """
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    of_this_worker = range(10_000 + worker * 40, 32_000, workers * 40)
-    test_run = os.getppid() if workers > 1 else os.getpid()  # two runs of one test differ
-    start = test_run % len(of_this_worker)
-    return cycle((*of_this_worker[start:], *of_this_worker[:start]))
-
-
-_BASES = bases()
 
 
 class Idler(Actor):
@@ -50,20 +32,6 @@ def write_stub_system(directory: Path) -> Path:
     file.write_text(re.sub(r'^actor = "[^"]+"', 'actor = "tests.stub_actors:Idler"', text,
                            flags=re.MULTILINE), encoding="utf-8")
     return file
-
-
-def free_base_port() -> int:
-    """Return a number that no run has."""
-    for base in islice(_BASES, 1000):
-        try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
-                probe.bind(run_info.address(base))
-            with socket.create_server(("127.0.0.1", base)):  # for a page of its own
-                pass
-        except OSError:
-            continue
-        return base
-    raise RuntimeError("no free number")
 
 
 def stub_plan(system: Path, **changes: object) -> RunPlan:

@@ -17,14 +17,14 @@ Two subtleties, both about a module that was not there for a while:
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from rampart.actors.bus.bounds import NAME_CHARS, clip
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DetectionReport, DetectionState
 from rampart.actors.runtime.actor import Actor, Context, every
-from rampart.manager.spec.schema import NonNegative
+from rampart.manager.spec.tables import NonNegative
 
 TRANSITIONS = {
     DetectionState.IDLE: frozenset({DetectionState.ACTIVE}),
@@ -75,6 +75,9 @@ class Monitor(Protocol):
         """Draw the conclusions from the time that has passed without an event."""
 
 
+M = TypeVar("M", bound=Monitor)
+
+
 class Waiting(Actor.Parameters, frozen=True):
     """Parameters of a module that waits for its first input.
 
@@ -89,8 +92,8 @@ class Waiting(Actor.Parameters, frozen=True):
 class DetectionModule(Actor):
     """Base of DM1 to DM7.
 
-    A subclass either calls `activate` and `know_idle` itself, or has a `Monitor`, hands it what it
-    hears, and calls `follow(monitor)` after each event. One that calls them itself calls
+    A subclass either calls `activate` and `know_idle` itself, or has a `Monitor` (`judged_by`),
+    hands it what it hears, and calls `follow` after each event. One that calls them itself calls
     `know_idle` whenever what it hears proves that the fault is not there, idle or not: from its
     second life on it is silent, and counts as active, until it has called one of the two.
     """
@@ -165,9 +168,24 @@ class DetectionModule(Actor):
 
     # -- the monitor ----------------------------------------------------------------------------
 
-    def follow(self, monitor: Monitor) -> None:
-        """Bring the state in line with the monitor, and see to it that its deadline is kept."""
+    def judged_by(self, monitor: M) -> M:
+        """Have a monitor judge from the start on; return it."""
         self._monitor = monitor
+        return monitor
+
+    def known_after_s(self, wait_s: float) -> float:
+        """Return when to claim idle though nothing was heard: at once in a system that starts."""
+        return -math.inf if self.first_life else self.clock.now() + wait_s
+
+    def on_start(self) -> None:
+        """Start waiting for the first input."""
+        self.follow()
+
+    def follow(self) -> None:
+        """Bring the state in line with the monitor, and see to it that its deadline is kept."""
+        monitor = self._monitor
+        if monitor is None:
+            return
         self._note_absence()
         if monitor.active:
             self.activate(monitor.reason, monitor.nodes)
@@ -193,7 +211,7 @@ class DetectionModule(Actor):
             self._sleep_until(self._judges_from_s)
         else:
             monitor.expire(now_s)
-            self.follow(monitor)
+            self.follow()
 
     def _note_absence(self) -> None:
         now_s = self.clock.now()

@@ -7,7 +7,7 @@ from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import Header, on
 from rampart.actors.runtime.parameters import NodeNames
-from rampart.manager.spec.schema import Positive
+from rampart.manager.spec.tables import Positive
 
 
 class StubDetection(DetectionModule):

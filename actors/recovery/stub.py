@@ -8,7 +8,7 @@ from rampart.actors.ftm.messages import RecoveryCommand, RecoveryPhase
 from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.timer import Timer
-from rampart.manager.spec.schema import NonNegative
+from rampart.manager.spec.tables import NonNegative
 
 
 class StubRecovery(RecoveryModule):

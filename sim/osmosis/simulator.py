@@ -26,7 +26,7 @@ from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
-from rampart.manager.spec.schema import Positive
+from rampart.manager.spec.tables import Positive
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.schedule import Schedule
 from rampart.sim.osmosis.sensors import LaserSpec

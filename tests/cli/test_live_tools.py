@@ -20,9 +20,9 @@ import pytest
 import websockets
 
 from rampart.actors.osmosis.control.teleoperation.joystick_device import AXIS, BUTTON, EVENT
+from rampart.testing import RealRun
 from tests import ROOT
 from tests.cli.pseudo_terminal import PseudoTerminal
-from tests.real_run import RealRun
 
 parser = pytest.importorskip("prometheus_client.parser")
 pytest.importorskip("foxglove")
@@ -36,7 +36,7 @@ UP, LEFT = "\x1b[A", "\x1b[D"
 def run(tmp_path_factory):
     directory = tmp_path_factory.mktemp("run")
     os.mkfifo(directory / "stick")
-    with RealRun(directory, "--joystick", str(directory / "stick")) as it:
+    with RealRun(directory, "paper", "--joystick", str(directory / "stick")) as it:
         it.wait_for("mission AB running", 60)
         yield it
 

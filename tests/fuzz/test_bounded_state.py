@@ -22,19 +22,20 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.recording.views import Views
+from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, on
-from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Shelf
-from rampart.actors.runtime.injection_desk import MAX_DELAYED, MAX_IN_FORCE
+from rampart.actors.runtime.injected_faults import MAX_DELAYED, MAX_IN_FORCE
 from rampart.actors.runtime.mailbox import Mailbox
+from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, Motor
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.runs.console import Console
 from rampart.sim.runs.mission_run import MissionRun
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
+from rampart.sim.virtual.virtual_loop import VirtualClock
+from rampart.testing import VirtualSystem, run
 from tests.fuzz.handler_fuzz import Machine, cases, system
 from tests.fuzz.message_extremes import all_topics
 
@@ -95,38 +96,29 @@ def holdings(root):
 def flooded(of, name):
     """Return an actor of a system that was told of `FLOOD` names on each of its topics."""
 
-    async def run():
-        loop = asyncio.get_running_loop()
-        hub, member = Hub(), of.layout.members[name]
-        clock = VirtualClock(loop, 0.0)
-        actor = member.actor(Context(
-            name, 1, clock, VirtualBus(hub, name), member.parameters,
-            of.run, pid=1, checkpoints=MemoryCheckpoints(Shelf(), 1),
-            members=frozenset(of.layout.members)), *([Machine()] if name == SUPERVISOR else []))
-        task = asyncio.create_task(actor.run())
-        stranger = VirtualBus(hub, "stranger")
-        await stranger.open()
-        await asyncio.sleep(1.0)
-        sequence = count(1)
-        for topic in actor.inputs():
-            kind = inspect.type_info(topic.type)
-            names = actor.names(topic, name, actor.parameters) or ()
-            for number in range(FLOOD):
-                source = f"s{number}" if number % 2 else "osmosis_control"
-                member_of = names[number % len(names)] if names else f"n{number}"
-                stranger.publish(
-                    topic, topic.at(member_of) if topic.is_family else topic.at(),
-                    msgspec.msgpack.encode((source, 1, next(sequence), 0.9, told(kind, number))))
-                if number % 100 == 0:
-                    await asyncio.sleep(0.02)
-        await asyncio.sleep(0.1)
-        sizes = [(path, size) for path, size in holdings(actor) if size > ROOM]
-        actor.stop()
-        await task
-        return sizes
+    async def scenario():
+        async with VirtualSystem(of.run, of.layout, keeps_checkpoints=True) as living:
+            actor = living.start_node(name, *([Machine()] if name == SUPERVISOR else []))
+            await asyncio.sleep(1.0)
+            sequence = count(1)
+            for topic in actor.inputs():
+                kind = inspect.type_info(topic.type)
+                names = actor.names(topic, name, actor.parameters) or ()
+                for number in range(FLOOD):
+                    source = f"s{number}" if number % 2 else "osmosis_control"
+                    member_of = names[number % len(names)] if names else f"n{number}"
+                    living.bus.publish(
+                        topic, topic.at(member_of) if topic.is_family else topic.at(),
+                        msgspec.msgpack.encode(
+                            (source, 1, next(sequence), 0.9, told(kind, number))))
+                    if number % 100 == 0:
+                        await asyncio.sleep(0.02)
+            await asyncio.sleep(0.1)
+            sizes = [(path, size) for path, size in holdings(actor) if size > ROOM]
+            await living.stop(name)
+            return sizes
 
-    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        return runner.run(run())
+    return run(scenario)
 
 
 def kinds():
@@ -169,7 +161,7 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
     of = system("osmosis")
     run = MissionRun(of.plan, of.run.application.airport, of.run.application.mission, strategy="x",
                      patience_s=60.0, console=Console(io.StringIO()))
-    picture, views = RunPicture(), Views()
+    picture, views = RunPicture(OsmosisLines()), OsmosisViews()
     clock = type("Clock", (), {"now": staticmethod(lambda: 0.0)})()
     for topic in all_topics():
         kind = inspect.type_info(topic.type)
@@ -178,7 +170,7 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
             body = msgspec.convert(told(kind, number), topic.type, builtin_types=(bytes,))
             for sink in run.sinks(clock) if number < FLOOD else ():
                 sink(topic, body, header)
-            if topic in DECODED:
+            if topic in (*DECODED, *OsmosisLines.read):
                 picture.heard(topic, header, body, 0.0)
             views.of(topic, topic.at(f"n{number}") if topic.is_family else topic.at(), header,
                      body, 0)
@@ -251,28 +243,19 @@ def test_error_reports_are_one_a_second_of_a_kind_and_few_in_all():
 
 def during(kind, act, seconds=1.5):
     """Let an actor live while `act(actor, stranger)` is done to it; return what it reported."""
-    reports = []
 
-    async def run():
-        loop = asyncio.get_running_loop()
-        hub = Hub()
-        hub.taps.append(lambda _now, source, key, payload: reports.append(
-            msgspec.msgpack.decode(payload)[4])
-            if (source, key) == ("node", "rampart/diagnostic/node") else None)
-        actor = kind(Context("node", 1, VirtualClock(loop, 0.0), VirtualBus(hub, "node"), pid=1,
-                             members=frozenset({"node", "friend"})))
-        task = asyncio.create_task(actor.run())
-        stranger = VirtualBus(hub, "stranger")
-        await stranger.open()
-        await asyncio.sleep(0.1)
-        act(actor, stranger)
-        await asyncio.sleep(seconds)
-        actor.stop()
-        await task
+    async def scenario():
+        async with VirtualSystem() as living:
+            living.members = frozenset({"node", "friend"})
+            sent = living.overhear("node")
+            actor = living.start("node", kind)
+            await asyncio.sleep(0.1)
+            act(actor, living.bus)
+            await asyncio.sleep(seconds)
+            await living.stop("node")
+            return [body for key, body in sent if key == "diagnostic/node"]
 
-    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        runner.run(run())
-    return reports
+    return run(scenario)
 
 
 class Quiet(Actor):
@@ -305,7 +288,7 @@ def order(number):
 def test_injections_of_one_node_are_bounded_and_so_is_what_they_hold_back():
     def act(actor, _):
         for number in range(MAX_IN_FORCE + 5):
-            actor._injections.order(order(number))
+            actor._injections.order(order(number), topics.POSE)
         assert len(actor._injections.gate.in_force) == MAX_IN_FORCE
         for _ in range(MAX_DELAYED + 100):
             actor.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
@@ -330,30 +313,21 @@ def test_actuator_faults_at_a_time_are_bounded():
 
 def test_the_supervisor_passes_on_a_bounded_number_of_reports_and_says_what_it_left_out():
     of = system("paper")
-    sent = []
 
-    async def run():
-        hub, loop = Hub(), asyncio.get_running_loop()
-        hub.taps.append(lambda _now, source, key, payload: sent.append(
-            (key, msgspec.msgpack.decode(payload)[4])) if source == SUPERVISOR else None)
-        member = of.layout.members[SUPERVISOR]
-        actor = member.actor(Context(
-            SUPERVISOR, 1, VirtualClock(loop, 0.0), VirtualBus(hub, SUPERVISOR), member.parameters,
-            of.run, pid=1), Machine())
-        task = asyncio.create_task(actor.run())
-        stranger = VirtualBus(hub, "stranger")
-        await stranger.open()
-        await asyncio.sleep(0.1)
-        for number in range(1000):
-            stranger.publish(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.at("x"), encode(
-                Header("x", 1, number, 0.0), bm.Diagnostic("x", "c", "r", f"{number}", 1)))
-        await asyncio.sleep(2.0)
-        actor.stop()
-        await task
+    async def scenario():
+        async with VirtualSystem(of.run, of.layout) as living:
+            sent = living.overhear(SUPERVISOR)
+            living.start_node(SUPERVISOR, Machine())
+            await asyncio.sleep(0.1)
+            for number in range(1000):
+                living.say(bus_topics.DIAGNOSTIC, bm.Diagnostic("x", "c", "r", f"{number}", 1),
+                           "x", stamp_s=0.0)
+            await asyncio.sleep(2.0)
+            await living.stop(SUPERVISOR)
+            return sent
 
-    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        runner.run(run())
-    told = [body["node"] for key, body in sent if key == ftm_topics.ERROR_REPORT.at()]
+    sent = run(scenario)
+    told = [body["node"] for key, body in sent if key == ftm_topics.ERROR_REPORT.key]
     assert told.count("x") == 200
-    assert [body["reason"] for key, body in sent if key == "rampart/diagnostic/supervisor"] == [
+    assert [body["reason"] for key, body in sent if key == "diagnostic/supervisor"] == [
         "800 more messages were not passed on"]

@@ -6,15 +6,13 @@ import asyncio
 
 import pytest
 
-from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.layout.layout import adapted_system
 from rampart.actors.osmosis import topics
 from rampart.actors.run.run_plan import SUPERVISOR
-from rampart.actors.runtime.actor import Actor, Context, on
-from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
+from rampart.actors.runtime.actor import Actor, on
+from rampart.testing import VirtualSystem, run
 from tests.fuzz import handler_fuzz
 from tests.fuzz.handler_fuzz import SYSTEMS, cases, fuzz_actor, fuzz_tools, system
 
@@ -66,28 +64,19 @@ def heard_by_the_supervisor(*bodies):
     """Return the contexts of what a supervisor reports when it is told of changed systems."""
     of = system("paper")
 
-    async def run():
-        hub, loop = Hub(), asyncio.get_running_loop()
-        reports = []
-        member = of.layout.members[SUPERVISOR]
-        actor = member.actor(Context(
-            SUPERVISOR, 1, VirtualClock(loop, 0.0), VirtualBus(hub, SUPERVISOR), member.parameters,
-            of.run, pid=1), handler_fuzz.Machine())
-        actor.report_diagnostic = lambda *report: reports.append(report)
-        task = asyncio.create_task(actor.run())
-        stranger = VirtualBus(hub, "stranger")
-        await stranger.open()
-        await asyncio.sleep(0.1)
-        for number, body in enumerate(bodies, start=1):
-            stranger.publish(ftm_topics.ADAPTED_SYSTEM, ftm_topics.ADAPTED_SYSTEM.at(), encode(
-                Header("ftm_manager", 1, number, 0.0), body))
+    async def scenario():
+        async with VirtualSystem(of.run, of.layout) as living:
+            reports = []
+            actor = living.start_node(SUPERVISOR, handler_fuzz.Machine())
+            actor.report_diagnostic = lambda *report: reports.append(report)
             await asyncio.sleep(0.1)
-        actor.stop()
-        await task
-        return reports
+            for body in bodies:
+                living.say(ftm_topics.ADAPTED_SYSTEM, body, "ftm_manager", stamp_s=0.0)
+                await asyncio.sleep(0.1)
+            await living.stop(SUPERVISOR)
+            return reports
 
-    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        return runner.run(run())
+    return run(scenario)
 
 
 @pytest.mark.parametrize("document", ["[]", "null", "1", "true", "{", "", "[" * 300_000, "{}"])

@@ -34,7 +34,7 @@ from rampart.actors.supervision.kill_node import SIGNALS
 from rampart.actors.supervision.process_title import find_processes, process_state
 from rampart.actors.supervision.spawner import NAMES
 from rampart.manager.spec.specification import Kind, SystemSpec
-from tests.real_run import RealRun
+from rampart.testing import RealRun
 
 WAYS = ("KILL", "STOP", "SEGV", "WEDGE")
 SPAWNERS = tuple(f"spawner_{name}" for name in NAMES)

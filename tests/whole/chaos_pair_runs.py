@@ -18,7 +18,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.real_run import RealRun
+from rampart.testing import RealRun
 from tests.whole.chaos import complaints, targets
 from tests.whole.chaos_pairs import Pair, PairChaos, plan_pairs
 from tests.whole.chaos_runs import load, say, start, write_laps

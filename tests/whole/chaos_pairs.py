@@ -32,7 +32,7 @@ from rampart.actors.supervision.kill_node import SIGNALS
 from rampart.actors.supervision.process_title import find_processes, process_state
 from rampart.cli.output import UsageError
 from rampart.cli.session import connect
-from tests.real_run import RealRun
+from rampart.testing import RealRun
 from tests.whole.chaos import SPAWNERS, WORLD_PAUSE_S, Targets, tells_end
 
 LAUNCHER = "launcher"

@@ -17,9 +17,8 @@ from pathlib import Path
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.manager.spec.specification import SystemSpec, check_document, read_document
+from rampart.testing import RealRun, free_base_port
 from tests import ROOT
-from tests.real_run import RealRun
-from tests.stub_actors import free_base_port
 from tests.whole.chaos import (
     SPAWNERS,
     Chaos,
@@ -49,8 +48,8 @@ def load() -> SystemSpec:
 def start(directory: Path, mission: str, rate: float) -> RealRun:
     """Return a run of the full system with the operator's page, not yet begun."""
     directory.mkdir()
-    return RealRun(directory, "--mission", mission, "--rate", f"{rate:g}", "--hmi-port",
-                   str(free_base_port()), "--patience", "90", hmi=True, system=str(SYSTEM))
+    return RealRun(directory, str(SYSTEM), "--mission", mission, "--rate", f"{rate:g}",
+                   "--hmi-port", str(free_base_port()), "--patience", "90", hmi=True)
 
 
 def say(line: object) -> None:

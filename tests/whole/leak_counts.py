@@ -17,7 +17,7 @@ from pathlib import Path
 import psutil
 
 from rampart.actors.supervision.process_title import find_processes
-from tests.real_run import RealRun
+from rampart.testing import RealRun
 
 LAUNCHER = "launch.py"
 MAX_GROWTH_MB = 15.0

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from rampart.manager.spec.specification import check_document, read_document
+from rampart.testing import RealRun
 from tests import ROOT
-from tests.real_run import RealRun
 from tests.whole.chaos import WAYS, Chaos, Targets, complaints, each_in_every_way, so_many, targets
 from tests.whole.leak_counts import Counts, leaks
 
@@ -73,8 +73,7 @@ def test_whatever_becomes_more_is_one_leak(after):
 @pytest.mark.timeout(240)
 def test_a_mission_survives_whatever_is_done_to_its_processes(tmp_path):
     hits = each_in_every_way(Targets(ALL_FOUR, ("simulator",)), 5, PAUSE_S)
-    with RealRun(tmp_path, "--mission", str(write_row(tmp_path)), "--rate", "2",
-                 system="osmosis") as run:
+    with RealRun(tmp_path, "osmosis", "--mission", str(write_row(tmp_path)), "--rate", "2") as run:
         run.wait_for("goal 1/2")
         chaos = Chaos(run, world=("simulator",))
         left = chaos.carry_out(hits)

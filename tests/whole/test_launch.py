@@ -14,9 +14,8 @@ import pytest
 
 from rampart.actors.osmosis.airport.formats import load_world
 from rampart.actors.supervision.process_title import find_processes
+from rampart.testing import RealRun, free_base_port
 from tests import ROOT
-from tests.real_run import RealRun
-from tests.stub_actors import free_base_port
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(240)]
 
@@ -34,7 +33,7 @@ def test_the_world_of_the_tests_is_the_one_they_think():
 
 @pytest.mark.slow
 def test_mission_a_succeeds_although_every_other_node_is_killed_once(tmp_path):
-    with RealRun(tmp_path, "--mission", "A", "--rate", "3") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "3") as run:
         run.wait_for("goal 1/3")
         start_s = 5.0
         for i, node in enumerate(EVERYBODY_BUT_THE_MISSION_MANAGER):
@@ -54,7 +53,7 @@ def test_mission_a_succeeds_although_every_other_node_is_killed_once(tmp_path):
 
 
 def test_a_killed_mission_manager_loses_the_mission_and_leaves_the_robot_safe(tmp_path):
-    with RealRun(tmp_path, "--mission", "A", "--rate", "3") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "3") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(8)
         run.kill("mission_manager")
@@ -65,7 +64,7 @@ def test_a_killed_mission_manager_loses_the_mission_and_leaves_the_robot_safe(tm
 
 
 def test_stopped_and_wedged_control_nodes_are_replaced_and_the_mission_goes_on(tmp_path):
-    with RealRun(tmp_path, "--mission", "A", "--rate", "2") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2") as run:
         run.wait_for("goal 1/3")
         for at_s, number in ((6, signal.SIGSTOP), (10, signal.SIGUSR2)):  # SIGUSR2: wedge
             run.sleep_until(at_s)
@@ -91,7 +90,7 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_with_ftm_a_fault_leaves_the_robot_safe(tmp_path, fault):
     module, recoveries = FAULTS[fault]
-    with RealRun(tmp_path, "--mission", "A", "--rate", "2", "--patience", "8") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2", "--patience", "8") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(3 if fault == "wrong-graph" else 9)
         injected = run.tool("inject", fault, "--duration", "60", "--at-once")
@@ -113,7 +112,7 @@ def stopped_when_unsafe(run: RealRun):
 @pytest.mark.parametrize("fault", ["command-out-of-bounds", "localization-not-updated"])
 def test_without_ftm_the_same_fault_is_unsafe(tmp_path, fault):
     # The others in virtual time: test_virtual_run.py.
-    with RealRun(tmp_path, "--mission", "A", "--rate", "3", "--patience", "35",
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "3", "--patience", "35",
                  "--no-ftm") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(9)
@@ -127,7 +126,7 @@ def test_without_ftm_the_same_fault_is_unsafe(tmp_path, fault):
 @pytest.mark.slow
 @pytest.mark.parametrize("node", ["localization", "osmosis_control"])
 def test_without_ftm_a_killed_node_stays_dead_and_the_run_is_unsafe(tmp_path, node):
-    with RealRun(tmp_path, "--mission", "A", "--rate", "3", "--patience", "35",
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "3", "--patience", "35",
                  "--no-ftm") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(9)
@@ -138,7 +137,7 @@ def test_without_ftm_a_killed_node_stays_dead_and_the_run_is_unsafe(tmp_path, no
 
 
 def test_an_emergency_stop_stays_until_it_is_reset_and_then_the_mission_goes_on(tmp_path):
-    with RealRun(tmp_path, "--mission", "A", "--rate", "2") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(8)
         assert run.tool("inject", "prohibited-area", "--duration", "20", "--at-once"
@@ -168,7 +167,7 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
         "                s.put(key, junk)\n"
         "    time.sleep(0.2)\n"
         "s.close()\n")
-    with RealRun(tmp_path, "--mission", "A", "--rate", "2") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(5)
         done = subprocess.run([sys.executable, "-c", script, *run.info.endpoints], cwd=ROOT,
@@ -183,7 +182,7 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_nothing_is_left_two_seconds_after_any_end(tmp_path, number):
     before = set(Path("/dev/shm").glob("*.zenoh")), set(Path("/tmp").glob("*rampart*"))
-    with RealRun(tmp_path, "--mission", "A") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A") as run:
         run.wait_for("goal 1/3")
         folder = Path(run.info.folder)
         assert folder.exists()
@@ -197,7 +196,7 @@ def test_nothing_is_left_two_seconds_after_any_end(tmp_path, number):
 
 
 def test_a_launcher_that_was_stopped_goes_on_and_its_nodes_came_back_meanwhile(tmp_path):
-    with RealRun(tmp_path, "--mission", "A", system="osmosis") as run:
+    with RealRun(tmp_path, "osmosis", "--mission", "A") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(3)
         run.process.send_signal(signal.SIGSTOP)
@@ -259,7 +258,7 @@ def test_a_mission_point_outside_the_graph_is_refused_with_file_line_and_value(t
 
 
 def test_a_second_run_on_the_same_ports_is_refused_and_does_not_disturb_the_first(tmp_path):
-    with RealRun(tmp_path, "--mission", "A", "--rate", "2") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2") as run:
         run.wait_for("goal 1/3")
         second = subprocess.run(
             [sys.executable, str(ROOT / "launch.py"), "--no-hmi", "--port", str(run.port),
@@ -276,8 +275,8 @@ def test_a_second_run_on_the_same_ports_is_refused_and_does_not_disturb_the_firs
 def test_two_runs_side_by_side_do_not_know_of_each_other(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
-    with RealRun(tmp_path / "a", "--mission", "A") as one:
-        with RealRun(tmp_path / "b", "--mission", "A") as two:
+    with RealRun(tmp_path / "a", "paper", "--mission", "A") as one:
+        with RealRun(tmp_path / "b", "paper", "--mission", "A") as two:
             one.wait_for("goal 1/3")
             two.wait_for("goal 1/3")
             two.kill("DM1")
@@ -297,7 +296,7 @@ def test_the_paper_s_strategy_leaves_a_dead_node_dead_where_repair_under_guard_r
                              ("guarded-repair", "safety-first")):
         directory = tmp_path / strategy
         directory.mkdir()
-        with RealRun(directory, "--mission", "A", "--rate", "2", "--strategy", strategy,
+        with RealRun(directory, "paper", "--mission", "A", "--rate", "2", "--strategy", strategy,
                      "--shadow", shadow) as run:
             run.wait_for("goal 1/3")
             freeze = subprocess.Popen(
@@ -328,7 +327,7 @@ def test_an_adapted_system_outlives_whatever_runs_it(tmp_path):
     def strategy() -> str:
         return str(json.loads(run.tool("status", "--json").stdout)["manager"]["strategy"])
 
-    with RealRun(tmp_path, "--mission", "A", "--rate", "1") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "1") as run:
         run.wait_for("goal 1/3")
         before = run.pid("DM1")
         assert run.tool("adapt", "retune", "DM1", "margin_m=0.7").returncode == 0

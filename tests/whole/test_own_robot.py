@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from rampart.testing import free_base_port
 from tests import ROOT
-from tests.stub_actors import free_base_port
 
 PAPER = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
 WORLD = ('[[node]]\nname = "simulator"\nactor = "rampart.sim.osmosis.simulator:Simulator"\n'

@@ -11,15 +11,15 @@ import psutil
 import pytest
 
 from rampart.actors.supervision.process_title import find_processes
+from rampart.testing import RealRun
 from tests import ROOT
-from tests.real_run import RealRun
 
 pytestmark = [pytest.mark.processes, pytest.mark.skipif(
     os.getuid() != 0, reason="only root can become another user")]
 
 
 def test_a_stranger_hears_nothing_and_is_not_heard(tmp_path):
-    with RealRun(tmp_path, "--mission", "A", "--rate", "2") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2") as run:
         run.wait_for("goal 1/3")
         info = run.info
         names = ",".join((*info.nodes, "spawner_a", "spawner_b"))
@@ -42,7 +42,7 @@ def test_a_stranger_hears_nothing_and_is_not_heard(tmp_path):
 
 
 def test_a_run_listens_on_no_port_but_its_page(tmp_path):
-    with RealRun(tmp_path, "--mission", "A") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A") as run:
         run.wait_for("goal 1/3")
         pids = [run.process.pid, *(p.pid for p in find_processes(run.port))]
         found = [c for pid in pids for c in psutil.Process(pid).net_connections("inet")]

@@ -21,11 +21,10 @@ from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.recording.virtual import VirtualRecording
 from rampart.cli import run as launch
 from rampart.sim.osmosis.report import RunRecorder, try_report
+from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port
 from tests import ROOT
 from tests.actors.recording.samples import pose
-from tests.real_run import HEEDS_SIGNALS, RealRun
-from tests.stub_actors import free_base_port
-from tests.whole.checkpoint_runs import with_checkpoints, write_short_mission
+from tests.whole.checkpoint_runs import with_checkpoints, write_near_mission, write_short_mission
 
 UNSAFE = 3
 
@@ -225,7 +224,7 @@ def test_a_recording_that_is_taken_away_is_not_said_to_be_there(tmp_path):
 
 @pytest.mark.processes
 def test_a_real_unsafe_run_is_unsafe_though_its_folder_is_gone_and_nobody_listens(tmp_path):
-    with RealRun(tmp_path, "--mission", "A", "--rate", "3", "--patience", "35",
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "3", "--patience", "35",
                  "--no-ftm") as run:
         run.wait_for("goal 1/3")
         run.sleep_until(9)
@@ -244,12 +243,12 @@ def test_a_real_unsafe_run_is_unsafe_though_its_folder_is_gone_and_nobody_listen
 @pytest.mark.processes
 @pytest.mark.timeout(180)
 def test_a_real_mission_succeeds_though_its_folder_goes_and_its_recording_stops(tmp_path):
-    with RealRun(tmp_path, "--system", str(with_checkpoints(tmp_path)), "--mission",
-                 str(write_short_mission(tmp_path)), "--rate", "2", "--record", "/dev/full",
+    with RealRun(tmp_path, with_checkpoints(tmp_path), "--mission",
+                 str(write_near_mission(tmp_path)), "--rate", "2", "--record", "/dev/full",
                  "--overwrite") as run:
-        run.sleep_until(8.0)
+        run.sleep_until(5.0)
         in_the_way(tmp_path / "report")
-        run.sleep_until(12.0)
+        run.sleep_until(9.0)
         run.kill("graph_planner")
         code, result = run.result(120)
     assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), run.story

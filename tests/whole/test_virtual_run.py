@@ -17,9 +17,9 @@ from rampart.cli import run as launch
 from rampart.sim.campaign.job import Job, run_job, run_virtually
 from rampart.sim.faults.scenario import PlannedFault, parse_fault
 from rampart.sim.runs.virtual_run import LEAD_S
+from rampart.testing import HEEDS_SIGNALS, RealRun
 from tests import ROOT
 from tests.actors.recording.samples import pose
-from tests.real_run import HEEDS_SIGNALS, RealRun
 from tests.whole.checkpoint_runs import write_short_mission
 
 SHORT = parse_fault("kill:mission_manager@6")
@@ -246,7 +246,7 @@ def test_virtual_and_real_runs_take_the_same_decisions_and_come_to_the_same_verd
               "kill:mission_manager@36")
     virtual = run_job(job(*faults))
     arguments = [x for fault in faults for x in ("--fault", fault)]
-    with RealRun(tmp_path, "--mission", "A", "--rate", "1", *arguments) as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "1", *arguments) as run:
         code, real = run.result(120)
     assert code == 1
     assert (real["mission"], real["safety"]) == ("fail", "safe")

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.actuator_failure_monitor import ActuatorMonitor, MotionLimits
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.manager.spec.schema import NonNegative
+from rampart.manager.spec.tables import NonNegative
 
 _FIRST_STATUS_S = 0.3
 """A respawned module waits this long for a first status of the base before it says idle."""
@@ -34,16 +32,12 @@ class ActuatorFailure(DetectionModule):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         system = context.run.system
-        self.monitor = ActuatorMonitor(
+        self.monitor = self.judged_by(ActuatorMonitor(
             MotionLimits(
                 wheel_radius_m=self.parameters.wheel_radius_m,
                 hold_s=self.parameters.hold_s,
                 braking_mps2=system.robot.braking_mps2),
-            -math.inf if self.first_life else self.clock.now() + _FIRST_STATUS_S)
-
-    def on_start(self) -> None:
-        """Start waiting for the base."""
-        self.follow(self.monitor)
+            self.known_after_s(_FIRST_STATUS_S)))
 
     @on(topics.BASE_COMMAND)
     def command(self, message: m.BaseCommand, _header: Header) -> None:
@@ -60,4 +54,4 @@ class ActuatorFailure(DetectionModule):
         """Hear how the wheels turn, and judge."""
         self.monitor.status(message.wheel_speeds_radps, braking=message.brake_engaged,
                             now_s=self.clock.now())
-        self.follow(self.monitor)
+        self.follow()

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.bounds_check import BoundsCheck
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import NodeNames
-from rampart.manager.spec.schema import NonNegative
+from rampart.manager.spec.tables import NonNegative
 
 _FIRST_COMMAND_S = 0.2
 """A respawned module waits this long for a first command, four periods, before it says idle."""
@@ -39,14 +37,10 @@ class Bounds(DetectionModule):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         system = context.run.system
-        self.monitor = BoundsCheck(
+        self.monitor = self.judged_by(BoundsCheck(
             system.robot.top_speed_mps, system.robot.top_turn_rate_radps,
             self.parameters.hold_s,
-            -math.inf if self.first_life else self.clock.now() + _FIRST_COMMAND_S)
-
-    def on_start(self) -> None:
-        """Start waiting for the first command."""
-        self.follow(self.monitor)
+            self.known_after_s(_FIRST_COMMAND_S)))
 
     @on(topics.COMMAND)
     def command(self, message: m.Twist, header: Header) -> None:
@@ -58,4 +52,4 @@ class Bounds(DetectionModule):
         elif not was_active or not self.monitor.good:
             self.monitor.nodes = tuple(
                 f"{n}#{header.incarnation}" for n in self.parameters.suspects)
-        self.follow(self.monitor)
+        self.follow()

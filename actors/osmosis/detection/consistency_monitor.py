@@ -18,7 +18,7 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.detection.plausible import is_possible, is_sane
+from rampart.actors.bus.plausible import is_possible, is_sane
 from rampart.actors.osmosis.messages import (
     ControlPhase,
     ControlStatus,
@@ -27,7 +27,7 @@ from rampart.actors.osmosis.messages import (
     MissionStatus,
     Route,
 )
-from rampart.manager.spec.schema import NonNegative
+from rampart.manager.spec.tables import NonNegative
 
 _DRIVING = frozenset({MissionPhase.RUNNING, MissionPhase.RETURNING})
 

@@ -8,8 +8,6 @@ message went wrong is found out by the first route.
 
 from __future__ import annotations
 
-import math
-
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -17,7 +15,7 @@ from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.route_monitor import RouteMonitor
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.manager.spec.schema import NonNegative
+from rampart.manager.spec.tables import NonNegative
 
 _FIRST_ROUTE_S = 0.5
 """A respawned module waits this long for a first route, two periods, before it says idle."""
@@ -41,14 +39,10 @@ class ErroneousRoute(DetectionModule):
         super().__init__(context)
         airport = Osmosis.of(context).airport
         check = RouteCheck(airport)
-        self.monitor = RouteMonitor(
+        self.monitor = self.judged_by(RouteMonitor(
             lambda waypoints, goal: check.fault(waypoints, None, goal),
             self.parameters.hold_s,
-            -math.inf if self.first_life else self.clock.now() + _FIRST_ROUTE_S)
-
-    def on_start(self) -> None:
-        """Start waiting for the first route."""
-        self.follow(self.monitor)
+            self.known_after_s(_FIRST_ROUTE_S)))
 
     @on(topics.MISSION_STATUS)
     def mission(self, message: m.MissionStatus, _header: Header) -> None:
@@ -64,4 +58,4 @@ class ErroneousRoute(DetectionModule):
     def route(self, message: m.Route, header: Header) -> None:
         """Check a route."""
         self.monitor.route(message, header.source, header.incarnation, self.clock.now())
-        self.follow(self.monitor)
+        self.follow()

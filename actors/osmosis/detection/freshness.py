@@ -10,7 +10,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import ControlTimeout, NodeNames
-from rampart.manager.spec.schema import NonNegative
+from rampart.manager.spec.tables import NonNegative
 
 
 class Freshness(DetectionModule):
@@ -44,14 +44,10 @@ class Freshness(DetectionModule):
             raise ValueError(f"{self.name}: actor Freshness hears no topic; name a subclass, "
                              "CommandFreshness or LocalizationFreshness")
         timeout_s = self.parameters.timeout_s
-        self.monitor = FreshnessMonitor(
+        self.monitor = self.judged_by(FreshnessMonitor(
             self.subject, timeout_s, self.parameters.hold_s, self.clock.now(),
-            self.grace_s(timeout_s), known=self.first_life)
+            self.grace_s(timeout_s), known=self.first_life))
         self.monitor.nodes = self._suspects = self.parameters.suspects
-
-    def on_start(self) -> None:
-        """Start waiting for the first sample."""
-        self.follow(self.monitor)
 
     def sample(self, header: Header) -> None:
         """Take note of a sample."""
@@ -62,7 +58,7 @@ class Freshness(DetectionModule):
             monitor.nodes = tuple(
                 f"{name}#{header.incarnation}" if name == header.source else name
                 for name in self._suspects)
-        self.follow(monitor)
+        self.follow()
 
 
 class CommandFreshness(Freshness):

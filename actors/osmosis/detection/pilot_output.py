@@ -10,7 +10,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.pilot_output_monitor import PilotLimits, PilotOutputMonitor
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import ControlTimeout, NodeName
-from rampart.manager.spec.schema import NonNegative
+from rampart.manager.spec.tables import NonNegative
 
 
 class PilotOutput(DetectionModule):
@@ -47,13 +47,9 @@ class PilotOutput(DetectionModule):
             timeout_s=parameters.timeout_s,
             wrong_s=parameters.wrong_s,
             hold_s=parameters.hold_s)
-        self.monitor = PilotOutputMonitor(
+        self.monitor = self.judged_by(PilotOutputMonitor(
             parameters.pilot, self.clock.now(), self.grace_s(limits.timeout_s), limits,
-            known=self.first_life)
-
-    def on_start(self) -> None:
-        """Start waiting for the first output."""
-        self.follow(self.monitor)
+            known=self.first_life))
 
     @on(topics.COMMAND)
     def command(self, message: m.Twist, _header: Header) -> None:
@@ -80,4 +76,4 @@ class PilotOutput(DetectionModule):
         """Hear what the base gets."""
         self.monitor.sent(message.linear_mps, message.angular_radps, header.stamp,
                           header.incarnation, self.clock.now())
-        self.follow(self.monitor)
+        self.follow()

@@ -7,11 +7,10 @@ less room. The mission goes on in a degraded mode, and takes longer.
 
 from __future__ import annotations
 
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import PilotMode, PilotOrder, PilotStatus
+from rampart.actors.osmosis.messages import PilotMode, PilotStatus
 from rampart.actors.osmosis.recovery.controlled_stop import PilotRecovery
-from rampart.actors.runtime.actor import Header
-from rampart.manager.spec.schema import Positive
+from rampart.actors.runtime.actor import Context, Header
+from rampart.manager.spec.tables import Positive
 
 
 class ReducedSpeed(PilotRecovery):
@@ -29,15 +28,13 @@ class ReducedSpeed(PilotRecovery):
     parameters: Parameters
     mode = PilotMode.AUTO
 
-    def give_order(self, *, engaged: bool) -> None:
-        """Order the bound, or end the order."""
-        self.publish(topics.PILOT_ORDER, PilotOrder(
-            engaged, self.mode, self.why if engaged else "",
-            self.parameters.top_speed_mps if engaged else 0.0))
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.top_speed_mps = self.parameters.top_speed_mps
 
     def pilot_status(self, message: PilotStatus, header: Header) -> None:
         """See which bound the Safety Pilot keeps."""
-        in_force = 0.0 < message.top_speed_mps <= self.parameters.top_speed_mps
-        self.status(in_force=in_force, stamp_s=header.stamp,
-                    reason=f"at most {message.top_speed_mps:g} m/s" if in_force
-                    else "the safety pilot does not bound the speed")
+        in_force = 0.0 < message.top_speed_mps <= self.top_speed_mps
+        self.order.status(in_force=in_force, stamp_s=header.stamp,
+                          reason=f"at most {message.top_speed_mps:g} m/s" if in_force
+                          else "the safety pilot does not bound the speed")

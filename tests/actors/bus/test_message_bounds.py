@@ -18,9 +18,8 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.runtime.actor import Actor, Context, on
-from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
+from rampart.actors.runtime.actor import Actor, on
+from rampart.testing import VirtualSystem, run
 from tests.fuzz.message_extremes import HEADER, all_topics, edges, pack, smallest, unbounded
 
 NOW_S = 2e12
@@ -53,7 +52,7 @@ def judged(topic, payload):
     taken, refused = [], []
     receive = ArrivalGuard(lambda: NOW_S).receiver(
         topic, lambda key, _message: taken.append(key), lambda _key, reason: refused.append(reason))
-    receive("rampart/x", payload)
+    receive("x", payload)
     assert len(taken) + len(refused) == 1
     return bool(taken), "".join(refused)
 
@@ -120,26 +119,18 @@ class Writer(Actor):
 
 def lived(kind, during=lambda _hub: None):
     """Return what an actor that lived for a second has published: key, body."""
-    sent = []
 
-    async def run():
-        loop = asyncio.get_running_loop()
-        hub = Hub()
-        hub.taps.append(lambda _now, _source, key, payload: sent.append(
-            (key, msgspec.msgpack.decode(payload)[4])))
-        actor = kind(Context("node", 1, VirtualClock(loop, 0.0), VirtualBus(hub, "node"), pid=1))
-        task = asyncio.create_task(actor.run())
-        stranger = VirtualBus(hub, "stranger")
-        await stranger.open()
-        await asyncio.sleep(0.1)
-        during(stranger)
-        await asyncio.sleep(1.0)
-        actor.stop()
-        await task
+    async def scenario():
+        async with VirtualSystem() as system:
+            sent = system.overhear("node")
+            system.start("node", kind)
+            await asyncio.sleep(0.1)
+            during(system.bus)
+            await asyncio.sleep(1.0)
+            await system.stop("node")
+            return sent
 
-    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        runner.run(run())
-    return sent
+    return run(scenario)
 
 
 def test_what_is_beyond_a_bound_is_reported_counted_and_never_handled():
@@ -153,17 +144,17 @@ def test_what_is_beyond_a_bound_is_reported_counted_and_never_handled():
 
     sent = lived(Reader, during)
     assert [message.name for message in Reader.heard] == ["n"]
-    report = next(body for k, body in sent if k == "rampart/diagnostic/node")
+    report = next(body for k, body in sent if k == "diagnostic/node")
     assert (report["context"], report["offender"]) == ("payload rejected", key)
     assert report["reason"] == "not a StubTrigger: Expected `str` of length <= 256 - at `$[4].name`"
-    beats = [body for k, body in sent if k == "rampart/heartbeat/node"]
+    beats = [body for k, body in sent if k == "heartbeat/node"]
     assert beats[-1]["rejected_payloads"] == 1
 
 
 def test_a_node_does_not_send_what_no_reader_would_take_and_says_so():
     sent = lived(Writer)
     assert not [key for key, _ in sent if key == topics.MISSION_STATUS.at()]
-    report = next(body for key, body in sent if key == "rampart/diagnostic/node")
+    report = next(body for key, body in sent if key == "diagnostic/node")
     assert (report["context"], report["offender"]) == ("not sent", topics.MISSION_STATUS.at())
 
 
@@ -172,7 +163,7 @@ def test_a_long_or_broken_text_is_shortened_where_it_is_reported():
         def on_start(self):
             self.report_diagnostic("c" * 5000, "r" * 5000 + "\udc80", "o" * 5000)
 
-    body = next(body for key, body in lived(Talker) if key == "rampart/diagnostic/node")
+    body = next(body for key, body in lived(Talker) if key == "diagnostic/node")
     assert [len(body[name]) for name in ("context", "reason", "offender")] == [TEXT_CHARS] * 3
 
 

@@ -13,8 +13,8 @@ from rampart.actors.ftm import messages as m
 from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.runtime.actor import Actor
 from rampart.actors.runtime.parameters import read_parameters
-from tests.detection_timeline import Ear, play, table
-from tests.virtual_loop import System, run
+from rampart.testing import Ear, play, run, table
+from tests.osmosis_system import System
 
 # One node. b heartbeat of the first life, B of the second, g one sent before the last change;
 # x first token vanishes, p it appears, X and P the second's.

@@ -7,9 +7,6 @@ from __future__ import annotations
 
 import asyncio
 
-import msgspec
-
-from rampart.actors.bus.envelope import Header, encode
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.holders import OTHERS, UNKNOWN, Holders
@@ -17,9 +14,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate
 from rampart.actors.osmosis.messages import PilotMode
-from rampart.actors.runtime.actor import Context
-from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
+from rampart.testing import VirtualSystem, run
 from tests.fuzz.handler_fuzz import system
 
 FORGED = 999_999
@@ -28,21 +23,13 @@ FORGED = 999_999
 class World:
     """One actor of the paper's system, what it says, and anybody who tells it something."""
 
-    def __init__(self, hub, clock, actor):
-        self.hub, self.clock, self.actor = hub, clock, actor
-        self.sent = []
-        self._sequence = 0
-        self._stranger = VirtualBus(hub, "stranger")
-        hub.taps.append(lambda _now, source, key, payload: self.sent.append(
-            (key, msgspec.msgpack.decode(payload)[4])) if source == actor.name else None)
+    def __init__(self, system, name):
+        self.system = system
+        self.sent = system.overhear(name)
+        self.actor = system.start_node(name)
 
     async def tell(self, topic, body, source, incarnation=1, *, wait_s=0.05):
-        if not self._stranger._open:
-            await self._stranger.open()
-        self._sequence += 1
-        self._stranger.publish(
-            topic, topic.at(source) if topic.is_family else topic.at(),
-            encode(Header(source, incarnation, self._sequence, self.clock.now()), body))
+        self.system.say(topic, body, source, incarnation=incarnation)
         await asyncio.sleep(wait_s)
 
     def last(self, key):
@@ -50,34 +37,27 @@ class World:
 
     @property
     def holders(self):
-        return tuple(self.last(f"rampart/holds/{self.actor.name}")["holders"])
+        return tuple(self.last(f"holds/{self.actor.name}")["holders"])
 
     @property
     def reports(self):
         return [(body["context"], body["offender"]) for key, body in self.sent
-                if key == f"rampart/diagnostic/{self.actor.name}"]
+                if key == f"diagnostic/{self.actor.name}"]
 
 
 def during(name, script):
     """Let an actor of the paper's system live, and a script be played to it."""
     of = system("paper")
 
-    async def run():
-        loop = asyncio.get_running_loop()
-        hub, clock = Hub(), VirtualClock(loop, 0.0)
-        member = of.layout.members[name]
-        actor = member.actor(Context(name, 1, clock, VirtualBus(hub, name), member.parameters,
-                                     of.run, pid=1, members=frozenset(of.layout.members),
-                                     register=dict.fromkeys(of.layout.members, 1).get))
-        world = World(hub, clock, actor)
-        task = asyncio.create_task(actor.run())
-        await asyncio.sleep(0.1)
-        await script(world)
-        actor.stop()
-        await task
+    async def scenario():
+        async with VirtualSystem(of.run, of.layout) as living:
+            living.register = dict.fromkeys(of.layout.members, 1).get
+            world = World(living, name)
+            await asyncio.sleep(0.1)
+            await script(world)
+            await living.stop(name)
 
-    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        runner.run(run())
+    run(scenario)
 
 
 def brake(engaged):
@@ -103,13 +83,13 @@ def test_an_unknown_holder_of_the_brake_is_obeyed_reported_shown_and_can_be_made
         assert ("brake", "nobody") in world.reports
         told = len(world.sent)
         await asyncio.sleep(0.5)
-        assert [key for key, _ in world.sent[told:]].count("rampart/holds/simulator") == 2
+        assert [key for key, _ in world.sent[told:]].count("holds/simulator") == 2
         await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
         assert not is_braked(world)
         assert world.holders == ()
         told = len(world.sent)
         await asyncio.sleep(0.5)
-        assert "rampart/holds/simulator" not in [key for key, _ in world.sent[told:]]
+        assert "holds/simulator" not in [key for key, _ in world.sent[told:]]
 
     during("simulator", script)
 
@@ -128,7 +108,7 @@ def test_a_recovery_module_s_brake_is_its_own_to_release_and_is_no_stranger_s():
         await world.tell(topics.BRAKE, brake(True), "RM1")
         await world.tell(ftm_topics.RESET, fm.Reset("RM1", "operator"), "tool")
         assert is_braked(world)
-        assert not any(key.startswith("rampart/holds") for key, _ in world.sent)
+        assert not any(key.startswith("holds") for key, _ in world.sent)
         assert world.reports == []
         await world.tell(topics.BRAKE, brake(False), "RM1")
         assert not is_braked(world)
@@ -184,11 +164,11 @@ def test_who_forges_a_later_incarnation_of_the_safety_pilot_neither_drives_nor_m
 def test_an_order_of_an_unknown_module_is_obeyed_reported_shown_and_can_be_ended():
     async def script(world):
         await world.tell(topics.PILOT_ORDER, stop(True), "nobody")
-        assert world.last("rampart/pilot/status")["mode"] == "stop"
+        assert world.last("pilot/status")["mode"] == "stop"
         assert world.holders == ("nobody",)
         assert ("pilot order", "nobody") in world.reports
         await world.tell(ftm_topics.RESET, fm.Reset("nobody", "operator"), "tool")
-        assert world.last("rampart/pilot/status")["mode"] == "auto"
+        assert world.last("pilot/status")["mode"] == "auto"
         assert world.holders == ()
 
     during("safety_pilot", script)
@@ -199,8 +179,8 @@ def test_an_order_of_a_recovery_module_is_not_ended_by_a_reset_and_not_muted_by_
         await world.tell(topics.PILOT_ORDER, stop(False), "RM2", FORGED)
         await world.tell(topics.PILOT_ORDER, stop(True), "RM2")
         await world.tell(ftm_topics.RESET, fm.Reset("RM2", "operator"), "tool")
-        assert world.last("rampart/pilot/status")["mode"] == "stop"
-        assert not any(key.startswith("rampart/holds") for key, _ in world.sent)
+        assert world.last("pilot/status")["mode"] == "stop"
+        assert not any(key.startswith("holds") for key, _ in world.sent)
 
     during("safety_pilot", script)
 

@@ -13,9 +13,10 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.manager.spec.specification import parse_specification
+from rampart.testing import free_port
 from tests import ROOT
 from tests.actors.operator.browser import browser
-from tests.actors.operator.world import AIRPORT, Others, World, free_port, served
+from tests.actors.operator.world import AIRPORT, Others, World, served
 
 FILE = ROOT / "systems" / "osmosis.toml"
 SPEC = parse_specification(FILE.read_text(encoding="utf-8"), FILE.name)

@@ -16,9 +16,9 @@ from pathlib import Path
 
 from PIL import Image
 
+from rampart.testing import RealRun
 from tests import ROOT
 from tests.actors.operator.browser import Browser, browser
-from tests.real_run import RealRun
 
 PAGE_PORT = 8580
 MOST_BYTES = 250_000
@@ -74,8 +74,8 @@ def main() -> int:
     into = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
     into.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder, RealRun(
-            Path(folder), "--rate", f"{RATE:g}", "--hmi-port", str(PAGE_PORT),
-            "--fault", f"weak-wheel@{FAULT_S:g}+60", hmi=True, system="osmosis") as run:
+            Path(folder), "osmosis", "--rate", f"{RATE:g}", "--hmi-port", str(PAGE_PORT),
+            "--fault", f"weak-wheel@{FAULT_S:g}+60", hmi=True) as run:
         asyncio.run(take(run, into.resolve()))
     return 0
 

@@ -16,13 +16,14 @@ from PIL import Image
 
 from rampart.actors.operator import camera_eye
 from rampart.actors.operator.camera_eye import CameraError, CameraEye, renderer
-from rampart.actors.operator.hmi import Hmi
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, Building, StartPose, Surface
+from rampart.actors.osmosis.page.hmi import OsmosisHmi
 from rampart.sim.osmosis.camera import MARGIN_M, MAX_PIXELS, View, ground_image
-from tests.actors.operator.browser import CHROMIUM, browser
-from tests.actors.operator.world import AIRPORT, World, free_port, served
+from rampart.testing import free_port
+from tests.actors.operator.browser import browser
+from tests.actors.operator.world import AIRPORT, World, served
 
 ECHO = """
 import struct, sys
@@ -149,7 +150,7 @@ def test_a_large_airport_has_a_picture_of_its_ground_that_fits_into_a_texture():
     assert max(colour) - min(colour) < 20, "grey"
 
 
-class Seen(Hmi):
+class Seen(OsmosisHmi):
     """An HMI with the camera of the shipped systems, or another."""
 
     def __init__(self, context, module: str = "rampart.sim.osmosis.camera") -> None:
@@ -197,7 +198,7 @@ async def test_a_pose_and_an_obstacle_that_are_no_numbers_end_no_renderer(monkey
     assert hmi._camera._process is renderer_before
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.page
 async def test_the_renderer_starts_when_somebody_looks_and_the_page_says_what_is_wrong_with_it():
     world = World()
     async with (world.running(world.others), browser() as tab,

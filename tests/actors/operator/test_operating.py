@@ -19,8 +19,9 @@ from rampart.actors.osmosis import topics
 from rampart.actors.supervision.kill_node import SignalError
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.faults.offered_faults import offered_faults
-from tests.actors.operator.world import eventually, free_port, hear, repeated, served
-from tests.virtual_loop import shipped_system
+from rampart.testing import eventually, free_port
+from tests.actors.operator.world import hear, repeated, served
+from tests.osmosis_system import shipped_system
 
 TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)

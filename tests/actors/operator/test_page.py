@@ -9,11 +9,12 @@ import pytest
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from tests.actors.operator.browser import CHROMIUM, browser
+from rampart.testing import free_port
+from tests.actors.operator.browser import browser
 from tests.actors.operator.page import LIVE, SPEC, events, page, speaking_world
-from tests.actors.operator.world import free_port, repeated, served
+from tests.actors.operator.world import repeated, served
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+pytestmark = pytest.mark.page
 
 
 @pytest.fixture

@@ -7,11 +7,10 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.actors.operator.browser import CHROMIUM
 from tests.actors.operator.page import events, page, speaking_world
 from tests.actors.operator.world import repeated
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+pytestmark = pytest.mark.page
 
 
 @pytest.fixture

@@ -18,10 +18,12 @@ from rampart.actors.osmosis.page import stick as hmi_stick
 from rampart.actors.osmosis.page.stick import Grip
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.faults.offered_faults import offered_faults
-from tests.actors.operator.browser import CHROMIUM, browser
-from tests.actors.operator.world import World, eventually, free_port, hear, repeated, served
+from rampart.testing import eventually, free_port
+from tests.actors.operator.browser import browser
+from tests.actors.operator.world import World, hear, repeated, served
+from tests.osmosis_system import shipped_system
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+pytestmark = pytest.mark.page
 
 TOKEN = "abcdefghijklmnop"
 RELEASED = m.Joystick(0.0, 0.0, dead_man=False)
@@ -331,7 +333,8 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, monk
 
 async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world):
     async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), faults=offered_faults()) as hmi):
+                world.hmi(hmi_port=free_port(), faults=offered_faults(),
+                          system=shipped_system()) as hmi):
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until("!document.getElementById('strategy-set').disabled")
         assert await tab.value("document.getElementById('strategy-name').value") == "safety-first"

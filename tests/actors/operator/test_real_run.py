@@ -12,10 +12,9 @@ import pytest
 from mcap.reader import make_reader
 
 from rampart.actors.supervision.process_title import find_processes
+from rampart.testing import RealRun, free_base_port
 from tests import ROOT
-from tests.actors.operator.browser import CHROMIUM, browser
-from tests.real_run import RealRun
-from tests.stub_actors import free_base_port
+from tests.actors.operator.browser import browser
 
 pytestmark = pytest.mark.processes
 TOKEN = "secret-of-the-hangar-7"
@@ -29,13 +28,13 @@ ROW = "document.querySelector('tr[data-node=localization]')"
 STATE = f"(({ROW}) || document.createElement('p')).textContent"
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.page
 async def test_a_mission_is_started_from_the_page_disturbed_from_it_and_followed_to_its_report(
         tmp_path):
     port = free_base_port()
     short = tmp_path / "SHORT.miss"
     short.write_text("x=-27,y=-8,taxi=1\n")
-    with RealRun(tmp_path, "--mission", str(short), "--rate", "1", "--hmi-port", str(port),
+    with RealRun(tmp_path, "paper", "--mission", str(short), "--rate", "1", "--hmi-port", str(port),
                  "--wait", hmi=True) as run:
         await asyncio.to_thread(run.sleep_until, 1.0)
         async with browser() as tab:
@@ -109,8 +108,8 @@ def test_an_address_that_cannot_be_served_is_one_clear_line(tmp_path, arguments,
 
 def test_a_page_for_the_network_prints_its_new_token_once_and_tools_are_not_told_it(tmp_path):
     port = free_base_port()
-    with RealRun(tmp_path, "--mission", "A", "--hmi-port", str(port), "--hmi-host", "0.0.0.0",
-                 hmi=True) as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--hmi-port", str(port),
+                 "--hmi-host", "0.0.0.0", hmi=True) as run:
         run.wait_for("#token=")
         address = next(w for w in run.story.split() if "#token=" in w)
         assert address.startswith(f"http://127.0.0.1:{port}/#token=")
@@ -126,7 +125,7 @@ def test_the_operators_own_token_opens_the_page_and_turns_up_nowhere(tmp_path, m
     port, bag = free_base_port(), tmp_path / "run.mcap"
     short = tmp_path / "SHORT.miss"
     short.write_text("x=-27,y=-8,taxi=1\n")
-    with RealRun(tmp_path, "--mission", str(short), "--rate", "4", "--hmi-port", str(port),
+    with RealRun(tmp_path, "paper", "--mission", str(short), "--rate", "4", "--hmi-port", str(port),
                  "--record", str(bag), hmi=True) as run:
         run.sleep_until(2.0)
         at = f"http://127.0.0.1:{port}/nothing"

@@ -14,8 +14,9 @@ import pytest
 from rampart.actors.web import guests as web_guests
 from rampart.actors.web import server as web_server
 from rampart.actors.web.tcp_peer import user_of_peer
+from rampart.testing import eventually, free_port
 from tests.actors.operator.test_operating import RELEASED, TOKEN, Hand, ask, open_page
-from tests.actors.operator.world import eventually, free_port, served
+from tests.actors.operator.world import served
 from tests.other_user import NOBODY, as_nobody, needs_root
 
 BEARER = {"Authorization": f"Bearer {TOKEN}"}

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 from contextlib import asynccontextmanager
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.operator.hmi import Hmi
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.page.hmi import OsmosisHmi
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from tests.virtual_loop import run_context
+from rampart.testing import eventually
+from tests.osmosis_system import run_context
 
 AIRPORT = load_airport("vallombre")
 RATE = 20.0
@@ -102,7 +102,7 @@ class World:
 
     @asynccontextmanager
     async def hmi(self, incarnation: int = 1, **shared: object):
-        async with self.running(Hmi(self.context("hmi", incarnation, **shared))) as hmi:
+        async with self.running(OsmosisHmi(self.context("hmi", incarnation, **shared))) as hmi:
             yield hmi
 
     def say_running(self, request: m.MissionRequest) -> None:
@@ -117,19 +117,6 @@ class World:
     def say_latched(self, *names: str) -> None:
         self.others.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus(
             (), (), names, names, "safety-first", 1))
-
-
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
-
-
-async def eventually(condition, timeout_s: float = 5.0) -> None:
-    deadline = asyncio.get_running_loop().time() + timeout_s
-    while not condition():
-        assert asyncio.get_running_loop().time() < deadline, "it did not happen in time"
-        await asyncio.sleep(0.005)
 
 
 @asynccontextmanager
@@ -147,7 +134,7 @@ async def repeated(say, period_s: float = 0.02):
         task.cancel()
 
 
-async def served(hmi: Hmi) -> str:
+async def served(hmi: OsmosisHmi) -> str:
     await eventually(lambda: hmi._starting is not None and hmi._starting.done())
     return f"127.0.0.1:{hmi.page_port}"
 

@@ -23,32 +23,25 @@ from mcap.stream_reader import StreamReader
 
 from rampart.actors.bus import tap as taps
 from rampart.actors.bus.tap import Tap, frame, parse_frame
+from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.bag_writer import BagError
-from rampart.actors.recording.message_form import form_of, header_of
+from rampart.actors.recording.message_form import Forms, header_of
 from rampart.actors.recording.process import Order, RecorderProcess
 from rampart.actors.recording.recorder import FLUSH_S, PERIOD_S, Recorder
 from rampart.actors.run.run_info import RunInfo
 from rampart.cli.main import main
+from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port, wait_until
 from tests import ROOT
 from tests.actors.recording.samples import AnsweringLauncher, pose
 from tests.porter_actors import write_porter_system
-from tests.real_run import HEEDS_SIGNALS, RealRun
-from tests.stub_actors import free_base_port
-
-
-def until(condition, what, timeout_s=15.0):
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.01)
 
 
 def numbers(path):
     """The numbers of the messages that are in a file so far."""
     if not path.exists() or not path.stat().st_size:
         return []
-    return [header_of(form_of(key).payload(message.data)).sequence
+    return [header_of(Forms(topics.ALL).of(key).payload(message.data)).sequence
             for channel, message in BagReader(path).messages() if (key := key_of(channel))]
 
 
@@ -115,7 +108,7 @@ def recording(port, launcher, tmp_path):
 def test_everything_is_written_from_the_first_message_to_the_last(recording):
     process, robot, path = recording
     robot.send(500)
-    until(lambda: numbers(path), "nothing is written")
+    wait_until(lambda: numbers(path), 15, "nothing is written")
     robot.send(500)
     process.end()
     assert numbers(path) == list(range(1, 1001))
@@ -160,19 +153,19 @@ def test_the_robot_does_not_notice_that_its_recorder_died(recording, port):
         robot.send(100)  # raises nothing, waits for nothing
         return robot.tap._socket is None
 
-    until(let_go, "the connection is still there")
+    wait_until(let_go, 15, "the connection is still there")
 
 
 def test_a_stopped_recorder_holds_nobody_up_and_what_did_not_fit_is_counted(recording, port):
     process, robot, path = recording
     robot.send(10)
-    until(lambda: len(numbers(path)) == 10, "nothing is written")
+    wait_until(lambda: len(numbers(path)) == 10, 15, "nothing is written")
     pid = recorder_pid(port)
     os.kill(pid, signal.SIGSTOP)
     big = 40_000
     robot.send(big)  # far more than the kernel keeps
     os.kill(pid, signal.SIGCONT)
-    until(lambda: len(numbers(path)) > 10, "it does not go on")
+    wait_until(lambda: len(numbers(path)) > 10, 15, "it does not go on")
     robot.send(1)
     process.end()
     kept = numbers(path)
@@ -186,11 +179,11 @@ def test_a_launcher_that_is_killed_leaves_a_whole_recording_and_no_recorder(
         recording, port, launcher):
     _, robot, path = recording
     robot.send(100)
-    until(path.exists, "it has not begun")
+    wait_until(path.exists, 15, "it has not begun")
     robot.send(100)
     robot.tap.close()
     launcher.kill()
-    until(lambda: recorder_pid(port) is None, "the recorder was left")
+    wait_until(lambda: recorder_pid(port) is None, 15, "the recorder was left")
     assert numbers(path) == list(range(1, 201))
     assert Summary(BagReader(path)).end["ended"] == "the run has ended"
 
@@ -198,9 +191,9 @@ def test_a_launcher_that_is_killed_leaves_a_whole_recording_and_no_recorder(
 def test_who_ended_a_recording_is_told(recording, port):
     _, robot, path = recording
     robot.send(100)
-    until(lambda: numbers(path), "nothing is written")
+    wait_until(lambda: numbers(path), 15, "nothing is written")
     os.kill(recorder_pid(port), signal.SIGTERM)
-    until(lambda: recorder_pid(port) is None, "it lives")
+    wait_until(lambda: recorder_pid(port) is None, 15, "it lives")
     assert Summary(BagReader(path)).end["ended"] == "it was told to"
 
 
@@ -233,7 +226,7 @@ def test_what_nodes_send_after_their_launcher_has_ended_is_recorded(port, tmp_pa
         robot = Robot(port)
         robot.send(1)
         thread.start()
-        until(path.exists, "it has not begun")
+        wait_until(path.exists, 15, "it has not begun")
         for _ in range(20):
             time.sleep(0.02)
             robot.send()
@@ -272,7 +265,7 @@ def test_a_recorder_that_is_stopped_when_its_launcher_dies_is_not_left_over(port
     parent.wait()
     parent.stdin.close()
     parent.stdout.close()
-    until(lambda: recorder_pid(port) is None, "the recorder was left")
+    wait_until(lambda: recorder_pid(port) is None, 15, "the recorder was left")
 
 
 def test_what_a_node_sent_before_it_was_killed_is_recorded(recording, port):
@@ -298,7 +291,7 @@ def test_a_full_disk_is_said_and_ends_only_the_recording(port, launcher, capfd):
         process.start()
         robot = Robot(port)
         robot.send(10)
-        until(lambda: recorder_pid(port) is None, "it lives")
+        wait_until(lambda: recorder_pid(port) is None, 15, "it lives")
         robot.send(10)
         process.end()
     error = capfd.readouterr().err
@@ -361,7 +354,7 @@ def test_topics_that_nobody_wants_are_left_out_and_gaps_are_told_all_the_same(
         robot.send(5)
         robot.sent += 3  # lost somewhere
         robot.send(1)
-        until(path.exists, "it has not begun")
+        wait_until(path.exists, 15, "it has not begun")
         os.write(write_end, b"x")
         thread.join()
         robot.tap.close()
@@ -414,7 +407,7 @@ def test_a_run_that_is_there_is_recorded_until_ctrl_c_or_the_terminal_is_closed(
         verb = subprocess.Popen(
             [*HEEDS_SIGNALS, sys.executable, "-m", "rampart.cli.main", "record", str(path),
              "--port", str(port)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
-        until(lambda: robot.send() or numbers(path), "nothing is written", 30)
+        wait_until(lambda: robot.send() or numbers(path), 30, "nothing is written")
         verb.send_signal(number)
         told = verb.communicate(timeout=20)[0]
     robot.tap.close()
@@ -465,7 +458,7 @@ def test_a_run_whose_recording_cannot_begin_does_not_begin(tmp_path, arguments, 
 @pytest.mark.processes
 def test_a_real_run_is_recorded_whole_with_a_node_killed_on_the_way(tmp_path):
     path = tmp_path / "run.mcap"
-    with RealRun(tmp_path, "--record", str(path), "--rate", "2") as run:
+    with RealRun(tmp_path, "paper", "--record", str(path), "--rate", "2") as run:
         run.sleep_until(4)
         run.kill("localization")
         run.wait_until(lambda: (run.pid("localization") or 0) > 0, 5, "it does not come back")
@@ -482,7 +475,7 @@ def test_a_real_run_is_recorded_whole_with_a_node_killed_on_the_way(tmp_path):
     lives = {}
     for channel, message in BagReader(path).messages():
         if (key := key_of(channel)) is not None:
-            header = header_of(form_of(key).payload(message.data))
+            header = header_of(Forms(topics.ALL).of(key).payload(message.data))
             lives.setdefault((header.source, header.incarnation), set()).add(header.sequence)
     assert ("localization", 2) in lives
     gaps = {life for life, heard in lives.items() if heard != set(range(1, len(heard) + 1))}

@@ -14,7 +14,8 @@ import msgspec
 import pytest
 
 from rampart.actors.run import run_info
-from tests.stub_actors import bases, free_base_port
+from rampart.testing import free_base_port
+from rampart.testing.ports import bases
 
 
 @contextmanager
@@ -75,7 +76,7 @@ def test_the_workers_of_a_test_run_take_different_ports(monkeypatch):
 
 def test_a_base_whose_launcher_s_name_is_taken_is_not_free(monkeypatch):
     free, other = free_base_port(), free_base_port()
-    monkeypatch.setattr("tests.stub_actors._BASES", iter((free, other)))
+    monkeypatch.setattr("rampart.testing.ports._BASES", iter((free, other)))
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as launcher:
         launcher.bind(run_info.address(free))
         assert free_base_port() == other

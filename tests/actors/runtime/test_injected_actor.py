@@ -14,7 +14,8 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.sim.virtual.virtual_bus import VirtualBus
-from tests.virtual_loop import System, run
+from rampart.testing import run
+from tests.osmosis_system import System
 
 
 class Talker(Actor):

@@ -20,12 +20,14 @@ from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.parameters import NodeNames, read_parameters
 from rampart.cli import systems as cli_systems
 from rampart.cli.output import UsageError
-from rampart.manager.spec.schema import NonNegative, SpecificationError, SystemSpec
+from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.specification import parse_specification
+from rampart.manager.spec.tables import NonNegative, SpecificationError
 from rampart.sim.virtual.virtual_bus import VirtualBus
+from rampart.testing import run
 from tests.manager.bench import FULL
+from tests.osmosis_system import System, run_context
 from tests.stub_actors import ROOT
-from tests.virtual_loop import System, run, run_context
 
 FILE = "osmosis.toml"
 SPECS = {path.name: parse_specification(path.read_text("utf-8"), path.name)

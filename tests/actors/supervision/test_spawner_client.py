@@ -31,8 +31,8 @@ from rampart.actors.supervision.spawner_client import (
     SpawnerClient,
     SpawnerUnavailableError,
 )
+from rampart.testing import free_base_port
 from tests import ROOT
-from tests.stub_actors import free_base_port
 
 DM1 = ("DM1",)
 

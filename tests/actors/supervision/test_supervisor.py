@@ -26,11 +26,13 @@ from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.patience import Usage
 from rampart.actors.supervision.processes import Living, SpawnerUnavailableError
 from rampart.actors.supervision.supervisor import Supervisor
+from rampart.manager.spec.tables import Supervision
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.testing import eventually, run, turns
 from tests import ROOT
-from tests.virtual_loop import run, turns, until
 
 PLAN = RunPlan("r", 20000, system_file=str(ROOT / "systems" / "paper.toml"))
+USUAL = Supervision()
 EXIT_S = 0.005
 """From a SIGKILL to the moment when the last thread has let go of the port."""
 
@@ -149,7 +151,7 @@ class Machine:
 class World:
     """A supervisor, its machine, and the bus between them."""
 
-    def __init__(self) -> None:
+    def __init__(self, supervision: Supervision) -> None:
         loop = asyncio.get_running_loop()
         self.machine = Machine()
         self.clock = Clock(loop.time(), source=loop.time)
@@ -158,7 +160,7 @@ class World:
         self.events: list[tuple[str, str, int]] = []
         self.silent: set[int] = set()
         self.hub.taps.append(self.see)
-        self.spec = load_system(PLAN)
+        self.spec = msgspec.structs.replace(load_system(PLAN), supervision=supervision)
         self.lives = 0
         self._sequence = 0
         self.supervisor, self.task = self.start()
@@ -199,10 +201,10 @@ class World:
 
     def row(self, name: str) -> tuple[str, int, int]:
         process = self.supervisor._processes[name]
-        return process.state.value, process.incarnation, process.pid
+        return process.shown.value, process.incarnation, process.pid
 
     def all_run(self) -> bool:
-        return all(p.state is NodeState.RUNNING for p in self.supervisor._processes.values())
+        return all(p.shown is NodeState.RUNNING for p in self.supervisor._processes.values())
 
     def kill(self, name: str) -> Process:
         (process,) = self.machine.of(name)
@@ -214,11 +216,11 @@ class World:
 
 
 @asynccontextmanager
-async def running() -> AsyncIterator[World]:
-    world = World()
+async def running(supervision: Supervision = USUAL) -> AsyncIterator[World]:
+    world = World(supervision)
     await world.bus.open()
     beats = asyncio.create_task(world.beats())
-    await until(world.all_run)
+    await eventually(world.all_run)
     world.machine.forks.clear()
     world.machine.searches = 0
     try:
@@ -251,7 +253,7 @@ def test_a_supervisor_that_fails_ends_nobody_and_its_next_life_adopts_all(mute):
                 p.pid for p in world.machine.processes.values() if not p.killed}
             world.machine.fork_error = None
             world.start()
-            await until(world.all_run)
+            await eventually(world.all_run)
             after = {p.pid for p in world.machine.processes.values() if not p.killed}
             assert len(after) == len(before)
             assert len(before - after) == 1
@@ -314,12 +316,12 @@ def test_who_waits_for_a_processor_is_not_taken_for_wedged_and_who_waits_for_not
             world.machine.starving = {"DM1"}
             world.machine.starves_from_s = asyncio.get_running_loop().time()
             world.silent |= {starved.pid, wedged.pid}
-            await until(lambda: wedged.killed, 0.8)
+            await eventually(lambda: wedged.killed, 0.8)
             await asyncio.sleep(3.0)
             assert not starved.killed
             assert world.row("DM1") == ("running", 1, starved.pid)
             world.machine.starving.clear()  # it has a processor, and says nothing all the same
-            await until(lambda: starved.killed, 0.8)
+            await eventually(lambda: starved.killed, 0.8)
 
     run(scenario)
 
@@ -338,10 +340,10 @@ def test_a_process_that_waits_for_a_processor_has_longer_to_start():
 
             for name in ("DM1", "DM2"):
                 world.kill(name)
-            await until(lambda: ("DM2", "wedged", 2) in world.events, 5.0)
+            await eventually(lambda: ("DM2", "wedged", 2) in world.events, 5.0)
             assert ("DM1", "wedged", 2) not in world.events
             world.silent.clear()
-            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
 
     run(scenario)
 
@@ -356,11 +358,11 @@ def test_a_process_that_no_descriptor_is_left_for_is_held_as_soon_as_there_is_on
         async with running() as world:
             world.machine.hold_error = no_descriptor()
             world.kill("DM1")
-            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
             world.machine.hold_error = None
             await asyncio.sleep(0.1)
             world.kill("DM1")
-            await until(lambda: world.row("DM1")[:2] == ("running", 3))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
             assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
 
     run(scenario)
@@ -371,11 +373,11 @@ def test_a_process_that_ends_while_nobody_can_hold_it_is_missed():
         async with running() as world:
             world.machine.hold_error = no_descriptor()
             world.kill("DM1")
-            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
             world.kill("DM1")
             await asyncio.sleep(0.1)
             world.machine.hold_error = None
-            await until(lambda: world.row("DM1")[:2] == ("running", 3))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
             assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
 
     run(scenario)
@@ -386,12 +388,12 @@ def test_a_process_that_nobody_can_hold_is_not_replaced_before_it_is_gone():
         async with running() as world:
             world.machine.hold_error = no_descriptor()
             world.kill("DM1")
-            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
             world.respawn("DM1", 2)
             await asyncio.sleep(1.0)
             assert world.machine.forks == [("DM1", 2)]
             world.machine.hold_error = None
-            await until(lambda: world.row("DM1")[:2] == ("running", 3))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
             assert world.machine.forks == [("DM1", 2), ("DM1", 3)]
 
     run(scenario)
@@ -402,13 +404,13 @@ def test_the_end_of_a_process_that_is_being_replaced_anyway_is_no_crash():
         async with running() as world:
             world.machine.hold_error = no_descriptor()
             world.kill("DM1")
-            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
             world.events.clear()
             world.respawn("DM1", 2)
             await asyncio.sleep(0.02)
             world.kill("DM1")
             world.machine.hold_error = None
-            await until(lambda: world.row("DM1")[:2] == ("running", 3))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 3))
             assert world.events == [("DM1", "respawned", 3), ("DM1", "running", 3)]
 
     run(scenario)
@@ -419,7 +421,7 @@ def test_a_process_that_was_replaced_is_not_held_in_the_place_of_its_successor()
         async with running() as world:
             world.machine.hold_error = no_descriptor()
             world.kill("DM1")
-            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
             (old,) = world.machine.of("DM1")
             world.machine.hold_error = None
             successor = world.machine.add(old.names, 5, bound=True)
@@ -427,7 +429,7 @@ def test_a_process_that_was_replaced_is_not_held_in_the_place_of_its_successor()
             await asyncio.sleep(0.1)
             world.machine.kill(old)
             world.respawn("DM1", 5)
-            await until(lambda: world.row("DM1")[:2] == ("running", 6))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 6))
             assert successor.gone
             assert world.machine.forks == [("DM1", 2), ("DM1", 6)]
 
@@ -440,12 +442,12 @@ def test_what_a_process_said_before_it_was_killed_does_not_make_it_run():
             world.machine.fork_error = SpawnerUnavailableError("none")
             (victim,) = world.machine.of("DM1")
             world.silent.add(victim.pid)
-            await until(lambda: victim.killed)
+            await eventually(lambda: victim.killed)
             world.beat(victim)
             await turns()
             assert world.row("DM1")[0] == "wedged"
             world.machine.fork_error = None
-            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
 
     run(scenario)
 
@@ -457,7 +459,7 @@ def test_a_fork_that_fails_for_want_of_descriptors_is_tried_again():
             world.kill("DM1")
             await asyncio.sleep(0.3)
             world.machine.fork_error = None
-            await until(lambda: world.row("DM1")[:2] == ("running", 2))
+            await eventually(lambda: world.row("DM1")[:2] == ("running", 2))
             assert world.machine.forks == [("DM1", 2)]
 
     run(scenario)
@@ -495,7 +497,7 @@ def test_a_process_that_is_adapted_while_it_is_replaced_is_replaced_once(outage_
                 1, "retune DM2", "tester", msgspec.json.encode(document).decode()))
             await asyncio.sleep(outage_s)
             world.machine.fork_error = None
-            await until(lambda: world.row("DM2")[:2] == ("running", 2))
+            await eventually(lambda: world.row("DM2")[:2] == ("running", 2))
             world.machine.questions = 0
             await asyncio.sleep(1.0)
             assert world.machine.forks == [("DM2", 2)]
@@ -529,7 +531,7 @@ def test_a_life_that_is_adopted_while_it_is_replaced_is_not_forked_again():
             names = world.kill("DM2").names
             await asyncio.sleep(0.02)
             orphan = world.machine.add(names, 2)
-            await until(lambda: world.row("DM2") == ("running", 2, orphan.pid))
+            await eventually(lambda: world.row("DM2") == ("running", 2, orphan.pid))
             world.machine.fork_error = None
             await asyncio.sleep(1.0)
             assert world.machine.forks == []
@@ -562,7 +564,7 @@ def test_a_life_without_its_port_leads_to_the_one_that_nobody_holds(name, phase_
             world.kill(name)  # it is held like any other
             await asyncio.sleep(0.02)
             world.respawn(name, 2)
-            await until(lambda: world.row(name)[:2] == ("running", 3))
+            await eventually(lambda: world.row(name)[:2] == ("running", 3))
 
     run(scenario)
 
@@ -572,12 +574,12 @@ def test_an_incarnation_that_was_given_is_never_given_again():
         async with running() as world:
             names = world.machine.of("DM2")[0].names
             world.kill("DM2")
-            await until(lambda: world.row("DM2")[:2] == ("running", 2))
+            await eventually(lambda: world.row("DM2")[:2] == ("running", 2))
             world.kill("DM2")
             orphan = world.machine.add(names, 2, bound=True)
-            await until(lambda: world.row("DM2") == ("running", 2, orphan.pid))
+            await eventually(lambda: world.row("DM2") == ("running", 2, orphan.pid))
             world.kill("DM2")
-            await until(lambda: world.row("DM2")[:2] == ("running", 4))
+            await eventually(lambda: world.row("DM2")[:2] == ("running", 4))
             assert world.machine.forks == [("DM2", 2), ("DM2", 3), ("DM2", 4)]
 
     run(scenario)
@@ -588,9 +590,9 @@ def test_a_search_for_which_no_descriptor_is_left_ends_nothing():
         async with running() as world:
             world.machine.look_error = no_descriptor()
             world.kill("DM2")
-            await until(lambda: world.row("DM2")[0] == "starting")
+            await eventually(lambda: world.row("DM2")[0] == "starting")
             world.kill("DM2")
-            await until(lambda: world.row("DM2")[:2] == ("running", 3))
+            await eventually(lambda: world.row("DM2")[:2] == ("running", 3))
             assert world.machine.searches == 1
             assert not world.task.done()
 
@@ -602,7 +604,7 @@ def test_an_ordinary_respawn_searches_for_nobody():
         async with running() as world:
             for life in (2, 3, 4):
                 world.kill("DM2")
-                await until(lambda n=life: world.row("DM2")[:2] == ("running", n))
+                await eventually(lambda n=life: world.row("DM2")[:2] == ("running", n))
             assert world.machine.searches == 0
 
     run(scenario)

@@ -12,16 +12,16 @@ import pytest
 
 from rampart.actors.osmosis.airport.formats import load_airport, load_mission
 from rampart.actors.run.run_plan import load_system
-from rampart.actors.supervision.descriptors import needed_descriptors
-from rampart.actors.supervision.launcher import Launcher
+from rampart.actors.supervision.launcher import Launcher, needed_descriptors
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
 from rampart.sim.runs.console import Console
 from rampart.sim.runs.mission_run import MissionRun
 from rampart.sim.runs.process_run import ProcessRun
 from rampart.sim.runs.watched_run import WatchedRun
+from rampart.testing import free_base_port
 from tests import ROOT
-from tests.stub_actors import Idler, free_base_port, launched, stub_plan, write_stub_system
+from tests.stub_actors import Idler, launched, stub_plan, write_stub_system
 
 
 class Stumbler(Idler):

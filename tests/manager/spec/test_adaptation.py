@@ -26,9 +26,9 @@ from rampart.manager.spec.adaptation import (
 )
 from rampart.manager.spec.checks import find_nonsense
 from rampart.manager.spec.specification import SpecificationError, SystemSpec, read_document
+from rampart.testing import run, turns
 from tests.manager.bench import PAPER, paper
 from tests.manager.test_actor import Whole
-from tests.virtual_loop import run, turns
 
 DOCUMENT = read_document(PAPER, "paper.toml")
 

@@ -30,8 +30,8 @@ from rampart.sim.faults.faults import (
 from rampart.sim.faults.topic_faults import DELAY_S, modes_of, systematic_faults, topic_fault
 from rampart.sim.osmosis.sensor_faults import LEFT_OUT, SENSORS
 from rampart.sim.osmosis.sensors import Gps
+from tests.osmosis_system import shipped_system
 from tests.porter_actors import AXLE, LOAD
-from tests.virtual_loop import shipped_system
 
 KEYS = published_keys(shipped_system())
 SYSTEMATIC = {fault.name: fault for fault in systematic_faults(KEYS)}

@@ -21,7 +21,7 @@ from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.simulator import Simulator
 from rampart.sim.osmosis.world import World
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from tests.virtual_loop import run_context
+from tests.osmosis_system import run_context
 
 STUCK = m.ActuatorFaultKind.STUCK_WHEEL
 WEAK = m.ActuatorFaultKind.WEAK_WHEEL

@@ -16,7 +16,7 @@ from rampart.actors.runtime.clock import Clock
 from rampart.sim.osmosis.schedule import Schedule
 from rampart.sim.osmosis.simulator import Simulator
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from tests.virtual_loop import run_context
+from tests.osmosis_system import run_context
 
 AIRPORT = load_airport("vallombre")
 

@@ -23,7 +23,7 @@ from rampart.actors.osmosis.control.teleoperation.stick_arbitration import (
 from rampart.actors.osmosis.messages import Joystick, Twist
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.timer import Timer
-from rampart.manager.spec.schema import NonNegative
+from rampart.manager.spec.tables import NonNegative
 
 _LOOK_S = 0.05
 """Period in which a held stick is repeated and a silent one noticed (simulated seconds)."""

@@ -16,7 +16,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
-from rampart.actors.osmosis.detection.area.geofence import FenceLimits, Fix
+from rampart.actors.osmosis.detection.area.geofence import FenceLimits
 from rampart.actors.osmosis.detection.area.position_vote import GPS, PositionVote
 from rampart.actors.osmosis.detection.area.prohibited_area import (
     GPS_PERIOD_S,
@@ -25,7 +25,7 @@ from rampart.actors.osmosis.detection.area.prohibited_area import (
 )
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.manager.spec.schema import NonNegative, Positive
+from rampart.manager.spec.tables import NonNegative, Positive
 
 _ABSOLUTE = "absolute pose"
 _ERROR_PER_M = 0.06
@@ -48,19 +48,19 @@ class VotedPosition:
         self._anchor: tuple[float, float] | None = None
         self._trusted_s = -math.inf
         self._since_m = 0.0
-        self._fix: Fix | None = None
+        self._fix: m.GpsFix | None = None
         self.by_gps = False
 
     def odometry(self, stamp_s: float, yaw_rad: float, linear_mps: float, now_s: float) -> None:
         """Take the way that the wheels made."""
         self._since_m += self.vote.track.odometry(stamp_s, yaw_rad, linear_mps, now_s)
 
-    def gps(self, fix: Fix, stamp_s: float, now_s: float) -> None:
+    def gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> None:
         """Take a GPS fix."""
         if self.vote.see_gps(fix, stamp_s, now_s):
             self._fix = fix
 
-    def look(self, now_s: float) -> tuple[Fix, float] | None:
+    def look(self, now_s: float) -> tuple[m.GpsFix, float] | None:
         """Return where the robot is, as far as is known, and when that was; None if it is not."""
         vote = self.vote
         two = vote.agreeing(now_s)
@@ -76,7 +76,7 @@ class VotedPosition:
             return None
         track = vote.track
         heading = track.heading_rad
-        return Fix(self._anchor[0] + track.place[0], self._anchor[1] + track.place[1],
+        return m.GpsFix(self._anchor[0] + track.place[0], self._anchor[1] + track.place[1],
                    track.speed_mps * math.cos(heading), track.speed_mps * math.sin(heading),
                    self._accuracy_m + _ERROR_PER_M * self._since_m), track.stamp_s
 
@@ -112,17 +112,13 @@ class VotedArea(DetectionModule):
         timeout_s = parameters.unknown_s
         self._looked_s = -math.inf
         self._where = VotedPosition(robot.gps_accuracy_m, parameters.blind_s, parameters.blind_m)
-        self.monitor = FenceMonitor(
+        self.monitor = self.judged_by(FenceMonitor(
             airport.prohibited_distance_m,
             FenceLimits(half_diagonal_m(robot), reaction_s(system, parameters.margin_m),
                         robot.braking_mps2),
             FreshnessMonitor("position that two sources agree on", timeout_s, 2 * GPS_PERIOD_S,
                              self.clock.now(), self.grace_s(timeout_s), known=self.first_life),
-            parameters.hold_s)
-
-    def on_start(self) -> None:
-        """Start waiting for the first position."""
-        self.follow(self.monitor)
+            parameters.hold_s))
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
@@ -139,9 +135,7 @@ class VotedArea(DetectionModule):
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:
         """Hear a fix, and look where the robot is and where it is going."""
-        fix = Fix(message.x_m, message.y_m, message.velocity_x_mps, message.velocity_y_mps,
-                  message.accuracy_m)
-        self._where.gps(fix, header.stamp, self.clock.now())
+        self._where.gps(message, header.stamp, self.clock.now())
         self._look()
 
     @on(topics.ODOMETRY)
@@ -158,4 +152,4 @@ class VotedArea(DetectionModule):
         found = self._where.look(now_s)
         if found is not None:
             self.monitor.fix(*found, now_s)
-        self.follow(self.monitor)
+        self.follow()

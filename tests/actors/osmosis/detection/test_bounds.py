@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis.detection.bounds_check import BoundsCheck
-from tests.detection_timeline import play, table
+from rampart.testing import play, table
 
 COMMANDS = {
     "0": (0.0, 0.0), "v": (1.0, 0.0), "r": (-1.0, 2.0), "t": (0.3, -2.0),

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rampart.actors.osmosis.detection.command_comparison import CommandComparison, ComparisonLimits
-from tests.detection_timeline import play, table
+from rampart.testing import play, table
 
 LIMITS = ComparisonLimits(angular_s=0.3, linear_s=0.6, hold_s=0.2, forget_s=1.0)
 GOOD, TURNS, SLOW = (0.8, 0.0), (0.8, 0.9), (0.2, 0.0)

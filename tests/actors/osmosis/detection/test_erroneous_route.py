@@ -22,8 +22,8 @@ from rampart.actors.osmosis.detection.mission_consistency import MissionConsiste
 from rampart.actors.osmosis.detection.route_monitor import RouteMonitor
 from rampart.actors.osmosis.messages import ControlPhase, Goal, MissionPhase, Mode
 from rampart.actors.runtime.actor import Actor
-from tests.detection_timeline import Ear, play, table, wake
-from tests.virtual_loop import System, run
+from rampart.testing import Ear, play, run, table, wake
+from tests.osmosis_system import System
 
 AIRPORT = load_airport("vallombre")
 GOALS = (Goal(10.0, 0.0, Mode.TAXI), Goal(40.0, 0.0, Mode.LIGHT_VERIFICATION))

@@ -16,8 +16,10 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.freshness import CommandFreshness, LocalizationFreshness
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Header, on
-from tests.detection_timeline import Ear, Source, play, table
-from tests.virtual_loop import System, VirtualLoop, run
+from rampart.sim.virtual.virtual_loop import VirtualLoop
+from rampart.testing import Ear, play, run, table
+from tests.actors.osmosis.detection.sources import Source
+from tests.osmosis_system import System
 
 # f fresh sample, o the first sample once more, d delayed by 1 s, + stamped 100 s ahead,
 # i infinitely far ahead, n no number

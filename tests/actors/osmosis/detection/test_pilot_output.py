@@ -19,9 +19,9 @@ from rampart.actors.osmosis.detection.pilot_output import PilotOutput
 from rampart.actors.osmosis.detection.pilot_output_monitor import PilotLimits, PilotOutputMonitor
 from rampart.actors.runtime.actor import Actor
 from rampart.manager.spec.specification import parse_specification
+from rampart.testing import Ear, run
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
-from tests.detection_timeline import Ear
-from tests.virtual_loop import System, run
+from tests.osmosis_system import System
 
 PERIOD_S = 0.05
 HELD_S = 0.99

@@ -12,8 +12,9 @@ from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
 from rampart.actors.osmosis.recovery.reduced_speed import ReducedSpeed
 from rampart.actors.osmosis.recovery.respawn_braked import RespawnBraked
 from rampart.actors.runtime.actor import every
+from rampart.testing import run
 from tests.actors.osmosis.recovery.world import Base, Boss, Node, Pilot, Supervisor
-from tests.virtual_loop import System, run
+from tests.osmosis_system import System
 
 
 class BoundedPilot(Pilot):

@@ -17,8 +17,9 @@ from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleopera
 from rampart.actors.recovery.module import TRANSITIONS, IllegalTransitionError, RecoveryModule
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.parameters import read_parameters
+from rampart.testing import run
 from tests.actors.osmosis.recovery.world import Base, Boss, Node, Pilot, Supervisor, hang
-from tests.virtual_loop import System, run
+from tests.osmosis_system import System
 
 P = fm.RecoveryPhase
 

@@ -17,8 +17,9 @@ from rampart.actors.osmosis.control.localization.localization import Localizatio
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.sim.faults.faults import find_fault
 from rampart.sim.osmosis.simulator import Simulator
+from rampart.testing import run
 from tests.actors.osmosis.control.localization_drive import field_airport
-from tests.virtual_loop import System, run, shipped_system
+from tests.osmosis_system import System, shipped_system
 
 
 class Ear(Actor):

@@ -20,8 +20,9 @@ from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserP
 from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
 from rampart.actors.osmosis.messages import LaserScan
 from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.testing import run
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
-from tests.virtual_loop import System, run, shipped_system
+from tests.osmosis_system import System, shipped_system
 
 RAYS, TOP_M, PERIOD_S = 5, 8.0, 0.05
 ANGLE_MIN = -0.2

@@ -26,8 +26,9 @@ from rampart.actors.osmosis.control.planning.route_search import plan_route
 from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.osmosis.messages import Mode
 from rampart.actors.runtime.actor import Actor, on
+from rampart.testing import run
 from tests.actors.osmosis.control.world import Circle, World, drive
-from tests.virtual_loop import System, run
+from tests.osmosis_system import System
 
 AIRPORT = load_airport("vallombre")
 RING = {"A": (0.0, 0.0), "B": (20.0, 0.0), "C": (20.0, 20.0), "D": (0.0, 20.0)}

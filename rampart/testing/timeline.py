@@ -6,52 +6,65 @@ what it finds is read in the middle of the slot: `-` idle, `A` active, `?` not k
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rampart.actors.detection.module import Monitor
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 
 SLOT_S = 0.1
-Handler = Callable[[str, float], None]
+NOTHING = "."
 
 
-def play(monitor: Monitor, handle: Handler, events: Iterable[str], start_s: float = 0.0) -> str:
+def play(monitor: Monitor, handle: Callable[[str, float], None], events: Iterable[str],
+         start_s: float = 0.0) -> str:
+    """Play events to a monitor and return what it found, slot by slot.
+
+    Args:
+        monitor: woken when it is due.
+        handle: told of each event but `.`, and of when it happens, simulated seconds.
+        events: one character per slot of 100 ms; `.` is none.
+        start_s: when the first slot begins, simulated seconds.
+
+    Raises:
+        AssertionError: the monitor is active without a reason or has one while idle, or is due
+            again at the time at which it was woken.
+    """
     found = []
     for slot, event in enumerate(events):
         begin_s = round(start_s + slot * SLOT_S, 9)
         wake(monitor, begin_s - 1e-9)
-        if event != ".":
+        if event != NOTHING:
             handle(event, begin_s)
         wake(monitor, begin_s + SLOT_S / 2)
         found.append("A" if monitor.active else "-" if monitor.known else "?")
-        assert bool(monitor.reason) == monitor.active
+        if bool(monitor.reason) != monitor.active:
+            raise AssertionError(f"active: {monitor.active}, and its reason: {monitor.reason!r}")
     return "".join(found)
 
 
 def wake(monitor: Monitor, until_s: float) -> None:
-    while monitor.due_s <= until_s:
-        due_s = monitor.due_s
+    """Wake a monitor whenever it is due, until a simulated time.
+
+    Raises:
+        AssertionError: woken at its due time, it is due at the same time again.
+    """
+    while (due_s := monitor.due_s) <= until_s:
         monitor.expire(due_s)
-        assert monitor.due_s > due_s, "woken at its due time, it is due at the same time again"
+        if monitor.due_s <= due_s:
+            raise AssertionError(f"woken at its due time, {due_s} s, it is due again at "
+                                 f"{monitor.due_s} s")
 
 
-def table(cases: dict[str, tuple[Any, ...]]) -> dict[str, Any]:
-    """Arguments for `pytest.mark.parametrize` from sentences to cases."""
+def table(cases: Mapping[str, tuple[Any, ...]]) -> dict[str, Any]:
+    """Return arguments for `pytest.mark.parametrize` from sentences to cases."""
     return {"argvalues": list(cases.values()), "ids": list(cases)}
 
 
-class Source(Actor):
-    """Publishes commands and poses when told."""
-
-    outputs = (topics.COMMAND, topics.POSE)
-
-
 class Ear(Actor):
-    """Keeps all detection reports with the time of their arrival."""
+    """Keeps all detection reports with the time of their arrival, simulated seconds."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -59,6 +72,7 @@ class Ear(Actor):
 
     @on(ftm_topics.DETECTION)
     def detection(self, message: m.DetectionReport, _header: Header) -> None:
+        """Keep a report."""
         self.heard.append((self.clock.now(), message))
 
     @property

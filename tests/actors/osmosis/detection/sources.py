@@ -1,0 +1,12 @@
+"""Whom detection modules listen to."""
+
+from __future__ import annotations
+
+from rampart.actors.osmosis import topics
+from rampart.actors.runtime.actor import Actor
+
+
+class Source(Actor):
+    """Publishes commands and poses when told."""
+
+    outputs = (topics.COMMAND, topics.POSE)

@@ -1,0 +1,52 @@
+"""docs/testing.md: its examples, on the tank of docs/specification.md, are run as they stand."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rampart import testing
+from tests import ROOT
+
+DOCUMENT = (ROOT / "docs" / "testing.md").read_text(encoding="utf-8")
+EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n(?:(?!^## ).)*?```python\n(.*?)```", DOCUMENT,
+                           re.DOTALL | re.MULTILINE))
+TANK = (ROOT / "docs" / "specification.md").read_text(encoding="utf-8")
+GAUGE = '[[node]]\nname = "gauge"\nactor = "tank_actors:Gauge"\nkind = "non-control"\n\n'
+
+
+def outcome(folder: Path, *sections: str) -> str:
+    """Return what pytest says of the examples of some sections, in a folder with the tank."""
+    (folder / "tank_actors.py").write_text(
+        re.findall(r"```python\n(.*?)```", TANK, re.DOTALL)[0])
+    system = re.findall(r"```toml\n(.*?)```", TANK, re.DOTALL)[0]
+    system = system.replace("rampart.actors.detection.stub:StubDetection",
+                            "tank_actors:LevelTooHigh")
+    (folder / "tank.toml").write_text(system.replace("[[node]]", GAUGE + "[[node]]", 1))
+    (folder / "test_tank.py").write_text("\n\n".join(EXAMPLES[name] for name in sections))
+    (folder / "pytest.ini").write_text("[pytest]\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], cwd=folder, text=True,
+        env={**os.environ, "PYTHONPATH": f"{folder}:{ROOT}"}, capture_output=True, check=False)
+    assert done.returncode == 0, done.stdout
+    return done.stdout.splitlines()[-1]
+
+
+def test_what_runs_in_virtual_time(tmp_path):
+    assert outcome(tmp_path, "Actors in virtual time", "Faults", "Detection as a timeline"
+                  ).startswith("8 passed")
+
+
+@pytest.mark.processes
+def test_what_runs_on_processes(tmp_path):
+    assert outcome(tmp_path, "Real runs").startswith("1 passed")
+
+
+def test_everything_there_is_has_its_place():
+    assert [name for name in testing.__all__ if f"`{name}`" not in DOCUMENT
+            and name not in {"Heard", "HEEDS_SIGNALS", "turns"}] == []

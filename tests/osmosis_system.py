@@ -1,0 +1,45 @@
+"""The shipped system, and systems in virtual time whose actors know of a place and a mission."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, TypeVar
+
+from rampart import systems
+from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.run.application import Application
+from rampart.actors.run.run_context import NO_SYSTEM, RunContext
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.actor import Actor
+from rampart.manager.spec.specification import SystemSpec, parse_specification
+from rampart.testing import VirtualSystem
+
+A = TypeVar("A", bound=Actor)
+
+
+@cache
+def shipped_system() -> SystemSpec:
+    """Return the spec of the shipped system."""
+    path = systems.SHIPPED / "paper.toml"
+    return parse_specification(path.read_text(), path.name)
+
+
+def run_context(*, system: SystemSpec = NO_SYSTEM, document: Any = None, adapted: Any = None,
+                airport: Any = None, mission: Any = None, world: Any = None, **plan: Any
+                ) -> RunContext:
+    """Return what actors have in common in a test; `plan` are fields of the `RunPlan`."""
+    application = Osmosis.on_map(airport, mission, world) if airport else Application()
+    return RunContext(RunPlan(**plan), system, document or {}, application, adapted)
+
+
+class System(VirtualSystem):
+    """Actors that know of `run_context(**known)`."""
+
+    def __init__(self, **known: Any) -> None:
+        super().__init__(run_context(**known))
+
+    def start(self, name: str, cls: type[A], **parameters: Any) -> A:
+        """Start an actor that can act on the system, `around` it."""
+        actor = super().start(name, cls, **parameters)
+        actor.around = self
+        return actor

@@ -1,0 +1,118 @@
+"""What tests rely on: what fails in an actor, in a monitor or in time, fails the test."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import pytest
+
+from rampart.actors.bus import topics
+from rampart.actors.bus.messages import Heartbeat
+from rampart.actors.runtime.actor import Actor, every
+from rampart.testing import (
+    VirtualSystem,
+    eventually,
+    free_base_port,
+    free_port,
+    play,
+    run,
+    wait_until,
+    wake,
+)
+
+
+class Failing(Actor):
+    """Fails after a second."""
+
+    @every(1.0)
+    def fail(self) -> None:
+        raise RuntimeError("it failed")
+
+
+async def living(end=None):
+    async with VirtualSystem() as system:
+        system.start("failing", Failing)
+        await asyncio.sleep(3.0)
+        if end:
+            await getattr(system, end)("failing")
+
+
+@pytest.mark.parametrize("end", [None, "stop"])
+def test_what_an_actor_raised_fails_the_test(end):
+    with pytest.raises(RuntimeError, match="it failed"):
+        run(lambda: living(end))
+
+
+def test_who_was_killed_has_not_failed():
+    run(lambda: living("kill"))
+
+
+def test_what_fails_in_the_test_itself_comes_first():
+    async def scenario():
+        async with VirtualSystem() as system:
+            system.start("failing", Failing)
+            await asyncio.sleep(3.0)
+            raise KeyError("the test")
+
+    with pytest.raises(KeyError, match="the test"):
+        run(scenario)
+
+
+def test_one_hears_what_nodes_say_and_forgeries_are_rejected():
+    async def scenario():
+        async with VirtualSystem() as system:
+            beats = system.hear(topics.HEARTBEAT, "quiet")
+            system.start("quiet", Actor)
+            await asyncio.sleep(1.0)
+            await system.kill("quiet")
+            system.start("quiet", Actor)
+            await asyncio.sleep(1.0)
+            system.say(topics.HEARTBEAT, Heartbeat(1, 1, 0.1, 0, 0), "quiet", incarnation=7)
+            await system.settle()
+            return [heard.header.incarnation for heard in beats]
+
+    incarnations = run(scenario)
+    assert incarnations == sorted(incarnations)
+    assert set(incarnations) == {1, 2, 7}
+
+
+def test_a_node_that_no_file_has_is_named():
+    async def scenario():
+        async with VirtualSystem.load("cell") as system:
+            system.start_node("camera")
+            system.start_node("nobody")
+
+    with pytest.raises(LookupError, match="no node 'nobody' in the file"):
+        run(scenario)
+
+
+def test_what_does_not_come_true_in_time_is_told():
+    with pytest.raises(AssertionError, match="no such luck"):
+        run(lambda: eventually(lambda: False, 60.0, "no such luck"))
+    with pytest.raises(AssertionError, match="nor here"):
+        wait_until(lambda: False, 0.0, lambda: "nor here")
+
+
+class Odd:
+    """A monitor with whatever is wrong."""
+
+    active, known, reason, nodes, due_s = False, True, "", (), math.inf
+
+    def expire(self, _now_s):
+        pass
+
+
+def test_a_monitor_that_is_due_for_ever_or_gives_no_reason_is_found_out():
+    odd = Odd()
+    odd.active = True
+    with pytest.raises(AssertionError, match="its reason: ''"):
+        play(odd, lambda _event, _now_s: None, ".")
+    odd.due_s = 0.5
+    with pytest.raises(AssertionError, match=r"due again at 0\.5 s"):
+        wake(odd, 1.0)
+
+
+def test_free_numbers_are_free_and_differ():
+    assert len({free_base_port() for _ in range(5)}) == 5
+    assert 0 < free_port() < 65536
