@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable
 from operator import itemgetter
 from pathlib import Path
 
-from rampart.actors.bus import tap
+from rampart.actors.bus import recorder_connection
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.airport.model import Airport
@@ -73,7 +73,7 @@ class Recorder:
         self._from_start = launcher is not None
         self._listener: socket.socket | None = None
         self._sockets = selectors.DefaultSelector()
-        self._buffer = bytearray(tap.MAX_FRAME_BYTES)
+        self._buffer = bytearray(recorder_connection.MAX_FRAME_BYTES)
         self._info: RunInfo | None = None
         self._waiting: list[Frame] = []
         self._next_ask_s = 0.0
@@ -87,7 +87,7 @@ class Recorder:
         """
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
-            listener.bind(tap.address(self._port))
+            listener.bind(recorder_connection.address(self._port))
         except OSError:
             listener.close()
             raise BagError(f"the run on port {self._port} is being recorded already") from None
@@ -225,8 +225,9 @@ class Recorder:
             connection: socket.socket = key.fileobj  # type: ignore[assignment]
             try:
                 while (size := connection.recv_into(self._buffer)) > 0:
-                    with contextlib.suppress(ValueError):  # not from a tap
-                        frames.append(tap.parse_frame(memoryview(self._buffer)[:size]))
+                    with contextlib.suppress(ValueError):  # not a node's
+                        frames.append(recorder_connection.parse_frame(
+                            memoryview(self._buffer)[:size]))
             except BlockingIOError:
                 continue
             except OSError:

@@ -1,7 +1,7 @@
 """The injector: carries out the planned faults of a run, and watches whether they had an effect.
 
 It lives beside the observer, outside the system under test. Faults of topics and actuators are
-ordered over the bus and reported by those they hit; processes are hit through a `Hand`.
+ordered over the bus and reported by those they hit; processes are hit through a `ProcessControl`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from rampart.sim.faults.scenario import (
 INJECTOR = "injector"
 
 
-class Hand(Protocol):
+class ProcessControl(Protocol):
     """Does things to processes; each method returns whether there was somebody to do it to."""
 
     def kill(self, node: str) -> bool:
@@ -92,7 +92,7 @@ class Injector(Actor):
     Args:
         context: of the actor.
         scenario: what goes wrong, and when.
-        hand: by which processes are hit.
+        processes: by which processes are hit.
         nodes: names that may be hit.
         known: all topics of the system.
 
@@ -102,10 +102,11 @@ class Injector(Actor):
 
     outputs = (bus_topics.INJECT, topics.ACTUATOR_FAULT, topics.OBSTACLE)
 
-    def __init__(self, context: Context, scenario: Sequence[PlannedFault], hand: Hand,
-                 nodes: Sequence[str], known: Sequence[Topic[Any]]) -> None:
+    def __init__(self, context: Context, scenario: Sequence[PlannedFault],
+                 processes: ProcessControl, nodes: Sequence[str],
+                 known: Sequence[Topic[Any]]) -> None:
         super().__init__(context)
-        self._hand = hand
+        self._control = processes
         self._planned = [
             _Planned(planned, action_of(planned, f"f{i}", nodes, known))
             for i, planned in enumerate(scenario, start=1)]
@@ -175,19 +176,20 @@ class Injector(Actor):
             self._place(fault, action)
 
     def _hit(self, fault: _Planned, action: OnProcess) -> None:
-        node, hand = action.node, self._hand
+        node, control = action.node, self._control
         if action.what == "slow":
-            hit = hand.slow_down(node, action.pace_s)
+            hit = control.slow_down(node, action.pace_s)
         else:
-            hit = {"kill": hand.kill, "stop": hand.stop, "wedge": hand.wedge}[action.what](node)
+            hit = {"kill": control.kill, "stop": control.stop,
+                   "wedge": control.wedge}[action.what](node)
         if not hit:
             fault.reason = f"{node} had no running process"
             return
         fault.affected["hit"] = 1
         if action.what == "stop" and math.isfinite(action.duration_s):
-            self.call_later(action.duration_s, lambda: self._end(hand.resume(node)))
+            self.call_later(action.duration_s, lambda: self._end(control.resume(node)))
         elif action.what == "slow" and math.isfinite(action.duration_s):
-            self.call_later(action.duration_s, lambda: self._end(hand.slow_down(node, 0.0)))
+            self.call_later(action.duration_s, lambda: self._end(control.slow_down(node, 0.0)))
 
     @staticmethod
     def _end(_done: bool) -> None:

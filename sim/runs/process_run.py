@@ -18,7 +18,7 @@ from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.unseen import watch
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.faults.injector import INJECTOR, Injector, can_be_hit
-from rampart.sim.faults.process_hand import ProcessHand
+from rampart.sim.faults.process_signals import ProcessSignals
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.osmosis.report_record import RunRecord
 from rampart.sim.runs.mission_run import MissionRun
@@ -85,7 +85,7 @@ class ProcessRun:
         if self._scenario:
             injector = Injector(
                 Context(INJECTOR, 1, clock, SharedBus(bus), **of_the_run), self._scenario,
-                ProcessHand(plan.base_port), can_be_hit(self._spec), system_topics(self._spec))
+                ProcessSignals(plan.base_port), can_be_hit(self._spec), system_topics(self._spec))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         for task, actor in zip(tasks, actors, strict=True):
