@@ -35,7 +35,7 @@ from rampart.actors.supervision.lifeline import kill_leftovers
 from rampart.actors.supervision.node_process import node_main, wedge
 from rampart.actors.supervision.process_title import set_title
 from rampart.files import streams, working_folder
-from rampart.manager.spec.schema import Supervision
+from rampart.manager.spec.tables import Supervision
 
 NAMES = ("a", "b")
 MAX_DATAGRAM = 160_000

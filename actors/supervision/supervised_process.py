@@ -23,7 +23,7 @@ from typing import NamedTuple
 from rampart.actors.ftm.messages import NodeState
 from rampart.actors.layout.layout import Unit
 from rampart.actors.supervision.patience import Patience, Usage
-from rampart.manager.spec.schema import Supervision
+from rampart.manager.spec.tables import Supervision
 
 START_TIMEOUT_S = 3.0
 """Wall seconds in which a new process must have sent its first heartbeat."""

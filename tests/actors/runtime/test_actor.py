@@ -307,9 +307,10 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
-    ("rampart.actors.operator.hmi:Hmi", "rampart.actors.operator.hmi:Hm",
-     "$.node[4].actor = 'rampart.actors.operator.hmi:Hm': no such actor class; known: Hmi"),
-    ("rampart.actors.operator.hmi:Hmi", "rampart.actors.operator.himi:Hmi",
+    ("rampart.actors.osmosis.page.hmi:OsmosisHmi", "rampart.actors.osmosis.page.hmi:Hm",
+     "$.node[4].actor = 'rampart.actors.osmosis.page.hmi:Hm': no such actor class; "
+     "known: OsmosisHmi"),
+    ("rampart.actors.osmosis.page.hmi:OsmosisHmi", "rampart.actors.operator.himi:Hmi",
      "$.node[4].actor = 'rampart.actors.operator.himi:Hmi': No module named "
      "'rampart.actors.operator.himi'"),
     ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.runtime.stub_node:StubNode",
@@ -353,6 +354,6 @@ def test_a_process_is_given_the_heartbeat_period_of_the_spec():
     timing = msgspec.structs.replace(spec.timing, heartbeat_period_s=0.123)
     layout = Layout(plan, msgspec.structs.replace(spec, timing=timing))
     loop = asyncio.new_event_loop()
-    node = make_actor(layout, "DM2", 1, RunContext(system=layout.spec), loop)
+    node = make_actor(layout, "DM2", 1, RunContext(plan, layout.spec), loop)
     loop.close()
     assert node.context.heartbeat_period_s == 0.123

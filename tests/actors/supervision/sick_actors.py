@@ -12,7 +12,7 @@ from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
 from rampart.actors.osmosis.detection.freshness import CommandFreshness
 from rampart.actors.runtime.actor import Actor
 from rampart.manager.actor import FtmManager
-from rampart.manager.spec.schema import Supervision
+from rampart.manager.spec.tables import Supervision
 from tests import ROOT
 from tests.stub_actors import Idler, write_stub_system
 

@@ -16,7 +16,8 @@ from rampart.actors.supervision.supervised_process import (
     State,
     SupervisedProcess,
 )
-from rampart.manager.spec.schema import Kind, NodeSpec, Supervision
+from rampart.manager.spec.schema import Kind, NodeSpec
+from rampart.manager.spec.tables import Supervision
 
 TABLE = """
 starting   heard          running    running   tell publish

@@ -35,7 +35,7 @@ from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.spawner import address
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import RestartPolicy
-from rampart.manager.spec.schema import Supervision
+from rampart.manager.spec.tables import Supervision
 from rampart.testing import eventually
 from tests import ROOT
 from tests.stub_actors import launched, stub_plan, write_stub_system

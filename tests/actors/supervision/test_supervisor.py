@@ -26,7 +26,7 @@ from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.patience import Usage
 from rampart.actors.supervision.processes import Living, SpawnerUnavailableError
 from rampart.actors.supervision.supervisor import Supervisor
-from rampart.manager.spec.schema import Supervision
+from rampart.manager.spec.tables import Supervision
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually, run, turns
 from tests import ROOT
