@@ -48,7 +48,7 @@ STILL_ROBOTIC = {
     "sim.campaign.report", "sim.campaign.worst_runs"}
 
 STILL_NAMED = {
-    "cli.operate.inject_verbs", "manager.spec.mobile_robot", "manager.spec.parameters",
+    "cli.operate.inject_verbs", "manager.spec.mobile_robot",
     "sim.campaign.grouping", "sim.campaign.job", "sim.campaign.report",
     "sim.campaign.worst_runs"}
 
