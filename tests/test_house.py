@@ -24,7 +24,7 @@ ROOMS = (
     "actors.detection", "actors.recovery", "actors.layout", "manager.actor",
     "actors.supervision", "actors.recording", "actors.operator",
     "sim.virtual", "sim.faults", "sim.runs", "sim.campaign",
-    "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.main", "cli.run",
+    "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.run", "cli.main",
     "testing",
 )
 """The rooms of the engine, from the bottom to the top: each may import those before it."""
@@ -50,7 +50,7 @@ STILL_ROBOTIC = {
     "sim.campaign.worst_runs"}
 
 STILL_TOO_LONG = {
-    "actors.osmosis.messages", "cli.analyse.campaigning", "cli.run", "sim.osmosis.world"}
+    "actors.osmosis.messages", "cli.analyse.campaigning", "sim.osmosis.world"}
 
 STILL_CIRCULAR: set[tuple[str, str]] = set()
 

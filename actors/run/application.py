@@ -36,6 +36,7 @@ class Application:
         topics: what its actors publish and hear besides the engine's topics.
         faults: class path of its `Faults`; "" if it has none of its own.
         observer: class path of who hears a run for judge and report.
+        examples: of the command line, for its help: options, and what they do.
         trial: class path of the `Trial` that its runs are; "" if nobody judges them.
 
     Attributes:
@@ -52,6 +53,7 @@ class Application:
     faults: ClassVar[str] = ""
     observer: ClassVar[str] = "rampart.sim.runs.observer:Observer"
     trial: ClassVar[str] = ""
+    examples: ClassVar[tuple[tuple[str, str], ...]] = ()
 
     def __init__(self, options: Any = None) -> None:
         self.options = options or self.Options()
