@@ -24,11 +24,12 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.recording.views import Views
+from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, on
 from rampart.actors.runtime.injected_faults import MAX_DELAYED, MAX_IN_FORCE
 from rampart.actors.runtime.mailbox import Mailbox
+from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, Motor
 from rampart.sim.osmosis.scene import WorldError
@@ -161,7 +162,7 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
     monkeypatch.setattr(rampart.sim.osmosis.trial.console, "MOST", 500)
     of = system("osmosis")
     run = MissionTrial(of.run, 60.0, io.StringIO())
-    picture, views = RunPicture(), Views()
+    picture, views = RunPicture(OsmosisLines()), OsmosisViews()
     clock = type("Clock", (), {"now": staticmethod(lambda: 0.0)})()
     for topic in all_topics():
         kind = inspect.type_info(topic.type)
@@ -170,7 +171,7 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
             body = msgspec.convert(told(kind, number), topic.type, builtin_types=(bytes,))
             for sink in run.sinks(clock) if number < FLOOD else ():
                 sink(topic, body, header)
-            if topic in DECODED:
+            if topic in (*DECODED, *OsmosisLines.read):
                 picture.heard(topic, header, body, 0.0)
             views.of(topic, topic.at(f"n{number}") if topic.is_family else topic.at(), header,
                      body, 0)

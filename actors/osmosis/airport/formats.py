@@ -75,6 +75,19 @@ def load_mission(name_or_path: str | Path, airport: Airport) -> Mission:
     return mission
 
 
+def files_of(source: Path) -> list[Path]:
+    """Return all files that an airport is read from: itself, and of a graph what lies beside it.
+
+    Args:
+        source: the airport's file.
+    """
+    if source.suffix != ".graph":
+        return [source]
+    images = [p for p in source.parent.iterdir() if p.suffix.lower() in foreign.IMAGE_SUFFIXES]
+    own = [p for p in images if p.stem.startswith(source.stem)]  # as `graph_format` chooses
+    return [source, *sorted([*(own or images), *source.parent.glob("*.miss")])]
+
+
 def _load(name_or_path: str | Path, scale: MaskScale | None) -> tuple[Airport, WorldTruth]:
     with readable(name_or_path, "give a file that exists"):
         path = _find(name_or_path)

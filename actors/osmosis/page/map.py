@@ -11,7 +11,6 @@ from itertools import islice
 import msgspec
 
 from rampart.actors.operator.bounds import MAX_NAME, clip
-from rampart.actors.operator.state import MAX_LIGHTS
 from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
 from rampart.actors.osmosis.airport.model import Airport, Light
 
@@ -22,6 +21,9 @@ MAX_GRAPH = 1500
 """Nodes, and edges."""
 
 MAX_BUILDINGS = 300
+MAX_LIGHTS = 1500
+"""So many lights are shown of an airport: an SVG with more is slow on a telephone."""
+
 _TOLERANCES_M = (0.02, 0.1, 0.5, 2.0)
 
 

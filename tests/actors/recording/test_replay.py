@@ -23,12 +23,15 @@ from rampart.actors.bus.topic import ROOT
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.operator.requests import Wish
+from rampart.actors.operator.requests import ResetRequest
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.osmosis.page.hmi import OsmosisHmi
+from rampart.actors.osmosis.page.state import OsmosisState
 from rampart.actors.recording.bag_reader import BagReader, key_of
 from rampart.actors.recording.bag_writer import BagWriter
-from rampart.actors.recording.message_form import MessageForm, form_of
+from rampart.actors.recording.message_form import Forms, MessageForm
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.run import run_info
 from rampart.actors.supervision.process_title import RunProcess
@@ -40,6 +43,8 @@ from rampart.cli.session import connect
 from rampart.testing import HEEDS_SIGNALS, eventually, free_base_port, wait_until
 from tests import ROOT as HERE
 from tests.actors.recording.samples import AnsweringLauncher, documents, pose, sample, write
+
+form_of = Forms(topics.ALL).of
 
 STRANGE = f"{ROOT}/no/such/topic"
 
@@ -216,7 +221,7 @@ async def test_a_start_before_the_beginning_is_the_beginning(tmp_path, port):
 async def test_a_recording_of_which_nothing_can_be_read_ends_also_in_a_loop(
         tmp_path, port, monkeypatch):
     write(tmp_path / "run.mcap", sample())
-    monkeypatch.setattr(replaying, "form_of", lambda _key: form_of("rampart/no/topic"))
+    monkeypatch.setattr(Forms, "of", lambda *_: MessageForm(None))
     monkeypatch.setattr(MessageForm, "payload", lambda *_: int("no payload"))
     player = Replay(tmp_path / "run.mcap", port=port, loop=True)
     async with asyncio.timeout(30):
@@ -229,7 +234,7 @@ async def test_a_page_that_fails_is_said_to_have_ended(tmp_path, port, monkeypat
         raise RuntimeError("it is\nbroken")
 
     write(tmp_path / "run.mcap", sample())
-    monkeypatch.setattr(replaying.ReplayPage, "_pose", fail)
+    monkeypatch.setattr(OsmosisState, "pose", fail)
     said = []
     player = Replay(tmp_path / "run.mcap", port=port, hmi_port=port + 30, rate=4.0,
                     said=said.append)
@@ -377,6 +382,18 @@ def test_messages_of_another_version_are_left_out_and_counted(tmp_path, port, ca
     assert "played 1 messages, 1 of another version left out" in capsys.readouterr().out
 
 
+def test_the_system_of_a_recording_of_0_6_is_that_of_the_shipped_robot():
+    text = (HERE / "systems" / "paper.toml").read_text()
+    head, _, rest = text.partition("[application]")
+    old = head + rest[rest.index("\n["):].replace(
+        "rampart.actors.osmosis.page.hmi:OsmosisHmi", "actors.hmi:Hmi")
+    document, known = replaying.recorded_system([("system.toml", "", old.encode())])
+    assert document["node"][4]["actor"] == "actors.hmi:Hmi"
+    assert (known.kind, known.topics) == (Osmosis, topics.ALL)
+    assert replaying.page_of(known.system) is OsmosisHmi
+    assert replaying.recorded_system([("system.toml", "", b"name = 1")])[1].kind is Osmosis
+
+
 async def test_the_page_shows_the_past_and_obeys_nobody(tmp_path, port):
     status = m.MissionStatus("1", "AB", m.MissionPhase.RUNNING, 0, (), (), (), "")
     manager = fm.ManagerStatus(("FTM1",), (), ("RM1",), ("RM1",), "safety-first", 1)
@@ -388,13 +405,12 @@ async def test_the_page_shows_the_past_and_obeys_nobody(tmp_path, port):
     write(tmp_path / "run.mcap", sorted(sent))
     page_port = port + 30
     player = Replay(tmp_path / "run.mcap", port=port, loop=True, hmi_port=page_port)
-    wish = next(kind for kind in Wish.__args__ if kind.__name__ == "ResetWish")
     async with playing(player), reading(port, ftm_topics.RESET.at()) as heard:
         url = f"http://127.0.0.1:{page_port}/"
         document = await asyncio.to_thread(lambda: urllib.request.urlopen(url).read())
         assert b"<html" in document
         async with open_socket(f"ws://127.0.0.1:{page_port}/ws") as page:
-            await page.send(msgspec.json.encode(wish(recovery="RM1")).decode())
+            await page.send(msgspec.json.encode(ResetRequest("RM1")).decode())
             told, airport, seen = "", None, ""
             deadline = time.monotonic() + 15
             while not (told and airport and "FTM1" in seen):

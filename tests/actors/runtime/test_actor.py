@@ -308,9 +308,10 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
-    ("rampart.actors.operator.hmi:Hmi", "rampart.actors.operator.hmi:Hm",
-     "$.node[4].actor = 'rampart.actors.operator.hmi:Hm': no such actor class; known: Hmi"),
-    ("rampart.actors.operator.hmi:Hmi", "rampart.actors.operator.himi:Hmi",
+    ("rampart.actors.osmosis.page.hmi:OsmosisHmi", "rampart.actors.osmosis.page.hmi:Hm",
+     "$.node[4].actor = 'rampart.actors.osmosis.page.hmi:Hm': no such actor class; "
+     "known: OsmosisHmi"),
+    ("rampart.actors.osmosis.page.hmi:OsmosisHmi", "rampart.actors.operator.himi:Hmi",
      "$.node[4].actor = 'rampart.actors.operator.himi:Hmi': No module named "
      "'rampart.actors.operator.himi'"),
     ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.runtime.stub_node:StubNode",
