@@ -19,7 +19,9 @@ import pytest
 from benchmarks.synthetic_system import synthetic_system
 from rampart import systems
 from rampart.manager.analysis.verification import verify
-from rampart.manager.arbitration.arbiter import DetectionHeard, Tick, build_arbiter
+from rampart.manager.arbitration.arbiter import build_arbiter
+from rampart.manager.arbitration.arbiter_state import Tick
+from rampart.manager.arbitration.detection_track import DetectionHeard
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.specification import parse_specification
 from rampart.manager.strategies.arrangement import Arrangement

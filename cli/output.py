@@ -41,6 +41,12 @@ def warn(text: str) -> None:
     print(f"rampart: {one_line(text, _WARNING_CHARS)}", file=sys.stderr, flush=True)
 
 
+def show_progress(text: str) -> None:
+    """Show on a terminal what is being done, in the place of what was; "" wipes it away."""
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{text[:100]}", end="", file=sys.stderr, flush=True)
+
+
 def print_json(data: Any, *, indent: bool = True) -> None:
     """Print data as JSON; NaN and infinity become null."""
     text = msgspec.json.encode(data)

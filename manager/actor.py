@@ -26,28 +26,32 @@ from rampart.actors.ftm import topics
 from rampart.actors.layout.wiring import load_class
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
-from rampart.manager.arbitration.arbiter import (
+from rampart.manager.arbitration.arbiter import build_arbiter
+from rampart.manager.arbitration.arbiter_memory import (
+    Memory,
+    objection,
+    recall,
+    remember,
+    take_over,
+)
+from rampart.manager.arbitration.arbiter_state import (
     DecisionMade,
-    DetectionHeard,
     Input,
-    RecoveryHeard,
     ResetAnswered,
     ResetAsked,
     ShadowDiffered,
     State,
     Tick,
-    build_arbiter,
 )
-from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
-from rampart.manager.arbitration.detection_track import overdue
-from rampart.manager.arbitration.recovery_track import Command, Phase
+from rampart.manager.arbitration.detection_track import DetectionHeard, overdue
+from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard
 from rampart.manager.spec.adaptation import Action, Change, Document, adapt, describe
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.specification import check_modules
 
 MANAGER_STATE = StateFormat(Memory, version=1, objection=objection)
 
-DECISIONS_PER_LIFE = 10_000
+DECISIONS_PER_INCARNATION = 10_000
 """Each incarnation numbers its decisions from a multiple of this."""
 
 ABSENCE_S = 0.3
@@ -66,10 +70,10 @@ class FtmManager(Actor):
         self._document: Document = dict(context.run.document)
         self._adapted: m.AdaptedSystem | None = context.run.adapted
         self._strategy = self._system.strategy
-        self._arbiter = build_arbiter(self._system, first_life=context.incarnation == 1)
+        self._arbiter = build_arbiter(self._system, first_start=context.incarnation == 1)
         now_s = self.clock.now()
         self.arbiter_state = self._arbiter.initial(
-            now_s, (context.incarnation - 1) * DECISIONS_PER_LIFE)
+            now_s, (context.incarnation - 1) * DECISIONS_PER_INCARNATION)
         self._ran_s = now_s
         self._shown: m.ManagerStatus | None = None
         self._remembered: tuple[int, tuple[str, ...]] | None = None
@@ -113,7 +117,7 @@ class FtmManager(Actor):
     def recovery(self, message: m.RecoveryReport, header: Header) -> None:
         """Hear a recovery module."""
         self._step(RecoveryHeard(
-            header.source, message.state is m.RecoveryState.ACTIVATED, Phase(message.phase.value),
+            header.source, message.state is m.RecoveryState.ACTIVATED, message.phase,
             message.decision, message.reason))
 
     @on(topics.RESET)
@@ -136,7 +140,7 @@ class FtmManager(Actor):
 
     @every(1.0)
     def repeat_system(self) -> None:
-        """Repeat the changed system for whoever joined late."""
+        """Repeat the changed system for those that joined late."""
         if self._adapted is not None:
             self.publish(topics.ADAPTED_SYSTEM, self._adapted)
 
@@ -181,7 +185,7 @@ class FtmManager(Actor):
         for recovery in system.recoveries:
             load_class(recovery.actor, topics.RECOVERY)
         arbiter = build_arbiter(system)
-        self.arbiter_state = arbiter.take_over(self.arbiter_state, self.clock.now())
+        self.arbiter_state = take_over(arbiter, self.arbiter_state, self.clock.now())
         self._arbiter, self._document, self._system = arbiter, document, system
         self._strategy = system.strategy
         self._adapted = m.AdaptedSystem(
@@ -220,13 +224,13 @@ class FtmManager(Actor):
             self.remember()
 
     def _replace_the_overdue(self) -> None:
-        """Ask for a new life of a detection module that is not heard, once for each life."""
+        """Ask for a restart of a detection module that is not heard, once for each incarnation."""
         silent = overdue(self.arbiter_state.detections, self._arbiter.rules, self.clock.now())
-        if silent is not None and self._replaced.get(silent.name) != silent.life:
-            self._replaced[silent.name] = silent.life
+        if silent is not None and self._replaced.get(silent.name) != silent.incarnation:
+            self._replaced[silent.name] = silent.incarnation
             self._request += 1
             self.publish(topics.RESPAWN, m.RespawnRequest(
-                self._request, silent.name, silent.life, self.name))
+                self._request, silent.name, silent.incarnation, self.name))
 
     def _command(self, command: Command) -> None:
         self.publish(topics.RECOVERY_COMMAND, m.RecoveryCommand(

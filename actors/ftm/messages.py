@@ -28,6 +28,7 @@ from rampart.actors.bus.bounds import (
     Texts,
 )
 from rampart.actors.bus.messages import Injection, Message
+from rampart.manager.model.mechanisms import RecoveryPhase
 
 
 class Holds(Message, frozen=True):
@@ -63,18 +64,8 @@ class RecoveryState(StrEnum):
     ACTIVATED = "activated"
 
 
-class RecoveryPhase(StrEnum):
-    """How far an activated recovery is: only `ACTING` must not be cut off."""
-
-    IDLE = "idle"
-    ACTING = "acting"
-    DONE = "done"
-    DEGRADED = "degraded"
-    FAILED = "failed"
-
-
 class RecoveryCommand(Message, frozen=True):
-    """The manager's wish for one recovery module, repeated until it is reported fulfilled."""
+    """What the manager orders one recovery module to do, repeated until it is reported done."""
 
     activate: bool
     decision: Count
@@ -217,7 +208,7 @@ class NodeTable(Message, frozen=True):
 
 
 class RespawnRequest(Message, frozen=True):
-    """A wish of a recovery module or the manager: kill a process, if it lives, and restart it."""
+    """A request of a recovery module or the manager: kill a process, if it runs, and restart it."""
 
     request: Count
     node: Name

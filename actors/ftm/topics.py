@@ -16,7 +16,7 @@ HOLDS = Topic("holds/{name}", m.Holds, Qos.STATE, 5, "",
 DETECTION = Topic("detection/{name}", m.DetectionReport, Qos.STATE, 5, "",
                   "State of detection module {name}.")
 RECOVERY_COMMAND = Topic("recovery/{name}/command", m.RecoveryCommand, Qos.STATE, 5, "",
-                         "The manager's wish for recovery module {name}.")
+                         "What the manager orders recovery module {name} to do.")
 RECOVERY = Topic("recovery/{name}/state", m.RecoveryReport, Qos.STATE, 5, "",
                  "State of recovery module {name}.")
 DECISION = Topic("manager/decision", m.DecisionRecord, Qos.COMMAND, 0, "",

@@ -15,8 +15,7 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.bounds import SHOWN, Bounds, clip
 from rampart.actors.operator.picture import Picture
-from rampart.manager.model.words import decision_in_words
-from rampart.manager.strategies.registry import STRATEGIES
+from rampart.manager.strategies.decision_words import decision_in_words
 
 STALE_S = 1.5
 """A state that was not heard for so long is shown as stale (simulated seconds)."""
@@ -94,8 +93,6 @@ class HmiState:
 
     def decision(self, record: fm.DecisionRecord, now_s: float) -> None:
         """Add a decision of the manager to the decision log."""
-        strategy = STRATEGIES.get(record.strategy)
-        rules = strategy.rules if strategy else {}
         self.picture.add("decisions", {
             "t": round(now_s, 2),
             "number": record.decision,
@@ -104,8 +101,7 @@ class HmiState:
             "strategy": record.strategy,
             "recoveries": record.recoveries,
             "words": decision_in_words(
-                record.active, record.rule, record.recoveries, record.strategy,
-                rules.get(record.rule, "")),
+                record.active, record.rule, record.recoveries, record.strategy),
             "rule": f"{record.rule} of {record.strategy}",
             "path": record.path,
             "rejected": [f"{name}: {why}" for name, why in record.rejected],

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import sys
 from pathlib import Path
 from typing import Any
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
 from rampart.cli import systems
-from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say
+from rampart.cli.output import (
+    NoEffectError,
+    UsageError,
+    print_json,
+    print_table,
+    say,
+    show_progress,
+)
 from rampart.cli.session import connect
 from rampart.files.reading import FileError, read_bytes
 from rampart.manager.analysis.barriers import Outlook, guard, outlook
@@ -73,11 +79,11 @@ def run(options: argparse.Namespace) -> int:
             return _export(spec, options.export)
         return _show_outlook(spec, options.active, as_json=options.json)
     try:
-        found = CutSets(formula, progress=_progress)
+        found = CutSets(formula, progress=show_progress)
     except TooLargeError as error:
         raise NoEffectError(f"{options.file}: {error}") from None
     finally:
-        _progress("")
+        show_progress("")
     if options.count:
         if options.json:
             print_json({"top": formula.top, "minimal_cut_sets": found.count})
@@ -193,8 +199,3 @@ async def _live(options: argparse.Namespace) -> int:
         raise NoEffectError("the FTM Manager does not answer; try again when it is back")
     known = {mechanism.name for mechanism in spec.mechanisms}
     return _show_outlook(spec, [n for n in status.active if n in known], as_json=options.json)
-
-
-def _progress(text: str) -> None:
-    if sys.stderr.isatty():
-        print(f"\r\x1b[K{text[:100]}", end="", file=sys.stderr, flush=True)

@@ -12,9 +12,9 @@ from typing import Any
 from rampart.cli import systems
 from rampart.cli.output import UsageError, print_json, print_table, say, say_text
 from rampart.manager.model.order import UnknownElementError
-from rampart.manager.model.words import decision_in_words
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.decision import Decision
+from rampart.manager.strategies.decision_words import decision_in_words
 from rampart.manager.strategies.registry import UnknownStrategyError, decide
 
 

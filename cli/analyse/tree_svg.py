@@ -8,13 +8,13 @@ two bars across the line above its event. What can be pointed at has a `<title>`
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from xml.sax.saxutils import escape
 
 import msgspec
 
 from rampart.manager.drawing.diagram import Box, Diagram, clean
-from rampart.manager.drawing.placing import Place, Placing, place
+from rampart.manager.drawing.placing import Place, place
 
 MARGIN = 24.0
 FONT = 12.0
@@ -66,16 +66,16 @@ def to_svg(diagrams: Sequence[Diagram]) -> str:
     y, width = MARGIN, 0.0
     for number, diagram in enumerate(diagrams):
         notes = _wrap(diagram.note, 90, 6) if number == 0 else []
-        placing = _place(diagram)
+        picture = _Picture(diagram)
         head = [f'<text class="head" x="0" y="16">{escape(diagram.title)}</text>']
         head += [f'<text class="note" x="0" y="{36 + LINE * i:g}">{escape(line)}</text>'
                  for i, line in enumerate(notes)]
         top = 40 + LINE * len(notes)
         body += [f'<g transform="translate({MARGIN:g} {y:g})" role="group" '
                  f'aria-label="{_attribute(diagram.title)}">', *head,
-                 f'<g transform="translate(0 {top:g})">', *_body(diagram, placing), "</g>", "</g>"]
-        y += top + placing.height + 2 * MARGIN
-        width = max(width, placing.width, text_width(diagram.title) * 17 / FONT,
+                 f'<g transform="translate(0 {top:g})">', *picture.body(), "</g>", "</g>"]
+        y += top + picture.placing.height + 2 * MARGIN
+        width = max(width, picture.placing.width, text_width(diagram.title) * 17 / FONT,
                     *map(text_width, notes), 0)
     y -= MARGIN
     width += 2 * MARGIN
@@ -100,8 +100,6 @@ class _Look(msgspec.Struct, frozen=True):
     """A box as it is drawn: its lines of text, and the sizes that are the same for a diagram."""
 
     lines: tuple[str, ...]
-    named: bool
-    """Whether the first line is the name."""
     barrier: tuple[str, str]
     """What stands left and right of the bars."""
     room: float
@@ -110,20 +108,10 @@ class _Look(msgspec.Struct, frozen=True):
     """Of its rectangle."""
 
 
-def _place(diagram: Diagram) -> Placing:
-    looks = _looks(diagram)
-    tall = _tall(looks)
-    fault_tree = diagram.what == "fault-tree"
-    stem = _stem(diagram)
-    sizes = {box.name: (looks[box.name].room,
-                        stem + tall + (SYMBOL if fault_tree else 0)) for box in diagram.boxes}
-    return place(sizes, diagram.edges, square=diagram.what != "order")
-
-
 def _looks(diagram: Diagram) -> dict[str, _Look]:
     looks = {}
+    fault_tree = diagram.what == "fault-tree"
     for box in diagram.boxes:
-        fault_tree = diagram.what == "fault-tree"
         readable = box.title or box.name.replace("_", " ").capitalize()
         lines = _wrap(readable, WRAP, TITLE_LINES) if fault_tree else [
             box.name, *_wrap(box.subtitle, WRAP + 8, TITLE_LINES)]
@@ -136,75 +124,69 @@ def _looks(diagram: Diagram) -> dict[str, _Look]:
         if not fault_tree and diagram.note:
             wide = max(wide, text_width(box.name) + TAGS)
         beside = 2 * max(map(text_width, barrier)) + 44 if barrier[0] else 0.0
-        looks[box.name] = _Look(tuple(lines), not fault_tree, barrier, round(beside), round(wide))
+        looks[box.name] = _Look(tuple(lines), barrier, round(beside), round(wide))
     common = min(max((look.width for look in looks.values()), default=0.0), COMMON_WIDTH)
     return {name: msgspec.structs.replace(
                 look, width=max(common, look.width), room=max(common, look.width, look.room))
             for name, look in looks.items()}
 
 
-def _tall(looks: Mapping[str, _Look]) -> float:
-    return LINE * max((len(look.lines) for look in looks.values()), default=1) + 14
+class _Picture:
+    """A diagram with the place of each box and each line."""
+
+    def __init__(self, diagram: Diagram) -> None:
+        self.diagram = diagram
+        self.looks = _looks(diagram)
+        self.fault_tree = diagram.what == "fault-tree"
+        self.tall = LINE * max((len(look.lines) for look in self.looks.values()), default=1) + 14
+        self.stem = 0.0 if not self.fault_tree else BARRIER if any(
+            box.mechanism for box in diagram.boxes) else 12.0
+        height = self.stem + self.tall + (SYMBOL if self.fault_tree else 0)
+        self.placing = place({name: (look.room, height) for name, look in self.looks.items()},
+                             diagram.edges, square=diagram.what != "order")
+
+    def body(self) -> Iterator[str]:
+        """Yield the elements, lines first."""
+        leaving: dict[str, list[str]] = {}
+        for (upper, _), line in zip(self.diagram.edges, self.placing.lines, strict=True):
+            leaving.setdefault(upper, []).append("M" + "L".join(f"{x:g} {y:g}" for x, y in line))
+        for lines in leaving.values():  # one path, for what is painted twice looks thicker
+            yield f'<path class="line" d="{"".join(lines)}"/>'
+        lowers = {lower for _, lower in self.diagram.edges}
+        for box in self.diagram.boxes:
+            at, look = self.placing.places[box.name], self.looks[box.name]
+            classes = " ".join(["node", *["active"] * box.active, *["decided"] * box.decided])
+            yield f'<g class="{classes}"><title>{escape(_tooltip(box, self.diagram))}</title>'
+            if self.fault_tree:
+                if box.name in lowers or box.mechanism:
+                    yield _line(at.x, at.top, at.x, at.top + self.stem)
+                if box.mechanism:
+                    yield from _barrier(look, at.x, at.top + self.stem / 2)
+                yield from _symbol(box, at.x, at.bottom - SYMBOL)
+            yield from self._rectangle(box, look, at)
+            yield "</g>"
+
+    def _rectangle(self, box: Box, look: _Look, at: Place) -> Iterator[str]:
+        top, left = at.top + self.stem, at.x - look.width / 2
+        yield (f'<rect class="box" x="{left:g}" y="{top:g}" width="{look.width:g}" '
+               f'height="{self.tall:g}" rx="3"/>')
+        if not self.fault_tree and box.decided:
+            yield (f'<rect class="frame" x="{left - 4:g}" y="{top - 4:g}" '
+                   f'width="{look.width + 8:g}" height="{self.tall + 8:g}" rx="6"/>')
+            yield _text("decided", left + look.width - 6, top + 12, "go right small")
+        if not self.fault_tree and box.active:
+            yield _text(self.diagram.active_words, left + 6, top + 12, "left small")
+        y = top + self.tall / 2 - LINE * len(look.lines) / 2 + 11.5
+        for number, line in enumerate(look.lines):
+            kind = "" if self.fault_tree else "faint" if number else "name"
+            yield _text(line, at.x, y + LINE * number, kind)
 
 
-def _stem(diagram: Diagram) -> float:
-    if diagram.what != "fault-tree":
-        return 0.0
-    return BARRIER if any(box.mechanism for box in diagram.boxes) else 12.0
-
-
-def _body(diagram: Diagram, placing: Placing) -> Iterator[str]:
-    looks = _looks(diagram)
-    tall = _tall(looks)
-    arriving: dict[str, list[float]] = {}
-    leaving: dict[str, list[str]] = {}
-    for (upper, lower), line in zip(diagram.edges, placing.lines, strict=True):
-        arriving.setdefault(lower, []).append(line[-1][0])
-        leaving.setdefault(upper, []).append("M" + "L".join(f"{x:g} {y:g}" for x, y in line))
-    for lines in leaving.values():  # one path, for what is painted twice looks thicker
-        yield f'<path class="line" d="{"".join(lines)}"/>'
-    for at, several in ((placing.places[name], xs) for name, xs in arriving.items()):
-        if min(several) < max(several):  # they are all inputs of the same box
-            yield _line(min(several), at.top, max(several), at.top)
-    for box in diagram.boxes:
-        at = placing.places[box.name]
-        classes = " ".join(["node", *["active"] * box.active, *["decided"] * box.decided])
-        yield f'<g class="{classes}"><title>{escape(_tooltip(box, diagram))}</title>'
-        if diagram.what == "fault-tree":
-            if box.name in arriving or box.mechanism:
-                yield _line(at.x, at.top, at.x, at.top + _stem(diagram))
-            yield from _barrier(looks[box.name], at, _stem(diagram))
-            yield from _symbol(box, at.x, at.bottom - SYMBOL)
-        yield from _rectangle(box, looks[box.name], at, _stem(diagram), tall,
-                              diagram.active_words)
-        yield "</g>"
-
-
-def _barrier(look: _Look, at: Place, stem: float) -> Iterator[str]:
-    if not look.barrier[0]:
-        return
-    middle = at.top + stem / 2
-    for y in (middle - 4, middle + 4):
-        yield f'<path class="bar" d="M{at.x - 13:g} {y:g}h26"/>'
-    yield _text(look.barrier[0], at.x - 19, middle + 4, "barrier right")
-    yield _text(look.barrier[1], at.x + 19, middle + 4, "go left")
-
-
-def _rectangle(box: Box, look: _Look, at: Place, stem: float,  # noqa: PLR0917
-               tall: float, active_words: str) -> Iterator[str]:
-    top, left = at.top + stem, at.x - look.width / 2
-    yield (f'<rect class="box" x="{left:g}" y="{top:g}" width="{look.width:g}" '
-           f'height="{tall:g}" rx="3"/>')
-    if look.named and box.decided:
-        yield (f'<rect class="frame" x="{left - 4:g}" y="{top - 4:g}" '
-               f'width="{look.width + 8:g}" height="{tall + 8:g}" rx="6"/>')
-        yield _text("decided", left + look.width - 6, top + 12, "go right small")
-    if look.named and box.active:
-        yield _text(active_words, left + 6, top + 12, "left small")
-    y = top + tall / 2 - LINE * len(look.lines) / 2 + 11.5
-    for number, line in enumerate(look.lines):
-        kind = "name" if look.named and number == 0 else "faint" if look.named else ""
-        yield _text(line, at.x, y + LINE * number, kind)
+def _barrier(look: _Look, x: float, y: float) -> Iterator[str]:
+    for bar_y in (y - 4, y + 4):
+        yield f'<path class="bar" d="M{x - 13:g} {bar_y:g}h26"/>'
+    yield _text(look.barrier[0], x - 19, y + 4, "barrier right")
+    yield _text(look.barrier[1], x + 19, y + 4, "go left")
 
 
 def _symbol(box: Box, x: float, y: float) -> Iterator[str]:

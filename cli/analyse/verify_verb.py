@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from typing import Any
 
 from rampart.cli import systems
-from rampart.cli.output import UsageError, print_json, print_table, say
+from rampart.cli.output import UsageError, print_json, print_table, say, show_progress
 from rampart.manager.analysis.verification import MEANING, Report, TooLargeError, verify
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import UnknownStrategyError
@@ -47,11 +46,11 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError(f"--together {options.together}: a number from 1 up is right")
     start = time.monotonic()
     try:
-        report = verify(spec, options.strategy, options.together, _progress)
+        report = verify(spec, options.strategy, options.together, show_progress)
     except (TooLargeError, UnknownStrategyError) as error:
         raise UsageError(str(error)) from None
     finally:
-        _progress("")
+        show_progress("")
     if options.json:
         print_json({
             "system": report.system, "strategy": report.strategy,
@@ -64,11 +63,6 @@ def run(options: argparse.Namespace) -> int:
     wanted = set(options.strategy or [spec.strategy]) | {""}
     failed = any(not p.holds and p.strategy in wanted for p in report.properties)
     return 1 if options.strict and failed else 0
-
-
-def _progress(text: str) -> None:
-    if sys.stderr.isatty():
-        print(f"\r\x1b[K{text[:100]}", end="", file=sys.stderr, flush=True)
 
 
 def _show(spec: SystemSpec, report: Report, seconds: float) -> None:

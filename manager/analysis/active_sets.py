@@ -13,9 +13,9 @@ from typing import TypeVar
 import msgspec
 
 from rampart.manager.model.order import PartialOrder
-from rampart.manager.model.words import listing
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision, Strategy
+from rampart.manager.strategies.decision_words import listing
 from rampart.manager.strategies.escalation import succession
 
 MAX_MECHANISMS = 14

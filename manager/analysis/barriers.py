@@ -44,22 +44,12 @@ def guard(spec: SystemSpec, sets: Iterable[Sequence[str]]) -> tuple[Guarded, ...
     event_of = {m.name: m.event for m in spec.mechanisms}
     return tuple(
         Guarded(tuple(events), tuple(
-            name for name in order if not occurs_without(tree, events, event_of[name])))
+            name for name in order if not _occurs(tree, events, event_of[name])))
         for events in sets)
 
 
-def occurs_without(tree: FaultTree, given: Iterable[str], blocked: str = "") -> bool:
-    """Tell whether the top occurs from given events although one event is kept from occurring."""
-    occurring = set(given) - {blocked}
-    changed = True
-    while changed:
-        changed = False
-        for event in tree.events.values():
-            if event.name != blocked and event.required and event.name not in occurring and \
-                    sum(name in occurring for name in event.inputs) >= event.required:
-                occurring.add(event.name)
-                changed = True
-    return tree.top in occurring
+def _occurs(tree: FaultTree, given: Iterable[str], prevented: str = "") -> bool:
+    return tree.top in tree.occurring(given, prevented)
 
 
 def outlook(spec: SystemSpec, active: Iterable[str], given: Iterable[str] = ()) -> Outlook:
@@ -80,12 +70,12 @@ def outlook(spec: SystemSpec, active: Iterable[str], given: Iterable[str] = ()) 
     left = {name: tuple(upper for upper in ftms.chain(ftms.root, name) if upper in idle)
             for name in breached}
     # If what has occurred suffices already, the next event is looked at by itself.
-    base = () if occurs_without(tree, occurred) else occurred
+    base = () if _occurs(tree, occurred) else occurred
     following = []
     for event in tree.events.values():
         if not event.required and event.name not in occurred \
-                and occurs_without(tree, (*base, event.name)):
+                and _occurs(tree, (*base, event.name)):
             following.append(Guarded((event.name,), tuple(
                 name for name in idle
-                if not occurs_without(tree, (*base, event.name), event_of[name]))))
+                if not _occurs(tree, (*base, event.name), event_of[name]))))
     return Outlook(occurred, left, tuple(sorted(following, key=lambda g: len(g.barriers))))

@@ -6,9 +6,7 @@ do, and minimal are those sets of which no part makes the top occur: the minimal
 
 The way, for trees with hundreds of events and millions of cut sets:
 
-1. *Modules.* A gate whose events occur nowhere else is analysed by itself and counts as one event
-   above (Dutuit and Rauzy 1996). Inputs of a gate that nobody else uses are gathered into a gate of
-   their own first, which is a module then.
+1. *Modules* (`rampart.manager.analysis.modules`): parts that are analysed by themselves.
 2. *A binary decision diagram* of each module, by a library (OxiDD), with the variables in the
    sequence of one of several depth-first searches; the first that stays within bounds is taken.
 3. *Minimal solutions* of the diagram as a zero-suppressed one (Rauzy 1993); from that the number
@@ -17,13 +15,15 @@ The way, for trees with hundreds of events and millions of cut sets:
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 
 import msgspec
 from oxidd.bdd import BDDFunction, BDDManager
 from oxidd.util import DDMemoryError
 
-from rampart.manager.analysis.formula import GENERATED, Connective, Formula
+from rampart.manager.analysis.formula import Connective, Formula, search
+from rampart.manager.analysis.modules import prepare
 from rampart.manager.analysis.zbdd import (
     EMPTY,
     UNIT,
@@ -40,6 +40,7 @@ _LISTING_LEVELS = 800
 """Modules within modules, and events in one, for listing; counting has no such limit."""
 
 Progress = Callable[[str], None]
+_Way = Callable[[tuple[str, ...]], Sequence[str]]
 
 
 class TooLargeError(ValueError):
@@ -80,7 +81,7 @@ class CutSets:
     def __init__(self, formula: Formula, bounds: Sequence[int] = BOUNDS,
                  progress: Progress = lambda _: None) -> None:
         self.formula = formula
-        self._gates, modules = _prepare(formula)
+        self._gates, modules = prepare(formula)
         self._modules: dict[str, _Module] = {}
         self._constants = dict(formula.house)
         self._sizes_below: dict[int, dict[int, int]] = {}
@@ -209,60 +210,31 @@ class _Inside:
         self._house = constants
         self._top = top
         self._modules = modules
-        self._sequence = self._upwards()
-        self.leaves = tuple(n for n in self._met(lambda inputs: inputs) if n not in self._house)
+        self._sequence, leaves = self._search(lambda inputs: inputs)
+        self.leaves = tuple(name for name in leaves if name not in constants)
+        self._users = Counter(
+            entry for name in self._sequence for entry in gates[name].inputs)
 
-    def _is_leaf(self, name: str) -> bool:
-        return name != self._top and (name in self._modules or name not in self._gates)
-
-    def _upwards(self) -> list[str]:
-        sequence: list[str] = []
-        done: set[str] = set()
-        stack = [(self._top, False)]
-        while stack:
-            name, inputs_done = stack.pop()
-            if name in done or self._is_leaf(name):
-                continue
-            if inputs_done:
-                done.add(name)
-                sequence.append(name)
-            else:
-                stack.append((name, True))
-                stack.extend((entry, False) for entry in self._gates[name].inputs)
-        return sequence
+    def _search(self, way: _Way) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Search with the inputs of each gate in a sequence of choice."""
+        return search(self._top, lambda name: () if name != self._top and (
+            name in self._modules or name not in self._gates) else way(self._gates[name].inputs))
 
     def orders(self) -> Iterator[tuple[str, ...]]:
         """Yield variable orders to try."""
         below: dict[str, int] = {}
-        users: dict[str, int] = {}
         for name in self._sequence:
-            inputs = self._gates[name].inputs
-            below[name] = 1 + sum(below.get(entry, 1) for entry in inputs)
-            for entry in inputs:
-                users[entry] = users.get(entry, 0) + 1
-        ways: tuple[Callable[[tuple[str, ...]], Sequence[str]], ...] = (
+            below[name] = 1 + sum(below.get(entry, 1) for entry in self._gates[name].inputs)
+        users = self._users
+        ways: tuple[_Way, ...] = (
             lambda inputs: inputs,
-            lambda inputs: sorted(inputs, key=lambda n: (-users.get(n, 0), below.get(n, 1))),
+            lambda inputs: sorted(inputs, key=lambda n: (-users[n], below.get(n, 1))),
             lambda inputs: sorted(inputs, key=lambda n: below.get(n, 1)),
             lambda inputs: sorted(inputs, key=lambda n: -below.get(n, 1)),
             lambda inputs: inputs[::-1],
         )
         yield from dict.fromkeys(
-            tuple(n for n in self._met(way) if n not in self._house) for way in ways)
-
-    def _met(self, way: Callable[[tuple[str, ...]], Sequence[str]]) -> list[str]:
-        """Return the leaves in the sequence in which a depth-first search meets them."""
-        met: dict[str, None] = {}
-        seen: set[str] = set()
-        stack = [self._top]
-        while stack:
-            name = stack.pop()
-            if self._is_leaf(name):
-                met[name] = None
-            elif name not in seen:
-                seen.add(name)
-                stack.extend(reversed(way(self._gates[name].inputs)))
-        return list(met)
+            tuple(n for n in self._search(way)[1] if n not in self._house) for way in ways)
 
     def diagram(self, order: tuple[str, ...], bound: int) -> Diagram | None:
         """Return the module's decision diagram, or None if it grows beyond a bound."""
@@ -277,16 +249,13 @@ class _Inside:
         value = {name: manager.var(i) for i, name in enumerate(order)}
         for name, state in self._house.items():
             value[name] = manager.true() if state else manager.false()
-        users: dict[str, int] = {}
-        for name in self._sequence:
-            for entry in self._gates[name].inputs:
-                users[entry] = users.get(entry, 0) + 1
+        left, inner = self._users.copy(), set(self._sequence)
         for name in self._sequence:
             gate = self._gates[name]
             value[name] = _gate(manager, gate, [value[entry] for entry in gate.inputs])
             for entry in gate.inputs:  # what nobody needs any more can be collected
-                users[entry] -= 1
-                if not users[entry] and entry in self._gates and not self._is_leaf(entry):
+                left[entry] -= 1
+                if not left[entry] and entry in inner:
                     del value[entry]
         return value[self._top]
 
@@ -339,87 +308,3 @@ def _as_numbers(function: BDDFunction) -> Diagram:
     if known[function] in {EMPTY, UNIT}:
         diagram.add(0, known[function], known[function])  # a constant, as the last number
     return diagram
-
-
-# -- modules -------------------------------------------------------------------------------------
-
-
-def _prepare(formula: Formula) -> tuple[dict[str, Connective], list[str]]:
-    """Return the gates, with lone inputs gathered, and the modules, inner ones first."""
-    gates = {name: formula.gates[name] for name in formula.sequence}
-    if formula.top not in gates:
-        return gates, []
-    if not formula.is_monotone:
-        return gates, [formula.top]  # below a negation a module's cut sets are not its own
-    gates = _without_aliases(gates, formula.top)
-    modules = _modules(gates, formula.top)
-    users: dict[str, int] = {}
-    for gate in gates.values():
-        for entry in gate.inputs:
-            users[entry] = users.get(entry, 0) + 1
-    for name in list(gates):
-        gate = gates[name]
-        uniform = gate.low in {1, len(gate.inputs)}
-        lone = [e for e in gate.inputs if users[e] == 1 and e not in formula.house
-                and (e not in gates or e in modules)]
-        if uniform and 2 <= len(lone) < len(gate.inputs):
-            gathered = f"{name}{GENERATED}lone"
-            rest = tuple(e for e in gate.inputs if e not in lone)
-            both = (gathered, *rest)
-            gates[gathered] = Connective(
-                tuple(lone), 1 if gate.low == 1 else len(lone), len(lone))
-            gates[name] = Connective(both, 1 if gate.low == 1 else len(both), len(both))
-    modules = _modules(gates, formula.top)
-    return gates, modules
-
-
-def _without_aliases(gates: dict[str, Connective], top: str) -> dict[str, Connective]:
-    """Take out gates that only pass one input on; `gates` has inputs before what uses them."""
-    stands_for: dict[str, str] = {}
-    left: dict[str, Connective] = {}
-    for name, gate in gates.items():
-        inputs = tuple(stands_for.get(entry, entry) for entry in gate.inputs)
-        gate = msgspec.structs.replace(gate, inputs=inputs)  # noqa: PLW2901
-        if len(gate.inputs) == 1 and gate.low == 1 and name != top:
-            stands_for[name] = gate.inputs[0]
-        else:
-            left[name] = gate
-    return left
-
-
-def _modules(gates: dict[str, Connective], top: str) -> list[str]:
-    """Return the gates of which no descendant is used elsewhere, inner ones first.
-
-    Dates of a depth-first search (Dutuit and Rauzy 1996): all descendants are met for the first
-    time after the gate, and for the last time before the search leaves it.
-    """
-    first: dict[str, int] = {}
-    last: dict[str, int] = {}
-    left: dict[str, int] = {}
-    sequence: list[str] = []
-    date = 0
-    stack: list[tuple[str, bool]] = [(top, False)]
-    while stack:
-        name, leaving = stack.pop()
-        date += 1
-        if leaving:
-            left[name] = last[name] = date
-            sequence.append(name)
-            continue
-        if name in first:
-            last[name] = date
-            continue
-        first[name] = last[name] = date
-        if name in gates:
-            stack.append((name, True))
-            stack.extend((entry, False) for entry in reversed(gates[name].inputs))
-    earliest: dict[str, int] = {}
-    latest: dict[str, int] = {}
-    modules = []
-    for name in sequence:
-        inputs = gates[name].inputs
-        earliest[name] = min(min(first[e], earliest.get(e, first[e])) for e in inputs)
-        latest[name] = max(max(last[e], latest.get(e, last[e])) for e in inputs)
-        if earliest[name] > first[name] and latest[name] < left[name]:
-            modules.append(name)
-    return modules

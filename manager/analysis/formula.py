@@ -7,7 +7,7 @@ holds when the number of its inputs that hold lies between two bounds, or when i
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import msgspec
 
@@ -67,10 +67,10 @@ class Formula:
         self.top = top or self._only_top()
         if self.top not in known:
             raise FormulaError(f"unknown top {top!r}")
-        self.sequence = tuple(self._upwards())
+        self.sequence, leaves = search(
+            self.top, lambda name: gates[name].inputs if name in gates else ())
         """Gates below the top and the top itself, inputs before what uses them."""
-        used = {entry for name in self.sequence for entry in gates[name].inputs} | {self.top}
-        self.basic = tuple(name for name in self._leftmost() if name in basic and name in used)
+        self.basic = tuple(name for name in leaves if name in basic)
         """Basic events below the top, in the sequence in which depth-first search meets them."""
         self.is_monotone = all(gates[name].is_monotone for name in self.sequence)
 
@@ -84,33 +84,6 @@ class Formula:
                 "top" if tops else "no gates; a top is needed")
         return tops[0]
 
-    def _upwards(self) -> Iterator[str]:
-        done: set[str] = set()
-        stack = [(self.top, False)]
-        while stack:
-            name, inputs_done = stack.pop()
-            if name in done or name not in self.gates:
-                continue
-            if inputs_done:
-                done.add(name)
-                yield name
-            else:
-                stack.append((name, True))
-                stack.extend((entry, False) for entry in reversed(self.gates[name].inputs))
-
-    def _leftmost(self) -> Iterator[str]:
-        seen: set[str] = set()
-        stack = [self.top]
-        while stack:
-            name = stack.pop()
-            if name in seen:
-                continue
-            seen.add(name)
-            if name in self.gates:
-                stack.extend(reversed(self.gates[name].inputs))
-            else:
-                yield name
-
     def holds(self, occurred: frozenset[str]) -> bool:
         """Tell whether the top occurs when exactly these basic events do."""
         value = {name: name in occurred for name in self.basic} | self.house
@@ -119,6 +92,32 @@ class Formula:
             count = sum(value[entry] for entry in gate.inputs)
             value[name] = (gate.low <= count <= gate.high) != gate.negated
         return value[self.top]
+
+
+def search(top: str, inputs: Callable[[str], Sequence[str]]
+           ) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Search depth first, from the left.
+
+    Returns:
+        What has inputs, each after these; and what has none, as it is met.
+    """
+    gates: list[str] = []
+    leaves: list[str] = []
+    met: set[str] = set()
+    stack = [(top, False)]
+    while stack:
+        name, leaving = stack.pop()
+        if leaving:
+            gates.append(name)
+        elif name not in met:
+            met.add(name)
+            below = inputs(name)
+            if below:
+                stack.append((name, True))
+                stack += [(entry, False) for entry in reversed(below)]
+            else:
+                leaves.append(name)
+    return tuple(gates), tuple(leaves)
 
 
 def formula_of(tree: FaultTree) -> Formula:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from functools import partial
 from itertools import count
 
 import msgspec
@@ -124,7 +125,7 @@ class _Reader:
     """Reads one document."""
 
     def __init__(self, root: ET.Element, file: str) -> None:
-        self._file = file
+        self._error = partial(OpenPsaError, file)
         self._definitions: dict[tuple[str, ...], _Definition] = {}
         self._public: dict[str, tuple[str, ...]] = {}
         self._gates: dict[str, Connective] = {}
@@ -144,34 +145,30 @@ class _Reader:
             inner = []
             counts: dict[str, int] = {}
             if len(place) > MAX_CONTAINERS:
-                raise OpenPsaError(self._file, path, f"more than {MAX_CONTAINERS} fault trees and "
-                                                     "components in each other")
+                raise self._error(
+                    path, f"more than {MAX_CONTAINERS} fault trees and components in each other")
             for element in parent:
                 tag = element.tag
                 counts[tag] = counts.get(tag, 0) + 1
                 name = element.get("name", "")
                 here = f"{path}/{tag}[{f'@name={shown(name)}' if name else counts[tag]}]"
                 if tag in _UNSUPPORTED:
-                    raise OpenPsaError(self._file, here, f"not supported: {_UNSUPPORTED[tag]}")
+                    raise self._error(here, f"not supported: {_UNSUPPORTED[tag]}")
+                role = element.get("role", "")
+                hidden = role == "private" or (private and role != "public")
                 if tag in {"define-fault-tree", "define-component", "model-data"}:
-                    role = element.get("role", "")
-                    hidden = role == "private" or (private and role != "public")
                     below = place if tag == "model-data" else (*place, self._checked(name, here))
                     inner.append((element, here, below, hidden))
                 elif tag in _DEFINITIONS:
-                    role = element.get("role", "")
-                    hidden = role == "private" or (private and role != "public")
                     yield _Definition(_DEFINITIONS[tag], here,
                                       (*place, self._checked(name, here)), hidden, element)
             stack.extend(reversed(inner))
 
     def _checked(self, name: str, path: str) -> str:
         if not name or "." in name:
-            raise OpenPsaError(self._file, path, f"name {shown(name)}: expected a name without "
-                                                 "dots")
+            raise self._error(path, f"name {shown(name)}: expected a name without dots")
         if len(name) > MAX_NAME:
-            raise OpenPsaError(self._file, path, f"name {shown(name)}: expected at most {MAX_NAME} "
-                                                 "characters")
+            raise self._error(path, f"name {shown(name)}: expected at most {MAX_NAME} characters")
         return name
 
     def _add(self, definition: _Definition) -> None:
@@ -180,8 +177,8 @@ class _Reader:
             None if definition.private else self._definitions.get(self._public.get(name, ())))
         # An event may be used in a fault tree and given its probability in the model data.
         if earlier is not None:
-            raise OpenPsaError(self._file, definition.path,
-                               f"duplicate name {name!r}, already defined at {earlier.path}")
+            raise self._error(definition.path,
+                              f"duplicate name {name!r}, already defined at {earlier.path}")
         self._definitions[place] = definition
         if not definition.private:
             self._public[name] = place
@@ -205,15 +202,15 @@ class _Reader:
             return Formula(self._gates, frozenset(self._basic), self._house,
                            self._resolved_top(top))
         except FormulaError as error:
-            raise OpenPsaError(self._file, "/opsa-mef", str(error)) from None
+            raise self._error("/opsa-mef", str(error)) from None
 
     def _resolved_top(self, top: str) -> str:
         if not top:
             return ""
         if top not in self._gates:
             known = ", ".join(sorted(self._gates)[:8])
-            raise OpenPsaError(self._file, "/opsa-mef", f"unknown top gate {top!r}; known: {known}"
-                               + (", ..." if len(self._gates) > 8 else ""))
+            raise self._error("/opsa-mef", f"unknown top gate {top!r}; known: {known}"
+                              + (", ..." if len(self._gates) > 8 else ""))
         return top
 
     def _constant(self, definition: _Definition) -> bool:
@@ -223,15 +220,13 @@ class _Reader:
     def _truth(self, constant: ET.Element, path: str) -> bool:
         value = constant.get("value", "")
         if value not in {"true", "false"}:
-            raise OpenPsaError(self._file, f"{path}/constant", f"value {value!r}: expected 'true' "
-                                                               "or 'false'")
+            raise self._error(f"{path}/constant", f"value {value!r}: expected 'true' or 'false'")
         return value == "true"
 
     def _define_gate(self, name: str, definition: _Definition) -> None:
         bodies = [child for child in definition.element if child.tag not in _ASIDE]
         if len(bodies) != 1:
-            raise OpenPsaError(self._file, definition.path, f"{len(bodies)} formulas; a gate has "
-                                                            "exactly one")
+            raise self._error(definition.path, f"{len(bodies)} formulas; a gate has exactly one")
         pending = [(name, bodies[0], definition.path)]
         place = definition.place[:-1]
         numbers = count(1)
@@ -246,8 +241,8 @@ class _Reader:
                 self._gates[own] = Connective((f"{own}{GENERATED}constant",), 1, 1)
                 continue
             if body.tag not in CONNECTIVES:
-                raise OpenPsaError(self._file, here[:200], "unknown connective; known: "
-                                   f"{', '.join(CONNECTIVES)}")
+                raise self._error(
+                    here[:200], f"unknown connective; known: {', '.join(CONNECTIVES)}")
             inputs = []
             for child in body:
                 if child.tag in REFERENCES:
@@ -267,10 +262,10 @@ class _Reader:
             if kind in {"", "basic-event"} and name and "." not in name:
                 self._basic.add(name)  # MEF lets basic events be declared by their use
                 return name
-            raise OpenPsaError(self._file, here, f"there is no {kind or 'event'} {name!r}")
+            raise self._error(here, f"there is no {kind or 'event'} {name!r}")
         actual = self._definitions[found].kind
         if kind and kind != actual:
-            raise OpenPsaError(self._file, here, f"{name!r} is a {actual}, not a {kind}")
+            raise self._error(here, f"{name!r} is a {actual}, not a {kind}")
         return self._names[found]
 
     def _resolve(self, name: str, place: tuple[str, ...]) -> tuple[str, ...] | None:
@@ -287,9 +282,9 @@ class _Reader:
         tag, count = element.tag, len(inputs)
         exactly = {"not": 1, "xor": 2, "iff": 2, "imply": 2}.get(tag, 0)
         if not count:
-            raise OpenPsaError(self._file, path, "empty gate; it needs inputs")
+            raise self._error(path, "empty gate; it needs inputs")
         if exactly and count != exactly:
-            raise OpenPsaError(self._file, path, f"{count} inputs; {tag!r} takes {exactly}")
+            raise self._error(path, f"{count} inputs; {tag!r} takes {exactly}")
         entries = tuple(inputs)
         match tag:
             case "atleast":
@@ -298,7 +293,7 @@ class _Reader:
                 low = self._number(element, "min", count, path)
                 high = self._number(element, "max", count, path)
                 if low > high:
-                    raise OpenPsaError(self._file, path, f"min = {low} is more than max = {high}")
+                    raise self._error(path, f"min = {low} is more than max = {high}")
                 return Connective(entries, low, high)
             case "imply":
                 self._gates[f"{name}{GENERATED}not"] = Connective((entries[0],), 1, 1, negated=True)
@@ -314,8 +309,8 @@ class _Reader:
         text = element.get(attribute, "")
         if not text.isdecimal() or len(text) > 9 or int(text) > count or (
                 attribute == "min" and int(text) == 0 and element.tag == "atleast"):
-            raise OpenPsaError(self._file, path, f"{attribute} = {text!r}: expected a number from "
-                               f"{1 if element.tag == 'atleast' else 0} to {count}, the inputs")
+            raise self._error(path, f"{attribute} = {text!r}: expected a number from "
+                              f"{1 if element.tag == 'atleast' else 0} to {count}, the inputs")
         return int(text)
 
 

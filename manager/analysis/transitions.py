@@ -32,10 +32,10 @@ from itertools import combinations
 import msgspec
 
 from rampart.manager.arbitration.arbiter import Arbiter
-from rampart.manager.arbitration.arbiter_state import RecoveryHeard, ResetAsked, State, Tick
+from rampart.manager.arbitration.arbiter_state import ResetAsked, State, Tick
 from rampart.manager.arbitration.detection_track import DetectionRules, DetectionTrack
-from rampart.manager.arbitration.recovery_track import Command, Phase, RecoveryTrack
-from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms
+from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard, RecoveryTrack
+from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, RecoveryPhase
 from rampart.manager.model.order import PartialOrder, Tree
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision, Late
@@ -54,7 +54,7 @@ class Module(msgspec.Struct, frozen=True):
         excused: It was given up on, and others no longer wait for it.
     """
 
-    phase: Phase = Phase.IDLE
+    phase: RecoveryPhase = RecoveryPhase.IDLE
     current: bool = True
     excused: bool = False
 
@@ -162,31 +162,31 @@ class Transitions:
         """Yield every report that a module could send."""
         track = now.state.recoveries[index]
         if track.wanted:
-            for phase in (Phase.ACTING, Phase.DONE, Phase.FAILED):
+            for phase in (RecoveryPhase.ACTING, RecoveryPhase.DONE, RecoveryPhase.FAILED):
                 if not track.acknowledged or track.phase is not phase:
                     yield f"{name} reports {phase}", self._step(
                         now, now.state, RecoveryHeard(name, True, phase, _CURRENT))
             if track.acknowledged and self.deaths:
                 yield f"{name} reports idle, it was respawned", self._step(
-                    now, now.state, RecoveryHeard(name, False, Phase.IDLE, _OLD))
+                    now, now.state, RecoveryHeard(name, False, RecoveryPhase.IDLE, _OLD))
         elif track.letting_go:
             yield f"{name} reports that it has let go", self._step(
-                now, now.state, RecoveryHeard(name, False, Phase.IDLE, _CURRENT))
+                now, now.state, RecoveryHeard(name, False, RecoveryPhase.IDLE, _CURRENT))
 
     def _module_steps(self, now: Situation, index: int, name: str
                       ) -> Iterator[tuple[str, Situation]]:
         module, track = now.modules[index], now.state.recoveries[index]
-        acting = module.phase is Phase.ACTING
+        acting = module.phase is RecoveryPhase.ACTING
         if not module.current and track.wanted:
-            yield f"{name} obeys", self._with_module(now, index, Module(Phase.ACTING))
+            yield f"{name} obeys", self._with_module(now, index, Module(RecoveryPhase.ACTING))
         elif not module.current and not acting:
             yield f"{name} lets go", self._with_module(now, index, Module())
         if acting:
-            for phase, words in ((Phase.DONE, "is done"), (Phase.FAILED, "fails")):
+            for phase, words in ((RecoveryPhase.DONE, "is done"), (RecoveryPhase.FAILED, "fails")):
                 yield f"{name} {words}", self._with_module(
                     now, index, msgspec.structs.replace(module, phase=phase))
         yield f"the arbiter hears {name}", self._hear(now, index, name)
-        if module.phase is not Phase.IDLE and self.deaths:
+        if module.phase is not RecoveryPhase.IDLE and self.deaths:
             yield f"{name} dies and comes back idle", self._with_module(
                 now, index, Module(current=False))
 
@@ -209,7 +209,7 @@ class Transitions:
     def _hear(self, now: Situation, index: int, name: str) -> Situation:
         module = now.modules[index]
         return self._step(now, now.state, RecoveryHeard(
-            name, module.phase is not Phase.IDLE, module.phase,
+            name, module.phase is not RecoveryPhase.IDLE, module.phase,
             _CURRENT if module.current else _OLD))
 
     def pass_deadline(self, now: Situation, index: int) -> Situation:
@@ -220,7 +220,7 @@ class Transitions:
             now, msgspec.structs.replace(now.state, recoveries=tuple(tracks)), Tick())
 
     def _with_module(self, now: Situation, index: int, module: Module) -> Situation:
-        excused = now.modules[index].excused and module.phase is not Phase.IDLE
+        excused = now.modules[index].excused and module.phase is not RecoveryPhase.IDLE
         modules = list(now.modules)
         modules[index] = msgspec.structs.replace(module, excused=excused)
         return Situation(now.state, tuple(modules))
@@ -233,7 +233,7 @@ class Transitions:
                                     strict=self.with_modules):
             current = module.current and is_.command == was.command
             given_up = (was.wanted or was.letting_go) and not is_.wanted and not is_.letting_go
-            busy = module.phase is not Phase.IDLE
+            busy = module.phase is not RecoveryPhase.IDLE
             modules.append(Module(module.phase, current, busy and (
                 module.excused or given_up or bool(is_.failure))))
         return self._canonical(after, tuple(modules))
@@ -248,11 +248,11 @@ class Transitions:
             RecoveryTrack(
                 Command(t.name, t.wanted, _CURRENT),
                 ordered_s=_OVER if t.ordered_s < 0 and t.wanted and not (
-                    t.acknowledged and t.phase is not Phase.ACTING) else 0.0,
+                    t.acknowledged and t.phase is not RecoveryPhase.ACTING) else 0.0,
                 cause=frozenset(
                     (d, 1) for d, r in t.cause if rises.get(d) == r
                     and self.contracts[t.name].kind.repairs),
-                heard=True, phase=t.phase if t.acknowledged else Phase.IDLE,
+                heard=True, phase=t.phase if t.acknowledged else RecoveryPhase.IDLE,
                 acknowledged=t.acknowledged, draining=t.draining, letting_go=t.letting_go,
                 latched=t.latched, failure="failed" if t.failure else "",
                 failed_for=tuple(n for n in t.failed_for if f"D_{n[2:]}" in rises))
@@ -274,7 +274,7 @@ class Transitions:
                 yield "no-conflicting-claims", (
                     f"{one.name} and {other.name} may both hold what they claim")
         for track, module in zip(tracks, now.modules, strict=self.with_modules):
-            if module.phase is not Phase.IDLE and not module.excused \
+            if module.phase is not RecoveryPhase.IDLE and not module.excused \
                     and not (track.wanted or track.letting_go):
                 yield "no-conflicting-claims", f"{track.name} holds on, and nobody knows"
         in_force = [t.name for t in tracks if t.wanted and not t.draining]
@@ -311,7 +311,7 @@ class Transitions:
         for was, is_, module in zip(before.state.recoveries, after.state.recoveries,
                                     before.modules, strict=self.with_modules):
             if was.wanted and not is_.wanted and module.current and not is_.failure \
-                    and not was.failure and module.phase is Phase.ACTING \
+                    and not was.failure and module.phase is RecoveryPhase.ACTING \
                     and not self.contracts[was.name].interruptible:
                 return was.name
         return ""

@@ -22,14 +22,6 @@ states can be explored. The strategy decides *which* recovery; the arbiter sees 
   in nobody's way: late is better than never.
 * An arbiter that starts while recoveries are activated, because the one before it was killed,
   adopts them, and releases none before it has heard every module (or has waited long enough).
-
-**The trap.** Safety-first runs the recovery of the dominating mechanism, and only that. When a
-control node dies, its command goes stale as well: if DM2 is active before RM3 was started, FTM2
-dominates FTM4 and RM2 runs. The robot stands, safely, and that is all that ever happens: RM3,
-dominated, is not started, so the node stays dead, so the command stays stale, so FTM2 stays
-active. This is the paper's strategy to the letter, not an error of the arbiter, which does what
-it can: an RM3 that was started first drains, and its success clears both causes. It takes another
-strategy to walk out of the trap.
 """
 
 from __future__ import annotations
@@ -37,24 +29,26 @@ from __future__ import annotations
 from collections.abc import Callable
 from operator import attrgetter
 
-import msgspec
+from msgspec.structs import replace
 
-from rampart.manager.arbitration import detection_track, recovery_track
+from rampart.manager.arbitration import detection_track, latching, recovery_track
 from rampart.manager.arbitration.arbiter_state import (
     DecisionMade,
-    DetectionHeard,
     Input,
     Output,
-    RecoveryHeard,
     ResetAnswered,
     ResetAsked,
     ShadowDiffered,
     State,
-    Tick,
 )
-from rampart.manager.arbitration.detection_track import DetectionRules, DetectionTrack
-from rampart.manager.arbitration.recovery_track import Command, Phase, RecoveryTrack
-from rampart.manager.model.mechanisms import Contract, Mechanisms
+from rampart.manager.arbitration.detection_track import (
+    DetectionHeard,
+    DetectionRules,
+    DetectionTrack,
+)
+from rampart.manager.arbitration.lateness import with_late
+from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard, RecoveryTrack
+from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.spec.budget import patience_s
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.arrangement import Arrangement, arrange
@@ -62,16 +56,9 @@ from rampart.manager.strategies.decision import NOTHING_ACTIVE, Decision, Strate
 from rampart.manager.strategies.escalation import escalate
 from rampart.manager.strategies.registry import Decider, find_strategy
 
-__all__ = [
-    "Arbiter", "Command", "DecisionMade", "DetectionHeard", "Input", "Output",
-    "Phase", "RecoveryHeard", "ResetAnswered", "ResetAsked", "ShadowDiffered", "State", "Tick",
-    "build_arbiter",
-]
-
-
 LARGEST_NUMBER = 1 << 52
-"""A decision number beyond it was never given, whoever reports or remembers it. What may follow
-still fits into a message (`rampart.actors.bus.bounds.Count`)."""
+"""A decision number beyond it was never given, although it be reported or remembered. What may
+follow still fits into a message (`rampart.actors.bus.bounds.Count`)."""
 
 _is_at_rest = attrgetter("is_at_rest")
 
@@ -95,33 +82,15 @@ class Arbiter:
         self.shadow = Decider(shadow, arrangement) if shadow else None
         self.rules = rules
         self._patient = strategy.patient or (shadow is not None and shadow.patient)
-        self._no_hold = msgspec.structs.replace(rules, release_hold_s=0.0, release_hold_max_s=0.0)
-        self._repairs = self._repaired_by(mechanisms)
+        self._no_hold = replace(rules, release_hold_s=0.0, release_hold_max_s=0.0)
         self._detection = {name: i for i, name in enumerate(mechanisms.detections)}
         self._recovery = {name: i for i, name in enumerate(mechanisms.recoveries)}
         self._needy = {name for name, c in mechanisms.contracts.items() if c.needs}
-        self._mechanisms_of = {
-            recovery: frozenset(ftm for ftm in mechanisms.names
-                                if any(recovery in way for way in mechanisms.alternatives(ftm)))
-            for recovery in mechanisms.recoveries}
-        self._detections_for = {
-            recovery: frozenset(detection for ftm in mine for detection in mechanisms.detect[ftm])
-            for recovery, mine in self._mechanisms_of.items()}
-
-    @staticmethod
-    def _repaired_by(mechanisms: Mechanisms) -> dict[str, tuple[str, ...]]:
-        """Return the recoveries of each detection module whose mechanisms only repair."""
-        recoveries: dict[str, tuple[str, ...]] = {}
-        for ftm in mechanisms.names:
-            for detection in mechanisms.detect[ftm]:
-                recoveries[detection] = (*recoveries.get(detection, ()), *mechanisms.recover[ftm])
-        return {detection: names for detection, names in recoveries.items()
-                if all(mechanisms.contracts[name].kind.repairs for name in names)}
 
     def explain(self, made: DecisionMade) -> Decision:
         """Return a decision with its certificate, what the arbiter itself rejected included."""
         reasons = self.decider.explain(made.chosen)
-        return msgspec.structs.replace(
+        return replace(
             made.decision, path=reasons.path, rejected=reasons.rejected + made.decision.rejected)
 
     def _rules_of(self, state: State, detection: str) -> DetectionRules:
@@ -129,9 +98,9 @@ class Arbiter:
         # flap. A repair that has been done has ended by itself. Held, its mechanism would still
         # count when another becomes active, and two unrelated crashes a second apart would end
         # in an emergency stop (block 4).
-        repairs = self._repairs.get(detection, ())
+        repairs = self.mechanisms.repairs.get(detection, ())
         if repairs and all(
-                track.phase is Phase.DONE and track.acknowledged
+                track.phase is RecoveryPhase.DONE and track.acknowledged
                 for track in (state.recoveries[self._recovery[name]] for name in repairs)):
             return self._no_hold
         return self.rules
@@ -150,19 +119,6 @@ class Arbiter:
                   for name in self.mechanisms.recoveries),
             number, NOTHING_ACTIVE, now)
 
-    def take_over(self, state: State, now: float) -> State:
-        """Return the state of another arbiter, one of the same system before a change, as mine.
-
-        What is known of modules that there still are is kept; new ones are waited for.
-        """
-        detections = {track.name: track for track in state.detections}
-        recoveries = {track.name: track for track in state.recoveries}
-        mine = self.initial(now, state.number)
-        return msgspec.structs.replace(
-            mine, started_s=state.started_s, oriented=state.oriented,
-            detections=tuple(detections.get(t.name, t) for t in mine.detections),
-            recoveries=tuple(recoveries.get(t.name, t) for t in mine.recoveries))
-
     def step(self, state: State, event: Input, now: float) -> tuple[State, tuple[Output, ...]]:
         """Take one input.
 
@@ -179,11 +135,11 @@ class Arbiter:
         answers: tuple[Output, ...] = ()
         match event:
             case DetectionHeard() if event.detection in self._detection:
-                state = self._with_detection(state, detection_track.hear(
-                    state.detections[self._detection[event.detection]],
-                    self.rules, now,
-                    active=event.active, reason=event.reason, nodes=event.nodes,
-                    since_s=event.since_s, stamp_s=event.stamp_s, life=event.life))
+                index = self._detection[event.detection]
+                state = replace(state, detections=(
+                    *state.detections[:index],
+                    detection_track.hear(state.detections[index], event, self.rules, now),
+                    *state.detections[index + 1:]))
             case RecoveryHeard() if event.recovery in self._recovery:
                 state = self._hear_recovery(state, event, now)
             case ResetAsked():
@@ -218,14 +174,9 @@ class Arbiter:
                 return False
         return all(map(_is_at_rest, state.recoveries))
 
-    def _with_detection(self, state: State, track: DetectionTrack) -> State:
-        index = self._detection[track.name]
-        return msgspec.structs.replace(state, detections=(
-            *state.detections[:index], track, *state.detections[index + 1:]))
-
     def _with_recovery(self, state: State, track: RecoveryTrack) -> State:
         index = self._recovery[track.name]
-        return msgspec.structs.replace(state, recoveries=(
+        return replace(state, recoveries=(
             *state.recoveries[:index], track, *state.recoveries[index + 1:]))
 
     def _hear_recovery(self, state: State, event: RecoveryHeard, now: float) -> State:
@@ -234,42 +185,25 @@ class Arbiter:
         if event.activated and not state.oriented and not track.wanted and not track.heard:
             if event.decision <= LARGEST_NUMBER:  # or it is no number that was ever given
                 number = max(number, event.decision)
-            track = msgspec.structs.replace(
+            track = replace(
                 track, ordered_s=now, adopted=True,
                 latched=self.mechanisms.contracts[event.recovery].latched,
                 command=Command(event.recovery, True, event.decision,
                                 reason="adopted, it was found activated"))
-        track = recovery_track.report(
-            track, now, activated=event.activated, phase=event.phase, decision=event.decision,
-            reason=event.reason)
+        track = recovery_track.hear(track, event, now)
         if track.failure and not track.failed_for:
-            track = msgspec.structs.replace(
-                track, failed_for=self._own(event.recovery, state.decision.active))
-        return self._with_recovery(msgspec.structs.replace(state, number=number), track)
-
-    def _own(self, recovery: str, active: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the active mechanisms for whose sake a recovery fails.
-
-        One that was chosen for another's sake, by block 4 or by escalation, fails for all.
-        """
-        own = self._mechanisms_of[recovery]
-        return tuple(name for name in active if name in own) or active
+            track = replace(track, failed_for=recovery_track.sakes(
+                self.mechanisms.users[event.recovery], state.decision.active))
+        return self._with_recovery(replace(state, number=number), track)
 
     def _reset(self, state: State, event: ResetAsked) -> tuple[State, ResetAnswered]:
-        name = event.recovery
-        index = self._recovery.get(name, -1)
-        if index < 0 or not state.recoveries[index].latched:
-            problem = "it is not latched" if index >= 0 else "there is no such recovery module"
-            return state, ResetAnswered(name, False, problem)
-        if not state.oriented:
-            return state, ResetAnswered(name, False, "not all modules have been heard yet")
         chosen = self._choose(state)[1]
-        if name in chosen.recoveries:
-            return state, ResetAnswered(
-                name, False, f"the cause persists: {', '.join(chosen.active)} active")
-        track = msgspec.structs.replace(state.recoveries[index], latched=False, adopted=False)
+        refusal = latching.refusal(state, event.recovery, chosen)
+        if refusal:
+            return state, ResetAnswered(event.recovery, False, refusal)
+        track = replace(self._track(state, event.recovery), latched=False, adopted=False)
         return self._with_recovery(state, track), ResetAnswered(
-            name, True, f"reset by {event.by}" if event.by else "reset")
+            event.recovery, True, f"reset by {event.by}" if event.by else "reset")
 
     def _pass_time(self, state: State, now: float) -> State:
         timeout_s = self.rules.silence_timeout_s
@@ -279,83 +213,23 @@ class Arbiter:
             for track in state.detections)
         believed = {track.name: track for track in detections}
         active = self._active(detections)
-        recoveries = tuple(self._judge(track, believed, active, now) for track in state.recoveries)
+        contracts, users = self.mechanisms.contracts, self.mechanisms.users
+        recoveries = tuple(
+            recovery_track.judge(track, contracts[track.name], users[track.name], believed,
+                                 active, now)
+            for track in state.recoveries)
         oriented = state.oriented or (
             all(t.ever_heard or t.silent for t in detections) and (
                 all(t.heard for t in recoveries)
                 or now - state.started_s > self.rules.startup_grace_s))
         if oriented and not state.oriented:
-            recoveries = tuple(msgspec.structs.replace(t, adopted=False) for t in recoveries)
-        state = msgspec.structs.replace(
-            state, detections=detections, recoveries=recoveries, oriented=oriented)
-        return self._with_late(state, active, now) if self._patient else state
+            recoveries = tuple(replace(t, adopted=False) for t in recoveries)
+        state = replace(state, detections=detections, recoveries=recoveries, oriented=oriented)
+        return with_late(state, active, self.arrangement, now) if self._patient else state
 
     def _active(self, detections: tuple[DetectionTrack, ...]) -> tuple[str, ...]:
         return self.mechanisms.detected_by(
             (t.name for t in detections if t.active), (t.name for t in detections if t.silent))
-
-    def _with_late(self, state: State, active: tuple[str, ...], now: float) -> State:
-        """Note since when mechanisms have had their turn, and which of them are late.
-
-        One that has to wait for a deeper one does not lose its patience meanwhile, or it would be
-        late, and the next above in force, the moment the deeper one has succeeded.
-        """
-        before = dict(state.since)
-        tree = self.arrangement.tree
-        in_time = [name for name in active if name not in state.late]
-        since = tuple(
-            (name, now if any(tree.is_above(name, deeper) for deeper in in_time)
-             else before.get(name, now)) for name in active)
-        late = frozenset(
-            name for name, since_s in since
-            if name in state.late or (
-                now - since_s > self.mechanisms.by_name[name].patience_s
-                and not all(self._in_force(state, recovery)
-                            for recovery in self.mechanisms.recover[name])))
-        return msgspec.structs.replace(state, since=since, late=late)
-
-    def _in_force(self, state: State, recovery: str) -> bool:
-        """Tell whether a forward recovery is in force; a repair ends the error or it does not."""
-        track = self._track(state, recovery)
-        return (track.wanted and track.acknowledged and not track.failure
-                and track.phase in {Phase.DONE, Phase.DEGRADED}
-                and not self.mechanisms.contracts[recovery].kind.repairs)
-
-    def _judge(self, track: RecoveryTrack, believed: dict[str, DetectionTrack],
-               active: tuple[str, ...], now: float) -> RecoveryTrack:
-        """Find a recovery to have failed, or forgive it."""
-        if track.failure:
-            forgiven = not set(track.failed_for) & set(active)
-            return msgspec.structs.replace(track, failure="", failed_for=()) if forgiven else track
-        contract = self.mechanisms.contracts[track.name]
-        if now - track.ordered_s <= contract.deadline_s:
-            return track
-        if track.letting_go:  # one that does not answer for so long is dead, and holds nothing
-            return msgspec.structs.replace(track, letting_go=False)
-        if not track.wanted or not (active or track.draining):
-            return track  # latched or adopted: there is nothing to escalate for
-        failure = self._failure(track, believed, contract)
-        if not failure:
-            return track
-        return msgspec.structs.replace(
-            track, failure=failure, failed_for=self._own(track.name, active))
-
-    @staticmethod
-    def _failure(track: RecoveryTrack, believed: dict[str, DetectionTrack], contract: Contract
-                 ) -> str:
-        """Say why a recovery has failed whose deadline is over; "" if it has not."""
-        if track.unfinished:
-            return f"not done within {contract.deadline_s:g} s"
-        if contract.kind.repairs and not track.draining:
-            # What it was not told of yet, it cannot have repaired.
-            lasting = sorted(
-                name for name, rises in track.cause
-                if believed[name].asserted and believed[name].rises == rises
-                and set(believed[name].nodes) <= set(track.command.nodes))
-            if lasting:
-                return (f"done, but {', '.join(lasting)} still active after "
-                        f"{contract.deadline_s:g} s")
-        return ""
 
     def _choose(self, state: State) -> tuple[Decision, Decision, Decision]:
         """Return the strategy's decision, that after escalation, and that after latching too."""
@@ -366,24 +240,9 @@ class Arbiter:
         if failures:
             decision = escalate(decision, failures, self.arrangement)
         kept = [t for t in state.recoveries if t.latched or t.adopted]
-        if not kept:
-            return chosen, decision, decision
-        # Several are kept only if one drains under another; the safest is the one in force.
-        safest = min(kept, key=lambda t: self.order.number[t.name])
-        winners = tuple(name for name in decision.recoveries
-                        if name == safest.name or self.order.is_above(name, safest.name))
-        base = winners or (safest.name,)
-        beneath = () if self.decider.strategy.exclusive else tuple(
-            name for name in decision.recoveries
-            if name not in base and self.mechanisms.contracts[name].kind.repairs
-            and self.arrangement.can_join(name, self.order.mask(base)))
-        losers = tuple(
-            name for name in decision.recoveries if name not in base and name not in beneath)
-        why = "is latched until reset" if safest.latched else "was found activated, and not all " \
-            "modules have been heard yet"
-        return chosen, decision, msgspec.structs.replace(
-            decision, recoveries=base + beneath,
-            rejected=decision.rejected + tuple((name, f"{safest.name} {why}") for name in losers))
+        return chosen, decision, latching.keep(
+            decision, kept, self.arrangement,
+            exclusive=self.decider.strategy.exclusive) if kept else decision
 
     def _unmet(self, state: State) -> dict[str, str]:
         """Return why recoveries are of no use now: a node that they need is reported failed."""
@@ -399,7 +258,7 @@ class Arbiter:
         fresh = decision != state.decision or any(
             self._has_new_cause(state, self._track(state, name)) for name in chosen)
         if fresh:
-            state = msgspec.structs.replace(state, number=state.number + 1, decision=decision)
+            state = replace(state, number=state.number + 1, decision=decision)
         outputs: list[Output] = []
         for before in state.recoveries:
             if before.wanted and before.name not in chosen:
@@ -436,7 +295,7 @@ class Arbiter:
         One that was chosen for another's sake, by block 4 or by escalation, answers to all.
         """
         active = [track for track in state.detections if track.active]
-        own = [track for track in active if track.name in self._detections_for[recovery]]
+        own = [track for track in active if track.name in self.mechanisms.causes[recovery]]
         return own or active
 
     def _has_new_cause(self, state: State, track: RecoveryTrack) -> bool:
@@ -445,9 +304,8 @@ class Arbiter:
         Only a repair has to: it is an action, and there is more to repair. A forward recovery is
         a state, which is in force already.
         """
-        if not track.wanted or not self.mechanisms.contracts[track.name].kind.repairs:
-            return False
-        return self._is_news(state, track)
+        return (track.wanted and self.mechanisms.contracts[track.name].kind.repairs
+                and self._is_news(state, track))
 
     def _is_news(self, state: State, track: RecoveryTrack,
                  named: Callable[[str], str] = str) -> bool:
@@ -463,9 +321,9 @@ class Arbiter:
         if track.unfinished and not self.mechanisms.contracts[track.name].interruptible:
             in_the_way = any(self.mechanisms.overlap(track.name, name) for name in chosen)
             if not track.failure or (track.acknowledged and not in_the_way):
-                return msgspec.structs.replace(track, draining=True)
+                return replace(track, draining=True)
         reason = f"superseded by {', '.join(chosen)}" if chosen else "the cause is gone"
-        return msgspec.structs.replace(
+        return replace(
             track, command=Command(track.name, False, number, reason=reason), cause=frozenset(),
             ordered_s=now, acknowledged=False, draining=False, adopted=False,
             letting_go=not track.failure)  # nobody waits for the word of one that failed
@@ -475,10 +333,10 @@ class Arbiter:
         ordered_s = now
         if track.wanted:
             if not self._has_new_cause(state, track):
-                return msgspec.structs.replace(track, draining=False)
-            if not track.acknowledged or not self._is_news(state, track, _without_life):
-                # It has been deaf since then; or its detection has not cleared and blames one life
-                # of a node after the other: it has not ended the error.
+                return replace(track, draining=False)
+            if not track.acknowledged or not self._is_news(state, track, _without_incarnation):
+                # It has been deaf since then; or its detection has not cleared and blames one
+                # incarnation of a node after the other: it has not ended the error.
                 ordered_s = track.ordered_s
         elif any(self._blocks(other, track.name, state.decision.recoveries)
                  for other in state.recoveries):
@@ -487,7 +345,7 @@ class Arbiter:
         nodes = tuple(dict.fromkeys(node for cause in causes for node in cause.nodes))
         reason = "; ".join(f"{cause.name}: {cause.reason}" if cause.reason else cause.name
                            for cause in causes)
-        return msgspec.structs.replace(
+        return replace(
             track, command=Command(track.name, True, state.number, nodes, reason),
             ordered_s=ordered_s, cause=frozenset((cause.name, cause.rises) for cause in causes),
             acknowledged=False, draining=False, letting_go=False, adopted=False,
@@ -505,29 +363,29 @@ class Arbiter:
         return not self.order.is_above(name, other.name)
 
 
-def _without_life(node: str) -> str:
-    """Return the name of a node that is blamed by its life, NODE#INCARNATION, or as it is."""
+def _without_incarnation(node: str) -> str:
+    """Return the name of a node that is blamed as NODE#INCARNATION, or as it is."""
     return node.partition("#")[0]
 
 
-def build_arbiter(spec: SystemSpec, strategy: str = "", *, first_life: bool = True) -> Arbiter:
+def build_arbiter(spec: SystemSpec, strategy: str = "", *, first_start: bool = True) -> Arbiter:
     """Build the arbiter of a system.
 
     Args:
         spec: The system.
         strategy: Name of a strategy; "" for the one that the spec names.
-        first_life: Whether modules may be starting as well, and are waited for accordingly; those
+        first_start: Whether modules may be starting as well, and are waited for accordingly; those
             of an arbiter that was respawned run already.
 
     Raises:
         UnknownStrategyError: No such strategy.
     """
     timing = spec.timing
+    silence_s = timing.detection_silence_timeout_s
     arrangement = arrange(
         spec.build_mechanisms(patience_s(spec)), spec.build_ftm_tree(), spec.build_order())
     return Arbiter(
         arrangement, find_strategy(strategy or spec.strategy),
-        DetectionRules(timing.detection_silence_timeout_s,
-                       timing.startup_grace_s if first_life else timing.detection_silence_timeout_s,
+        DetectionRules(silence_s, timing.startup_grace_s if first_start else silence_s,
                        timing.release_hold_s, timing.release_hold_max_s),
         find_strategy(spec.shadow) if spec.shadow else None)

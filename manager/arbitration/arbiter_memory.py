@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 
 import msgspec
+from msgspec.structs import replace
 
 from rampart.manager.arbitration.arbiter import LARGEST_NUMBER, Arbiter
 from rampart.manager.arbitration.arbiter_state import State
@@ -70,15 +71,29 @@ def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
     state = arbiter.initial(now, max(number, memory.number))
     latches = {latch.command.recovery: latch for latch in memory.latches}
     buckets = {name: (bucket_s, at_s) for name, bucket_s, at_s in memory.buckets}
-    return msgspec.structs.replace(
+    return replace(
         state,
         detections=tuple(
-            msgspec.structs.replace(track, bucket_s=buckets[track.name][0],
+            replace(track, bucket_s=buckets[track.name][0],
                                     bucket_at_s=min(buckets[track.name][1], now))
             if track.name in buckets else track for track in state.detections),
         recoveries=tuple(
             _latched(latches[track.name], now) if track.name in latches else track
             for track in state.recoveries))
+
+
+def take_over(arbiter: Arbiter, state: State, now: float) -> State:
+    """Return the state of another arbiter, one of the same system before a change, as this one's.
+
+    What is known of modules that there still are is kept; new ones are waited for.
+    """
+    detections = {track.name: track for track in state.detections}
+    recoveries = {track.name: track for track in state.recoveries}
+    fresh = arbiter.initial(now, state.number)
+    return replace(
+        fresh, started_s=state.started_s, oriented=state.oriented,
+        detections=tuple(detections.get(t.name, t) for t in fresh.detections),
+        recoveries=tuple(recoveries.get(t.name, t) for t in fresh.recoveries))
 
 
 def _latched(latch: Latch, now: float) -> RecoveryTrack:

@@ -2,45 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import msgspec
 
-from rampart.manager.arbitration.detection_track import DetectionTrack
-from rampart.manager.arbitration.recovery_track import Command, Phase, RecoveryTrack
+from rampart.manager.arbitration.detection_track import DetectionHeard, DetectionTrack
+from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard, RecoveryTrack
 from rampart.manager.strategies.decision import Decision
-
-
-class DetectionHeard(msgspec.Struct, frozen=True, tag=True):
-    """Input: a report of a detection module.
-
-    Attributes:
-        detection: Its name.
-        active: Its state.
-        reason: Why.
-        nodes: Failed nodes that it names.
-        since_s: When it took that state.
-        stamp_s: When the report was true; infinite for now.
-        life: Its incarnation.
-    """
-
-    detection: str
-    active: bool
-    reason: str = ""
-    nodes: tuple[str, ...] = ()
-    since_s: float = 0.0
-    stamp_s: float = math.inf
-    life: int = 0
-
-
-class RecoveryHeard(msgspec.Struct, frozen=True, tag=True):
-    """Input: a report of a recovery module, for the decision it last obeyed."""
-
-    recovery: str
-    activated: bool
-    phase: Phase
-    decision: int
-    reason: str = ""
 
 
 class ResetAsked(msgspec.Struct, frozen=True, tag=True):
@@ -149,11 +115,6 @@ class State(msgspec.Struct, frozen=True):
         """Names of the recovery modules that are in the middle of something."""
         return tuple(track.name for track in self.recoveries
                      if track.wanted or track.letting_go or track.latched)
-
-    @property
-    def draining(self) -> tuple[str, ...]:
-        """Names of the recovery modules that are superseded and finishing their action."""
-        return tuple(track.name for track in self.recoveries if track.draining)
 
     @property
     def latched(self) -> tuple[str, ...]:

@@ -31,6 +31,29 @@ from __future__ import annotations
 import math
 
 import msgspec
+from msgspec.structs import replace
+
+
+class DetectionHeard(msgspec.Struct, frozen=True, tag=True):
+    """Input: a report of a detection module.
+
+    Attributes:
+        detection: Its name.
+        active: Its state.
+        reason: Why.
+        nodes: Failed nodes that it names.
+        since_s: When it took that state.
+        stamp_s: When the report was true; infinite for now.
+        incarnation: Its own.
+    """
+
+    detection: str
+    active: bool
+    reason: str = ""
+    nodes: tuple[str, ...] = ()
+    since_s: float = 0.0
+    stamp_s: float = math.inf
+    incarnation: int = 0
 
 
 class DetectionRules(msgspec.Struct, frozen=True):
@@ -48,7 +71,7 @@ class DetectionTrack(msgspec.Struct, frozen=True):
     Attributes:
         name: Of the module.
         heard_s: When its newest report was true, or else when its time to report began to run.
-        life: Its incarnation, as last heard; 0 before.
+        incarnation: Its own, as last heard; 0 before.
         ever_heard: Whether it was heard at all since the arbiter started.
         reported: What it last said: active or not.
         silent: Not heard for too long.
@@ -75,7 +98,7 @@ class DetectionTrack(msgspec.Struct, frozen=True):
     bucket_at_s: float = 0.0
     nodes: tuple[str, ...] = ()
     reason: str = ""
-    life: int = 0
+    incarnation: int = 0
 
     @property
     def asserted(self) -> bool:
@@ -89,7 +112,7 @@ class DetectionTrack(msgspec.Struct, frozen=True):
 
 OVERDUE_SHARE = 0.6
 """Of the silence timeout: older news of a module, and it is overdue; half of that is late. Three
-reports fit in before, and a new life has time to be heard after."""
+reports fit in before, and its successor has time to be heard after."""
 
 
 def overdue(tracks: tuple[DetectionTrack, ...], rules: DetectionRules, now: float
@@ -107,17 +130,17 @@ def overdue(tracks: tuple[DetectionTrack, ...], rules: DetectionRules, now: floa
     return found if found is not None and found.ever_heard and not found.silent else None
 
 
-def hear(track: DetectionTrack, rules: DetectionRules, now: float, *, active: bool, reason: str,
-         nodes: tuple[str, ...], since_s: float, stamp_s: float = math.inf, life: int = 0
+def hear(track: DetectionTrack, report: DetectionHeard, rules: DetectionRules, now: float
          ) -> DetectionTrack:
-    """Take in a report that arrives at `now` and was true at `stamp_s`, at most now."""
-    heard_s = max(track.heard_s, min(stamp_s, now))
-    heard = msgspec.structs.replace(
-        track, heard_s=heard_s, ever_heard=True, reported=active, life=life,
+    """Take in a report that arrives at `now`; it was true then at the latest."""
+    heard_s = max(track.heard_s, min(report.stamp_s, now))
+    heard = replace(
+        track, heard_s=heard_s, ever_heard=True, reported=report.active,
+        incarnation=report.incarnation,
         silent=track.silent and now - heard_s > rules.silence_timeout_s)
-    if active:
-        heard = msgspec.structs.replace(heard, nodes=nodes, reason=reason)
-    return _follow(track, heard, rules, now, since_s)
+    if report.active:
+        heard = replace(heard, nodes=report.nodes, reason=report.reason)
+    return _follow(track, heard, rules, now, report.since_s)
 
 
 def pass_time(track: DetectionTrack, rules: DetectionRules, now: float) -> DetectionTrack:
@@ -126,11 +149,11 @@ def pass_time(track: DetectionTrack, rules: DetectionRules, now: float) -> Detec
     if not track.ever_heard:
         patience_s = max(patience_s, rules.startup_grace_s)
     if not track.silent and now - track.heard_s > patience_s:
-        silent = msgspec.structs.replace(
+        silent = replace(
             track, silent=True, reason="silent", nodes=track.nodes if track.reported else ())
         return _follow(track, silent, rules, now, now)
     if track.active and not track.asserted and now - track.clear_s >= release_hold_s(track, rules):
-        return msgspec.structs.replace(track, active=False, nodes=(), reason="")
+        return replace(track, active=False, nodes=(), reason="")
     return track
 
 
@@ -145,11 +168,11 @@ def _follow(before: DetectionTrack, after: DetectionTrack, rules: DetectionRules
     """Note a rise or a fall."""
     if after.asserted and not before.asserted:
         bucket_s = _bucket_s(before, rules, now) + rules.release_hold_s
-        return msgspec.structs.replace(
+        return replace(
             after, active=True, rises=before.rises + 1, since_s=since_s, bucket_at_s=now,
             bucket_s=min(bucket_s, rules.release_hold_max_s))
     if before.asserted and not after.asserted:
-        return msgspec.structs.replace(after, clear_s=now)
+        return replace(after, clear_s=now)
     return after
 
 

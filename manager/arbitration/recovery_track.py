@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
+from collections.abc import Mapping, Set
 
 import msgspec
+from msgspec.structs import replace
 
-
-class Phase(StrEnum):
-    """How far an activated recovery is; the values are those of its reports on the bus."""
-
-    IDLE = "idle"
-    ACTING = "acting"
-    DONE = "done"
-    DEGRADED = "degraded"
-    FAILED = "failed"
+from rampart.manager.arbitration.detection_track import DetectionTrack
+from rampart.manager.model.mechanisms import Contract, RecoveryPhase
 
 
 class Command(msgspec.Struct, frozen=True):
@@ -33,6 +27,16 @@ class Command(msgspec.Struct, frozen=True):
     activate: bool
     decision: int
     nodes: tuple[str, ...] = ()
+    reason: str = ""
+
+
+class RecoveryHeard(msgspec.Struct, frozen=True, tag=True):
+    """Input: a report of a recovery module, for the decision it last obeyed."""
+
+    recovery: str
+    activated: bool
+    phase: RecoveryPhase
+    decision: int
     reason: str = ""
 
 
@@ -61,7 +65,7 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
     cause: frozenset[tuple[str, int]] = frozenset()
     heard: bool = False
     activated: bool = False
-    phase: Phase = Phase.IDLE
+    phase: RecoveryPhase = RecoveryPhase.IDLE
     acknowledged: bool = False
     draining: bool = False
     letting_go: bool = False
@@ -87,7 +91,13 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
         An order that is not acknowledged is on its way: to release the module now could reach it
         half-way.
         """
-        return self.wanted and (not self.acknowledged or self.phase is Phase.ACTING)
+        return self.wanted and (not self.acknowledged or self.phase is RecoveryPhase.ACTING)
+
+    @property
+    def in_force(self) -> bool:
+        """Whether it has done what it was told; for a repair that says nothing of the error."""
+        return (self.wanted and self.acknowledged and not self.failure
+                and self.phase in {RecoveryPhase.DONE, RecoveryPhase.DEGRADED})
 
     @property
     def is_at_rest(self) -> bool:
@@ -96,25 +106,70 @@ class RecoveryTrack(msgspec.Struct, frozen=True):
                     or self.failure)
 
 
-def report(track: RecoveryTrack, now: float, *, activated: bool, phase: Phase, decision: int,
-           reason: str) -> RecoveryTrack:
+def hear(track: RecoveryTrack, report: RecoveryHeard, now: float) -> RecoveryTrack:
     """Take in a report that arrives at `now`."""
-    replace = msgspec.structs.replace
-    after = replace(track, heard=True, activated=activated, phase=phase)
+    after = replace(track, heard=True, activated=report.activated, phase=report.phase)
+    # One on an earlier decision says nothing about this one.
+    current = report.decision == track.command.decision
     if not track.wanted:
-        if track.letting_go and not activated and decision == track.command.decision:
-            after = replace(after, letting_go=False)
-        return after
-    if activated:
-        # A report on an earlier decision says nothing about this one.
-        acknowledged = decision == track.command.decision
-        after = replace(after, acknowledged=acknowledged)
-        if acknowledged and phase is Phase.FAILED and not track.failure:
-            after = replace(after, failure=reason or "it reports failure")
-        return after
+        return replace(after, letting_go=False) if current and not report.activated else after
+    if report.activated:
+        failed = current and report.phase is RecoveryPhase.FAILED and not track.failure
+        return replace(after, acknowledged=current, failure=(
+            report.reason or "it reports failure") if failed else track.failure)
     if track.acknowledged and not track.draining:
         # It was at work and is idle now: it was respawned. Being done earlier earns it the whole
         # deadline; dying half-way does not, or a crash loop would never be found out.
-        finished = track.phase is not Phase.ACTING
+        finished = track.phase is not RecoveryPhase.ACTING
         return replace(after, acknowledged=False, ordered_s=now if finished else track.ordered_s)
     return after
+
+
+def sakes(own: Set[str], active: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the active mechanisms for whose sake a recovery acts, given those that run it.
+
+    One that was chosen for another's sake, by block 4 or by escalation, acts for all.
+    """
+    return tuple(name for name in active if name in own) or active
+
+
+def judge(track: RecoveryTrack, contract: Contract, own: Set[str],  # noqa: PLR0917
+          believed: Mapping[str, DetectionTrack], active: tuple[str, ...], now: float
+          ) -> RecoveryTrack:
+    """Find a recovery to have failed, or forgive it.
+
+    Args:
+        track: Of the recovery.
+        contract: Its promises.
+        own: Mechanisms that run it.
+        believed: Belief about all detection modules.
+        active: Active mechanisms.
+        now: Time, seconds.
+    """
+    if track.failure:
+        forgiven = set(track.failed_for).isdisjoint(active)
+        return replace(track, failure="", failed_for=()) if forgiven else track
+    if now - track.ordered_s <= contract.deadline_s:
+        return track
+    if track.letting_go:  # one that does not answer for so long is dead, and holds nothing
+        return replace(track, letting_go=False)
+    if not track.wanted or not (active or track.draining):
+        return track  # latched or adopted: there is nothing to escalate for
+    failure = _failure(track, contract, believed)
+    return replace(track, failure=failure, failed_for=sakes(own, active)) if failure else track
+
+
+def _failure(track: RecoveryTrack, contract: Contract, believed: Mapping[str, DetectionTrack]
+             ) -> str:
+    """Say why a recovery has failed whose deadline is over; "" if it has not."""
+    if track.unfinished:
+        return f"not done within {contract.deadline_s:g} s"
+    if contract.kind.repairs and not track.draining:
+        # What it was not told of yet, it cannot have repaired.
+        lasting = sorted(
+            name for name, rises in track.cause
+            if believed[name].asserted and believed[name].rises == rises
+            and set(believed[name].nodes) <= set(track.command.nodes))
+        if lasting:
+            return f"done, but {', '.join(lasting)} still active after {contract.deadline_s:g} s"
+    return ""

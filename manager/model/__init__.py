@@ -1,1 +1,1 @@
-"""Fault trees, gates, mechanisms and orders: the words in which a system is described."""
+"""What a system is, to the arbiter: fault tree, gates, mechanisms, orders."""

@@ -94,18 +94,18 @@ class FaultTree:
             joined.add(name)
             self.parents[name].append(event.name)
 
-    def occurring(self, basic: Iterable[str]) -> frozenset[str]:
-        """Return all events that occur when the given ones do."""
-        occurring = set(basic)
+    def occurring(self, given: Iterable[str], prevented: str = "") -> set[str]:
+        """Return all events that occur when the given ones do and one is prevented."""
+        occurring = set(given) - {prevented}
         changed = True
         while changed:
             changed = False
             for event in self.events.values():
-                if event.name not in occurring and event.required and \
-                        sum(name in occurring for name in event.inputs) >= event.required:
+                if event.name != prevented and event.required and event.name not in occurring \
+                        and sum(name in occurring for name in event.inputs) >= event.required:
                     occurring.add(event.name)
                     changed = True
-        return frozenset(occurring)
+        return occurring
 
     def derive_ftm_tree(self, placement: Mapping[str, str]) -> Tree:
         """Derive the FTMTree from the event on which each mechanism sits.

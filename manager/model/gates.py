@@ -68,11 +68,6 @@ class Gate(msgspec.Struct, frozen=True):
     inputs: tuple[Gate, ...] = ()
 
     @property
-    def is_name(self) -> bool:
-        """Whether it is no more than a name."""
-        return bool(self.name) and not self.negated
-
-    @property
     def names(self) -> tuple[str, ...]:
         """Names in the gate, each once, as written."""
         if self.name:

@@ -35,6 +35,16 @@ class RecoveryKind(StrEnum):
         return self is not RecoveryKind.FORWARD
 
 
+class RecoveryPhase(StrEnum):
+    """How far an activated recovery is: only `ACTING` must not be cut off."""
+
+    IDLE = "idle"
+    ACTING = "acting"
+    DONE = "done"
+    DEGRADED = "degraded"
+    FAILED = "failed"
+
+
 class Contract(msgspec.Struct, frozen=True):
     """What a recovery module promises the arbiter.
 
@@ -85,6 +95,9 @@ class Mechanisms:
     Attributes:
         recover: The recoveries that each mechanism runs, where all can be had.
         detect: The detection modules that each mechanism listens to.
+        users: The mechanisms that may run each recovery.
+        causes: The detection modules that each recovery answers to.
+        repairs: What is run for a detection module, where all of it repairs.
 
     Raises:
         ValueError: Two of one name, or a recovery without a contract.
@@ -109,6 +122,17 @@ class Mechanisms:
         self.detections = tuple(dict.fromkeys(chain.from_iterable(self.detect.values())))
         self.recoveries = tuple(self.contracts)
         self._number = {name: index for index, name in enumerate(self.names)}
+        self.users: dict[str, set[str]] = {recovery: set() for recovery in self.recoveries}
+        self.causes: dict[str, set[str]] = {recovery: set() for recovery in self.recoveries}
+        run_for: dict[str, list[str]] = {detection: [] for detection in self.detections}
+        for name, ways in self._alternatives.items():
+            for recovery in chain.from_iterable(ways):
+                self.users[recovery].add(name)
+                self.causes[recovery].update(self.detect[name])
+            for detection in self.detect[name]:
+                run_for[detection] += self.recover[name]
+        self.repairs = {detection: run for detection, run in run_for.items()
+                        if all(self.contracts[recovery].kind.repairs for recovery in run)}
 
     def sort(self, names: Iterable[str]) -> tuple[str, ...]:
         """Return mechanism names once each, in the declared sequence.

@@ -20,7 +20,9 @@ a tree the two definitions agree.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import graphlib
+from collections.abc import Iterable, Mapping, Sequence
+from graphlib import TopologicalSorter
 
 
 class CycleError(ValueError):
@@ -40,27 +42,11 @@ class UnknownElementError(ValueError):
 
 
 def find_cycle(above: Mapping[str, Iterable[str]]) -> tuple[str, ...] | None:
-    """Return one cycle of a directed graph, first name repeated at the end, or None.
-
-    Depth first with an explicit stack, so a chain of thousands of events is no problem.
-    """
-    finished: set[str] = set()
-    for start in above:
-        if start in finished:
-            continue
-        trail = {start: None}  # a dict: ordered like the trail, and quick to look into
-        branches: list[Iterator[str]] = [iter(above[start])]
-        while trail:
-            child = next(branches[-1], None)
-            if child is None:
-                finished.add(trail.popitem()[0])
-                branches.pop()
-            elif child in trail:
-                names = list(trail)
-                return (*names[names.index(child):], child)
-            elif child not in finished and child in above:
-                trail[child] = None
-                branches.append(iter(above[child]))
+    """Return one cycle of a directed graph, first name repeated at the end, or None."""
+    try:
+        TopologicalSorter(above).prepare()
+    except graphlib.CycleError as error:
+        return tuple(reversed(error.args[1]))
     return None
 
 
@@ -210,10 +196,6 @@ class Tree(PartialOrder):
         self.root = roots[0]
         self.parents = dict(parents)
 
-    def children(self, name: str) -> tuple[str, ...]:
-        """Return the direct children of an element."""
-        return tuple(child for child in self.names if self.parents[child] == name)
-
     def lowest_common_in(self, mask: int) -> int:
         """Return the number of the closest element above or equal to all of a non-empty set."""
         bit = (mask & -mask).bit_length() - 1
@@ -239,17 +221,8 @@ class Tree(PartialOrder):
 
 def _linear_extension(relation: Mapping[str, Iterable[str]]) -> tuple[str, ...]:
     """Number an acyclic relation so that the upper comes first; ties keep declaration order."""
-    waiting = dict.fromkeys(relation, 0)
-    for lowers in relation.values():
-        for lower in set(lowers):
-            waiting[lower] += 1
-    extension: list[str] = []
-    ready = [name for name, count in waiting.items() if count == 0]
-    while ready:
-        name = ready.pop(0)
-        extension.append(name)
-        for lower in dict.fromkeys(relation[name]):
-            waiting[lower] -= 1
-            if waiting[lower] == 0:
-                ready.append(lower)
-    return tuple(extension)
+    sorter = TopologicalSorter[str](dict.fromkeys(relation, ()))
+    for upper, lowers in relation.items():
+        for lower in lowers:
+            sorter.add(lower, upper)
+    return tuple(sorter.static_order())

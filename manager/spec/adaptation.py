@@ -15,8 +15,9 @@ import msgspec
 
 from rampart.files import toml
 from rampart.files.reading import FileError, shown
-from rampart.manager.spec.schema import SpecificationError, SystemSpec
+from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.specification import check_document
+from rampart.manager.spec.tables import SpecificationError
 
 Document = dict[str, Any]
 

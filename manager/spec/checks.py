@@ -1,4 +1,4 @@
-"""Whether a system spec makes sense: names, cycles, the tree, the order, the time budget.
+"""Whether a system spec makes sense: names, nodes, processes, modules, and what others check.
 
 One small validator per concern; each yields what it finds wrong as a `Finding`. They run in
 sequence and the first finding is the one reported, so a validator may rely on those before it.
@@ -6,35 +6,24 @@ sequence and the first finding is the one reported, so a validator may rely on t
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection, Iterator
-from functools import reduce
-from itertools import chain, permutations, product
-from operator import or_
-from typing import Any, NamedTuple
+from collections.abc import Callable, Collection, Iterable, Iterator
+from itertools import chain
 
-import msgspec
-
-from rampart.manager.model.fault_tree import FaultTreeError
 from rampart.manager.model.gates import WORDS, GateError, detection_gate, recovery_gate
-from rampart.manager.model.order import CycleError, PartialOrder, find_cycle
-from rampart.manager.spec.budget import (
-    braking_distance_m,
-    check,
-    find_false_alarm,
-    find_false_alarms,
-)
+from rampart.manager.model.order import find_cycle
+from rampart.manager.spec import arbitration_checks, time_checks
 from rampart.manager.spec.parameters import TAKES, TIMES_OUT_ON, find_wrong
 from rampart.manager.spec.schema import (
     NODE_KINDS,
     DetectionSpec,
-    Hazard,
     Kind,
     RecoverySpec,
-    Robot,
     SystemSpec,
 )
-from rampart.manager.strategies.registry import STRATEGIES
+from rampart.manager.spec.tables import Finding, unknown
+from rampart.manager.spec.timeouts import find_false_alarm
+
+Validator = Callable[[SystemSpec], Iterator[Finding]]
 
 SUPERVISOR = "supervisor"
 MANAGER_CLASS = "rampart.manager.actor:FtmManager"
@@ -42,20 +31,9 @@ RESERVED = frozenset({
     SUPERVISOR, "spawner", "spawner_a", "spawner_b", "launch", "observer", "injector"})
 
 
-class Finding(NamedTuple):
-    """Something wrong: where, what, and the offending value if one value is to blame."""
-
-    path: str
-    problem: str
-    value: tuple[Any, ...] = ()
-
-
 def find_nonsense(spec: SystemSpec) -> Finding | None:
     """Return the first thing wrong with a spec that is well-typed, or None."""
-    for validator in VALIDATORS:
-        for finding in validator(spec):
-            return finding
-    return None
+    return _first(spec, VALIDATORS)
 
 
 def find_nonsense_of_rest(spec: SystemSpec) -> Finding | None:
@@ -68,14 +46,13 @@ def find_nonsense_of_rest(spec: SystemSpec) -> Finding | None:
             return Finding(f"$.recovery[{index}].escalate_to",
                            f"{recovery.name} escalates to it, and it is disabled",
                            (recovery.escalate_to,))
-    for validator in (_fault_tree, _criteria, _order_against_tree, _budget):
-        for finding in validator(spec):
-            return finding
-    return None
+    return _first(spec, (
+        arbitration_checks.find_wrong_tree, arbitration_checks.find_contradictions,
+        arbitration_checks.find_wrong_precedence, time_checks.find_wrong_budget))
 
 
-def _unknown(path: str, value: str, what: str, known: Collection[str]) -> Finding:
-    return Finding(path, f"unknown {what}; known: {', '.join(known) or 'none'}", (value,))
+def _first(spec: SystemSpec, validators: Iterable[Validator]) -> Finding | None:
+    return next(chain.from_iterable(validator(spec) for validator in validators), None)
 
 
 def _modules(spec: SystemSpec) -> Iterator[tuple[str, str, str, str]]:
@@ -116,12 +93,12 @@ def _nodes(spec: SystemSpec) -> Iterator[Finding]:
         if node.kind in {Kind.DETECTION, Kind.RECOVERY}:
             yield Finding(f"{path}.kind", f"belongs into [[{node.kind.value}]]", (node.kind.value,))
         if node.kind not in NODE_KINDS:
-            yield _unknown(f"{path}.kind", node.kind.value, "kind", NODE_KINDS)
+            yield unknown(f"{path}.kind", node.kind.value, "kind", NODE_KINDS)
         if node.actor == MANAGER_CLASS and node.kind is not Kind.MANAGER:
             yield Finding(f"{path}.kind", f"{node.actor} has to be of kind 'manager'",
                           (node.kind.value,))
         if node.respawn not in respawners:
-            yield _unknown(f"{path}.respawn", node.respawn, "recovery module", respawners)
+            yield unknown(f"{path}.respawn", node.respawn, "recovery module", respawners)
         if node.kind is Kind.MANAGER and node.respawn != SUPERVISOR:
             yield Finding(f"{path}.respawn", "the manager cannot command its own recovery; only "
                                              f"{SUPERVISOR!r} is right", (node.respawn,))
@@ -176,7 +153,7 @@ def _detections(spec: SystemSpec) -> Iterator[Finding]:
             watched: set[str] = set()
             for place, name in enumerate(watch):
                 if name not in nodes:
-                    yield _unknown(f"{path}.parameters.watch[{place}]", name, "node", nodes)
+                    yield unknown(f"{path}.parameters.watch[{place}]", name, "node", nodes)
                 if name in watched:
                     yield Finding(f"{path}.parameters.watch[{place}]", "listed twice", (name,))
                 watched.add(name)
@@ -219,9 +196,9 @@ def _mechanisms(spec: SystemSpec) -> Iterator[Finding]:
                 return
             for name in names:
                 if name not in known:
-                    yield _unknown(f"{path}.{field}", name, what, known)
+                    yield unknown(f"{path}.{field}", name, what, known)
         if mechanism.event not in events:
-            yield _unknown(f"{path}.event", mechanism.event, "event", events)
+            yield unknown(f"{path}.event", mechanism.event, "event", events)
     if not spec.mechanisms and (spec.detections or spec.recoveries):
         yield Finding("$.mechanism", "missing; no mechanism joins detection to recovery")
 
@@ -243,7 +220,7 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
                               f"{need!r}; leave it out of one of the two",
                               (sorted(recovery.disables),))
         if recovery.escalate_to and recovery.escalate_to not in names:
-            yield _unknown(f"$.recovery[{index}].escalate_to", recovery.escalate_to,
+            yield unknown(f"$.recovery[{index}].escalate_to", recovery.escalate_to,
                            "recovery module", names)
         own = ["nodes"] if recovery.name in respawns else []
         yield from _parameters(f"$.recovery[{index}]", recovery, nodes, own)
@@ -289,202 +266,9 @@ def _reachability(spec: SystemSpec) -> Iterator[Finding]:
                           "watches it", (node.respawn,))
 
 
-def _fault_tree(spec: SystemSpec) -> Iterator[Finding]:
-    names = [event.name for event in spec.events]
-    known = set(names)
-    for index, event in enumerate(spec.events):
-        path = f"$.event[{index}]"
-        if event.of and event.gate is None:
-            yield Finding(f"{path}.of", "inputs without a gate; add gate = 'or'", (event.of,))
-        for place, name in enumerate(event.of):
-            if name not in known:
-                yield _unknown(f"{path}.of[{place}]", name, "event", names)
-    try:
-        tree = spec.build_fault_tree()
-    except FaultTreeError as error:
-        index = len(names) - 1 - names[::-1].index(error.subject) if error.subject else -1
-        path = f"$.event[{index}]" if error.subject else "$.event"
-        yield Finding(path, str(error), (error.subject,) if error.subject else ())
-        return
-    mechanisms = [mechanism.name for mechanism in spec.mechanisms]
-    if not mechanisms:
-        return
-    try:
-        tree.derive_ftm_tree({m.name: m.event for m in spec.mechanisms})
-    except FaultTreeError as error:
-        if error.subject:
-            index = mechanisms.index(error.subject)
-            yield Finding(f"$.mechanism[{index}].event", f"{error.subject}: {error}",
-                          (spec.mechanisms[index].event,))
-        else:
-            yield Finding("$.mechanism", str(error))
-
-
-def _policy(spec: SystemSpec) -> Iterator[Finding]:
-    for field in ("strategy", "shadow"):
-        name = getattr(spec, field)
-        if name not in STRATEGIES and (name or field == "strategy"):
-            yield _unknown(f"$.{field}", name, "strategy", sorted(STRATEGIES))
-    if not spec.criteria:
-        yield Finding("$.order", "expected the name of an order, or a list of such", ([],))
-    for name in spec.criteria:
-        if name not in spec.orders:
-            yield _unknown("$.order", name, "order", list(spec.orders))
-        if spec.criteria.count(name) > 1:
-            yield Finding("$.order", f"{name!r} is listed twice", (list(spec.criteria),))
-
-
-def _orders(spec: SystemSpec) -> Iterator[Finding]:
-    recoveries = dict.fromkeys(recovery.name for recovery in spec.recoveries)
-    for name, relation in spec.orders.items():
-        for upper, lowers in relation.items():
-            path = f"$.orders.{name}.{upper}"
-            if upper not in recoveries:
-                yield _unknown(path, upper, "recovery module", recoveries)
-            listed: set[str] = set()
-            for place, lower in enumerate(lowers):
-                if lower not in recoveries:
-                    yield _unknown(f"{path}[{place}]", lower, "recovery module", recoveries)
-                if lower in listed:
-                    yield Finding(f"{path}[{place}]", "duplicate", (lower,))
-                listed.add(lower)
-        try:
-            spec.build_order(name)
-        except CycleError as error:
-            yield Finding(f"$.orders.{name}.{error.cycle[0]}",
-                          f"{error}; no recovery can be above itself",
-                          (list(relation[error.cycle[0]]),))
-
-
-def _criteria(spec: SystemSpec) -> Iterator[Finding]:
-    try:
-        spec.build_order()
-    except CycleError as error:
-        yield Finding("$.order", f"the criteria contradict each other, {error}; leave one out or "
-                                 "let them agree", (list(spec.criteria),))
-
-
-def _compounds(spec: SystemSpec) -> Iterator[Finding]:
-    """Recoveries that one mechanism runs together must be able to run together."""
-    contracts = spec.build_mechanisms().contracts
-    for index, mechanism in enumerate(spec.mechanisms):
-        ways = recovery_gate(mechanism.recover).alternatives()
-        together = dict.fromkeys(chain.from_iterable(permutations(way, 2) for way in ways))
-        for one, other in together:
-            shared = contracts[one].claims & contracts[other].claims
-            harmed = contracts[one].disables & contracts[other].needs
-            if shared or harmed:
-                yield Finding(f"$.mechanism[{index}].recover", (
-                    f"{one} and {other} both claim {', '.join(sorted(shared))}" if shared else
-                    f"{one} disables {', '.join(sorted(harmed))}, which {other} needs"
-                    ) + "; they cannot run together", (mechanism.recover,))
-
-
-def _order_against_tree(spec: SystemSpec) -> Iterator[Finding]:
-    if not spec.mechanisms:
-        return
-    order, tree = spec.build_safety_order(), spec.build_ftm_tree()
-    safer = spec.criteria[0]
-    recover = {mechanism.name: mechanism.recoveries for mechanism in spec.mechanisms}
-    own = {name: order.mask(names) for name, names in recover.items()}
-    under = {name: reduce(or_, (order.below[order.number[r]] for r in names))
-             for name, names in recover.items()}
-    for upper in tree.names:
-        for lower in tree.members(tree.below[tree.number[upper]]):
-            if not under[lower] & own[upper]:
-                continue
-            for above, below in product(recover[lower], recover[upper]):
-                if order.is_above(above, below):
-                    yield Finding(
-                        f"$.orders.{safer}.{above}",
-                        f"contradicts the FTMTree: {above} of {lower} is above {below} of {upper}, "
-                        f"but {upper} is above {lower}",
-                        (list(spec.orders[safer].get(above, ())),))
-    for index, recovery in enumerate(spec.recoveries):
-        if recovery.escalate_to and order.is_above(recovery.name, recovery.escalate_to):
-            yield Finding(f"$.recovery[{index}].escalate_to",
-                          f"{recovery.name} is above it in the order {safer!r}; escalation "
-                          "must not lead to less", (recovery.escalate_to,))
-    for last_resort in recover[tree.root]:
-        yield from _undelayed(spec, order, last_resort)
-
-
-def _undelayed(spec: SystemSpec, order: PartialOrder, last_resort: str) -> Iterator[Finding]:
-    """A recovery of the FTMTree's root is a last resort: nothing may make it wait."""
-    contracts = spec.build_mechanisms().contracts
-    names = [recovery.name for recovery in spec.recoveries]
-    for name in order.names:
-        shared = contracts[name].claims & contracts[last_resort].claims
-        if name != last_resort and shared:
-            yield Finding(f"$.recovery[{names.index(name)}].claims",
-                          f"{last_resort}, the last resort, would have to wait for {name}, which "
-                          f"claims {', '.join(sorted(shared))} as well",
-                          (sorted(contracts[name].claims),))
-
-
-def _timing(spec: SystemSpec) -> Iterator[Finding]:
-    timing = spec.timing
-    if spec.mobile is not None:
-        yield from _room(spec.mobile)
-    else:
-        for field, value in msgspec.structs.asdict(timing).items():
-            if math.isnan(value):
-                yield Finding(f"$.timing.{field}", "missing; it is derived from [robot], and this "
-                                                   "system has none")
-    if timing.release_hold_max_s < timing.release_hold_s:
-        yield Finding("$.timing.release_hold_max_s", "must be no less than release_hold_s = "
-                      f"{timing.release_hold_s}", (timing.release_hold_max_s,))
-    for path, value, problem in find_false_alarms(spec):
-        yield Finding(path, problem, (value,))
-
-
-def _room(robot: Robot) -> Iterator[Finding]:
-    braking_m = braking_distance_m(robot, robot.top_speed_mps)
-    for field in ("corridor_clearance_m", "stop_distance_m"):
-        room_m = getattr(robot, field)
-        if room_m <= braking_m:
-            yield Finding(f"$.robot.{field}", f"too little to brake in; from top_speed_mps the "
-                          f"robot takes {braking_m:.3f} m", (room_m,))
-    if robot.hardware_speed_mps < robot.top_speed_mps:
-        yield Finding("$.robot.hardware_speed_mps", "the drive cannot be slower than top_speed_mps "
-                      f"= {robot.top_speed_mps}", (robot.hardware_speed_mps,))
-    if robot.sensing_range_m <= robot.stop_distance_m:
-        yield Finding("$.robot.sensing_range_m", "obstacles must be seen before they are nearer "
-                      f"than stop_distance_m = {robot.stop_distance_m}", (robot.sensing_range_m,))
-
-
-def _budget(spec: SystemSpec) -> Iterator[Finding]:
-    root = spec.build_ftm_tree().root if spec.mechanisms else ""
-    detections = {detection.name: detection for detection in spec.detections}
-    for index, mechanism in enumerate(spec.mechanisms):
-        if spec.mobile is None and mechanism.against is Hazard.DRIFT:
-            yield Finding(f"$.mechanism[{index}].against", "'drift', which it is if left out, "
-                          "needs a [robot]; 'parent' or { within_s = ..., hazard = '...' } is "
-                          "right")
-        if spec.mobile is None and mechanism.against in {Hazard.RUNAWAY, Hazard.INTRUSION}:
-            yield Finding(f"$.mechanism[{index}].against", "needs a [robot]; 'parent' or "
-                          "{ within_s = ..., hazard = '...' } is right", (mechanism.against.value,))
-        if mechanism.against is Hazard.PARENT and mechanism.name == root:
-            yield Finding(f"$.mechanism[{index}].against", f"{root} is the root of the FTMTree and "
-                          "has no parent to be faster than", (mechanism.against.value,))
-        if mechanism.against is Hazard.INTRUSION and \
-                any("margin_m" not in detections[name].parameters
-                    for name in mechanism.detections):
-            yield Finding(f"$.mechanism[{index}].against", f"{mechanism.detect} needs "
-                          "parameters.margin_m, the distance at which it warns",
-                          (mechanism.against.value,))
-    for index, detection in enumerate(spec.detections):
-        margin_m = detection.parameters.get("margin_m", 0.0)
-        if spec.mobile is not None and margin_m >= spec.robot.corridor_clearance_m:
-            yield Finding(f"$.detection[{index}].parameters.margin_m", "would raise false alarms; "
-                          "it must be below corridor_clearance_m = "
-                          f"{spec.robot.corridor_clearance_m:g}", (margin_m,))
-    for budget in check(spec):
-        if not budget.fits:
-            yield Finding("$.timing", f"the time budget does not fit: {budget}")
-
-
-VALIDATORS: tuple[Callable[[SystemSpec], Iterator[Finding]], ...] = (
-    _timing, _names, _nodes, _detections, _recoveries, _disabling, _processes, _mechanisms,
-    _reachability, _fault_tree, _policy, _orders, _criteria, _compounds, _order_against_tree,
-    _budget)
+VALIDATORS: tuple[Validator, ...] = (
+    time_checks.find_wrong_times, _names, _nodes, _detections, _recoveries, _disabling, _processes,
+    _mechanisms, _reachability, arbitration_checks.find_wrong_tree,
+    arbitration_checks.find_wrong_policy, arbitration_checks.find_wrong_orders,
+    arbitration_checks.find_contradictions, arbitration_checks.find_wrong_compounds,
+    arbitration_checks.find_wrong_precedence, time_checks.find_wrong_budget)

@@ -1,4 +1,4 @@
-"""The tables of a system specification: robot, timing, nodes, mechanisms, fault tree.
+"""The tables of a system specification: nodes, modules, mechanisms, fault tree, orders.
 
 One TOML file says everything that the arbiter, the launcher and the supervisor need to know;
 `systems/osmosis.toml` shows every field. These classes are its shape, and what
@@ -16,149 +16,23 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from rampart.files.reading import plain_line, shown
 from rampart.manager.model.fault_tree import Event, FaultTree
 from rampart.manager.model.gates import detection_gate, recovery_gate
 from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
 from rampart.manager.model.order import PartialOrder, Tree, refine
-
-OptionalName = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z][A-Za-z0-9_]{0,63})?\Z")]
-Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
-"""As long as the address of a node's socket has room for (`actors.bus.run_folder`), and well
-below what a message takes as a name (`rampart.actors.bus.bounds`), which may add to it."""
+from rampart.manager.spec.mobile_robot import Hazard, Robot
+from rampart.manager.spec.tables import (
+    DERIVED,
+    Layers,
+    Name,
+    OptionalName,
+    Positive,
+    Supervision,
+    Table,
+    Timing,
+)
 
 ClassPath = Annotated[str, msgspec.Meta(pattern=r"^[a-z_]\w*(\.[a-z_]\w*)*:[A-Z]\w*\Z")]
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NonNegative = Annotated[float, msgspec.Meta(ge=0)]
-
-DERIVED = math.nan
-"""Default of a timing value that is derived; a file cannot say it, numbers there are finite."""
-
-
-_LONGEST_SHOWN = 200
-"""Characters of a value in a message."""
-
-
-class SpecificationError(ValueError):
-    """A system spec that cannot be accepted. The message is one line.
-
-    Attributes:
-        file: Name of the file, as given by the caller.
-        path: Where in it, e.g. `$.mechanism[2].detect`.
-        problem: What is wrong and what would be right.
-    """
-
-    def __init__(self, file: str, path: str, problem: str, *value: object) -> None:
-        self.file = file
-        self.path = path
-        self.problem = problem
-        said = f" = {shown(value[0], _LONGEST_SHOWN)}" if value else ""
-        super().__init__(plain_line(f"{file}: {path}{said}: {problem}"))
-
-
-class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of all tables of a spec: immutable, and a field it does not know is an error."""
-
-
-class Robot(Table, frozen=True):
-    """The robot and the room it has, as far as time budgets depend on them.
-
-    Attributes:
-        length_m: Of the footprint, along x of `base_link`.
-        width_m: Of the footprint, along y.
-        top_speed_mps: Fastest command that the controller gives.
-        top_turn_rate_radps: Fastest turn that the controller commands.
-        hardware_speed_mps: Fastest the drive goes when it is commanded nonsense.
-        acceleration_mps2: With which it gets there.
-        braking_mps2: Deceleration that is certain on wet concrete.
-        stop_distance_m: The Safety Pilot stops for an obstacle this far ahead of the footprint.
-        lateral_distance_m: And for one this far beside it.
-        sensing_range_m: The laser shows everything up to this distance ...
-        sensing_field_rad: ... in this angle, half of it on either side of straight ahead ...
-        sensing_gap_rad: ... with rays no farther apart. A sweep that covers less is not believed.
-        gps_accuracy_m: Error bound of the redundant positioning device.
-        corridor_clearance_m: From the footprint to the nearest prohibited area, when the robot
-            is where it should be.
-    """
-
-    length_m: Positive
-    width_m: Positive
-    top_speed_mps: Positive
-    top_turn_rate_radps: Positive
-    hardware_speed_mps: Positive
-    acceleration_mps2: Positive
-    braking_mps2: Positive
-    stop_distance_m: Positive
-    lateral_distance_m: NonNegative
-    sensing_range_m: Positive
-    gps_accuracy_m: NonNegative
-    corridor_clearance_m: Positive
-    sensing_field_rad: Positive = 4.7
-    sensing_gap_rad: Positive = 0.035
-
-
-class Timing(Table, frozen=True):
-    """All times, in seconds. Those that default to `DERIVED` follow from the robot if left out.
-
-    Attributes:
-        heartbeat_period_s: Between two heartbeats of an actor.
-        control_period_s: Between two commands, poses or scans.
-        manager_period_s: Between two statuses of the FTM Manager.
-        detection_period_s: Between two reports of a detection module whose state stays the same.
-        arbitration_s: From a detection report sent to the recovery's command received.
-        actuation_s: From a recovery's command received to the wheels feeling it.
-        respawn_s: From a node's death being known to its first useful message.
-        heartbeat_timeout_s: Without heartbeat for so long, a node counts as crashed (DM4, 5, 7).
-        command_timeout_s: Without new command for so long, it is stale (DM2).
-        localization_timeout_s: Without new pose for so long, it is stale (DM6).
-        scan_timeout_s: A laser sweep older than this shows nothing: the Safety Pilot stops.
-        dead_man_timeout_s: Without command for so long, the base brakes by itself.
-        manager_timeout_s: Without manager status for so long, the Safety Pilot stops.
-        detection_silence_timeout_s: Without report for so long, a detection module counts as
-            active.
-        startup_grace_s: Silence of a module that was never heard is forgiven for so long.
-        release_hold_s: A detection module has to be idle for so long before its mechanism is.
-        release_hold_max_s: To which this grows while the module flaps.
-    """
-
-    heartbeat_period_s: Positive = 0.1
-    control_period_s: Positive = 0.05
-    manager_period_s: Positive = 0.1
-    detection_period_s: Positive = 0.2
-    arbitration_s: Positive = 0.05
-    actuation_s: Positive = 0.1
-    respawn_s: Positive = 0.4
-    heartbeat_timeout_s: Positive = DERIVED
-    command_timeout_s: Positive = DERIVED
-    localization_timeout_s: Positive = DERIVED
-    scan_timeout_s: Positive = DERIVED
-    dead_man_timeout_s: Positive = DERIVED
-    manager_timeout_s: Positive = DERIVED
-    detection_silence_timeout_s: Positive = DERIVED
-    startup_grace_s: NonNegative = 5.0
-    release_hold_s: NonNegative = 0.5
-    release_hold_max_s: NonNegative = 10.0
-
-
-class Layers(Table, frozen=True):
-    """Guards, each of which can be switched off, to run the paper's unprotected baseline.
-
-    Attributes:
-        dead_man: The base brakes when commands cease.
-        safety_pilot_checks: The Safety Pilot refuses commands out of bounds, stale or out of
-            sequence. It stops for obstacles in any case.
-        manager_watch: The Safety Pilot stops when the FTM Manager is silent.
-        supervisor_respawn: The supervisor respawns what dies and is not the manager's to respawn.
-        ftm: Detection modules, recovery modules and the FTM Manager run at all.
-        checkpoints: Nodes that hold data keep it on stable storage and come back with it.
-    """
-
-    dead_man: bool = True
-    safety_pilot_checks: bool = True
-    manager_watch: bool = True
-    supervisor_respawn: bool = True
-    ftm: bool = True
-    checkpoints: bool = True
 
 
 class Kind(StrEnum):
@@ -237,7 +111,7 @@ class DetectionSpec(Table, frozen=True):
 
     @property
     def soonest_s(self) -> float:
-        """The shorter of the two, for whoever has to be faster than this module."""
+        """The shorter of the two, for what has to be faster than this module."""
         return min(self._times_s)
 
     @property
@@ -263,19 +137,6 @@ class RecoverySpec(Table, frozen=True):
     process: OptionalName = ""
     parameters: dict[str, Any] = {}
     enabled: bool = True
-
-
-class Hazard(StrEnum):
-    """What a mechanism races against; `rampart.manager.spec.budget` has the physics."""
-
-    DRIFT = "drift"
-    """The robot goes on as before, at top speed, until the corridor ends."""
-    RUNAWAY = "runaway"
-    """It accelerates as hard as it can."""
-    INTRUSION = "intrusion"
-    """It has come within the detection module's `margin_m` of the prohibited area."""
-    PARENT = "parent"
-    """Nothing yet, but the mechanism above is about to detect the consequence."""
 
 
 class Within(Table, frozen=True):
@@ -362,6 +223,7 @@ class SystemSpec(Table, frozen=True):
     order: Name | tuple[Name, ...] = "safer"
     timing: Timing = Timing()
     layers: Layers = Layers()
+    supervision: Supervision = Supervision()
     nodes: tuple[NodeSpec, ...] = msgspec.field(name="node", default=())
     detections: tuple[DetectionSpec, ...] = msgspec.field(name="detection", default=())
     recoveries: tuple[RecoverySpec, ...] = msgspec.field(name="recovery", default=())

@@ -4,9 +4,9 @@ Reading happens in three steps, each with its own kind of error, and every error
 names file, path, value, and what would be right (`SpecificationError`):
 
 1. syntax, sizes and types: `rampart.files.toml`, then `msgspec`, strict, unknown fields forbidden;
-2. timing values left out are derived from the robot (`rampart.manager.spec.budget`), and parameters
-   that name a timing value are replaced by it; 3. sense: names, cycles, the tree, the order, the
-   time budget (`rampart.manager.spec.checks`).
+2. timing values left out are derived from the robot (`rampart.manager.spec.mobile_robot`), and
+   parameters that name a timing value are replaced by it;
+3. sense: names, cycles, the tree, the order, the time budget (`rampart.manager.spec.checks`).
 
 There is no file I/O here: the caller hands over the text, and the name to use in messages.
 """
@@ -15,46 +15,43 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from enum import Enum
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from rampart.files import toml
 from rampart.files.reading import FileError
 from rampart.manager.model.mechanisms import RecoveryKind
-from rampart.manager.spec.budget import derive_timeouts
 from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
+from rampart.manager.spec.mobile_robot import Hazard, Robot, derive_timeouts
 from rampart.manager.spec.schema import (
     NODE_KINDS,
     AtLeast,
     DetectionSpec,
     EventSpec,
-    Hazard,
     Kind,
-    Layers,
     MechanismSpec,
     NodeSpec,
     RecoverySpec,
-    Robot,
-    SpecificationError,
     SystemSpec,
-    Table,
-    Timing,
     Within,
 )
+from rampart.manager.spec.tables import Layers, SpecificationError, Supervision, Table, Timing
 
 __all__ = [
     "AtLeast", "DetectionSpec", "EventSpec", "Hazard", "Kind", "Layers", "MechanismSpec",
-    "NodeSpec", "RecoverySpec", "Robot", "SpecificationError", "SystemSpec", "Timing",
-    "check_document", "check_modules", "parse_specification", "read_document",
+    "NodeSpec", "RecoverySpec", "Robot", "SpecificationError", "Supervision", "SystemSpec",
+    "Timing", "check_document", "check_modules", "parse_specification", "read_document",
 ]
 
 TABLES: dict[str, type[Table]] = {
-    "": SystemSpec, "robot": Robot, "timing": Timing, "layers": Layers, "node": NodeSpec,
-    "detection": DetectionSpec, "recovery": RecoverySpec, "mechanism": MechanismSpec,
-    "event": EventSpec, "gate": AtLeast, "against": Within,
+    "": SystemSpec, "robot": Robot, "timing": Timing, "layers": Layers,
+    "supervision": Supervision, "node": NodeSpec, "detection": DetectionSpec,
+    "recovery": RecoverySpec, "mechanism": MechanismSpec, "event": EventSpec, "gate": AtLeast,
+    "against": Within,
 }
 
 ENUMS: dict[tuple[str, str], Iterable[Enum]] = {
@@ -69,6 +66,8 @@ limits of a float, and a thousand million seconds are thirty years.
 
 LARGEST_INTEGER = 2 ** 63 - 1
 """In parameters, which go to an actor as they are, by way of MessagePack."""
+
+Row = TypeVar("Row", NodeSpec, DetectionSpec, RecoverySpec)
 
 MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
             "orders": 16}
@@ -146,7 +145,7 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
         spec = msgspec.convert(document, SystemSpec)
     except msgspec.ValidationError as error:
         raise _explain(error, document, file) from None
-    spec = msgspec.structs.replace(spec, timing=derive_timeouts(spec.mobile, spec.timing))
+    spec = replace(spec, timing=derive_timeouts(spec.mobile, spec.timing))
     spec = _resolve_timing_names(spec, file)
     finding = find_nonsense(spec)
     if finding is None:
@@ -215,29 +214,19 @@ def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
                                                  f"{', '.join(times)}", value)
         return times[value]
 
-    def resolve_parameters(parameters: dict[str, Any], path: str) -> dict[str, Any]:
-        return {key: resolve(value, f"{path}.parameters.{key}") if key.endswith("_s") else value
-                for key, value in parameters.items()}
+    def resolved(table: str, rows: Sequence[Row]) -> tuple[Row, ...]:
+        return tuple(replace(row, parameters={
+            key: resolve(value, f"$.{table}[{index}].parameters.{key}") if key.endswith("_s")
+            else value for key, value in row.parameters.items()}) for index, row in enumerate(rows))
 
-    def resolve_detection(detection: DetectionSpec, path: str) -> DetectionSpec:
-        parameters = resolve_parameters(detection.parameters, path)
-        within_s = resolve(detection.within_s, f"{path}.within_s")
-        if isinstance(within_s, float) and math.isnan(within_s):
-            within_s = parameters.get("timeout_s", within_s)
-        return replace(detection, within_s=within_s, parameters=parameters)
-
-    replace = msgspec.structs.replace
-    return replace(
-        spec,
-        nodes=tuple(
-            replace(node, parameters=resolve_parameters(node.parameters, f"$.node[{index}]"))
-            for index, node in enumerate(spec.nodes)),
-        detections=tuple(resolve_detection(detection, f"$.detection[{index}]")
-                         for index, detection in enumerate(spec.detections)),
-        recoveries=tuple(
-            replace(recovery,
-                    parameters=resolve_parameters(recovery.parameters, f"$.recovery[{index}]"))
-            for index, recovery in enumerate(spec.recoveries)))
+    detections = []
+    for index, row in enumerate(resolved("detection", spec.detections)):
+        within_s = resolve(row.within_s, f"$.detection[{index}].within_s")
+        if math.isnan(within_s):
+            within_s = row.parameters.get("timeout_s", within_s)
+        detections.append(replace(row, within_s=within_s))
+    return replace(spec, nodes=resolved("node", spec.nodes), detections=tuple(detections),
+                   recoveries=resolved("recovery", spec.recoveries))
 
 
 def _explain(error: msgspec.ValidationError, document: dict[str, Any],

@@ -72,10 +72,6 @@ class Arrangement:
         """Tell whether a recovery can run beside others: no common claim, no need disabled."""
         return not self._conflicts[recovery] & others
 
-    def covered(self, recovery: str, by: Iterable[str]) -> bool:
-        """Tell whether one of some recoveries is the same as this one or above it."""
-        return any(one == recovery or self.order.is_above(one, recovery) for one in by)
-
 
 arrange = lru_cache(maxsize=16)(Arrangement)
 """The arrangement of these three; the tables are made only the first time."""

@@ -9,7 +9,7 @@ Deciding and giving reasons are two steps, because a robot should brake first an
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Protocol
 
 import msgspec
@@ -46,7 +46,10 @@ Late = frozenset[str]
 
 
 class Strategy(Protocol):
-    """A policy, pure. It can be replaced without touching any detection or recovery module."""
+    """A policy without a state, so its answers can be remembered.
+
+    It can be replaced without touching any detection or recovery module.
+    """
 
     name: str
     patient: bool
@@ -75,6 +78,22 @@ class Strategy(Protocol):
 def chains(order: PartialOrder, upper: str, lowers: Iterable[str]) -> tuple[str, ...]:
     """Return the chain from `upper` down to each of `lowers`, as text; `upper` itself excepted."""
     return tuple(" > ".join(order.chain(upper, lower)) for lower in lowers if lower != upper)
+
+
+def dominance(order: PartialOrder, taken: Iterable[str], candidates: Iterable[str]
+              ) -> tuple[str, ...]:
+    """Return the chains from what was taken down to the candidates below it."""
+    candidates = tuple(candidates)
+    return tuple(chain for one in taken for chain in chains(
+        order, one, (c for c in candidates if order.is_above(one, c))))
+
+
+def turned_down(order: PartialOrder, taken: Collection[str], candidates: Iterable[str]
+                ) -> tuple[tuple[str, str], ...]:
+    """Return the candidates that were not taken, each with the reason."""
+    return tuple((name, next((f"{one} is safer" for one in taken if order.is_above(one, name)),
+                             "conflicts with another recovery"))
+                 for name in candidates if name not in taken)
 
 
 def undominated(order: PartialOrder, names: Iterable[str]) -> tuple[tuple[str, str], ...]:

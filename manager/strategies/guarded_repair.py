@@ -21,7 +21,7 @@ from itertools import chain
 import msgspec
 
 from rampart.manager.strategies.arrangement import Arrangement
-from rampart.manager.strategies.decision import Decision, Late, chains
+from rampart.manager.strategies.decision import Decision, Late, dominance, turned_down
 
 
 class GuardedRepair:
@@ -96,20 +96,13 @@ class GuardedRepair:
             return msgspec.structs.replace(decision, path=decision.active)
         order, taken = arrangement.order, decision.recoveries
         candidates = arrangement.demanded(decision.active)
-        path = tuple(line for one in taken for line in chains(
-            order, one, (c for c in candidates if order.is_above(one, c))))
         mask = order.mask(taken)
-        return msgspec.structs.replace(decision, path=path or taken, rejected=tuple(
-            (name, self._why_not(name, taken, mask, arrangement))
-            for name in candidates if name not in taken))
-
-    @staticmethod
-    def _why_not(name: str, taken: tuple[str, ...], mask: int, arrangement: Arrangement) -> str:
-        if arrangement.repairs & arrangement.order.bit[name] and \
-                not arrangement.can_join(name, mask):
-            return "waits, another recovery claims the same"
-        return next((f"{one} is safer" for one in taken if arrangement.order.is_above(one, name)),
-                    "conflicts with another recovery")
+        waiting = {name for name in candidates if arrangement.repairs & order.bit[name]
+                   and not arrangement.can_join(name, mask)}
+        return msgspec.structs.replace(
+            decision, path=dominance(order, taken, candidates) or taken,
+            rejected=tuple((name, "waits, another recovery claims the same" if name in waiting
+                            else why) for name, why in turned_down(order, taken, candidates)))
 
 
 def _numbers(mask: int) -> list[int]:

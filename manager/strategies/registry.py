@@ -62,49 +62,24 @@ def find_strategy(name: str) -> Strategy:
 
 
 class Decider:
-    """A strategy applied to an arrangement; pure, so the answer to a known question is known."""
+    """A strategy applied to an arrangement, which remembers its answers."""
 
     def __init__(self, strategy: Strategy, arrangement: Arrangement) -> None:
         self.strategy = strategy
         self.arrangement = arrangement
-        self._chosen: dict[tuple[tuple[str, ...], Late], Decision] = {}
-        self._decided: dict[tuple[tuple[str, ...], Late], Decision] = {}
-        self._explained: dict[Decision, Decision] = {}
+        self._choose = lru_cache(MEMORY)(lambda active, late: strategy.choose(
+            active, arrangement, late))
+        self._explain = lru_cache(MEMORY)(lambda decision: strategy.explain(decision, arrangement))
 
     def choose(self, active: tuple[str, ...], late: Late = frozenset()) -> Decision:
         """Decide without a certificate; `active` is in declared sequence."""
         if not active:
             return NOTHING_ACTIVE
-        question = (active, late if self.strategy.patient else frozenset())
-        decision = self._chosen.get(question)
-        if decision is None:
-            if len(self._chosen) >= MEMORY:
-                self._chosen.clear()
-            decision = self._chosen[question] = self.strategy.choose(
-                active, self.arrangement, question[1])
-        return decision
-
-    def decide(self, active: tuple[str, ...], late: Late = frozenset()) -> Decision:
-        """Decide with a certificate; `active` is in declared sequence."""
-        question = (active, late)
-        decision = self._decided.get(question)
-        if decision is None:
-            if len(self._decided) >= MEMORY:
-                self._decided.clear()
-            decision = self._decided[question] = self.explain(self.choose(active, late))
-        return decision
+        return self._choose(active, late if self.strategy.patient else frozenset())
 
     def explain(self, decision: Decision) -> Decision:
         """Return a decision of `choose` with its certificate."""
-        if not decision.active:
-            return decision
-        explained = self._explained.get(decision)
-        if explained is None:
-            if len(self._explained) >= MEMORY:
-                self._explained.clear()
-            explained = self._explained[decision] = self.strategy.explain(
-                decision, self.arrangement)
-        return explained
+        return self._explain(decision) if decision.active else decision
 
 
 def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,  # noqa: PLR0917
@@ -117,7 +92,7 @@ def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,  # noqa: P
         UnknownStrategyError: No such strategy.
     """
     decider = _decider(find_strategy(strategy), arrange(mechanisms, tree, order))
-    return decider.decide(mechanisms.sort(active), frozenset(late))
+    return decider.explain(decider.choose(mechanisms.sort(active), frozenset(late)))
 
 
 _decider = lru_cache(maxsize=64)(Decider)

@@ -5,7 +5,14 @@ from __future__ import annotations
 import msgspec
 
 from rampart.manager.strategies.arrangement import Arrangement
-from rampart.manager.strategies.decision import Decision, Late, chains, undominated
+from rampart.manager.strategies.decision import (
+    Decision,
+    Late,
+    chains,
+    dominance,
+    turned_down,
+    undominated,
+)
 
 
 class SafetyFirst:
@@ -66,12 +73,9 @@ class SafetyFirst:
         no_block_2 = undominated(tree, names)
         candidates = arrangement.demanded(names)
         if decision.rule == 3:
-            path = tuple(chain for one in taken for chain in chains(
-                order, one, (c for c in candidates if order.is_above(one, c))))
             return msgspec.structs.replace(
-                decision, path=path or taken, rejected=no_block_2 + tuple(
-                    (name, f"{next(o for o in taken if order.is_above(o, name))} is safer")
-                    for name in candidates if name not in taken))
+                decision, path=dominance(order, taken, candidates) or taken,
+                rejected=no_block_2 + turned_down(order, taken, candidates))
         return msgspec.structs.replace(
             decision, path=chains(tree, decision.mechanisms[0], names),
             rejected=no_block_2 + tuple(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from rampart.manager.strategies.arrangement import Arrangement
-from rampart.manager.strategies.decision import Decision, Late, chains
+from rampart.manager.strategies.decision import Decision, Late, dominance, turned_down
 
 
 class Simultaneous:
@@ -53,12 +53,7 @@ class Simultaneous:
         tree, order = arrangement.tree, arrangement.order
         taken = decision.recoveries
         candidates = arrangement.demanded(decision.active)
-        path = tuple(chain for one in taken for chain in chains(
-            order, one, (c for c in candidates if order.is_above(one, c))))
-        path += tuple(chain for upper in decision.mechanisms if upper not in decision.active
-                      for chain in chains(tree, upper, (
-                          n for n in decision.active if tree.is_above(upper, n))))
-        return msgspec.structs.replace(decision, path=path or taken, rejected=tuple(
-            (name, next((f"{one} is safer" for one in taken if order.is_above(one, name)),
-                        "conflicts with another recovery")) for name in candidates
-            if name not in taken))
+        climbed = (upper for upper in decision.mechanisms if upper not in decision.active)
+        path = dominance(order, taken, candidates) + dominance(tree, climbed, decision.active)
+        return msgspec.structs.replace(decision, path=path or taken,
+                                       rejected=turned_down(order, taken, candidates))

@@ -19,7 +19,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
 from rampart.actors.osmosis.airport.model import Airport, Mission
 from rampart.actors.runtime.actor import Header
-from rampart.manager.model.words import decision_in_words
+from rampart.manager.strategies.decision_words import decision_in_words
 from rampart.sim.faults.scenario import FaultOutcome
 
 TRACK_STEP_M = 0.2

@@ -31,8 +31,8 @@ from rampart.manager.analysis.formula import formula_of
 from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa, write_open_psa
 from rampart.manager.model.gates import GateError, detection_gate, recovery_gate
 from rampart.manager.spec.adaptation import Change, ChangeError, adapt, parse_value
-from rampart.manager.spec.schema import SpecificationError
 from rampart.manager.spec.specification import check_document, parse_specification, read_document
+from rampart.manager.spec.tables import SpecificationError
 from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.store import _NO_RUN, _run
 from rampart.sim.faults.faults import UnknownFaultError

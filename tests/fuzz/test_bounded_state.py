@@ -25,7 +25,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, on
-from rampart.actors.runtime.injection_desk import MAX_DELAYED, MAX_IN_FORCE
+from rampart.actors.runtime.injected_faults import MAX_DELAYED, MAX_IN_FORCE
 from rampart.actors.runtime.mailbox import Mailbox
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
@@ -288,7 +288,7 @@ def order(number):
 def test_injections_of_one_node_are_bounded_and_so_is_what_they_hold_back():
     def act(actor, _):
         for number in range(MAX_IN_FORCE + 5):
-            actor._injections.order(order(number))
+            actor._injections.order(order(number), topics.POSE)
         assert len(actor._injections.gate.in_force) == MAX_IN_FORCE
         for _ in range(MAX_DELAYED + 100):
             actor.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))

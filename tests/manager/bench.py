@@ -7,17 +7,11 @@ from functools import cache
 import msgspec
 
 from rampart import systems
-from rampart.manager.arbitration.arbiter import (
-    Command,
-    DecisionMade,
-    DetectionHeard,
-    Phase,
-    RecoveryHeard,
-    ResetAnswered,
-    ResetAsked,
-    Tick,
-    build_arbiter,
-)
+from rampart.manager.arbitration.arbiter import build_arbiter
+from rampart.manager.arbitration.arbiter_state import DecisionMade, ResetAnswered, ResetAsked, Tick
+from rampart.manager.arbitration.detection_track import DetectionHeard
+from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard
+from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.spec.specification import SystemSpec, parse_specification
 
 PAPER, FULL = ((systems.SHIPPED / name).read_text(encoding="utf-8")
@@ -54,7 +48,7 @@ class Bench:
             for dm in DMS:
                 self.idle(dm)
             for rm in RMS:
-                self.report(rm, Phase.IDLE)
+                self.report(rm, RecoveryPhase.IDLE)
             self.log.clear()
 
     def send(self, event) -> list:
@@ -68,10 +62,10 @@ class Bench:
     def idle(self, dm: str) -> list:
         return self.send(DetectionHeard(dm, False, "", (), self.now))
 
-    def report(self, rm: str, phase: Phase, decision: int | None = None) -> list:
+    def report(self, rm: str, phase: RecoveryPhase, decision: int | None = None) -> list:
         """Report as a module does that has obeyed its last command (or that decision)."""
         number = self.state.desired[rm].decision if decision is None else decision
-        return self.send(RecoveryHeard(rm, phase is not Phase.IDLE, phase, number))
+        return self.send(RecoveryHeard(rm, phase is not RecoveryPhase.IDLE, phase, number))
 
     def reset(self, rm: str) -> ResetAnswered:
         return next(o for o in self.send(ResetAsked(rm, "the tower"))

@@ -31,7 +31,7 @@ from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
 from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
 from rampart.actors.recovery.respawn import Respawn
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.manager.actor import DECISIONS_PER_LIFE, FtmManager
+from rampart.manager.actor import DECISIONS_PER_INCARNATION, FtmManager
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from rampart.testing import run
 from tests.actors.osmosis.recovery.world import Base, Node, Pilot, Supervisor, hang
@@ -456,7 +456,7 @@ def test_a_respawned_manager_keeps_the_stop_in_force_while_it_finds_its_way():
         assert system.pilot.mode is PilotMode.AUTO
         numbers = [d.decision for d in system.recorder.decisions]
         assert numbers == sorted(set(numbers))
-        assert numbers[-1] > DECISIONS_PER_LIFE
+        assert numbers[-1] > DECISIONS_PER_INCARNATION
 
     in_whole_system(scenario)
 

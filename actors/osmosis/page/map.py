@@ -11,7 +11,7 @@ from itertools import islice
 import msgspec
 
 from rampart.actors.operator.bounds import MAX_NAME, clip
-from rampart.actors.osmosis.airport.drawing import AirportDrawing, DrawnLight, draw
+from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
 from rampart.actors.osmosis.airport.model import Airport, Light
 
 MAX_PATHS_BYTES = 100_000
@@ -70,7 +70,7 @@ def lights_shown(airport: Airport) -> frozenset[str]:
     return frozenset(light.name for light in islice(filter(_is_plain, airport.lights), MAX_LIGHTS))
 
 
-def _is_plain(light: Light | DrawnLight) -> bool:
+def _is_plain(light: Light) -> bool:
     """Tell whether the page can show a light's name as it is: by that the light is known."""
     return light.name == clip(light.name, MAX_NAME) and light.row == clip(light.row, MAX_NAME)
 

@@ -58,7 +58,7 @@ async def test_a_handler_of_the_operators_nodes_survives_every_extreme(world, ki
             actor._state.grow_old(1e9)
             assert len(actor._server._feed.frame(0)) < FRAME_BYTES
         await asyncio.sleep(0.05)
-        assert not actor._ended.done()
+        assert not actor._dispatcher._ended.done()
     diagnosed = {d.context for d in world.others.diagnostics}
     assert "handler failed" not in diagnosed
 

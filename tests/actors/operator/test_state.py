@@ -11,7 +11,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.drawing import draw
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.page.state import TRACK_POINTS, OsmosisState
-from rampart.manager.model.words import decision_in_words
+from rampart.manager.strategies.decision_words import decision_in_words
 
 
 def shown(state: OsmosisState, now_s: float = 0.0) -> dict:
@@ -99,7 +99,10 @@ def test_decisions_are_put_in_words():
     assert decision_in_words((), 0, ("RM1",)) == (
         "No mechanism is active any more; RM1 stays in force until reset.")
     assert decision_in_words(("FTM3",), 2, ("RM2", "RM3"), "mission-first") == (
-        "FTM3 is active: run RM2 and RM3 (strategy mission-first, rule 2).")
+        "FTM3 is active: run RM2 and RM3, because a deeper barrier did not end the error in time, "
+        "so the next one above takes over (mission-first, rule 2).")
+    assert decision_in_words(("FTM3",), 2, ("RM2",), "of-yesterday") == (
+        "FTM3 is active: run RM2 (of-yesterday, rule 2).")
 
 
 def test_the_drawing_holds_the_whole_airport_within_its_bounds():

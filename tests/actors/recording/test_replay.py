@@ -40,7 +40,7 @@ from rampart.cli.output import UsageError
 from rampart.cli.record import replaying
 from rampart.cli.record.replaying import Replay
 from rampart.cli.session import connect
-from rampart.testing import HEEDS_SIGNALS, free_base_port
+from rampart.testing import HEEDS_SIGNALS, eventually, free_base_port, wait_until
 from tests import ROOT as HERE
 from tests.actors.recording.samples import AnsweringLauncher, documents, pose, sample, write
 
@@ -79,11 +79,12 @@ async def playing(player, delay_s=0.5):
 async def reading(port, *keys):
     """All that can be heard on keys meanwhile: key and payload in order."""
     heard = []
-    deadline = time.monotonic() + 10
-    while not (found := [run for run in run_info.find_runs() if run.base_port == port]):
-        assert time.monotonic() < deadline
-        await asyncio.sleep(0.01)
-    bus = ZenohBus("", 0, None, found[0].endpoints)
+
+    def found():
+        return [run for run in run_info.find_runs() if run.base_port == port]
+
+    await eventually(lambda: bool(found()))
+    bus = ZenohBus("", 0, None, found()[0].endpoints)
     await bus.open()
     for key in keys:
         bus.subscribe(topics.POSE, key, lambda key, payload: heard.append((key, payload)))
@@ -139,10 +140,7 @@ async def test_every_lap_passes_the_guard_that_drops_copies(tmp_path, port):
                              lambda key, reason: refused.append(reason))
     player = Replay(tmp_path / "run.mcap", port=port, loop=True, rate=2.0)
     async with playing(player), reading(port, topics.POSE.at()) as heard:
-        deadline = time.monotonic() + 15
-        while len(heard) < 30:
-            assert time.monotonic() < deadline
-            await asyncio.sleep(0.01)
+        await eventually(lambda: len(heard) >= 30, 15)
     for key, payload in heard[:30]:
         receive(key, payload)
     assert refused == []
@@ -255,10 +253,7 @@ def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(tmp_path, po
          "--loop", "--port", str(port)], cwd=HERE, stdout=subprocess.PIPE, text=True,
         env={**os.environ, "TMPDIR": str(folder)})
     assert "playing" in verb.stdout.readline()
-    deadline = time.monotonic() + 30
-    while not list(folder.iterdir()):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until(lambda: any(folder.iterdir()), 30)
     verb.send_signal(signal.SIGHUP)
     told = verb.communicate(timeout=30)[0]
     assert (verb.returncode in (0, 1), "played" in told) == (True, True), told

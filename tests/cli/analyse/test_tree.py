@@ -23,8 +23,7 @@ from rampart.cli.analyse.tree_svg import to_svg
 from rampart.cli.analyse.tree_text import to_text
 from rampart.cli.main import main
 from rampart.manager.drawing.diagram import Box, Diagram, Situation, clean, covers, draw
-from rampart.manager.drawing.layered import arrange_in_layers, crossings
-from rampart.manager.drawing.placing import _isotonic, place
+from rampart.manager.drawing.placing import place
 from rampart.manager.model.order import PartialOrder
 from rampart.systems import SHIPPED
 from tests import ROOT
@@ -205,17 +204,18 @@ def test_lines_of_different_origin_do_not_lie_on_each_other_across(diagram):
         assert one == other or y != y2 or b < a2 or b2 < a
 
 
-@settings(deadline=None)
-@given(st.lists(st.tuples(st.floats(-100, 100), st.floats(0.1, 6)), min_size=1, max_size=8))
-def test_the_nearest_rising_values_are_those_of_the_closed_form(pairs):
-    def mean(i, k):
-        part = pairs[i:k + 1]
-        return sum(v * w for v, w in part) / sum(w for _, w in part)
-
-    last = len(pairs) - 1  # Robertson, Wright, Dykstra (1988): the max-min formula
-    expected = [max(min(mean(j, k) for k in range(i, last + 1)) for j in range(i + 1))
-                for i in range(last + 1)]
-    assert _isotonic(*zip(*pairs, strict=True)) == pytest.approx(expected, abs=1e-6)
+@settings(max_examples=60, deadline=None)
+@given(fault_trees(), st.booleans())
+def test_no_line_crosses_a_box(diagram, square):
+    sizes = {box.name: (40.0 + 7 * len(box.title), 50.0) for box in diagram.boxes}
+    placing = place(sizes, diagram.edges, square=square)
+    for line in placing.lines:
+        for (x, y), (x2, y2) in itertools.pairwise(line):
+            for box in placing.places.values():
+                high, low = max(y, box.top + 0.1), min(y2, box.bottom - 0.1)
+                for inside in (high, low) if high < low else ():
+                    at = x + (x2 - x) * (inside - y) / (y2 - y)
+                    assert not box.left < at < box.left + box.width
 
 
 def test_what_is_above_stands_centred_over_what_is_below():
@@ -226,33 +226,28 @@ def test_what_is_above_stands_centred_over_what_is_below():
     assert places["e"].x == places["d"].x
 
 
-def test_crossings_are_counted_as_by_hand():
-    # 0 1 above 2 3: 0-3 and 1-2 cross; 0-2 and 1-3 do not; all four lines have one crossing.
-    assert crossings([[0, 1], [2, 3]], [[3], [2], [], []]) == 1
-    assert crossings([[0, 1], [2, 3]], [[2], [3], [], []]) == 0
-    assert crossings([[0, 1], [2, 3]], [[2, 3], [2, 3], [], []]) == 1
-
-
-def test_a_crossing_that_can_be_avoided_is():
-    edges = [("a", "x"), ("a", "y"), ("x", "p"), ("y", "q"), ("x", "q"), ("y", "r"), ("y", "p")]
-    layering = arrange_in_layers(("a", "x", "y", "q", "p", "r"), edges)
-    _, lowers = layering.links()
-    fewest = min(crossings([layering.layers[0], second, third], lowers)
-                 for second in itertools.permutations(layering.layers[1])
-                 for third in itertools.permutations(layering.layers[2]))
-    assert crossings(layering.layers, lowers) == fewest
+def test_what_all_ways_lead_to_stands_centred_below_where_they_part():
+    edges = [("t", "a"), ("t", "b"), ("a", "s"), ("b", "c"), ("b", "s"), ("s", "d")]
+    places = place(dict.fromkeys("tabscd", (60.0, 30.0)), edges, square=True).places
+    assert places["s"].top == places["c"].top
+    assert places["s"].left >= places["c"].left + 60  # where the place is taken: beside
+    places = place(dict.fromkeys("tabsd", (60.0, 30.0)), [e for e in edges if e[1] != "c"],
+                   square=True).places
+    assert places["t"].x == places["s"].x == places["d"].x
 
 
 def test_a_tree_has_no_crossing_and_keeps_the_declared_sequence():
     edges = [("t", "b"), ("t", "a"), ("b", "z"), ("a", "y"), ("a", "x")]
-    layering = arrange_in_layers(("a", "b", "t", "x", "y", "z"), edges)
-    names = [["abtxyz"[v] for v in layer] for layer in layering.layers]
-    assert names == [["t"], ["b", "a"], ["z", "y", "x"]]
+    places = place(dict.fromkeys("abtxyz", (60.0, 30.0)), edges, square=True).places
+    rows = {}
+    for name, at in sorted(places.items(), key=lambda item: item[1].left):
+        rows.setdefault(at.top, []).append(name)
+    assert [rows[top] for top in sorted(rows)] == [["t"], ["b", "a"], ["z", "y", "x"]]
 
 
 def test_what_is_no_graph_of_layers_is_refused():
     with pytest.raises(CycleError):
-        arrange_in_layers(("a", "b"), [("a", "b"), ("b", "a")])
+        place(dict.fromkeys("ab", (60.0, 30.0)), [("a", "b"), ("b", "a")], square=True)
 
 
 def test_a_shared_event_is_drawn_once_and_referred_to():
@@ -355,7 +350,7 @@ def bush_of(count):
 @pytest.mark.parametrize("edges", [
     chain_of(1000), [("e0", f"e{i}") for i in range(1, 1000)], bush_of(1000),
     [*chain_of(600), *(("e0", f"e{i}") for i in range(2, 600))],
-], ids=["chain", "flat", "bush", "too many bends"])
+], ids=["chain", "flat", "bush", "long lines"])
 def test_a_thousand_events_are_drawn_by_every_renderer(edges):
     diagram = graph(edges)
     root = ET.fromstring(to_svg([diagram]))

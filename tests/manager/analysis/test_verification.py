@@ -1,6 +1,7 @@
 """What verification finds about the shipped system, and that it finds what is broken on purpose."""
 
 import json
+import math
 from collections import defaultdict
 from itertools import combinations
 
@@ -12,7 +13,8 @@ from rampart.manager.analysis import active_sets, transitions
 from rampart.manager.analysis.active_sets import ActiveSets, order_agrees_with_tree
 from rampart.manager.analysis.transitions import Transitions, explore
 from rampart.manager.analysis.verification import MEANING, Report, TooLargeError, _askable, verify
-from rampart.manager.arbitration.arbiter import Arbiter, Phase
+from rampart.manager.arbitration.arbiter import Arbiter
+from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.model.order import PartialOrder
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision
@@ -144,7 +146,7 @@ def test_the_start_of_a_manager_is_not_explored_and_holds_less():
     """The example in docs/verification.md: if this fails, the limits there can be narrowed."""
     bench = Bench(oriented=False)
     bench.active("DM6")
-    bench.report("RM2", Phase.DEGRADED, 41)  # ordered by the manager before this one
+    bench.report("RM2", RecoveryPhase.DEGRADED, 41)  # ordered by the manager before this one
     assert bench.orders == "RM2 (RM5)"
     assert bench.arbiter.mechanisms.overlap("RM2", "RM5")
     assert not bench.state.oriented
@@ -180,8 +182,11 @@ class MakesAllWait(Arbiter):
 class ForgetsDeadlines(Arbiter):
     """Waits for ever."""
 
-    def _judge(self, track, believed, active, now):
-        return track
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.mechanisms.contracts = {
+            name: msgspec.structs.replace(contract, deadline_s=math.inf)
+            for name, contract in self.mechanisms.contracts.items()}
 
 
 class CutsOff(Arbiter):
@@ -189,7 +194,7 @@ class CutsOff(Arbiter):
 
     def _release(self, track, chosen, number, now):
         return super()._release(msgspec.structs.replace(
-            track, acknowledged=True, phase=Phase.DONE), chosen, number, now)
+            track, acknowledged=True, phase=RecoveryPhase.DONE), chosen, number, now)
 
 
 class NeverReleases(Arbiter):

@@ -3,7 +3,9 @@
 import msgspec
 import pytest
 
-from rampart.manager.arbitration.arbiter import Command, Phase, State, Tick
+from rampart.manager.arbitration.arbiter_state import State, Tick
+from rampart.manager.arbitration.recovery_track import Command
+from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 from tests.manager.bench import DMS, Bench, commands, edited
 
 ACTING, DONE, IDLE, DEGRADED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.DEGRADED

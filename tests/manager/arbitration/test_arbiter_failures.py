@@ -1,7 +1,8 @@
 """The arbiter when recoveries fail, and when the manager itself is killed, as timelines."""
 
-from rampart.manager.arbitration.arbiter import Phase, build_arbiter
+from rampart.manager.arbitration.arbiter import build_arbiter
 from rampart.manager.arbitration.arbiter_memory import Memory, objection, recall, remember
+from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 from tests.manager.bench import DMS, RMS, Bench, commands, edited, paper
 
 ACTING, DONE, IDLE, FAILED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.FAILED
@@ -283,7 +284,7 @@ def test_the_wait_for_orientation_ends_with_the_grace():
 def respawned() -> Bench:
     """The arbiter of a manager that was respawned: modules run already."""
     bench = Bench(oriented=False)
-    bench.arbiter = build_arbiter(paper(), first_life=False)
+    bench.arbiter = build_arbiter(paper(), first_start=False)
     return bench
 
 

@@ -7,15 +7,11 @@ from unittest import mock
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rampart.manager.arbitration.arbiter import (
-    Arbiter,
-    DetectionHeard,
-    Phase,
-    RecoveryHeard,
-    ResetAsked,
-    Tick,
-    build_arbiter,
-)
+from rampart.manager.arbitration.arbiter import Arbiter, build_arbiter
+from rampart.manager.arbitration.arbiter_state import ResetAsked, Tick
+from rampart.manager.arbitration.detection_track import DetectionHeard
+from rampart.manager.arbitration.recovery_track import RecoveryHeard
+from rampart.manager.model.mechanisms import RecoveryPhase
 from tests.manager.bench import DMS, RMS, paper
 
 STRATEGIES = ("safety-first", "mission-first", "simultaneous", "guarded-repair")
@@ -24,14 +20,14 @@ INPUTS = st.one_of(
     st.builds(DetectionHeard, st.sampled_from(DMS), st.booleans(), st.sampled_from(["", "why"])),
     # Calm far more often than not, or the short way would hardly be taken.
     st.builds(DetectionHeard, st.sampled_from(DMS), st.just(False)),
-    st.builds(RecoveryHeard, st.sampled_from(RMS), st.booleans(), st.sampled_from(Phase),
+    st.builds(RecoveryHeard, st.sampled_from(RMS), st.booleans(), st.sampled_from(RecoveryPhase),
               st.integers(0, 4)),
-    st.builds(RecoveryHeard, st.sampled_from(RMS), st.just(False), st.just(Phase.IDLE),
+    st.builds(RecoveryHeard, st.sampled_from(RMS), st.just(False), st.just(RecoveryPhase.IDLE),
               st.integers(0, 4)),
     st.builds(ResetAsked, st.sampled_from(RMS)),
 )
 EVERYBODY = [*(DetectionHeard(name, False) for name in DMS),
-             *(RecoveryHeard(name, False, Phase.IDLE, 0) for name in RMS)]
+             *(RecoveryHeard(name, False, RecoveryPhase.IDLE, 0) for name in RMS)]
 
 
 @settings(max_examples=150, deadline=None)

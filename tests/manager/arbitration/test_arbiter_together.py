@@ -3,7 +3,8 @@
 import msgspec
 import pytest
 
-from rampart.manager.arbitration.arbiter import Phase, ShadowDiffered
+from rampart.manager.arbitration.arbiter_state import ShadowDiffered
+from rampart.manager.model.mechanisms import RecoveryPhase as Phase
 from tests.manager.bench import Bench, commands, paper
 
 ACTING, DONE, IDLE, FAILED = Phase.ACTING, Phase.DONE, Phase.IDLE, Phase.FAILED

@@ -3,12 +3,14 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rampart.manager.arbitration.arbiter import Command, DecisionMade, Phase
+from rampart.manager.arbitration.arbiter_state import DecisionMade
+from rampart.manager.arbitration.recovery_track import Command
+from rampart.manager.model.mechanisms import RecoveryPhase
 from tests.manager.bench import DMS, RMS, Bench, paper
 
 MECHANISMS = paper().build_mechanisms()
 ORDER = paper().build_order()
-FINISHED = (Phase.DONE, Phase.DEGRADED)
+FINISHED = (RecoveryPhase.DONE, RecoveryPhase.DEGRADED)
 
 
 class Modules:
@@ -19,7 +21,7 @@ class Modules:
 
     def __init__(self) -> None:
         self.inbox = {rm: [] for rm in RMS}
-        self.phase = dict.fromkeys(RMS, Phase.IDLE)
+        self.phase = dict.fromkeys(RMS, RecoveryPhase.IDLE)
         self.decision = dict.fromkeys(RMS, 0)
 
     def deliver(self, rm: str) -> bool:
@@ -28,10 +30,10 @@ class Modules:
             return False
         command = self.inbox[rm].pop(0)
         if command.activate and command.decision != self.decision[rm]:
-            self.phase[rm], self.decision[rm] = Phase.ACTING, command.decision
+            self.phase[rm], self.decision[rm] = RecoveryPhase.ACTING, command.decision
         elif not command.activate:
-            cut_off = self.phase[rm] is Phase.ACTING
-            self.phase[rm] = Phase.IDLE
+            cut_off = self.phase[rm] is RecoveryPhase.ACTING
+            self.phase[rm] = RecoveryPhase.IDLE
             return cut_off
         return False
 
@@ -67,12 +69,12 @@ class Walk:
             track = before.recoveries[RMS.index(subject)]
             assert not cut_off or self.crashed or track.failure or self.failed, \
                 f"{subject} was cut off"
-        elif action == "finish" and modules.phase[subject] is Phase.ACTING:
-            modules.phase[subject] = Phase.DONE
-        elif action == "fail" and modules.phase[subject] is Phase.ACTING:
-            modules.phase[subject], self.failed = Phase.FAILED, True
+        elif action == "finish" and modules.phase[subject] is RecoveryPhase.ACTING:
+            modules.phase[subject] = RecoveryPhase.DONE
+        elif action == "fail" and modules.phase[subject] is RecoveryPhase.ACTING:
+            modules.phase[subject], self.failed = RecoveryPhase.FAILED, True
         elif action == "crash":
-            modules.phase[subject], modules.decision[subject] = Phase.IDLE, 0
+            modules.phase[subject], modules.decision[subject] = RecoveryPhase.IDLE, 0
             self.crashed = True
         elif action == "reset" and bench.reset(subject).granted:
             granted = {subject}
@@ -142,7 +144,7 @@ def test_in_the_end_there_is_one_decision_and_it_is_carried_out(actions, remaini
     state = walk.bench.state
     assert {dm for name in state.active for dm in MECHANISMS.detect[name]} == remaining
     assert list(state.activated) == list(state.decision.recoveries)
-    assert state.draining == ()
+    assert not any(track.draining for track in state.recoveries)
     assert bool(state.activated) == bool(remaining or state.latched)
     for rm in RMS:
         assert (walk.modules.phase[rm] in FINISHED) == (rm in state.activated)

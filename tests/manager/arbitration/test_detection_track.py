@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rampart.manager.arbitration.detection_track import (
+    DetectionHeard,
     DetectionRules,
     DetectionTrack,
     hear,
@@ -27,7 +28,7 @@ def play(reports: str, rules: DetectionRules = RULES) -> str:
     for tick, report in enumerate(reports):
         now = tick / 10
         if report in "Ai":
-            track = hear(track, rules, now, active=report == "A", reason="", nodes=(), since_s=now)
+            track = hear(track, DetectionHeard("DM", report == "A", since_s=now), rules, now)
         track = pass_time(track, rules, now)
         beliefs += "S" if track.silent else "A" if track.active else "."
     return beliefs
@@ -55,27 +56,27 @@ def test_timeline(reports, beliefs):
 
 
 def heard(name: str, at_s: float, **changes) -> DetectionTrack:
-    track = hear(DetectionTrack(name, heard_s=0.0), RULES, at_s, active=False, reason="", nodes=(),
-                 since_s=0.0)
+    track = hear(DetectionTrack(name, heard_s=0.0), DetectionHeard(name, False), RULES, at_s)
     return msgspec.structs.replace(track, **changes)
 
 
 def test_a_report_is_as_old_as_what_it_says_not_as_its_arrival():
-    old = {"active": False, "reason": "", "nodes": (), "since_s": 0.0}
+    def said(stamp_s: float, active: bool = False) -> DetectionHeard:
+        return DetectionHeard("DM", active, stamp_s=stamp_s)
+
     track = heard("DM", 10.0)
-    assert hear(track, RULES, 10.5, stamp_s=9.0, **old).heard_s == 10.0
-    assert hear(track, RULES, 10.5, stamp_s=10.2, **old).heard_s == 10.2
-    assert hear(track, RULES, 10.5, stamp_s=10.55, **old).heard_s == 10.5  # a clock that is ahead
+    assert hear(track, said(9.0), RULES, 10.5).heard_s == 10.0
+    assert hear(track, said(10.2), RULES, 10.5).heard_s == 10.2
+    assert hear(track, said(10.55), RULES, 10.5).heard_s == 10.5  # a clock that is ahead
     silent = pass_time(track, RULES, 11.0)
     assert silent.silent
-    assert hear(silent, RULES, 11.1, stamp_s=10.1, **old).silent
-    assert not hear(silent, RULES, 11.1, stamp_s=10.9, **old).silent
-    assert hear(silent, RULES, 11.1, stamp_s=9.0, **{**old, "active": True}).reported
+    assert hear(silent, said(10.1), RULES, 11.1).silent
+    assert not hear(silent, said(10.9), RULES, 11.1).silent
+    assert hear(silent, said(9.0, active=True), RULES, 11.1).reported
 
 
 def test_old_news_that_a_fault_is_there_counts_all_the_same():
-    track = hear(heard("DM", 10.0), RULES, 12.0, stamp_s=9.0, active=True, reason="x", nodes=(),
-                 since_s=9.0)
+    track = hear(heard("DM", 10.0), DetectionHeard("DM", True, "x", (), 9.0, 9.0), RULES, 12.0)
     assert track.active
 
 
@@ -96,8 +97,8 @@ def test_one_that_was_never_heard_or_counts_as_silent_is_not_overdue():
 
 def test_one_fault_is_held_for_the_plain_hold():
     track = DetectionTrack("DM", heard_s=0.0)
-    track = hear(track, RULES, 100.0, active=True, reason="x", nodes=("a",), since_s=99.9)
-    track = hear(track, RULES, 101.0, active=False, reason="", nodes=(), since_s=101.0)
+    track = hear(track, DetectionHeard("DM", True, "x", ("a",), 99.9), RULES, 100.0)
+    track = hear(track, DetectionHeard("DM", False, since_s=101.0), RULES, 101.0)
     assert release_hold_s(track, RULES) == 0.5
     assert (track.since_s, track.nodes, track.rises) == (99.9, ("a",), 1)
 

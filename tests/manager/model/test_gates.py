@@ -79,12 +79,6 @@ def test_names_come_once_each_as_written():
     assert detection_gate("C and A or C and not B").names == ("C", "A", "B")
 
 
-def test_only_a_plain_name_is_one():
-    assert detection_gate("A").is_name
-    assert not detection_gate("A or B").is_name
-    assert not Gate(name="A", negated=True).is_name
-
-
 # ---- silence ----------------------------------------------------------------------------------
 
 

@@ -5,16 +5,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rampart.manager.spec.budget import (
-    check,
+from rampart.manager.spec.budget import check
+from rampart.manager.spec.mobile_robot import (
     derive_timeouts,
-    find_false_alarms,
     time_to_drift_s,
     time_to_intrusion_s,
     time_to_obstacle_s,
     time_to_runaway_s,
 )
-from rampart.manager.spec.schema import Timing, Within
+from rampart.manager.spec.schema import Within
+from rampart.manager.spec.tables import Timing
+from rampart.manager.spec.timeouts import find_false_alarms
 from tests.manager.bench import full_system, paper
 
 SPEC = paper()
@@ -79,7 +80,7 @@ def test_everything_in_the_shipped_system_fits():
     assert {"FTM1", "FTM2", "FTM3", "FTM4", "FTM5", "FTM6", "FTM7", "safety_pilot",
             "blind_pilot", "dead_man", "manager_watch", "silent_detection"} == set(budgets)
     assert all(budget.fits for budget in budgets.values())
-    assert not list(find_false_alarms(SPEC))
+    assert not list(find_false_alarms(SPEC.timing))
 
 
 def test_everything_in_the_full_system_fits_and_what_races_no_distance_says_what_it_races():
@@ -87,7 +88,7 @@ def test_everything_in_the_full_system_fits_and_what_races_no_distance_says_what
     budgets = {budget.name: budget for budget in check(spec)}
     assert len(budgets) == len(spec.mechanisms) + 5
     assert all(budget.fits for budget in budgets.values())
-    assert not list(find_false_alarms(spec))
+    assert not list(find_false_alarms(spec.timing))
     stated = {m.name for m in spec.mechanisms if isinstance(m.against, Within)}
     assert stated == {"FTM2", "FTM3", "FTM6", "FTM9", "FTM10", "FTM11", "FTM13"}
     assert all(budgets[name].hazard for name in stated)
@@ -133,7 +134,7 @@ def test_derived_timeouts_always_fit_whatever_the_robot(speed, brake, clearance,
             "DM2": "command_timeout_s", "DM6": "localization_timeout_s"}.get(
                 d.name, "heartbeat_timeout_s"))])
     spec = changed(spec, detections=detections)
-    if list(find_false_alarms(spec)):
+    if list(find_false_alarms(spec.timing)):
         return
     late = {b.name for b in check(spec) if not b.fits}
     assert late <= {"FTM1", "FTM3", "safety_pilot"}  # these have no timeout that could be derived
@@ -168,6 +169,7 @@ def test_all_timeouts_are_guarded_against_false_alarms():
                          "localization_timeout_s": 0.15, "scan_timeout_s": 0.15,
                          "dead_man_timeout_s": 0.15,
                          "manager_timeout_s": 0.3, "detection_silence_timeout_s": 0.6}.items():
-        assert not list(find_false_alarms(with_timing(**{field: least})))
-        path, value, _ = next(find_false_alarms(with_timing(**{field: least - 0.01})))
+        assert not list(find_false_alarms(with_timing(**{field: least}).timing))
+        path, value, _ = next(find_false_alarms(
+            with_timing(**{field: least - 0.01}).timing))
         assert (f"$.timing.{field}", least - 0.01) == (path, value)

@@ -521,8 +521,8 @@ def test_the_core_of_the_manager_imports_nothing_but_itself_and_how_files_are_re
             modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else \
                 [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             for module in modules:
-                assert module.split(".")[0] in allowed or module.startswith(
-                    ("rampart.manager.", "rampart.files")), path
+                assert module.split(".")[0] in allowed or f"{module}.".startswith(
+                    ("rampart.manager.", "rampart.files.")), path
                 assert module != "rampart.manager.actor", path
             assert not {"time", "asyncio", "random"} & set(modules), path
 

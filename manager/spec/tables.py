@@ -1,0 +1,147 @@
+"""What the tables of a system specification have in common, and those that know no other.
+
+`Timing` and `Layers` are tables of a spec; the rest of them is in `rampart.manager.spec.schema`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
+
+from rampart.files.reading import plain_line, shown
+
+OptionalName = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z][A-Za-z0-9_]{0,63})?\Z")]
+Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
+"""As long as the address of a node's socket has room for (`actors.bus.run_folder`), and well
+below what a message takes as a name (`rampart.actors.bus.bounds`), which may add to it."""
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+
+DERIVED = math.nan
+"""Default of a timing value that is derived; a file cannot say it, numbers there are finite."""
+
+_LONGEST_SHOWN = 200
+"""Characters of a value in a message."""
+
+
+class SpecificationError(ValueError):
+    """A system spec that cannot be accepted. The message is one line.
+
+    Attributes:
+        file: Name of the file, as given by the caller.
+        path: Where in it, e.g. `$.mechanism[2].detect`.
+        problem: What is wrong and what would be right.
+    """
+
+    def __init__(self, file: str, path: str, problem: str, *value: object) -> None:
+        self.file = file
+        self.path = path
+        self.problem = problem
+        said = f" = {shown(value[0], _LONGEST_SHOWN)}" if value else ""
+        super().__init__(plain_line(f"{file}: {path}{said}: {problem}"))
+
+
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of all tables of a spec: immutable, and a field it does not know is an error."""
+
+
+class Timing(Table, frozen=True):
+    """All times, in seconds. Those that default to `DERIVED` follow from the robot if left out.
+
+    Attributes:
+        heartbeat_period_s: Between two heartbeats of an actor.
+        control_period_s: Between two commands, poses or scans.
+        manager_period_s: Between two statuses of the FTM Manager.
+        detection_period_s: Between two reports of a detection module whose state stays the same.
+        arbitration_s: From a detection report sent to the recovery's command received.
+        actuation_s: From a recovery's command received to the wheels feeling it.
+        respawn_s: From a node's death being known to its first useful message.
+        heartbeat_timeout_s: Without heartbeat for so long, a node counts as crashed (DM4, 5, 7).
+        command_timeout_s: Without new command for so long, it is stale (DM2).
+        localization_timeout_s: Without new pose for so long, it is stale (DM6).
+        scan_timeout_s: A laser sweep older than this shows nothing: the Safety Pilot stops.
+        dead_man_timeout_s: Without command for so long, the base brakes by itself.
+        manager_timeout_s: Without manager status for so long, the Safety Pilot stops.
+        detection_silence_timeout_s: Without report for so long, a detection module counts as
+            active.
+        startup_grace_s: Silence of a module that was never heard is forgiven for so long.
+        release_hold_s: A detection module has to be idle for so long before its mechanism is.
+        release_hold_max_s: To which this grows while the module flaps.
+    """
+
+    heartbeat_period_s: Positive = 0.1
+    control_period_s: Positive = 0.05
+    manager_period_s: Positive = 0.1
+    detection_period_s: Positive = 0.2
+    arbitration_s: Positive = 0.05
+    actuation_s: Positive = 0.1
+    respawn_s: Positive = 0.4
+    heartbeat_timeout_s: Positive = DERIVED
+    command_timeout_s: Positive = DERIVED
+    localization_timeout_s: Positive = DERIVED
+    scan_timeout_s: Positive = DERIVED
+    dead_man_timeout_s: Positive = DERIVED
+    manager_timeout_s: Positive = DERIVED
+    detection_silence_timeout_s: Positive = DERIVED
+    startup_grace_s: NonNegative = 5.0
+    release_hold_s: NonNegative = 0.5
+    release_hold_max_s: NonNegative = 10.0
+
+
+class Layers(Table, frozen=True):
+    """Guards, each of which can be switched off, to run the paper's unprotected baseline.
+
+    Attributes:
+        dead_man: The base brakes when commands cease.
+        safety_pilot_checks: The Safety Pilot refuses commands out of bounds, stale or out of
+            sequence. It stops for obstacles in any case.
+        manager_watch: The Safety Pilot stops when the FTM Manager is silent.
+        supervisor_respawn: The supervisor respawns what dies and is not the manager's to respawn.
+        ftm: Detection modules, recovery modules and the FTM Manager run at all.
+        checkpoints: Nodes that hold data keep it on stable storage and come back with it.
+    """
+
+    dead_man: bool = True
+    safety_pilot_checks: bool = True
+    manager_watch: bool = True
+    supervisor_respawn: bool = True
+    ftm: bool = True
+    checkpoints: bool = True
+
+
+class Finding(NamedTuple):
+    """Something wrong: where, what, and the offending value if one value is to blame."""
+
+    path: str
+    problem: str
+    value: tuple[Any, ...] = ()
+
+
+def unknown(path: str, value: str, what: str, known: Collection[str]) -> Finding:
+    """Return the finding for a name that is none; it lists those that are."""
+    return Finding(path, f"unknown {what}; known: {', '.join(known) or 'none'}", (value,))
+
+
+class Supervision(Table, frozen=True):
+    """How often a process is restarted; wall seconds. See `actors.supervision.supervised_process`.
+
+    Attributes:
+        intensity: Restarts of one process within `period_s`; one more, and it is given up.
+        period_s: The window in which they are counted.
+        backoff_s: Before the first restart that comes after half of `intensity` in the window; each
+            further one waits twice as long ...
+        backoff_max_s: ... up to this.
+        attempt_s: Between being given up and the next attempt; each that fails doubles it ...
+        attempt_max_s: ... up to this.
+    """
+
+    intensity: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 50
+    period_s: Positive = 60.0
+    backoff_s: Positive = 0.05
+    backoff_max_s: Positive = 2.0
+    attempt_s: Positive = 10.0
+    attempt_max_s: Positive = 60.0
