@@ -9,12 +9,12 @@ from typing import TypeVar
 from rampart import systems
 from rampart.actors.layout.layout import application_class
 from rampart.actors.layout.system_topics import declared_topics, own_topics, system_topics
-from rampart.actors.layout.wiring import import_class
+from rampart.actors.layout.wiring import REPORTS_ON, import_class, load_member
 from rampart.cli.output import UsageError
 from rampart.cli.robot_lines import RobotLines
 from rampart.files import toml
 from rampart.files.reading import FileError, read_text
-from rampart.manager.spec.specification import SpecificationError, SystemSpec, parse_specification
+from rampart.manager.spec.specification import SystemSpec, parse_specification
 
 T = TypeVar("T")
 
@@ -38,6 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser, *, what: str = "", dest: str 
 def load(file: str | None) -> SystemSpec:
     """Read a system spec.
 
+    Parameters are checked of the detection and recovery modules that ship. Others are imported when
+    they are started, and for no look at a file that somebody else may have written.
+
     Args:
         file: path, or name of a shipped system; None for the shipped default.
 
@@ -46,14 +49,18 @@ def load(file: str | None) -> SystemSpec:
     """
     path = DEFAULT if file is None else systems.find(file)
     try:
-        return parse_specification(read_text(path, toml.MAX_SIZE), str(path))
+        spec = parse_specification(read_text(path, toml.MAX_SIZE), str(path))
+        for node in spec.actors():
+            if node.kind in REPORTS_ON and node.actor.startswith("rampart."):
+                load_member(node, spec, str(path))
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}; a spec is right, or the name of a shipped "
                          f"one: {systems.names()}") from None
     except FileError as error:
         raise UsageError(f"{path}: {error}") from None
-    except SpecificationError as error:
+    except ValueError as error:
         raise UsageError(str(error)) from None
+    return spec
 
 
 def _usable(of: Callable[[SystemSpec], T]) -> Callable[[SystemSpec], T]:
