@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from rampart import systems
-from rampart.actors.bus.topic import Topic
 from rampart.actors.layout.layout import application_class
 from rampart.actors.layout.system_topics import declared_topics, own_topics, system_topics
 from rampart.actors.layout.wiring import REPORTS_ON, import_class, load_member
@@ -64,45 +63,28 @@ def load(file: str | None) -> SystemSpec:
     return spec
 
 
-def declared(spec: SystemSpec) -> tuple[Topic[Any], ...]:
-    """Return the topics of the engine and of a system's application.
-
-    Raises:
-        UsageError: the application's class cannot be had.
-    """
-    return _usable(declared_topics, spec)
-
-
-def lines_of(spec: SystemSpec) -> RobotLines:
-    """Return what is told of a system's robot.
-
-    Raises:
-        UsageError: the application's class cannot be had, or what it names for this.
-    """
-    return _usable(lambda of: import_class(
-        application_class(of).lines, RobotLines, "lines")(), spec)
+def _usable(of: Callable[[SystemSpec], T]) -> Callable[[SystemSpec], T]:
+    """Return a function of a system that has users told what its actors or application lack."""
+    def told(spec: SystemSpec) -> T:
+        try:
+            return of(spec)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+    return told
 
 
-def topics_of(spec: SystemSpec) -> tuple[Topic[Any], ...]:
-    """Return all topics of a system.
-
-    Raises:
-        UsageError: an actor class that the spec names cannot be had, or declares what is no topic.
-    """
-    return _usable(system_topics, spec)
+def _lines_of(spec: SystemSpec) -> RobotLines:
+    return import_class(application_class(spec).lines, RobotLines, "lines")()
 
 
-def own_topics_of(spec: SystemSpec) -> tuple[Topic[Any], ...]:
-    """Return the topics that a system has beyond the common ones.
+declared = _usable(declared_topics)
+"""Returns the topics of the engine and of a system's application."""
 
-    Raises:
-        UsageError: as `topics_of`.
-    """
-    return _usable(own_topics, spec)
+topics_of = _usable(system_topics)
+"""Returns all topics of a system."""
 
+own_topics_of = _usable(own_topics)
+"""Returns the topics that a system has beyond the declared ones."""
 
-def _usable(of: Callable[[SystemSpec], T], spec: SystemSpec) -> T:
-    try:
-        return of(spec)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
+lines_of = _usable(_lines_of)
+"""Returns what is told of a system's robot."""
