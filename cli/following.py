@@ -9,11 +9,12 @@ from collections.abc import AsyncGenerator, Iterator
 from typing import Any
 
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import topics
 from rampart.actors.run.run_info import RunInfo, find_runs
 from rampart.actors.supervision.process_title import process_state
 from rampart.cli import systems
 from rampart.cli.output import UsageError, warn
-from rampart.cli.run_picture import COUNTED, DECODED, RunPicture
+from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.cli.session import Session, connect
 
 LOOK_S = 0.25
@@ -80,7 +81,7 @@ def stopped_by_signals(stop: asyncio.Event) -> Iterator[None]:
 
 
 def draw(session: Session, picture: RunPicture) -> None:
-    """Have everything that a session hears drawn into a picture, a robot's own topics too."""
+    """Have everything that a session hears drawn into a picture, with the lines of its robot."""
     clock = session.clock
 
     def read(topic: Topic[Any]) -> None:
@@ -90,14 +91,13 @@ def draw(session: Session, picture: RunPicture) -> None:
     def count(topic: Topic[Any]) -> None:
         session.overhear(topic, lambda _key, _load: picture.count(topic))
 
-    for topic in DECODED:
-        read(topic)
-    for topic in COUNTED:
-        count(topic)
+    known: tuple[Topic[Any], ...] = topics.ALL
     try:
-        own = systems.own_topics_of(systems.load(session.run.system_file))
+        spec = systems.load(session.run.system_file)
+        picture.lines = systems.lines_of(spec)
+        known = systems.declared(spec)
+        known = (*known, *systems.own_topics_of(spec))
     except UsageError as error:  # of a run from elsewhere, say: the common topics are enough
         warn(f"{error}; topics of its own are not counted")
-        return
-    for topic in own:
-        count(topic)
+    for topic in known:
+        (read if topic in (*DECODED, *picture.lines.read) else count)(topic)

@@ -9,14 +9,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from importlib.metadata import entry_points
 
 from rampart.cli.analyse import campaign_verb, cut_set_verbs, decide_verbs, tree_verbs, verify_verb
 from rampart.cli.look import live_verb, metrics_verb, top_verb, topic_verbs
 from rampart.cli.operate import (
     adapt_verb,
     inject_verbs,
-    joystick_verb,
-    mission_verb,
     node_verbs,
     operator_verbs,
 )
@@ -44,7 +43,11 @@ _EPILOG = """examples:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Return the parser with all verbs; each sets `run`, a function of the options."""
+    """Return the parser with all verbs; each sets `run`, a function of the options.
+
+    A package adds verbs of its own by entry points of the group `rampart.verbs`: functions of the
+    verbs' subparsers, the formatter class, and a parent parser with `--port`.
+    """
     formatter = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
         prog="rampart", formatter_class=formatter, epilog=_EPILOG,
@@ -58,9 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
     topic_verbs.add(verbs, formatter, common)
     inject_verbs.add(verbs, formatter, common)
     operator_verbs.add(verbs, formatter, common)
-    mission_verb.add(verbs, formatter, common)
-    joystick_verb.add(verbs, formatter, common)
-    live_verb.add(verbs, formatter, common)
+    live_verb.add(verbs, formatter)
     metrics_verb.add(verbs, formatter)
     adapt_verb.add(verbs, formatter, common)
     record_verbs.add(verbs, formatter, common)
@@ -70,6 +71,11 @@ def build_parser() -> argparse.ArgumentParser:
     decide_verbs.add(verbs, formatter)
     tree_verbs.add(verbs, formatter)
     verify_verb.add(verbs, formatter)
+    for found in sorted(entry_points(group="rampart.verbs")):
+        try:
+            found.load()(verbs, formatter, common)
+        except Exception as error:  # of somebody else's package: the other verbs are there
+            warn(f"verb {found.name} ({found.value}): {type(error).__name__}: {error}")
     return parser
 
 

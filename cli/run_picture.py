@@ -16,15 +16,12 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.osmosis import topics
+from rampart.cli.robot_lines import SILENT, RobotLines
 
 DECODED: tuple[Topic[Any], ...] = (
-    topics.MISSION_STATUS, topics.CONTROL_STATUS, topics.POSE, topics.PILOT_STATUS,
     ftm_topics.MANAGER_STATUS, ftm_topics.DETECTION, ftm_topics.RECOVERY, ftm_topics.DECISION,
-    ftm_topics.NODES, ftm_topics.PROCESS_EVENT, bus_topics.HEARTBEAT, topics.TRUTH)
-"""What is read; of all other topics the messages are counted."""
-
-COUNTED: tuple[Topic[Any], ...] = tuple(t for t in topics.ALL if t not in DECODED)
+    ftm_topics.NODES, ftm_topics.PROCESS_EVENT, bus_topics.HEARTBEAT)
+"""What is read besides what the lines of the robot need; all other messages are counted."""
 
 STALE_S = 2.0
 """A state that was not heard for so long is silent (simulated seconds)."""
@@ -55,6 +52,7 @@ class RunPicture:
     """One run as a tool has heard it.
 
     Attributes:
+        lines: what is told of the robot.
         messages: messages heard so far, by topic key as declared.
         detections: newest report of each detection module.
         recoveries: newest report of each recovery module.
@@ -66,7 +64,8 @@ class RunPicture:
         process_events_total: process events heard, by node and event.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, lines: RobotLines | None = None) -> None:
+        self.lines = lines or RobotLines()
         self.messages: Counter[str] = Counter()
         self.detections: dict[str, m.DetectionReport] = Remembered(_NAMES)
         self.recoveries: dict[str, m.RecoveryReport] = Remembered(_NAMES)
@@ -84,7 +83,7 @@ class RunPicture:
         self.messages[topic.key] += 1
 
     def heard(self, topic: Topic[Any], header: Header, body: Any, now_s: float) -> None:
-        """Take a message of one of `DECODED`, heard at a simulated time."""
+        """Take a message that is read, heard at a simulated time."""
         self.messages[topic.key] += 1
         if topic is bus_topics.HEARTBEAT:
             self.beats[header.source] = Beat(header.incarnation, now_s, body)
@@ -131,3 +130,16 @@ class RunPicture:
         if last_s <= first_s:
             return {}
         return {key: (last[key] - first[key]) / (last_s - first_s) for key in sorted(last)}
+
+
+def manager_in_words(status: m.ManagerStatus | None) -> str:
+    """Return what the FTM Manager sees and does."""
+    if status is None:
+        return SILENT
+    parts = [f"{status.strategy}, decision {status.decision}"]
+    parts += [f"{word} {', '.join(names)}" for word, names in (
+        ("ACTIVE", status.active), ("recovery", status.activated),
+        ("latched", status.latched), ("silent", status.silent)) if names]
+    if len(parts) == 1:
+        parts.append("nothing active")
+    return "; ".join(parts)

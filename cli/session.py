@@ -11,7 +11,7 @@ import asyncio
 import contextlib
 import uuid
 from collections.abc import AsyncIterator, Callable
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
@@ -23,6 +23,8 @@ from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.actors.runtime.clock import Clock
 from rampart.cli.output import UsageError
+
+T = TypeVar("T")
 
 RESEND_S = 0.1
 """Real seconds between copies of a command whose effect does not show."""
@@ -139,6 +141,25 @@ class Session:
                 resend = now + RESEND_S
             await asyncio.sleep(0.01)
         return True
+
+
+class Latest(Generic[T]):
+    """The newest message of a topic."""
+
+    def __init__(self) -> None:
+        self.value: T | None = None
+        self._heard = asyncio.Event()
+
+    def keep(self, _key: str, _header: Header, body: T) -> None:
+        """Take a message; for `listen`."""
+        self.value = body
+        self._heard.set()
+
+    async def first(self, timeout_s: float) -> T | None:
+        """Return the newest message, or wait for the first one, at most real seconds."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._heard.wait(), timeout_s)
+        return self.value
 
 
 def _checked(topic: Topic[Any], payload: bytes) -> bytes:

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from rampart import systems
 from rampart.actors.bus.topic import Topic
-from rampart.actors.layout.system_topics import own_topics, system_topics
+from rampart.actors.layout.layout import application_class
+from rampart.actors.layout.system_topics import declared_topics, own_topics, system_topics
+from rampart.actors.layout.wiring import import_class
 from rampart.cli.output import UsageError
+from rampart.cli.robot_lines import RobotLines
 from rampart.files import toml
 from rampart.files.reading import FileError, read_text
 from rampart.manager.spec.specification import SpecificationError, SystemSpec, parse_specification
+
+T = TypeVar("T")
 
 DEFAULT = systems.DEFAULT
 
@@ -52,6 +57,25 @@ def load(file: str | None) -> SystemSpec:
         raise UsageError(str(error)) from None
 
 
+def declared(spec: SystemSpec) -> tuple[Topic[Any], ...]:
+    """Return the topics of the engine and of a system's application.
+
+    Raises:
+        UsageError: the application's class cannot be had.
+    """
+    return _usable(declared_topics, spec)
+
+
+def lines_of(spec: SystemSpec) -> RobotLines:
+    """Return what is told of a system's robot.
+
+    Raises:
+        UsageError: the application's class cannot be had, or what it names for this.
+    """
+    return _usable(lambda of: import_class(
+        application_class(of).lines, RobotLines, "lines")(), spec)
+
+
 def topics_of(spec: SystemSpec) -> tuple[Topic[Any], ...]:
     """Return all topics of a system.
 
@@ -70,9 +94,7 @@ def own_topics_of(spec: SystemSpec) -> tuple[Topic[Any], ...]:
     return _usable(own_topics, spec)
 
 
-def _usable(
-    of: Callable[[SystemSpec], tuple[Topic[Any], ...]], spec: SystemSpec
-) -> tuple[Topic[Any], ...]:
+def _usable(of: Callable[[SystemSpec], T], spec: SystemSpec) -> T:
     try:
         return of(spec)
     except ValueError as error:

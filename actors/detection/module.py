@@ -17,7 +17,7 @@ Two subtleties, both about a module that was not there for a while:
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from rampart.actors.bus.bounds import NAME_CHARS, clip
 from rampart.actors.bus.topic import Topic
@@ -40,9 +40,6 @@ EXCUSE_S = 0.1
 
 NEXT_EXCUSE_S = 1.0
 """Not sooner does another absence count: a module that is always late is not excused for ever."""
-
-DEFAULT_GRACE_S = 5.0
-"""How long a starting system may take, if no spec says."""
 
 _SHORTEST_SLEEP_S = 1e-4
 """Rounding must not make a timer that is due now come again now, for ever."""
@@ -78,11 +75,14 @@ class Monitor(Protocol):
         """Draw the conclusions from the time that has passed without an event."""
 
 
+M = TypeVar("M", bound=Monitor)
+
+
 class DetectionModule(Actor):
     """Base of DM1 to DM7.
 
-    A subclass either calls `activate` and `know_idle` itself, or has a `Monitor`, hands it what it
-    hears, and calls `follow(monitor)` after each event. One that calls them itself calls
+    A subclass either calls `activate` and `know_idle` itself, or has a `Monitor` (`judged_by`),
+    hands it what it hears, and calls `follow` after each event. One that calls them itself calls
     `know_idle` whenever what it hears proves that the fault is not there, idle or not: from its
     second life on it is silent, and counts as active, until it has called one of the two.
     """
@@ -156,9 +156,24 @@ class DetectionModule(Actor):
 
     # -- the monitor ----------------------------------------------------------------------------
 
-    def follow(self, monitor: Monitor) -> None:
-        """Bring the state in line with the monitor, and see to it that its deadline is kept."""
+    def judged_by(self, monitor: M) -> M:
+        """Have a monitor judge from the start on; return it."""
         self._monitor = monitor
+        return monitor
+
+    def known_after_s(self, wait_s: float) -> float:
+        """Return when to claim idle though nothing was heard: at once in a system that starts."""
+        return -math.inf if self.first_life else self.clock.now() + wait_s
+
+    def on_start(self) -> None:
+        """Start waiting for the first input."""
+        self.follow()
+
+    def follow(self) -> None:
+        """Bring the state in line with the monitor, and see to it that its deadline is kept."""
+        monitor = self._monitor
+        if monitor is None:
+            return
         self._note_absence()
         if monitor.active:
             self.activate(monitor.reason, monitor.nodes)
@@ -184,7 +199,7 @@ class DetectionModule(Actor):
             self._sleep_until(self._judges_from_s)
         else:
             monitor.expire(now_s)
-            self.follow(monitor)
+            self.follow()
 
     def _note_absence(self) -> None:
         now_s = self.clock.now()

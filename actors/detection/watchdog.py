@@ -28,9 +28,9 @@ class Watchdog(DetectionModule):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         timeout_s = amount(self.parameters, "timeout_s", 0.5)
-        self.monitor = WatchdogCore(
+        self.monitor = self.judged_by(WatchdogCore(
             watched_nodes(self.parameters), timeout_s, self.clock.now(),
-            self.grace_s(timeout_s), known=self.first_life)
+            self.grace_s(timeout_s), known=self.first_life))
 
     @classmethod
     def names(
@@ -44,21 +44,17 @@ class Watchdog(DetectionModule):
         """Watch the life of the watched nodes."""
         return watched_nodes(parameters)
 
-    def on_start(self) -> None:
-        """Start waiting for the first heartbeats."""
-        self.follow(self.monitor)
-
     def on_peer(self, node: str, incarnation: int, alive: bool) -> None:
         """See a process come or go: the fast path to a crash."""
         self.monitor.peer(node, incarnation, alive, self.clock.now())
-        self.follow(self.monitor)
+        self.follow()
 
     @on(topics.HEARTBEAT)
     def heartbeat(self, _message: m.Heartbeat, header: Header) -> None:
         """Hear that a loop turns."""
         self.monitor.beat(header.source, header.incarnation, header.stamp,
                           self.clock.now())
-        self.follow(self.monitor)
+        self.follow()
 
 
 def watched_nodes(parameters: Mapping[str, Any]) -> tuple[str, ...]:

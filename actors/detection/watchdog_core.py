@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from operator import attrgetter
 
-from rampart.actors.detection.plausible import is_possible
+from rampart.actors.bus.plausible import is_possible
 
 
 @dataclass(slots=True)

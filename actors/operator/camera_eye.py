@@ -1,6 +1,6 @@
 """Gets pictures from a renderer, a program of its own that is started when somebody looks.
 
-The renderer (`rampart.sim.osmosis.camera`, or another that speaks the same way) lives as long as
+The renderer, which the robot's page names, lives as long as
 pictures are asked for and `IDLE_S` longer. All pages share its pictures, `PERIOD_S` apart. It may
 fail, hang or be killed: then the page is told why, and the next try is made after `RETRY_S`.
 Nothing else waits for it, and it costs nothing while nobody looks.

@@ -1,16 +1,14 @@
-"""The HMI: hands missions, orders and resets to the controller, and shows what happens.
+"""The operator's page as a node: shows what happens, and hands on what the operator asks for.
 
 A non-control node (paper, section III): memoryless, may be killed and respawned at any time. What
-it must not do after a respawn is decided in `hmi_submission`, which orders make sense in
-`hmi_orders`; what it shows is collected in `hmi_state`; the page is served by `hmi_server`.
+every system has is here: nodes, decisions, detections, faults, strategies, signals. A robot's page
+is derived from it. What is shown is collected in `state`, the page is served by `server`.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
-from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 
@@ -20,79 +18,99 @@ from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.operator.bounds import MAX_NAME, clip
-from rampart.actors.operator.camera_eye import CameraEye, renderer
+from rampart.actors.operator.bounds import clip
+from rampart.actors.operator.camera_eye import CameraEye
 from rampart.actors.operator.feed import Feed
-from rampart.actors.operator.operating import OUTPUTS, SHOWN, Operating
+from rampart.actors.operator.operating import Operating
 from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.operator.requests import (
-    MissionWish,
-    OrderWish,
+    REQUESTS,
     RefusedError,
-    ResetWish,
-    Wish,
+    Request,
+    RequestReader,
+    ResetRequest,
 )
 from rampart.actors.operator.server import Handlers, PageServer, PortError, Visitor
 from rampart.actors.operator.state import HmiState
 from rampart.actors.operator.system import draw_system
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Airport, Mission
-from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.page.map import PageMap, lights_shown, page_map
-from rampart.actors.osmosis.page.orders import NoSenseError, Orders
-from rampart.actors.osmosis.page.submission import (
-    REPEAT_S,
-    BusyError,
-    Submission,
-    first_request,
-    system_is_up,
-)
 from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.manager.spec.specification import SystemSpec, check_document
 
-__all__ = ["Hmi"]
+REPEAT_S = 0.5
+"""Simulated seconds between repetitions of what was not answered."""
 
 
 class Hmi(Actor):
     """The operator's node.
 
-    Parameters: `camera`, the module that renders the picture of the robot
-        (`rampart.sim.osmosis.camera`), if any.
+    Class attributes:
+        requests: what its page may ask for.
+        shown: topics that are heard for the page alone.
     """
 
-    outputs = (topics.MISSION_REQUEST, topics.MISSION_ORDER, ftm_topics.RESET, *OUTPUTS)
+    outputs: ClassVar[tuple[Topic[Any], ...]] = (
+        ftm_topics.RESET, ftm_topics.ADAPT, bus_topics.INJECTION_REQUEST)
+    requests: ClassVar[tuple[type[Request], ...]] = REQUESTS
+    shown: ClassVar[tuple[Topic[Any], ...]] = (
+        ftm_topics.ADAPTED_SYSTEM, ftm_topics.PROCESS_EVENT, ftm_topics.ERROR_REPORT,
+        ftm_topics.ADAPTATION, bus_topics.INJECTION_RESULT)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         run, plan = context.run, context.run.plan
-        known = run.application if isinstance(run.application, Osmosis) else None
-        self._airport: Airport | None = known.airport if known else None
         self._port: int = self.parameters.get("port", plan.hmi_port)
-        mission: Mission | None = known.mission if known else None
-        run_id, waits = plan.run_id, plan.waits
-        first = (first_request(run_id, mission.name, _goals(mission))
-                 if mission and mission.goals and not waits else None)
-        self._missions: Mapping[str, Mission] = (
-            {mission.name: mission} if mission and mission.goals and waits
-            else self._airport.missions if self._airport else {})
-        self._submission = Submission(run_id, context.incarnation, self.clock.now(), first)
-        self._orders = Orders(f"{run_id}/{context.name}.{context.incarnation}", "operator")
-        self._state = HmiState(lights_shown(self._airport) if self._airport else None)
-        self._operating = Operating(self, self._state)
+        self._state = self._make_state()
+        self._operating = self._make_operating()
+        self._camera = self._make_camera()
         self._table: fm.NodeTable | None = None
         self._server: PageServer | None = None
         self._starting: asyncio.Task[None] | None = None
-        self._camera = self._make_camera()
-        self._observer = ProcessObserver(
-            plan.base_port, plan.launcher_pid)
+        self._observer = ProcessObserver(plan.base_port, plan.launcher_pid)
         self._version = -1
         self._show_system(run.system, run.adapted.version if run.adapted else 0)
 
+    # -- what a robot's page may override --------------------------------------------------------
+
+    def _make_state(self) -> HmiState:
+        return HmiState()
+
+    def _make_operating(self) -> Operating:
+        return Operating(self, self._state)
+
+    def _make_camera(self) -> CameraEye | None:
+        return None
+
+    def _hello(self) -> dict[str, Any]:
+        """Return what a page needs to know to begin; what it is not told of, it does not show."""
+        return {"type": "hello", "run_id": self.context.run.plan.run_id, "rate": self.clock.rate,
+                "camera": self._camera is not None}
+
+    def _fulfil(self, request: Request, visitor: Visitor) -> str | dict[str, Any]:
+        """Act on a request of a page and return what to tell it.
+
+        Raises:
+            RefusedError: it cannot be met; the text says why.
+        """
+        if not isinstance(request, ResetRequest):
+            return self._operating.fulfil(request, visitor.number)
+        if request.recovery not in self._state.latched:
+            waiting = ", ".join(self._state.latched) or "none"
+            raise RefusedError(f"{request.recovery[:40]!r} does not wait for a reset; "
+                               f"waiting: {waiting}")
+        self.publish(ftm_topics.RESET, fm.Reset(request.recovery, self.name))
+        return f"reset of {request.recovery} asked for"
+
+    @every(REPEAT_S)
+    def _repeat(self) -> None:
+        """Send again what was not answered."""
+        self._operating.repeat()
+
+    # -- the page -------------------------------------------------------------------------------
+
     def listens(self, topic: Topic[Any]) -> bool:
-        """Without a page, hear only what missions and orders depend on."""
-        return bool(self._port) or topic not in _SHOWN
+        """Without a page, hear only what this node does without one."""
+        return bool(self._port) or topic not in self.shown
 
     @property
     def page_port(self) -> int | None:
@@ -100,8 +118,8 @@ class Hmi(Actor):
         return self._server.port if self._server else None
 
     def on_start(self) -> None:
-        """Send the mission, and open the page's port; the robot drives without the page."""
-        self._submit()
+        """Open the page's port; the robot drives without the page."""
+        self._repeat()
         if not self._port:
             return
         self._operating.start()
@@ -109,7 +127,8 @@ class Hmi(Actor):
         try:
             self._server = PageServer(
                 self._port, Feed(self._state, self.clock.now, self._hello, self._look),
-                Handlers(lambda page: self._operating.introduction(page.number), self._fulfil,
+                Handlers(RequestReader(self.requests),
+                         lambda page: self._operating.introduction(page.number), self._fulfil,
                          lambda page: self._operating.left(page.number)),
                 plan.hmi_host, plan.hmi_token,
                 camera=self._camera)
@@ -135,100 +154,6 @@ class Hmi(Actor):
             self.report_diagnostic("operator's page", f"{type(error).__name__}: {error}",
                                    f"port {self._port}")
 
-    # -- missions, orders and resets ------------------------------------------------------------
-
-    @every(REPEAT_S)
-    def _submit(self) -> None:
-        now = self.clock.now()
-        withdrawn = self._submission.expire(now)
-        if withdrawn is not None:
-            self._state.log(now, "note", f"mission {withdrawn.name} was not taken: "
-                                         "the Mission Manager does not answer")
-        if self._submission.pending is not None and system_is_up(self._table, now):
-            self.publish(topics.MISSION_REQUEST, self._submission.pending)
-        self._tell(self._orders.expire(now))
-        if self._orders.pending is not None:
-            self.publish(topics.MISSION_ORDER, self._orders.pending)
-        self._operating.repeat()
-
-    def _tell(self, outcome: str) -> None:
-        """Say what became of an order, if there is anything to say."""
-        if outcome:
-            self._state.order(outcome, self.clock.now())
-
-    def _fulfil(self, wish: Wish, visitor: Visitor) -> str | dict[str, Any]:
-        match wish:
-            case MissionWish():
-                return self._start(wish.name)
-            case OrderWish():
-                return self._order(wish)
-            case ResetWish():
-                return self._reset(wish)
-            case _:
-                return self._operating.fulfil(wish, visitor.number)
-
-    def _reset(self, wish: ResetWish) -> str:
-        if wish.recovery not in self._state.latched:
-            waiting = ", ".join(self._state.latched) or "none"
-            raise RefusedError(f"{wish.recovery[:40]!r} does not wait for a reset; "
-                               f"waiting: {waiting}")
-        self.publish(ftm_topics.RESET, fm.Reset(wish.recovery, self.name))
-        return f"reset of {wish.recovery} asked for"
-
-    def _start(self, name: str) -> str:
-        if name not in self._missions:
-            raise RefusedError(f"no mission {name[:40]!r}; there are: "
-                               f"{', '.join(self._missions) or 'none'}")
-        try:
-            request = self._submission.ask(name, _goals(self._missions[name]), self.clock.now())
-        except BusyError as error:
-            raise RefusedError(str(error)) from None
-        self.publish(topics.MISSION_REQUEST, request)
-        return f"mission {name} asked for"
-
-    def _order(self, wish: OrderWish) -> str:
-        try:
-            order = self._orders.give(wish.action, wish.reason, self.clock.now())
-        except NoSenseError as error:
-            raise RefusedError(str(error)) from None
-        self.publish(topics.MISSION_ORDER, order)
-        return f"{wish.action.value} asked for"
-
-    def _hello(self) -> dict[str, Any]:
-        return {
-            "type": "hello",
-            "run_id": self.context.run.plan.run_id,
-            "rate": self.clock.rate,
-            "map": self._map.encoded if self._map else None,
-            "left_out": self._map.left_out if self._map else {},
-            "footprint_m": self._footprint_m,
-            "camera": self._camera is not None,
-            "missions": [name for name in self._missions if name == clip(name, MAX_NAME)][:200],
-            "track": list(self._state.track),
-        }
-
-    def _make_camera(self) -> CameraEye | None:
-        module = str(self.parameters.get("camera", ""))
-        if not (module and self._port and self._airport and self._airport.source):
-            return None
-        return CameraEye(renderer(module), {"airport": self._airport.source}, self._camera_view)
-
-    def _camera_view(self) -> dict[str, Any] | None:
-        heard = self._state.picture.value("pose")
-        if heard is None:
-            return None
-        return {**msgspec.structs.asdict(heard.value), "obstacles": [
-            (o.name, o.x_m, o.y_m, o.radius_m) for o in self._state.picture.value("obstacles")]}
-
-    @property
-    def _footprint_m(self) -> tuple[float, float] | None:
-        robot = self.context.run.system.mobile
-        return (robot.length_m, robot.width_m) if robot else None
-
-    @cached_property
-    def _map(self) -> PageMap | None:
-        return page_map(self._airport) if self._airport else None
-
     def _look(self) -> None:
         self._state.usage(self._observer.look(self._table))
 
@@ -251,41 +176,6 @@ class Hmi(Actor):
             return
         self._show_system(system, message.version)
 
-    @on(topics.MISSION_STATUS)
-    def _mission_status(self, message: m.MissionStatus, _header: Header) -> None:
-        self._submission.hear(message)
-        self._orders.hear(message)
-        self._state.mission(message, self.clock.now())
-
-    @on(topics.MISSION_ORDER_ANSWER)
-    def _order_answer(self, message: m.MissionOrderAnswer, _header: Header) -> None:
-        self._tell(self._orders.answer(message))
-
-    @on(topics.POSE)
-    def _pose(self, message: m.Pose, header: Header) -> None:
-        self._state.pose(message, header.stamp, self.clock.now())
-
-    @on(topics.SCAN)
-    def _scan(self, message: m.LaserScan, _header: Header) -> None:
-        self._state.laser("laser", message, self.clock.now())
-
-    @on(topics.UPPER_SCAN)
-    def _upper_scan(self, message: m.LaserScan, _header: Header) -> None:
-        self._state.laser("upper_laser", message, self.clock.now())
-
-    @on(topics.ROUTE)
-    def _route(self, message: m.Route, _header: Header) -> None:
-        self._state.route(message)
-
-    @on(topics.CONTROL_STATUS)
-    def _control(self, message: m.ControlStatus, _header: Header) -> None:
-        self._state.keep("control", message, self.clock.now())
-
-    @on(topics.PILOT_STATUS)
-    def _pilot(self, message: m.PilotStatus, _header: Header) -> None:
-        self._operating.pilot(message)
-        self._state.keep("pilot", message, self.clock.now())
-
     @on(ftm_topics.MANAGER_STATUS)
     def _manager(self, message: fm.ManagerStatus, _header: Header) -> None:
         self._operating.manager(message)
@@ -296,10 +186,6 @@ class Hmi(Actor):
         self._operating.nodes(message)
         self._table = message
         self._state.keep("nodes", message, self.clock.now())
-
-    @on(topics.OBSTACLES)
-    def _obstacles(self, message: m.ObstacleList, _header: Header) -> None:
-        self._state.obstacles(message)
 
     @on(ftm_topics.DECISION)
     def _decision(self, message: fm.DecisionRecord, header: Header) -> None:
@@ -321,22 +207,3 @@ class Hmi(Actor):
     @on(bus_topics.INJECTION_RESULT)
     def _injection(self, message: bm.InjectionReport, _header: Header) -> None:
         self._operating.injected(message)
-
-    @on(topics.BASE_STATUS)
-    def _base(self, message: m.BaseStatus, _header: Header) -> None:
-        self._operating.base(message)
-
-    @on(topics.LIGHT_MEASURED)
-    def _light(self, message: m.LightMeasurement, _header: Header) -> None:
-        self._state.light(message)
-
-
-_SHOWN = (
-    topics.POSE, topics.SCAN, topics.UPPER_SCAN, topics.ROUTE, topics.CONTROL_STATUS,
-    topics.PILOT_STATUS, topics.OBSTACLES, ftm_topics.ADAPTED_SYSTEM,
-    ftm_topics.PROCESS_EVENT, ftm_topics.ERROR_REPORT, topics.LIGHT_MEASURED, *SHOWN)
-"""What is heard for the page alone."""
-
-
-def _goals(mission: Mission) -> tuple[m.Goal, ...]:
-    return tuple(m.Goal(g.x_m, g.y_m, m.Mode(g.mode)) for g in mission.goals)

@@ -1,113 +1,146 @@
-"""What a page may ask of the HMI: one struct each, decoded strictly. Pure.
+"""What a page may ask of its node: one struct each, decoded strictly. Pure.
 
 An unknown tag, an unknown field or a wrong type makes the whole message refused; so does a number
-that JSON cannot hold. Whether a wish makes sense now is not decided here.
+that JSON cannot hold. Whether a request makes sense now is not decided here.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Sequence
+from typing import Annotated, Generic, TypeVar, Union
 
 import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE
-from rampart.actors.osmosis.messages import MissionAction
 
-__all__ = ["AdaptWish", "EndFaultWish", "InjectWish", "MissionWish", "OrderWish", "RefusedError",
-           "ResetWish", "SignalWish", "StickWish", "Wish", "WishError", "read_wish"]
-
-_Name = Annotated[str, msgspec.Meta(max_length=200)]
+Name = Annotated[str, msgspec.Meta(max_length=200)]
 _Seconds = Annotated[float, msgspec.Meta(ge=0, le=86_400)]
+R = TypeVar("R")
 
 
-class _Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    pass
+class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a page asks for; the tag of a derived class is the `type` of its JSON."""
 
 
-class ResetWish(_Wish, frozen=True, tag="reset"):
-    """The operator wants a latched recovery released."""
+class ResetRequest(Request, frozen=True, tag="reset"):
+    """A latched recovery is to be released."""
 
-    recovery: _Name
-
-
-class MissionWish(_Wish, frozen=True, tag="mission"):
-    """The operator wants a mission of the airport started."""
-
-    name: _Name
+    recovery: Name
 
 
-class OrderWish(_Wish, frozen=True, tag="order"):
-    """The operator wants something of the mission under way."""
+class StrategyRequest(Request, frozen=True, tag="strategy"):
+    """Another strategy is to be set."""
 
-    action: MissionAction
-    reason: _Name = ""
-
-
-class StickWish(_Wish, frozen=True, tag="stick"):
-    """Where the operator's stick is, and whether the dead man is held.
-
-    `ticket` is the newest that the page was given (`hmi_stick`). Forward and left are in [-1, 1].
-    """
-
-    held: bool
-    ticket: int = 0
-    forward: float = 0.0
-    left: float = 0.0
+    name: Name
 
 
-class AdaptWish(_Wish, frozen=True, tag="strategy"):
-    """The operator wants another strategy."""
+class SignalRequest(Request, frozen=True, tag="signal"):
+    """A signal is to be sent to the process of a node."""
 
-    name: _Name
-
-
-class SignalWish(_Wish, frozen=True, tag="signal"):
-    """The operator wants a signal sent to the process of a node."""
-
-    node: _Name
-    signal: _Name
+    node: Name
+    signal: Name
 
 
-class InjectWish(_Wish, frozen=True, tag="inject"):
-    """The operator wants a fault injected.
+class InjectRequest(Request, frozen=True, tag="inject"):
+    """A fault is to be injected.
 
     `duration_s` None takes the fault's own, `permanent` lets it last; both in simulated seconds,
     as is `delay_s`, the time until it begins.
     """
 
-    fault: _Name
+    fault: Name
     delay_s: _Seconds = 0.0
     duration_s: Annotated[float, msgspec.Meta(gt=0, le=86_400)] | None = None
     permanent: bool = False
 
 
-class EndFaultWish(_Wish, frozen=True, tag="end-fault"):
-    """The operator wants an injected fault to end now."""
+class EndFaultRequest(Request, frozen=True, tag="end-fault"):
+    """An injected fault is to end now."""
 
-    injection: _Name
+    injection: Name
 
 
-Wish = (ResetWish | MissionWish | OrderWish | StickWish | AdaptWish | SignalWish | InjectWish
-        | EndFaultWish)
-_wishes = msgspec.json.Decoder(Wish)
+REQUESTS: tuple[type[Request], ...] = (
+    ResetRequest, StrategyRequest, SignalRequest, InjectRequest, EndFaultRequest)
+"""What every page may ask for."""
 
 
 class RefusedError(ValueError):
-    """A wish that cannot be fulfilled; the text is shown on the page."""
+    """A request that cannot be met; the text is shown on the page."""
 
 
-class WishError(ValueError):
-    """A message that is no wish; the text says what is wrong with it."""
+class RequestError(ValueError):
+    """A message that is no request; the text says what is wrong with it."""
 
 
-def read_wish(text: str | bytes | None) -> Wish:
-    """Decode a message of a page.
+class RequestReader:
+    """Reads the messages of a page.
 
-    Raises:
-        WishError: it is none.
+    Args:
+        kinds: of requests that there are.
     """
-    try:
-        wish: Wish = _wishes.decode(text or b"")
-    except UNREADABLE as error:
-        raise WishError(f"message not understood: {error}") from None
-    return wish
+
+    def __init__(self, kinds: Sequence[type[Request]] = REQUESTS) -> None:
+        self._decoder = msgspec.json.Decoder(Union[tuple(kinds)])  # noqa: UP007 known at run time
+
+    def read(self, text: str | bytes | None) -> Request:
+        """Decode a message of a page.
+
+        Raises:
+            RequestError: it is none.
+        """
+        try:
+            request: Request = self._decoder.decode(text or b"")
+        except UNREADABLE as error:
+            raise RequestError(f"message not understood: {error}") from None
+        return request
+
+
+class Pending(Generic[R]):
+    """The one message of a kind that is sent again and again until somebody answers.
+
+    Args:
+        prefix: of the messages' ids; another one for each incarnation of the node.
+        unanswered: what is said of one that was withdrawn.
+        patience_s: simulated seconds after which it is.
+
+    Attributes:
+        pending: the message to be sent now and again, or None.
+        name: what it asks for, for people.
+    """
+
+    def __init__(self, prefix: str, unanswered: str, patience_s: float) -> None:
+        self.pending: R | None = None
+        self.name = ""
+        self._prefix = prefix
+        self._unanswered = unanswered
+        self._patience_s = patience_s
+        self._asked = 0
+        self._give_up_s = float("inf")
+
+    def new_id(self) -> str:
+        """Return the id of the next message.
+
+        Raises:
+            RefusedError: there is one that waits.
+        """
+        if self.pending is not None:
+            raise RefusedError(f"{self.name} waits for its answer")
+        self._asked += 1
+        return f"{self._prefix}.{self._asked}"
+
+    def put(self, name: str, message: R, now_s: float) -> R:
+        """Have a message wait from now on, simulated seconds; for ever without patience."""
+        self.pending, self.name, self._give_up_s = message, name, now_s + self._patience_s
+        return message
+
+    def settle(self) -> str:
+        """Take an answer: nothing waits any more. Return what was asked for."""
+        self.pending = None
+        return self.name
+
+    def expire(self, now_s: float) -> str:
+        """Withdraw a message that nobody answers, and return what to tell; "" if none."""
+        if self.pending is None or now_s < self._give_up_s:
+            return ""
+        return f"{self.settle()} {self._unanswered}"

@@ -1,10 +1,10 @@
-"""The web side of the HMI: static files and a WebSocket, on loopback unless asked otherwise.
+"""The web side of the page: static files and a WebSocket, on loopback unless asked otherwise.
 
 It runs on the actor's own event loop and costs nothing while no page is open
 (`rampart.actors.web.server`, where connections are also let in and seen out).
 
-Who may do what is decided in `rampart.actors.web.access`, how much one may say in `hmi_limits`, and
-what may be said in `hmi_wishes`. The files are the same for everybody; everything else needs the
+Who may do what is decided in `rampart.actors.web.access`, how much one may say in `limits`, and
+what may be said in `requests`. The files are the same for everybody; everything else needs the
 token where there is one. Where there is none, only this process's user is let in at all.
 """
 
@@ -21,7 +21,8 @@ from typing import Any
 import msgspec
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import HTTPConnection
+from starlette.requests import Request as HttpRequest
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -30,7 +31,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from rampart.actors.operator.camera_eye import CameraError, CameraEye
 from rampart.actors.operator.feed import SEND_TIMEOUT_S, Feed, PageFeed
 from rampart.actors.operator.limits import MessageBudget, Verdict
-from rampart.actors.operator.requests import RefusedError, Wish, WishError, read_wish
+from rampart.actors.operator.requests import RefusedError, Request, RequestError, RequestReader
 from rampart.actors.web.access import SUBPROTOCOL, Access, AccessError, is_loopback, shown_token
 from rampart.actors.web.server import WebServer, is_known, served
 
@@ -79,7 +80,7 @@ class PortError(OSError):
 
 @dataclass(frozen=True, slots=True)
 class Visitor:
-    """An open page: its number in this life of the HMI."""
+    """An open page: its number in this incarnation of the node."""
 
     number: int
 
@@ -89,13 +90,15 @@ class Handlers:
     """Who deals with the pages.
 
     Attributes:
+        reader: of what pages ask for.
         came: returns what a new page is told first.
-        fulfil: acts on a page's wish and returns what to tell it; raises RefusedError.
+        fulfil: acts on a page's request and returns what to tell it; raises RefusedError.
         left: hears of a page that was closed.
     """
 
+    reader: RequestReader
     came: Callable[[Visitor], dict[str, Any]]
-    fulfil: Callable[[Wish, Visitor], str | dict[str, Any]]
+    fulfil: Callable[[Request, Visitor], str | dict[str, Any]]
     left: Callable[[Visitor], None]
 
 
@@ -137,7 +140,7 @@ class PageServer:
         """Begin to serve; to be awaited on the actor's loop."""
         files = {path: (_PAGE / name).read_bytes() for path, (name, _) in _FILES.items()}
 
-        async def file(request: Request) -> Response:
+        async def file(request: HttpRequest) -> Response:
             path = request.url.path
             return Response(files[path], media_type=_FILES[path][1], headers=_HEADERS)
 
@@ -158,7 +161,7 @@ class PageServer:
         else:
             self._server.stop()
 
-    async def _picture(self, request: Request) -> Response:
+    async def _picture(self, request: HttpRequest) -> Response:
         if request.headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
             return PlainTextResponse("only for this page", 403)
         try:
@@ -221,8 +224,8 @@ class PageServer:
 
     def _answer(self, text: str | bytes | None, visitor: Visitor) -> dict[str, Any]:
         try:
-            told = self._handlers.fulfil(read_wish(text), visitor)
-        except (WishError, RefusedError) as error:
+            told = self._handlers.fulfil(self._handlers.reader.read(text), visitor)
+        except (RequestError, RefusedError) as error:
             return {"type": "error", "text": str(error)}
         return {"type": "done", "text": told} if isinstance(told, str) else told
 

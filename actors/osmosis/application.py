@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from rampart.actors.osmosis.airport.model import Airport, Mission
     from rampart.actors.osmosis.airport.world import WorldTruth
 
-_TELEOPERATION = "rampart.actors.osmosis.control.teleoperation.teleoperation:Teleoperation"
+_AIRPORT = "airport"
+"""Folder of a recording with the airport's files."""
+
+TELEOPERATION = "rampart.actors.osmosis.control.teleoperation.teleoperation:Teleoperation"
 
 
 class Osmosis(Application):
@@ -47,6 +50,8 @@ class Osmosis(Application):
             extra={"metavar": "DEVICE", "alone": "auto"})] = ""
 
     topics = topics.ROBOT
+    views = "rampart.actors.osmosis.recording.views:OsmosisViews"
+    lines = "rampart.cli.osmosis.lines:OsmosisLines"
     options: Options
 
     def __init__(self, options: Options) -> None:
@@ -82,6 +87,31 @@ class Osmosis(Application):
         found.mission = mission or Mission("", ())
         return found
 
+    def documents(self) -> list[tuple[str, Path]]:
+        """Return the airport's files, and the mission's if it has one."""
+        from rampart.actors.osmosis.airport.formats import files_of  # noqa: PLC0415 as above
+
+        found = [(f"{_AIRPORT}/{path.name}", path) for path in files_of(Path(self.airport.source))]
+        mission = Path(self.options.mission)
+        if mission.suffix in (".miss", ".toml") and mission.is_file():
+            found.append((f"mission/{mission.name}", mission))
+        return found
+
+    @classmethod
+    def restored(cls, directory: Path) -> Application:
+        """Return the application on the airport of a recording, without a mission.
+
+        Raises:
+            OSError, ValueError: it has none, or it is unsound.
+        """
+        from rampart.actors.osmosis.airport.formats import load_airport  # noqa: PLC0415 as above
+
+        found = sorted((directory / _AIRPORT).glob("*.toml")) or sorted(
+            (directory / _AIRPORT).glob("*.graph"))
+        if not found:
+            raise ValueError("no airport in the recording")
+        return cls.on_map(load_airport(found[0]))
+
     def check(self, spec: SystemSpec, *, virtual: bool) -> str:
         """Refuse a joystick that nobody can drive with; one that is not plugged in is waited for.
 
@@ -93,7 +123,7 @@ class Osmosis(Application):
             return ""
         if virtual:
             raise ValueError(f"--joystick {name}: not with --virtual, nobody can drive that fast")
-        if all(node.actor != _TELEOPERATION for node in spec.nodes):
+        if all(node.actor != TELEOPERATION for node in spec.nodes):
             raise ValueError(f"--joystick {name}: no node of {spec.name} reads it")
         device = Path(name)
         if device.is_file() or device.is_dir():

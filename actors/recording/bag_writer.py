@@ -24,10 +24,10 @@ from mcap.writer import CompressionType, Writer
 from rampart.actors.bus.topic import ROOT
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.json_schema import plain_schema
-from rampart.actors.recording.message_form import MessageForm, Recorded, form_of
+from rampart.actors.recording.message_form import Forms, MessageForm, Recorded
 from rampart.actors.recording.run_documents import Documents
 from rampart.actors.recording.sequence_gaps import SequenceGaps
-from rampart.actors.recording.views import CHANNELS, View, Views, encode
+from rampart.actors.recording.views import View, Views, encode
 
 PROFILE = "rampart"
 RUN = "rampart.run"
@@ -98,6 +98,7 @@ class BagWriter:
         self.gaps = SequenceGaps(from_start=from_start)
         self._file = file
         self._zero_s = time_zero_s
+        self._forms = Forms(documents.known.topics)
         self._views = views
         self._wants = wants
         self._schemas: dict[str, int] = {}
@@ -108,7 +109,7 @@ class BagWriter:
         self._describe(documents)
         if views is not None:
             begin_ns = 0 if begin_s is None else self._ns(begin_s)
-            self._show(views.start(begin_ns), begin_ns)
+            self._show(views, views.start(begin_ns), begin_ns)
         self.flush()
 
     def take(self, at_s: float, key: str, payload: bytes) -> None:
@@ -125,7 +126,7 @@ class BagWriter:
         channel = self._channels.get(key, ...)
         if channel is ...:
             channel = self._channels[key] = self._channel(key) if self._wants(key) else None
-        form = form_of(key) if channel is None else channel[1]
+        form = self._forms.of(key) if channel is None else channel[1]
         text, header, body = form.recorded(payload)
         if header is not None:
             self.gaps.hear(header)
@@ -143,7 +144,8 @@ class BagWriter:
         if self._views is None or header is None or form.topic is None:
             return
         try:
-            self._show(self._views.of(form.topic, key, header, body, log_ns), log_ns)
+            self._show(self._views,
+                       self._views.of(form.topic, key, header, body, log_ns), log_ns)
         except (ValueError, TypeError, OverflowError):  # the message itself is recorded
             self.untranslated += 1
 
@@ -176,7 +178,7 @@ class BagWriter:
     # -- channels -------------------------------------------------------------------------------
 
     def _channel(self, key: str) -> _Entry:
-        form = form_of(key)
+        form = self._forms.of(key)
         topic = form.topic
         described = {KEY: key}
         schema = 0
@@ -195,11 +197,11 @@ class BagWriter:
                 name, "jsonschema", plain_schema(kind))
         return self._schemas[name]
 
-    def _show(self, views: list[View], log_ns: int) -> None:
-        for name, view in views:
+    def _show(self, views: Views, found: list[View], log_ns: int) -> None:
+        for name, view in found:
             number = self._view_channels.get(name)
             if number is None:
-                kind = CHANNELS[name]
+                kind = views.channels[name]
                 number = self._view_channels[name] = self._writer.register_channel(
                     name, "json", self._schema(fg.schema_name(kind), kind))
             self._writer.add_message(number, log_ns, encode(view), log_ns)

@@ -7,7 +7,7 @@ is not guessed: it is tried, unless the message is of a kind that cannot go wron
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, Generic, TypeVar
 
@@ -15,11 +15,9 @@ import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE, Envelope, Header, decode, pack
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.osmosis import topics
+from rampart.actors.layout.system_topics import find_topic
 
 B = TypeVar("B")
-
-FAMILY = "{name}"
 
 
 class Recorded(msgspec.Struct, Generic[B], frozen=True, omit_defaults=True):
@@ -147,25 +145,22 @@ _of_anything = msgspec.msgpack.Decoder(Envelope[Any])
 _encode_msgpack = msgspec.msgpack.Encoder().encode
 
 
-@cache
-def form_of(key: str) -> MessageForm:
-    """Return the form of the messages on a full key."""
-    return MessageForm(topic_of(key))
+class Forms:
+    """The forms of the messages of a system.
 
+    Args:
+        topics: that are known.
+    """
 
-def topic_of(key: str) -> Topic[Any] | None:
-    """Return the topic that a full key belongs to, or None."""
-    short = key.removeprefix(f"{ROOT}/")
-    for topic in topics.ALL:
-        if not topic.is_family:
-            if topic.key == short:
-                return topic
-            continue
-        head, tail = topic.key.split(FAMILY)
-        member = short[len(head):len(short) - len(tail)]
-        if member and "/" not in member and short == f"{head}{member}{tail}":
-            return topic
-    return None
+    def __init__(self, topics: Sequence[Topic[Any]]) -> None:
+        self._topics = topics
+        self._forms: dict[str, MessageForm] = {}
+
+    def of(self, key: str) -> MessageForm:
+        """Return the form of the messages on a full key."""
+        if key not in self._forms:
+            self._forms[key] = MessageForm(find_topic(key.removeprefix(f"{ROOT}/"), self._topics))
+        return self._forms[key]
 
 
 @cache

@@ -24,11 +24,8 @@ from pathlib import Path
 
 from rampart.actors.bus import tap
 from rampart.actors.bus.unix_peer import is_same_user
-from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.recording.bag_writer import BagError, BagWriter, open_target
-from rampart.actors.recording.run_documents import Documents, collect, footprint_m, restore
-from rampart.actors.recording.views import Views
+from rampart.actors.recording.run_documents import Documents, collect
 from rampart.actors.run.run_info import RunInfo, ask
 
 PERIOD_S = 0.05
@@ -209,7 +206,7 @@ class Recorder:
         try:
             self.writer = BagWriter(
                 file, documents, time_zero_s=zero_s, begin_s=begin_s,
-                views=views_of(documents), wants=self._wants,
+                views=documents.known.views(), wants=self._wants,
                 from_start=self._from_start)
         except OSError as error:
             self._give_up(error)
@@ -255,22 +252,6 @@ def describe(info: RunInfo) -> Documents:
     """Return what a recording keeps of a run."""
     return collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
                    nodes=tuple(info.nodes), started=_wall())
-
-
-def views_of(documents: Documents) -> Views:
-    """Return what viewers get to see of a run: its airport, if it can be read, and its robot."""
-    return Views(_airport_of(documents), footprint_m(documents.files))
-
-
-def _airport_of(documents: Documents) -> Airport | None:
-    import tempfile  # noqa: PLC0415 once a recording
-
-    with tempfile.TemporaryDirectory() as directory:
-        path = restore(documents.files, Path(directory))
-        try:
-            return load_airport(path) if path else None
-        except (ValueError, OSError):
-            return None
 
 
 def _pidfd(pid: int) -> int:

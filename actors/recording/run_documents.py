@@ -1,24 +1,30 @@
-"""What a recording keeps of its run, so that a replay needs nothing else: plan, system, airport."""
+"""What a recording keeps of its run, so that a replay needs nothing else: plan, system, files."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import msgspec
 
-from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.osmosis.airport.graph_format import IMAGE_SUFFIXES
-from rampart.files import toml
+from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import topics
+from rampart.actors.layout.layout import application_class, load_application
+from rampart.actors.layout.wiring import import_class
+from rampart.actors.recording.views import Views
+from rampart.actors.run.application import Application
+from rampart.actors.run.run_context import NO_SYSTEM
+from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.files.reading import FileError, read_bytes
+from rampart.manager.spec.specification import SystemSpec
 
 FORMAT = "1"
 SYSTEM = "system.toml"
-AIRPORT = "airport/"
-"""Directory of attachments with the airport's files."""
 
 _MEDIA = {".toml": "application/toml", ".graph": "application/json", ".png": "image/png",
           ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
@@ -26,6 +32,30 @@ MAX_FILE_BYTES = 64 << 20
 
 File = tuple[str, str, bytes]
 """Name in the recording, media type, content."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What could be loaded of a run: a viewer or recorder makes do without the rest.
+
+    Attributes:
+        system: its spec.
+        kind: class of its application.
+        application: of the run; None if an option of it cannot be had.
+    """
+
+    system: SystemSpec = NO_SYSTEM
+    kind: type[Application] = Application
+    application: Application | None = None
+
+    @property
+    def topics(self) -> tuple[Topic[Any], ...]:
+        """The topics of the engine and of the application."""
+        return (*topics.ALL, *self.kind.topics)
+
+    def views(self) -> Views:
+        """Return what translates the run for viewers."""
+        return import_class(self.kind.views, Views, "views")(self.application, self.system)
 
 
 class Documents(msgspec.Struct, frozen=True):
@@ -36,10 +66,11 @@ class Documents(msgspec.Struct, frozen=True):
         title: for people.
         rate: simulated seconds per second.
         nodes: names of the nodes.
-        plan: the run's plan (`run_plan.RunPlan`), as plain data.
+        plan: the run's plan (`RunPlan.description`), as plain data.
         started: wall time at which the recording began, ISO 8601; empty in virtual time.
-        files: system, airport and mission as files.
+        files: system, and what the application names, as files.
         version: of the program.
+        known: system and application.
     """
 
     run_id: str
@@ -50,36 +81,67 @@ class Documents(msgspec.Struct, frozen=True):
     started: str
     files: tuple[File, ...] = ()
     version: str = ""
+    known: Known = Known()
 
     def metadata(self) -> dict[str, str]:
-        """Return what stands in the metadata record."""
-        told = {name: str(self.plan.get(name, "")) for name in (
-            "airport", "mission", "strategy", "shadow", "seed", "obstacles", "ftm")}
-        told["airport"], told["mission"] = (
-            PurePosixPath(told[name]).name for name in ("airport", "mission"))
+        """Return what stands in the metadata record; of a file that was chosen its name."""
+        chosen = self.known.application.options if self.known.application else None
+        options = {**self.plan, **(msgspec.structs.asdict(chosen) if chosen else {})}
+        told = {name: PurePosixPath(str(value)).name or str(value)
+                for name, value in options.items() if name != "system_file"}
         return {
-            "format": FORMAT, "run_id": self.run_id, "title": self.title,
+            **told, "format": FORMAT, "run_id": self.run_id, "title": self.title,
             "rate": f"{self.rate:g}", "started": self.started, "rampart_version": self.version,
-            "nodes": json.dumps(self.nodes), **told}
+            "nodes": json.dumps(self.nodes)}
 
 
-def collect(plan: Mapping[str, Any], **known: Any) -> Documents:
-    """Return the documents of a run, with the files that its plan names.
+NOT_CHOSEN = ("format", "run_id", "title", "rate", "started", "rampart_version", "nodes",
+              "time_zero_s")
+"""What stands in the metadata record besides the choices of the plan."""
+
+
+def collect(plan: Mapping[str, Any], **described: Any) -> Documents:
+    """Return the documents of a run, with the files that belong to it.
 
     A file that cannot be read is left out: the messages are what counts.
 
     Args:
         plan: as plain data.
-        known: the other attributes of `Documents`.
+        described: the other attributes of `Documents`.
     """
+    known = known_of(plan)
+    paths = [(SYSTEM, Path(str(plan.get("system_file", ""))))]
+    with contextlib.suppress(OSError):  # a folder that cannot be listed
+        paths += known.application.documents() if known.application else []
     files: list[File] = []
-    for name, path in _paths(plan):
+    for name, path in paths:
         try:
             data = read_bytes(path, MAX_FILE_BYTES)
         except (OSError, FileError):
             continue
         files.append((name, _MEDIA.get(path.suffix.lower(), "text/plain"), data))
-    return Documents(plan=plan, files=tuple(files), version=own_version(), **known)
+    return Documents(plan=plan, files=tuple(files), version=own_version(), known=known,
+                     **described)
+
+
+def known_of(plan: Mapping[str, Any]) -> Known:
+    """Return system and application of a run, as far as they can be loaded.
+
+    Args:
+        plan: as plain data.
+    """
+    system, kind = NO_SYSTEM, Application
+    try:
+        run = RunPlan(system_file=str(plan.get("system_file", "")))
+        system = load_system(run)
+        kind = application_class(system)
+        options = {field.name: msgspec.convert(plan[field.name], field.type, strict=False)
+                   for field in msgspec.structs.fields(kind.Options)
+                   if plan.get(field.name, "") != ""}
+        return Known(system, kind, load_application(
+            msgspec.structs.replace(run, options=options), system))
+    except (OSError, ValueError):
+        return Known(system, kind)
 
 
 def own_version() -> str:
@@ -90,56 +152,15 @@ def own_version() -> str:
         return "unknown"
 
 
-def footprint_m(files: Sequence[File]) -> tuple[float, float] | None:
-    """Return length and width of the robot that the system's file states, None if it does not."""
-    for name, _media, data in files:
-        if name == SYSTEM:
-            try:
-                robot = toml.parse(data.decode())["robot"]
-                return float(robot["length_m"]), float(robot["width_m"])
-            except (ValueError, KeyError, TypeError, OverflowError):
-                return None
-    return None
-
-
-def restore(files: Sequence[File], directory: Path) -> Path | None:
-    """Write the airport's files into a directory and return the one to load it from.
+def restore(files: Sequence[File], directory: Path) -> None:
+    """Write the files of a run's application into a directory, each into a folder there.
 
     Names that would lead out of the directory are not followed.
     """
-    found: list[Path] = []
     for name, _media, data in files:
-        short = PurePosixPath(name).name
-        if name != f"{AIRPORT}{short}" or short in ("", ".", ".."):
+        parts = PurePosixPath(name).parts
+        if len(parts) != 2 or "/".join(parts) != name or ".." in parts:
             continue
-        path = directory / short
+        path = directory.joinpath(*parts)
+        path.parent.mkdir(exist_ok=True)
         path.write_bytes(data)
-        found.append(path)
-    return next((p for suffix in (".toml", ".graph") for p in found if p.suffix == suffix), None)
-
-
-def _airport_file(name: str) -> Path | None:
-    try:
-        return Path(load_airport(name).source) if name else None
-    except (ValueError, OSError):
-        return None
-
-
-def _paths(plan: Mapping[str, Any]) -> list[tuple[str, Path]]:
-    paths = [(SYSTEM, Path(str(plan.get("system_file", ""))))]
-    source = _airport_file(str(plan.get("airport") or ""))
-    if source is not None:
-        beside = [source]
-        if source.suffix == ".graph":
-            beside += sorted(p for p in source.parent.iterdir()
-                             if p.suffix.lower() in (*IMAGE_SUFFIXES, ".miss"))
-            own = [p for p in beside if p.stem.startswith(source.stem)
-                   and p.suffix.lower() in IMAGE_SUFFIXES]
-            if own:  # as `rampart.actors.osmosis.airport.graph_format` chooses among several images
-                beside = [p for p in beside
-                          if p in own or p.suffix.lower() not in IMAGE_SUFFIXES]
-        paths += [(f"{AIRPORT}{path.name}", path) for path in beside]
-    mission = Path(str(plan.get("mission") or ""))
-    if mission.suffix in (".miss", ".toml") and mission.is_file():
-        paths.append((f"mission/{mission.name}", mission))
-    return paths

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from rampart.actors.recording.bag_writer import BagError, BagWriter, open_target
-from rampart.actors.recording.recorder import views_of
 from rampart.actors.recording.run_documents import collect
 
 FLUSH_S = 10.0
@@ -41,7 +40,7 @@ class VirtualRecording:
         file = open_target(path, overwrite=overwrite)
         try:
             self._writer = BagWriter(
-                file, documents, time_zero_s=-lead_s, views=views_of(documents),
+                file, documents, time_zero_s=-lead_s, views=documents.known.views(),
                 from_start=True)
         except OSError as error:
             file.close()

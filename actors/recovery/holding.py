@@ -1,4 +1,4 @@
-"""Recoveries that hold an order in force: the forward recoveries RM1, RM2 and RM5.
+"""Orders that a recovery module keeps in force: what RM1, RM2, RM5 and RM8 have in common.
 
 They act by giving an order to another node and repeating it, have acted when that node's status
 confirms it, and then stay: the robot is in a degraded mode until they are released.
@@ -11,58 +11,62 @@ failure.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from rampart.actors.ftm.messages import RecoveryCommand, RecoveryPhase
 from rampart.actors.recovery.module import RecoveryModule
-from rampart.actors.runtime.actor import Context
 
 _FAREWELLS = 5
 """How often the end of an order is said: one second long, for whoever is being respawned."""
 
 
-class HoldingRecovery(RecoveryModule):
-    """A recovery that keeps an order in force while it is activated."""
+class HeldOrder:
+    """An order that is in force while its module is activated.
 
-    def __init__(self, context: Context) -> None:
-        super().__init__(context)
+    Args:
+        module: whose order it is; told of how it goes.
+        give: publishes the order with its reason, or its end.
+        inherits: an earlier life of the module may have left an order behind.
+    """
+
+    def __init__(self, module: RecoveryModule, give: Callable[[bool, str], None], *,
+                 inherits: bool) -> None:
+        self._module = module
+        self._give = give
+        self._inherits = inherits
         self.why = ""
         self._farewells = 0
         self._lost_s = math.inf
-        self._inherits = context.incarnation > 1
-
-    def give_order(self, *, engaged: bool) -> None:
-        """Publish the order, or its end."""
-        raise NotImplementedError
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Give the order, unless it is in force already."""
         self._farewells = 0
         self._inherits = False
         self.why = command.reason
-        if self.phase is not RecoveryPhase.DEGRADED:
-            self.give_order(engaged=True)
-        if renewed and self.phase is RecoveryPhase.FAILED:
-            self.resume(command.reason)
+        if self._module.phase is not RecoveryPhase.DEGRADED:
+            self._give(True, self.why)
+        if renewed and self._module.phase is RecoveryPhase.FAILED:
+            self._module.resume(command.reason)
 
     def let_go(self) -> None:
         """End the order."""
         self._lost_s = math.inf
         self._farewells = _FAREWELLS
-        self.give_order(engaged=False)
+        self._give(False, "")
 
     def stay_idle(self) -> None:
-        """End an order that an earlier life of this module may have left behind."""
+        """End an order that an earlier life of the module may have left behind."""
         if self._inherits:
             self._inherits = False
             self.let_go()
 
     def repeat(self) -> None:
         """Repeat the order while it is in force, and a while its end."""
-        if self.activated:
-            self.give_order(engaged=True)
+        if self._module.activated:
+            self._give(True, self.why)
         elif self._farewells > 0:
             self._farewells -= 1
-            self.give_order(engaged=False)
+            self._give(False, "")
 
     def status(self, *, in_force: bool, reason: str, stamp_s: float) -> None:
         """Take note of whether the order is obeyed.
@@ -72,14 +76,15 @@ class HoldingRecovery(RecoveryModule):
             reason: in words.
             stamp_s: when that was true; what was true before the order says nothing.
         """
-        if not self.activated or stamp_s < self.ordered_s:
+        module = self._module
+        if not module.activated or stamp_s < module.ordered_s:
             return
         if in_force:
             self._lost_s = math.inf
-            self.degrade(reason)
-        elif self.phase is RecoveryPhase.DEGRADED:
+            module.degrade(reason)
+        elif module.phase is RecoveryPhase.DEGRADED:
             self._lost_s = min(self._lost_s, stamp_s)
-            if stamp_s - self._lost_s > self.deadline_s:
-                self.fail(f"no longer in force: {reason}")
+            if stamp_s - self._lost_s > module.deadline_s:
+                module.fail(f"no longer in force: {reason}")
             else:
-                self.give_order(engaged=True)
+                self._give(True, self.why)

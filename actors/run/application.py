@@ -13,6 +13,7 @@ It is loaded once for a run, before its processes are forked, and read-only afte
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self
 
 import msgspec
@@ -34,6 +35,8 @@ class Application:
 
     Class attributes:
         topics: what its actors publish and hear besides the engine's topics.
+        views: class that translates them for viewers, as `module:Class`, derived from this one.
+        lines: class that tells of them in `rampart status`, `top` and `metrics`, likewise.
 
     Attributes:
         options: what was chosen for this run.
@@ -46,6 +49,8 @@ class Application:
         """What a run can be told; fields are options of the command line, with their help."""
 
     topics: ClassVar[tuple[Topic[Any], ...]] = ()
+    views: ClassVar[str] = "rampart.actors.recording.views:Views"
+    lines: ClassVar[str] = "rampart.cli.robot_lines:RobotLines"
 
     def __init__(self, options: Any = None) -> None:
         self.options = options or self.Options()
@@ -53,6 +58,23 @@ class Application:
     def world_parameters(self) -> Mapping[str, Any]:
         """Return what the node that simulates the world has to know of the options."""
         return {}
+
+    def documents(self) -> list[tuple[str, Path]]:
+        """Return the files that belong to a recording: `FOLDER/NAME` there, and where they are."""
+        return []
+
+    @classmethod
+    def restored(cls, directory: Path) -> Application:
+        """Return what a replay's page is to know, from the documents of a recording.
+
+        Args:
+            directory: where the files are, by their name in the recording.
+
+        Raises:
+            OSError, ValueError: one of them cannot be read or is unsound.
+        """
+        del directory
+        return Application()
 
     def check(self, spec: SystemSpec, *, virtual: bool) -> str:
         """Return what the user has to be told before the run starts, "" for nothing.

@@ -8,43 +8,31 @@ needs no lock and its code no `await`.
 A handler that raises ends the actor: the error is reported on `diagnostic/NAME`, `on_failure`
 is called, and the process exits non-zero so that its supervisor starts a fresh one. The
 heartbeat is an item of the same mailbox: a handler that never returns silences it, although the
-process and its liveliness token live on.
+process and its liveliness token are still there.
 """
 
 from __future__ import annotations
 
-import asyncio
-import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import msgspec
 
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
-from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from rampart.actors.bus.limits import RateLimit, ReportLimit
 from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection
-from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import Qos, Topic
-from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
-from rampart.actors.runtime.clock import Clock
-from rampart.actors.runtime.injection_desk import InjectionDesk
-from rampart.actors.runtime.mailbox import Mailbox
-from rampart.actors.runtime.timer import Timer
+from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT
+from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
+from rampart.actors.runtime.context import Context
+from rampart.actors.runtime.declaration import BASE_INPUTS, BASE_OUTPUTS, Declared, every, on
+from rampart.actors.runtime.injected_faults import InjectedFaults
+from rampart.actors.runtime.mailbox import IDLE, Dispatcher
+from rampart.actors.runtime.timer import Timer, Timers
 
-__all__ = ["Actor", "Context", "Header", "every", "on"]
-
-F = TypeVar("F", bound=Callable[..., None])
-
-BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, HELLO, DIAGNOSTIC, INJECTION_REPORT)
-"""What every actor publishes besides its own outputs."""
-
-BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT, HELLO)
-"""What every actor hears besides its own inputs: injections from tools, hellos from partners."""
+__all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every", "on"]
 
 _REPEATED_SOON_HZ = 7.0
 """A state that is repeated this often anyway is not repeated for a newcomer."""
@@ -55,92 +43,9 @@ _HELLOS_PER_S = 100
 _STRANGE_HELLOS_PER_S = 5
 """Of those that are no nodes of the system."""
 
-# What an actor is doing. Numbers, because they are compared and set for each message.
-_RESTING = 0
-"""Nothing, and what comes goes through the mailbox."""
-_IDLE = 1
-"""Nothing, and what comes may be handled without a stay in the mailbox."""
-_AWAKE = 2
-"""It handles an item, is about to, or has not started yet."""
 
-
-@dataclass(frozen=True, slots=True)
-class Context:
-    """What an actor gets from whoever starts it.
-
-    Attributes:
-        name: the node's name, unique in the system.
-        incarnation: which life of the node this is, counted from 1.
-        clock: simulated time.
-        bus: this actor's access to the bus, not yet open.
-        parameters: the node's parameters from the system spec.
-        run: what all actors of the run have in common, loaded once.
-        pid: number of the process that it lives in.
-        checkpoints: where this node's state is kept.
-        heartbeat_period_s: simulated seconds between two heartbeats.
-        failed: told of the error that ends the actor, while its peers still believe that it lives.
-        register: returns the incarnation of a node that was issued last, None if it is not known.
-        members: names of all nodes of the system; what others make it remember is bounded.
-    """
-
-    name: str
-    incarnation: int
-    clock: Clock
-    bus: Bus
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    run: RunContext = field(default_factory=RunContext)
-    pid: int = field(default_factory=os.getpid)
-    checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
-    heartbeat_period_s: float = 0.1
-    failed: Callable[[Exception], None] = lambda _error: None
-    register: Register = lambda _node: None
-    members: frozenset[str] = frozenset()
-
-
-def on(topic: Topic[Any]) -> Callable[[F], F]:
-    """Declare a method as the handler of a topic: `handler(self, message, header)`."""
-
-    def mark(function: F) -> F:
-        function.__dict__.setdefault("_rampart_topics", []).append(topic)
-        return function
-
-    return mark
-
-
-def every(period_s: float) -> Callable[[F], F]:
-    """Declare a method to be called each `period_s` simulated seconds, first after one period."""
-
-    def mark(function: F) -> F:
-        function.__dict__["_rampart_period_s"] = period_s
-        return function
-
-    return mark
-
-
-class Actor:
-    """Base of every node, detection module, recovery module and manager.
-
-    Class attributes:
-        outputs: topics it publishes; publishing another one raises.
-    """
-
-    outputs: ClassVar[tuple[Topic[Any], ...]] = ()
-    _handlers: ClassVar[tuple[tuple[Topic[Any], str], ...]] = ()
-    _periodic: ClassVar[tuple[tuple[float, str], ...]] = ()
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        handlers: dict[tuple[str, str], tuple[Topic[Any], str]] = {}
-        periodic: dict[str, float] = {}
-        for base in reversed(cls.__mro__):
-            for name, member in vars(base).items():
-                for topic in getattr(member, "_rampart_topics", ()):
-                    handlers[(topic.key, name)] = (topic, name)
-                if hasattr(member, "_rampart_period_s"):
-                    periodic[name] = member._rampart_period_s
-        cls._handlers = (
-            (INJECT, "_on_injection"), (HELLO, "_on_hello"), *handlers.values())
-        cls._periodic = tuple((period, name) for name, period in periodic.items())
+class Actor(Declared):
+    """Base of every node, detection module, recovery module and manager."""
 
     def __init__(self, context: Context) -> None:
         self.context = context
@@ -151,26 +56,17 @@ class Actor:
         self._bus = context.bus
         self._guard = ArrivalGuard(
             context.clock.now, context.members, self._crowded, context.register)
-        self._injections = InjectionDesk(self)
+        self._injections = InjectedFaults(self)
         self._in_force = self._injections.gate.in_force
         self._last_sent = self._injections.gate.last
         self._keeper = Keeper(
             context.checkpoints, lambda line: self.report_diagnostic("checkpoint", line, self.name),
             context.clock.now, expected=context.incarnation > 1)
-        self._mailbox = Mailbox(on_overflow=self._overflowed, on_item=self._wake)
-        self._waiting = self._mailbox.waiting
-        self._ended: asyncio.Future[None] | None = None
-        self._stance = _RESTING
-        self._on_hold = False
-        self._pace_s = 0.0
+        self._dispatcher = Dispatcher(context.bus.bursts, self._overflowed)
+        self._timers = Timers(context.clock, self._dispatcher)
         self._sequence = 0
-        self._progress = 0
         self._rejected = 0
-        self._timer_count = 0
-        self._stopping = False
         self._abandoned = False
-        self._timers: set[asyncio.TimerHandle] = set()
-        self._tickers: list[_Ticker] = []
         self._reports = ReportLimit()
         self._hellos = RateLimit(_HELLOS_PER_S)
         self._strange_hellos = RateLimit(_STRANGE_HELLOS_PER_S)
@@ -179,34 +75,10 @@ class Actor:
         self._outlets: dict[str | tuple[str, str], tuple[str, bool]] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
 
-    # -- what a subclass may override -----------------------------------------------------------
-
-    @classmethod
-    def names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
-    ) -> tuple[str, ...] | None:
-        """Which members of an input family the node `name` hears; None for all."""
-        return None
-
-    @classmethod
-    def output_names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
-    ) -> tuple[str, ...] | None:
-        """Which members of an output family the node `name` publishes; None for any."""
-        return (name,)
-
-    @classmethod
-    def watches(cls, name: str, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003
-        """Nodes whose life and death `on_peer` reports."""
-        return ()
-
-    @classmethod
-    def inputs(cls) -> tuple[Topic[Any], ...]:
-        """Topics it has handlers for, those of every actor included."""
-        return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
+    # -- what a subclass may override, besides what `Declared` has ---------------------------------
 
     def listens(self, topic: Topic[Any]) -> bool:  # noqa: ARG002
-        """Whether this life of the node, as it was started, has any use for one of its inputs."""
+        """Whether this process of the node has any use for one of its inputs."""
         return True
 
     def on_start(self) -> None:
@@ -244,10 +116,7 @@ class Actor:
             stamp = self.clock.now()
         if is_kept:
             self._states[key] = (topic, body, stamp)
-        if self._in_force:
-            self._injections.send(topic, key, body, stamp)
-        else:
-            self.send(topic, key, body, stamp)
+        (self._injections.send if self._in_force else self.send)(topic, key, body, stamp)
 
     def _outlet(self, topic: Topic[Any], name: str | None) -> tuple[str, bool]:
         """Return the key of a topic, and whether its last message is kept for newcomers."""
@@ -266,18 +135,7 @@ class Actor:
 
     def call_later(self, delay_s: float, call: Callable[[], None]) -> Timer:
         """Have `call` made as a mailbox item after `delay_s` simulated seconds."""
-        timer = Timer(call)
-        self._timer_count += 1
-        slot = f"later {self._timer_count}"
-        due = self.clock.source_time(self.clock.now() + delay_s)
-        handle = self._at(due, lambda: self._tick(slot, timer.fire))
-
-        def release() -> None:
-            handle.cancel()
-            self._timers.discard(handle)
-
-        timer.arm(release)
-        return timer
+        return self._timers.later(delay_s, call)
 
     def kept(self, form: StateFormat[S]) -> S | None:
         """Return the state to go on from, in `on_start`: the newest sound one, or None."""
@@ -300,104 +158,41 @@ class Actor:
 
     def stop(self) -> None:
         """End the actor after the items that already wait."""
-        self._mailbox.put_latest("stop", self._stop)
+        self._dispatcher.stop()
+
+    # -- what happens to its process in virtual time --------------------------------------------
 
     def abandon(self) -> None:
-        """Have nothing more run when its task is cancelled: in virtual time what SIGKILL does."""
+        """Have nothing more run when its task is cancelled: what SIGKILL does."""
         self._abandoned = True
+        self._dispatcher.abandon()
 
     def hold(self, held: bool) -> None:
-        """Handle nothing while held: in virtual time what SIGSTOP and a wedged loop do."""
-        self._on_hold = held
-        if self._stance == _IDLE:
-            self._stance = _RESTING
-        self._wake()
+        """Handle nothing while held: what SIGSTOP and a wedged loop do."""
+        self._dispatcher.hold(held)
 
     def slow_down(self, pace_s: float) -> None:
         """Take so many virtual seconds for each item, as on a machine that is overloaded."""
-        self._pace_s = pace_s
-        if self._stance == _IDLE:
-            self._stance = _RESTING
+        self._dispatcher.slow_down(pace_s)
 
     # -- the three phases -----------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Live from set-up to teardown.
+        """Run from set-up to teardown.
 
         Raises:
             BusError: the bus could not be opened.
             Exception: whatever a handler raised.
         """
         await self._bus.open()
-        self._ended = asyncio.get_running_loop().create_future()
-        self._stance = _AWAKE  # nothing is handled before `on_start`
         try:
             self._set_up()
-            self._stance = _RESTING
-            self._wake()
-            await self._ended
-        except asyncio.CancelledError:
-            raise
+            await self._dispatcher.run()
         except Exception as error:
             self._fail(error)
             raise
         finally:
             await self._tear_down()
-
-    def _wake(self) -> None:
-        """See to it that the mailbox is worked off.
-
-        Not at once if messages arrive in bursts: what is overtaken within one need not be handled.
-        """
-        if self._stance != _AWAKE and self._ended is not None:
-            self._stance = _AWAKE
-            if self._bus.bursts:
-                self._ended.get_loop().call_soon(self._work)
-            else:
-                self._work()
-
-    def _rest(self) -> None:
-        """The mailbox is empty. Whether the next item may be handled without a stay in it?"""
-        self._stance = _RESTING if (
-            self._bus.bursts or self._on_hold or self._pace_s
-            or self._ended is None or self._ended.done()) else _IDLE
-
-    def _handle(self, item: Callable[[], None]) -> None:
-        """Handle an item at once, being idle, and then what it has put into the mailbox."""
-        self._stance = _AWAKE
-        try:
-            item()
-        except Exception as error:
-            self._broken(error)
-            return
-        self._progress += 1
-        if self._waiting:
-            self._work()
-        else:
-            self._stance = _IDLE
-
-    def _broken(self, error: Exception) -> None:
-        if self._ended is not None:
-            self._ended.set_exception(error)
-        self._rest()
-
-    def _work(self) -> None:
-        mailbox, ended = self._mailbox, self._ended
-        if ended is None or ended.done() or self._on_hold:
-            self._rest()
-            return
-        try:
-            while mailbox.waiting and not self._stopping:
-                mailbox.take()()
-                self._progress += 1
-                if self._pace_s:
-                    ended.get_loop().call_later(self._pace_s, self._work)
-                    return  # still awake: whatever arrives meanwhile waits
-        except Exception as error:
-            ended.set_exception(error)
-        if self._stopping and not ended.done():
-            ended.set_result(None)
-        self._rest()
 
     def _set_up(self) -> None:
         for topic, method in self._handlers:
@@ -413,16 +208,12 @@ class Actor:
         self.on_start()
         self.publish(HELLO, Hello())
         self._beat()
-        self._start_timer(self.context.heartbeat_period_s, "_beat")
+        self._timers.every(self.context.heartbeat_period_s, "_beat", self._beat)
         for period_s, method in self._periodic:
-            self._start_timer(period_s, method)
+            self._timers.every(period_s, method, getattr(self, method))
 
     async def _tear_down(self) -> None:
-        for handle in self._timers:
-            handle.cancel()
-        self._timers.clear()
-        for ticker in self._tickers:
-            ticker.cancel()
+        self._timers.cancel()
         if self._abandoned:
             return
         try:
@@ -430,9 +221,6 @@ class Actor:
         finally:
             self._keeper.close()
             await self._bus.close()
-
-    def _stop(self) -> None:
-        self._stopping = True
 
     def _fail(self, error: Exception) -> None:
         try:
@@ -449,28 +237,19 @@ class Actor:
     def _receiver(
         self, topic: Topic[Any], handler: Callable[[Any, Header], None]
     ) -> Callable[[str, bytes], None]:
-        command, name, waiting = topic.qos is Qos.COMMAND, handler.__name__, self._waiting
-        members, mailbox = self.context.members, self._mailbox
+        command, name, members = topic.qos is Qos.COMMAND, handler.__name__, self.context.members
+        dispatcher, mailbox = self._dispatcher, self._dispatcher.mailbox
 
         def take(key: str, message: Envelope[Any]) -> None:
-            if self._stance == _IDLE:  # as `_handle`, once more because it is run so often
-                self._stance = _AWAKE
-                try:
-                    handler(message.body, message)
-                except Exception as error:
-                    self._broken(error)
-                    return
-                self._progress += 1
-                if waiting:
-                    self._work()
-                else:
-                    self._stance = _IDLE
-            elif command:
-                mailbox.put(lambda: handler(message.body, message),
-                            reserved=not members or message.source in members)
+            item = partial(handler, message.body, message)
+            if dispatcher.stance == IDLE:
+                dispatcher.work(item)
+                return
+            reserved = not members or message.source in members
+            if command:
+                mailbox.put(item, reserved=reserved)
             else:
-                mailbox.put_message(f"{key} {name}", lambda: handler(message.body, message),
-                                    reserved=not members or message.source in members)
+                mailbox.put_message(f"{key} {name}", item, reserved=reserved)
 
         return self._guard.receiver(topic, take, self._reject)
 
@@ -479,7 +258,7 @@ class Actor:
         self.report_diagnostic("payload rejected", reason, key)
 
     def _peer_changed(self, node: str, incarnation: int, alive: bool) -> None:
-        self._mailbox.put_message(
+        self._dispatcher.mailbox.put_message(
             f"peer {node} {incarnation} {alive}", lambda: self.on_peer(node, incarnation, alive))
 
     def _overflowed(self, _item: Any) -> None:
@@ -502,43 +281,27 @@ class Actor:
         for _ in range(copies):
             self._bus.publish(topic, key, payload)
 
-    # -- timers ---------------------------------------------------------------------------------
-
-    def _at(self, when: float, call: Callable[[], None]) -> asyncio.TimerHandle:
-        loop = asyncio.get_running_loop()
-        handle: asyncio.TimerHandle
-
-        def fire() -> None:
-            self._timers.discard(handle)
-            call()
-
-        handle = loop.call_at(when, fire)
-        self._timers.add(handle)
-        return handle
-
-    def _start_timer(self, period_s: float, method: str) -> None:
-        ticker = _Ticker(self, period_s, method)
-        self._tickers.append(ticker)
-        ticker.arm(self.clock.now() + period_s)
-
-    def _tick(self, slot: str, call: Callable[[], None]) -> None:
-        if self._stance == _IDLE:
-            self._handle(call)
-        else:
-            self._mailbox.put_latest(slot, call)
-
     def _beat(self) -> None:
         context = self.context
         self.publish(HEARTBEAT, Heartbeat(
-            context.pid, self._progress, context.heartbeat_period_s, self._rejected,
-            self._mailbox.overflowed))
+            context.pid, self._dispatcher.progress, context.heartbeat_period_s, self._rejected,
+            self._dispatcher.mailbox.overflowed))
         left_out = self._reports.left_out(self.clock.now())
         if left_out:
             self.report_diagnostic(
                 "diagnostics", f"{left_out} more reports were left out", self.name)
 
+    # -- fault injection ------------------------------------------------------------------------
+
+    @on(INJECT)
+    def _on_injection(self, order: Injection, _header: Header) -> None:
+        topic = self.published(order.topic, self.name, self.parameters)
+        if topic is not None:
+            self._injections.order(order, topic)
+
     # -- newcomers ------------------------------------------------------------------------------
 
+    @on(HELLO)
     def _on_hello(self, _hello: Hello, header: Header) -> None:
         if header.source == self.name or self._answer_due:
             return
@@ -553,65 +316,4 @@ class Actor:
     def _repeat_states(self) -> None:
         self._answer_due = False
         for key, (topic, body, stamp) in list(self._states.items()):
-            if self._in_force:
-                self._injections.send(topic, key, body, stamp)
-            else:
-                self.send(topic, key, body, stamp)
-
-    # -- fault injection ------------------------------------------------------------------------
-
-    def _on_injection(self, order: Injection, _header: Header) -> None:
-        self._injections.order(order)
-
-    def published(self, key: str) -> Topic[Any] | None:
-        """Return the topic of a key below `rampart/`, if this actor publishes it."""
-        for topic in (*self.outputs, *BASE_OUTPUTS):
-            if not topic.is_family and topic.key == key:
-                return topic
-            if topic.is_family:
-                names = self.output_names(topic, self.name, self.parameters)
-                head, tail = topic.key.split("{name}")
-                member = key[len(head):len(key) - len(tail)] if tail else key[len(head):]
-                if key.startswith(head) and key.endswith(tail) and (
-                        names is None or member in names):
-                    return topic
-        return None
-
-
-class _Ticker:
-    """A periodic timer of an actor. One that is late skips; it does not catch up."""
-
-    __slots__ = (
-        "_actor", "_call", "_cancelled", "_clock", "_due_s", "_period_s", "_post_at", "_slot")
-
-    def __init__(self, actor: Actor, period_s: float, method: str) -> None:
-        loop = asyncio.get_running_loop()
-        self._actor = actor
-        self._clock = actor.clock
-        self._post_at = getattr(loop, "post_at", loop.call_at)  # cheaper, on a virtual loop
-        self._period_s = period_s
-        self._call = getattr(actor, method)
-        self._slot = f"timer {method}"
-        self._due_s = 0.0
-        self._cancelled = False
-
-    def arm(self, due_s: float) -> None:
-        """Tick next at a simulated time."""
-        self._due_s = due_s
-        self._post_at(self._clock.source_time(due_s), _Ticker._fire, self, None)
-
-    def cancel(self) -> None:
-        """Tick no more."""
-        self._cancelled = True
-
-    def _fire(self, _nothing: None) -> None:
-        if self._cancelled:
-            return
-        clock, actor = self._clock, self._actor
-        now_s, next_s = clock.now(), self._due_s + self._period_s
-        self._due_s = due_s = next_s if next_s > now_s else now_s + self._period_s
-        self._post_at(clock.source_time(due_s), _Ticker._fire, self, None)
-        if actor._stance == _IDLE:
-            actor._handle(self._call)
-        else:
-            actor._mailbox.put_latest(self._slot, self._call)
+            (self._injections.send if self._in_force else self.send)(topic, key, body, stamp)

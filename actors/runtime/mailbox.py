@@ -1,11 +1,16 @@
-"""One mailbox per actor: latest wins for sensors and states, a bounded queue for commands.
+"""One mailbox per actor, and the dispatcher that handles its items, one at a time.
 
-A slow actor thus never works through a backlog of old samples, and never loses a command
-silently: a full queue is counted and handed to `on_overflow`.
+Latest wins for sensors and states; commands wait in a bounded queue. A slow actor thus never works
+through a backlog of old samples, and never loses a command silently: a full queue is counted and
+handed to `on_overflow`.
+
+Every item, whether message, tick or change of a peer, in real and in virtual time, is handled by
+`Dispatcher.work` and nowhere else.
 """
 
 from __future__ import annotations
 
+import asyncio
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -107,3 +112,125 @@ class Mailbox:
             self._commands -= 1
             return item
         return self._latest.pop(slot)
+
+
+# What a dispatcher is doing. Numbers, because they are compared and set for each item.
+RESTING = 0
+"""Nothing, and what comes goes through the mailbox."""
+IDLE = 1
+"""Nothing, and what comes may be given to `Dispatcher.work` without a stay in the mailbox."""
+AWAKE = 2
+"""It handles an item, is about to, has not started yet, or has ended."""
+
+
+class Dispatcher:
+    """Handles an actor's items, each to its end before the next one.
+
+    Messages that arrive in bursts all wait in the mailbox until the burst is over: what is
+    overtaken within one need not be handled. What arrives by itself is handled at once.
+
+    Args:
+        bursts: Whether messages arrive in bursts, see `Bus`.
+        on_overflow: Called with a message that is refused because too many wait.
+
+    Attributes:
+        mailbox: Items that wait.
+        stance: `RESTING`, `IDLE` or `AWAKE`.
+        progress: Items handled so far.
+        stopping: It was asked to end, and handles nothing more.
+    """
+
+    def __init__(self, bursts: bool, on_overflow: Callable[[Any], None]) -> None:
+        self.mailbox = Mailbox(on_overflow=on_overflow, on_item=self.wake)
+        self.stance = AWAKE
+        self.progress = 0
+        self.stopping = False
+        self._bursts = bursts
+        self._held = False
+        self._pace_s = 0.0
+        self._at_rest = RESTING if bursts else IDLE
+        self._ended: asyncio.Future[None] | None = None
+
+    async def run(self) -> None:
+        """Handle items until `stop` was handled.
+
+        Raises:
+            Exception: whatever an item raised.
+        """
+        self._ended = asyncio.get_running_loop().create_future()
+        self.stance = RESTING
+        self.wake()
+        await self._ended
+
+    def put(self, slot: str, item: Callable[[], None]) -> None:
+        """Handle an item of the actor's own; one that waits is replaced by the next of its slot."""
+        if self.stance == IDLE:
+            self.work(item)
+        else:
+            self.mailbox.put_latest(slot, item)
+
+    def stop(self) -> None:
+        """End after the items that already wait."""
+        self.mailbox.put_latest("stop", self._stop)
+
+    def abandon(self) -> None:
+        """Handle nothing more, not even what waits."""
+        self.stance = AWAKE
+
+    def hold(self, held: bool) -> None:
+        """Handle nothing while held."""
+        self._held = held
+        self._change_rest()
+        self.wake()
+
+    def slow_down(self, pace_s: float) -> None:
+        """Take so many seconds of the loop's clock for each item."""
+        self._pace_s = pace_s
+        self._change_rest()
+
+    def wake(self) -> None:
+        """See to it that the mailbox is worked off."""
+        if self.stance != AWAKE and self._ended is not None:
+            self.stance = AWAKE
+            if self._bursts:
+                self._ended.get_loop().call_soon(self.work)
+            else:
+                self.work()
+
+    def work(self, item: Callable[[], None] | None = None) -> None:
+        """Handle an item, which may be given while `IDLE` only, and then all that wait."""
+        self.stance = AWAKE
+        mailbox, ended = self.mailbox, self._ended
+        waiting = mailbox.waiting
+        if ended is None or ended.done():
+            return
+        if item is None:
+            if self._held:
+                self.stance = RESTING
+                return
+            if waiting:
+                item = mailbox.take()
+        try:
+            while item is not None:
+                item()
+                self.progress += 1
+                if self._pace_s:
+                    ended.get_loop().call_later(self._pace_s, self.work)
+                    return  # still awake: whatever arrives meanwhile waits
+                item = mailbox.take() if waiting and not self.stopping else None
+        except Exception as error:
+            ended.set_exception(error)
+            return
+        if self.stopping:
+            ended.set_result(None)
+        else:
+            self.stance = self._at_rest
+
+    def _stop(self) -> None:
+        self.stopping = True
+
+    def _change_rest(self) -> None:
+        direct = not (self._bursts or self._held or self._pace_s)
+        self._at_rest = IDLE if direct else RESTING
+        if self.stance == IDLE:
+            self.stance = self._at_rest

@@ -1,8 +1,16 @@
-"""One pending call of an actor, which can be taken back until the moment it is made."""
+"""Timers of an actor: calls that are made once and can be taken back, and periodic ones.
+
+All are made as items of the actor's mailbox.
+"""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
+from functools import partial
+
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.mailbox import Dispatcher
 
 
 class Timer:
@@ -28,3 +36,85 @@ class Timer:
         call, self._call = self._call, None
         if call is not None:
             call()
+
+
+class Timers:
+    """The timers of one actor; `len` counts the pending calls, without the periodic ones.
+
+    Args:
+        clock: Simulated time.
+        dispatcher: Handles the calls.
+    """
+
+    def __init__(self, clock: Clock, dispatcher: Dispatcher) -> None:
+        self._clock = clock
+        self._dispatcher = dispatcher
+        self._count = 0
+        self._pending: set[asyncio.TimerHandle] = set()
+        self._periodic: list[_Ticker] = []
+
+    def __len__(self) -> int:
+        return len(self._pending)
+
+    def later(self, delay_s: float, call: Callable[[], None]) -> Timer:
+        """Have `call` made after `delay_s` simulated seconds."""
+        timer = Timer(call)
+        self._count += 1
+        slot = f"later {self._count}"
+
+        def fire() -> None:
+            self._pending.discard(handle)
+            self._dispatcher.put(slot, timer.fire)
+
+        def release() -> None:
+            handle.cancel()
+            self._pending.discard(handle)
+
+        handle = asyncio.get_running_loop().call_at(
+            self._clock.source_time(self._clock.now() + delay_s), fire)
+        self._pending.add(handle)
+        timer.arm(release)
+        return timer
+
+    def every(self, period_s: float, name: str, call: Callable[[], None]) -> None:
+        """Have `call` made each `period_s` simulated seconds, first after one period."""
+        self._periodic.append(_Ticker(
+            self._clock, period_s, partial(self._dispatcher.put, f"timer {name}", call)))
+
+    def cancel(self) -> None:
+        """Make none of the calls any more."""
+        for handle in self._pending:
+            handle.cancel()
+        self._pending.clear()
+        for ticker in self._periodic:
+            ticker.cancel()
+
+
+class _Ticker:
+    """A periodic timer. One that is late skips; it does not catch up."""
+
+    __slots__ = ("_call", "_cancelled", "_clock", "_due_s", "_period_s", "_post_at")
+
+    def __init__(self, clock: Clock, period_s: float, call: Callable[[], None]) -> None:
+        loop = asyncio.get_running_loop()
+        self._clock = clock
+        self._post_at = getattr(loop, "post_at", loop.call_at)  # cheaper, on a virtual loop
+        self._period_s = period_s
+        self._call = call
+        self._cancelled = False
+        self._arm(clock.now() + period_s)
+
+    def cancel(self) -> None:
+        """Tick no more."""
+        self._cancelled = True
+
+    def _arm(self, due_s: float) -> None:
+        self._due_s = due_s
+        self._post_at(self._clock.source_time(due_s), _Ticker._fire, self, None)
+
+    def _fire(self, _nothing: None) -> None:
+        if not self._cancelled:
+            now_s, next_s = self._clock.now(), self._due_s + self._period_s
+            self._arm(next_s if next_s > now_s else now_s + self._period_s)
+            self._call()
+

@@ -20,9 +20,9 @@ from collections.abc import Callable, Mapping
 from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
 from rampart.actors.supervision.patience import Patience, usage
 from rampart.actors.supervision.process_title import RunProcess, find_processes
-from rampart.actors.supervision.restart_policy import RestartPolicy
 from rampart.actors.supervision.spawner import NAMES
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+from rampart.actors.supervision.supervised_process import RestartPolicy
 
 PERIOD_S = 0.25
 SUPERVISOR_PATIENCE_S = 1.5
@@ -235,8 +235,8 @@ class Guard:
         policy = self.policy
         delay_s = policy.delay_s(time.monotonic())
         if delay_s is None:
-            self._tell(f"the supervisor ended {policy.intensity} times within "
-                       f"{policy.period_s:.0f} s: it is started less often from now on")
+            self._tell(f"the supervisor ended {policy.limits.intensity} times within "
+                       f"{policy.limits.period_s:.0f} s: it is started less often from now on")
             return False
         if self._supervisor_due_s is None:
             self._supervisor_due_s = time.monotonic() + delay_s

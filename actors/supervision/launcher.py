@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import ctypes
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -27,15 +28,15 @@ from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
 from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
-from rampart.actors.supervision.descriptors import needed_descriptors, raise_descriptor_limit
 from rampart.actors.supervision.guard import Guard
 from rampart.actors.supervision.lifeline import kill_leftovers
-from rampart.actors.supervision.spawner import NAMES
+from rampart.actors.supervision.spawner import NAMES, Loaded
 from rampart.actors.supervision.spawner_client import (
     START_PATIENCE_S,
     SpawnerClient,
     SpawnerUnavailableError,
 )
+from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
 from rampart.files import working_folder
 
@@ -47,6 +48,12 @@ long the machine took to load the first process."""
 
 STOP_TIMEOUT_S = 1.2
 _PR_SET_CHILD_SUBREAPER = 36
+
+# A process of a run holds a socket for each partner. The supervisor and the observer have every
+# process for a partner, and the supervisor holds each by a descriptor besides. With too few of them
+# nothing fails at once, and everything fails later.
+_DESCRIPTORS_EACH = 4
+_DESCRIPTORS_BESIDES = 40
 
 
 class LaunchError(Exception):
@@ -104,7 +111,8 @@ class Launcher:
         self._spawners.folder = folder
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         self._lifeline = os.pipe()
-        self._descriptors = raise_descriptor_limit()
+        _, self._descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (self._descriptors, self._descriptors))
         self._begun_s = time.monotonic()
         self._first = self._load(NAMES[0])
 
@@ -138,9 +146,11 @@ class Launcher:
         text = line.decode().strip()
         if text.startswith("error: "):
             raise LaunchError(text.removeprefix("error: "))
-        if not text.startswith("["):
+        if not text.startswith("{"):
             raise LaunchError("the spawner ended while it loaded")
-        self.names = msgspec.json.decode(text, type=tuple[str, ...])
+        loaded = msgspec.json.decode(text, type=Loaded)
+        self.names = loaded.names
+        self.guard.policy = RestartPolicy(loaded.supervision)
         needed = needed_descriptors(len(self.names))
         if self._descriptors < needed:
             raise LaunchError(f"open files: the hard limit is {self._descriptors}, and "
@@ -251,3 +261,8 @@ class Launcher:
             time.sleep(0.01)
         run_folder.remove(self.plan.folder)
         self._reap()
+
+
+def needed_descriptors(processes: int) -> int:
+    """Return how many files a process of a run with so many processes may have to hold open."""
+    return _DESCRIPTORS_BESIDES + _DESCRIPTORS_EACH * processes

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.supervision.patience import Usage, usage
+from rampart.actors.supervision.patience import AT_LEISURE, Usage, usage
 from rampart.actors.supervision.process_title import find_processes, is_stopped
 from rampart.actors.supervision.spawner_client import (
     SpawnerBusyError,
@@ -25,7 +25,7 @@ from rampart.actors.supervision.spawner_client import (
     SpawnerUnavailableError,
 )
 
-__all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerBusyError",
+__all__ = ["Hold", "Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerBusyError",
            "SpawnerUnavailableError"]
 
 
@@ -91,6 +91,49 @@ class Processes(Protocol):
 
     def close(self) -> None:
         """Let go of everything."""
+
+
+class Hold:
+    """The hold on a process that may not be there, or for which no descriptor was left.
+
+    Attributes:
+        handle: What it is held by, None if it is not.
+    """
+
+    def __init__(self) -> None:
+        self.handle: ProcessHandle | None = None
+        self._is_lacking = False
+
+    def take(self, machine: Processes, pid: int, ended: Callable[[], None]) -> None:
+        """Take hold of a process; raises as `Processes.hold`, and counts then as not gone."""
+        self._is_lacking = True
+        self.handle = machine.hold(pid, ended)
+        self._is_lacking = False
+
+    def is_gone(self) -> bool:
+        """Whether it certainly runs no more and holds nothing."""
+        return not self._is_lacking and (self.handle is None or self.handle.gone())
+
+    def stopped(self) -> bool:
+        """Whether it was stopped from outside; False if that cannot be known."""
+        return self.handle is not None and self.handle.stopped()
+
+    def usage(self) -> Usage:
+        """Return what it has run, and waited for a processor, as far as that is known."""
+        return self.handle.usage() if self.handle is not None else AT_LEISURE
+
+    def kill(self) -> None:
+        """End it at once, and do not report that."""
+        if self.handle is not None:
+            self.handle.ignore()
+            self.handle.kill()
+
+    def let_go(self) -> None:
+        """Let go of it."""
+        self._is_lacking = False
+        if self.handle is not None:
+            self.handle.close()
+            self.handle = None
 
 
 class _OsHandle:

@@ -35,6 +35,7 @@ from rampart.actors.supervision.lifeline import kill_leftovers
 from rampart.actors.supervision.node_process import node_main, wedge
 from rampart.actors.supervision.process_title import set_title
 from rampart.files import streams, working_folder
+from rampart.manager.spec.tables import Supervision
 
 NAMES = ("a", "b")
 MAX_DATAGRAM = 160_000
@@ -75,6 +76,18 @@ class Reply(msgspec.Struct, frozen=True):
 
 
 Request = ForkRequest | Ping | SetOrigin | Adapt
+
+
+class Loaded(msgspec.Struct, frozen=True):
+    """What the launcher is told of the system that was loaded.
+
+    Attributes:
+        names: Of all actors.
+        supervision: How often its processes are restarted.
+    """
+
+    names: tuple[str, ...]
+    supervision: Supervision
 
 
 def address(folder: str, name: str) -> str:
@@ -251,8 +264,8 @@ def main() -> int:
 
     NAME is `a` or `b`, FD the read end of the lifeline.
 
-    Prints one line on stdout: a JSON list of all actors' names when it is ready to fork, or
-    `error: …` if the plan cannot be run.
+    Prints one line on stdout: `Loaded` as JSON when it is ready to fork, or `error: …` if the plan
+    cannot be run.
     """
     name, lifeline = sys.argv[1], int(sys.argv[2])
     working_folder.admit()
@@ -269,7 +282,8 @@ def main() -> int:
     spawner = Spawner(name, layout, run, lifeline)
     try:
         spawner.open()
-        print(msgspec.json.encode(tuple(layout.members)).decode(), flush=True)
+        loaded = Loaded(tuple(layout.members), spec.supervision)
+        print(msgspec.json.encode(loaded).decode(), flush=True)
         os.dup2(2, 1)  # nobody reads the pipe from here on
         streams.secure()  # and perhaps nobody stderr: that ends no node
         spawner.serve()

@@ -7,7 +7,8 @@
   whose silence stops the robot, the status counts as much as the heartbeat.
 
 Who waits for a processor is neither (see `patience`): on a machine that stands still for half a
-second all are silent, and replacing them all would keep it busy for longer.
+second all are silent, and replacing them all would keep it busy for longer. What follows from what
+is in `supervised_process`.
 
 What a recovery module owns (RM3, RM4) is respawned on that module's request, so that the FTM
 Manager arbitrates; everything else by the supervisor itself. OTP's rules hold: start in order,
@@ -29,43 +30,36 @@ from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
-from rampart.actors.bus.limits import RateLimit
-from rampart.actors.bus.messages import Diagnostic, Heartbeat, Injection, InjectionReport
+from rampart.actors.bus.messages import Heartbeat
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import (
-    AdaptedSystem,
-    ManagerStatus,
-    NodeInfo,
-    NodeState,
-    NodeTable,
-    ProcessEvent,
-    RespawnRequest,
-)
-from rampart.actors.layout.layout import Layout, Unit, adapted_system
-from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.layout.layout import Layout, adapted_system
+from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
-from rampart.actors.supervision.patience import AT_LEISURE, Patience
+from rampart.actors.supervision.patience import Patience
 from rampart.actors.supervision.processes import (
+    Hold,
     Living,
     OsProcesses,
     Processes,
-    ProcessHandle,
     SpawnerBusyError,
     SpawnerUnavailableError,
 )
-from rampart.actors.supervision.restart_policy import RestartPolicy
+from rampart.actors.supervision.relay import Relay
+from rampart.actors.supervision.supervised_process import (
+    STATUS,
+    Action,
+    Event,
+    RestartPolicy,
+    State,
+    SupervisedProcess,
+)
 from rampart.manager.spec.adaptation import changed_actors
 from rampart.manager.spec.specification import Kind
 
 STOP_GRACE_S = 0.5
 """Wall seconds between SIGTERM and SIGKILL at the end of a run."""
-
-START_TIMEOUT_S = 3.0
-"""Wall seconds in which a new process must have sent its first heartbeat."""
-
-PASSED_ON_PER_S = 200
-"""Error reports, orders and results of injections that are passed on in a simulated second."""
 
 _CHECK_S = 0.1
 """Simulated seconds between two looks at who is silent."""
@@ -73,52 +67,39 @@ _CHECK_S = 0.1
 _SEARCH_S = 0.05
 """Wall seconds between two looks into /proc on account of one node's messages."""
 
-_STATUS = "fresh status of the manager"
-"""Stands among the names of a process' nodes for what the Safety Pilot lives on."""
+_GONE_S = 0.002
+"""Wall seconds between two looks whether a process that was killed is gone."""
 
 _RETRY_S = 0.05
 _ASK_AGAIN_S = 0.01
-_DEAD = (NodeState.CRASHED, NodeState.GIVEN_UP)
-_HEALTHY = (NodeState.RUNNING, NodeState.STARTING)
 
 
-@dataclass(slots=True)
-class _Process:
-    """One process of the run as the supervisor knows it. Times are the event loop's seconds.
+@dataclass
+class _Process(SupervisedProcess):
+    """A process, and what the supervisor has in hand of it.
 
     Attributes:
-        unheld: It may be there, but there was no descriptor left to hold it by.
-        highest: The highest incarnation that there was.
-        requested_by: The module that asked for it, until it was heard.
-        next_step: Of its respawn, while that is under way; there is never more than one.
+        hold: On the process that is there.
+        next_step: Towards its fork, while that is under way; there is never more than one.
     """
 
-    unit: Unit
-    policy: RestartPolicy
-    patience: Patience
-    pid: int = 0
-    handle: ProcessHandle | None = None
-    unheld: bool = False
-    incarnation: int = 0
-    highest: int = 0
-    requested_by: str = ""
-    state: NodeState = NodeState.CRASHED
-    started_s: float = 0.0
-    searched_s: float = -math.inf
-    heard_s: dict[str, float] = field(default_factory=dict)
+    hold: Hold = field(default_factory=Hold)
     next_step: Timer | None = None
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The actors in it."""
-        return tuple(n.name for n in self.unit.nodes)
+    def take(self, pid: int, incarnation: int) -> None:
+        self.forget_step()
+        self.hold.let_go()
+        super().take(pid, incarnation)
+
+    def forget_step(self) -> None:
+        if self.next_step is not None:
+            self.next_step.cancel()
 
 
-class Supervisor(Actor):
-    """Keeps the processes of the run alive. Parameters: `nodes`, the names it watches."""
+class Supervisor(Relay):
+    """Keeps the processes of the run running. Parameters: `nodes`, the names it watches."""
 
-    outputs = (topics.NODES, topics.PROCESS_EVENT, topics.ERROR_REPORT, bus_topics.INJECT,
-               bus_topics.INJECTION_RESULT)
+    outputs = (topics.NODES, topics.PROCESS_EVENT, *Relay.outputs)
 
     def __init__(self, context: Context, processes: Processes | None = None) -> None:
         super().__init__(context)
@@ -128,17 +109,17 @@ class Supervisor(Actor):
         self._machine: Processes = processes or OsProcesses(
             self._plan.base_port, self._plan.launcher_pid, self._plan.folder)
         self._processes = {
-            u.name: _Process(u, RestartPolicy(), Patience(2 * _CHECK_S / self._plan.rate))
+            u.name: _Process(u, RestartPolicy(self._spec.supervision),
+                             Patience(2 * _CHECK_S / self._plan.rate))
             for u in self._layout.units.values()}
         for node, incarnation in run.known_incarnations.items():
-            if node in self._layout.unit_of:
-                process = self._processes[self._layout.unit_of[node]]
+            process = self._process_of(node)
+            if process is not None:
                 process.incarnation = process.highest = incarnation
         self._version = (0, run.adapted.version if run.adapted else 0)
         if run.adapted is not None:
             self._machine.adapt(run.adapted)
         self._timeout_s = self._spec.timing.heartbeat_timeout_s / self._plan.rate
-        self._passed_on = RateLimit(PASSED_ON_PER_S)
         self._loop = asyncio.get_running_loop()
         self._checked_s = self._loop.time()
 
@@ -149,30 +130,33 @@ class Supervisor(Actor):
         """Hear the heartbeats of the nodes that it starts."""
         return tuple(parameters.get("nodes", ())) if topic is bus_topics.HEARTBEAT else None
 
+    def _process_of(self, node: str) -> _Process | None:
+        return self._processes.get(self._layout.unit_of.get(node, ""))
+
     # -- start and stop -------------------------------------------------------------------------
 
     def on_start(self) -> None:
-        """Adopt what lives, start what does not, in the order of the spec."""
+        """Adopt what runs, start what does not, in the order of the spec."""
         living = self._machine.living()
         for process in self._processes.values():
             if self._adopt_living(process, living):
                 continue
             if self.context.incarnation == 1 or self._owns(process):
-                self._spawn(process, by=self.name)
+                self._on(process, Event.START)
         self._publish_table()
 
     def on_stop(self) -> None:
         """End all processes in reverse order: SIGTERM, then SIGKILL for those that linger.
 
-        After a failure nobody is ended: the next life adopts them.
+        After a failure nobody is ended: the next supervisor adopts them.
         """
         handles = []
         for process in reversed(self._processes.values()):
-            if not self._stopping:
-                self._unwatch(process)
-            elif process.handle is not None and process.state is not NodeState.CRASHED:
-                process.handle.ignore()
-                handles.append(process.handle)
+            if not self._dispatcher.stopping:
+                process.hold.let_go()
+            elif process.hold.handle and process.shown is not fm.NodeState.CRASHED:
+                process.hold.handle.ignore()
+                handles.append(process.hold.handle)
         self._machine.end(handles, STOP_GRACE_S)
         self._machine.close()
 
@@ -181,57 +165,33 @@ class Supervisor(Actor):
     @on(bus_topics.HEARTBEAT)
     def heartbeat(self, message: Heartbeat, header: Header) -> None:
         """Note that a node's loop turns; adopt a process that was not known, if the kernel does."""
-        unit = self._layout.unit_of.get(header.source)
-        if unit is None:
+        process = self._process_of(header.source)
+        if process is None:
             return
-        process = self._processes[unit]
         if header.incarnation > process.incarnation or (
                 header.incarnation == process.incarnation and process.pid != message.pid
-                and process.state in _DEAD):
+                and process.is_dead):
             self._look_for(process)
         if (header.incarnation, message.pid) != (process.incarnation, process.pid):
             return
-        if process.next_step is not None:  # said before it was killed
+        if process.waits:  # said before it was killed
             return
         process.heard_s[header.source] = self._loop.time()
         process.requested_by = ""
-        if process.state in (NodeState.STARTING, NodeState.STOPPED, NodeState.WEDGED):
-            resumed = process.state is not NodeState.STARTING
-            process.state = NodeState.RUNNING
-            self._event(process, "resumed" if resumed else "running", self.name)
-            self._publish_table()
+        self._on(process, Event.HEARD)
 
     @on(topics.MANAGER_STATUS)
-    def manager(self, _status: ManagerStatus, header: Header) -> None:
-        """Note that the manager is heard, or was when it said so: old news is no sign of life."""
-        process = self._processes.get(self._layout.unit_of.get(header.source, ""))
-        if process is None or header.incarnation != process.incarnation or (
-                process.next_step is not None):
+    def manager(self, _status: fm.ManagerStatus, header: Header) -> None:
+        """Note when the manager said this: an old status does not show that it works now."""
+        process = self._process_of(header.source)
+        if process is None or header.incarnation != process.incarnation or process.waits:
             return
         age_s = max(0.0, self.clock.now() - header.stamp) / self._plan.rate
-        process.heard_s[_STATUS] = max(
-            process.heard_s.get(_STATUS, -math.inf), self._loop.time() - age_s)
-
-    @on(bus_topics.DIAGNOSTIC)
-    def diagnostic(self, message: Diagnostic, _header: Header) -> None:
-        """Pass a node's error report on to whoever shows it, unless there are too many."""
-        if self._passed_on.allows(self.clock.now()):
-            self.publish(topics.ERROR_REPORT, message)
-
-    @on(bus_topics.INJECTION_REQUEST)
-    def inject(self, message: Injection, _header: Header) -> None:
-        """Order a fault for the operator's page; whoever publishes the topic hears it."""
-        if self._passed_on.allows(self.clock.now()):
-            self.publish(bus_topics.INJECT, message)
-
-    @on(bus_topics.INJECTION_REPORT)
-    def injected(self, message: InjectionReport, _header: Header) -> None:
-        """Pass on what came of a fault."""
-        if self._passed_on.allows(self.clock.now()):
-            self.publish(bus_topics.INJECTION_RESULT, message)
+        process.heard_s[STATUS] = max(
+            process.heard_s.get(STATUS, -math.inf), self._loop.time() - age_s)
 
     @on(topics.ADAPTED_SYSTEM)
-    def adapted(self, message: AdaptedSystem, header: Header) -> None:
+    def adapted(self, message: fm.AdaptedSystem, header: Header) -> None:
         """Fork by the changed system from now on, and start the changed modules anew."""
         # A manager that died before it was heard counts from an older version.
         version = (header.incarnation, message.version)
@@ -249,102 +209,56 @@ class Supervisor(Actor):
         for unit in {self._layout.unit_of[name] for name in changed}:
             process = self._processes[unit]
             process.unit = self._layout.units[unit]
-            self._anew(process)
-            self._event(process, "adapted", self.name, message.change)
-            self._respawn(process, self.name)
+            if process.step(Event.ADAPTED):  # it was given up: it may do better now
+                process.forget_step()
+                process.policy = RestartPolicy(self._spec.supervision)
+            self._tell(process, "adapted", self.name, message.change)
+            self._restart(process, self.name)
 
     @on(topics.RESPAWN)
-    def respawn(self, request: RespawnRequest, _header: Header) -> None:
+    def respawn(self, request: fm.RespawnRequest, _header: Header) -> None:
         """Kill what is left of a node and start it anew, once per failed incarnation."""
-        unit = self._layout.unit_of.get(request.node)
-        if unit is None:
-            self.publish(topics.PROCESS_EVENT, ProcessEvent(
+        process = self._process_of(request.node)
+        if process is None:
+            self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
                 request.node, "refused", 0, 0, request.by,
                 clip(f"no such node: {request.node!r}")))
-            return
-        process = self._processes[unit]
-        if process.state in _HEALTHY and process.incarnation > request.failed_incarnation:
-            self._event(process, "respawned", request.by, "already")
-            return
-        process.requested_by = request.by
-        self._respawn(process, request.by)
+        elif (process.state in (State.STARTING, State.RUNNING)
+              and process.incarnation > request.failed_incarnation):
+            self._tell(process, "respawned", request.by, "already")
+        else:
+            process.requested_by = request.by
+            self._restart(process, request.by)
 
     # -- watching -------------------------------------------------------------------------------
 
     @every(_CHECK_S)
     def check(self) -> None:
         """Look for processes whose loops are silent."""
-        now = self._loop.time()
-        self._discount_own_stall(now)
+        # A supervisor that was stopped, starved or waiting for a hung spawner heard nobody. What
+        # was said is still on its way here, and silence counts only while this loop turned.
+        now, period_s = self._loop.time(), _CHECK_S / self._plan.rate
+        stall_s = now - self._checked_s - period_s
+        self._checked_s = now
         for process in self._processes.values():
-            if process.state is NodeState.STARTING:
-                if self._has_been_silent(process, process.started_s, START_TIMEOUT_S):
-                    self._event(process, "wedged", self.name, "no heartbeat after its start")
-                    self._lost(process, NodeState.WEDGED)
-            elif process.state is NodeState.RUNNING:
-                silent = [n for n, at in process.heard_s.items() if now - at > self._timeout_s]
-                heard_s = min(process.heard_s.values(), default=now)
-                if self._has_been_silent(process, heard_s, self._timeout_s) and silent:
-                    self._silent(process, silent)
-
-    def _has_been_silent(self, process: _Process, since_s: float, limit_s: float) -> bool:
-        """Whether a process that is silent since then could have been heard for so long."""
-        now = self._loop.time()
-        if now - since_s <= limit_s / 2:  # not worth a look into /proc
-            process.patience.answered()
-            return False
-        used = process.handle.usage() if process.handle is not None else AT_LEISURE
-        return process.patience.look(now, process.pid, used, since_s) > limit_s
+            if stall_s > period_s:
+                process.excuse(now, stall_s)
+            silence = process.silence(now, self._timeout_s, process.hold.usage)
+            if silence:
+                stopped = process.state is State.RUNNING and process.hold.stopped()
+                self._on(process, Event.SILENT_STOPPED if stopped else Event.SILENT,
+                         detail=silence)
 
     @every(0.5)
     def repeat(self) -> None:
-        """Repeat the node table for whoever joined late."""
+        """Repeat the node table for those who joined late."""
         self._publish_table()
-        left_out = self._passed_on.left_out(self.clock.now())
-        if left_out:
-            self.report_diagnostic(
-                "passing on", f"{left_out} more messages were not passed on", self.name)
+        self.report_left_out()
 
-    def _discount_own_stall(self, now: float) -> None:
-        # Who was stopped, starved or waiting for a hung spawner has heard nobody meanwhile. What
-        # was said is still on its way here, and silence counts only while this loop turned.
-        period_s = _CHECK_S / self._plan.rate
-        stall_s = now - self._checked_s - period_s
-        self._checked_s = now
-        if stall_s > period_s:
-            for process in self._processes.values():
-                process.started_s = min(now, process.started_s + stall_s)
-                process.heard_s = {n: min(now, at + stall_s) for n, at in process.heard_s.items()}
-
-    def _silent(self, process: _Process, nodes: list[str]) -> None:
-        stopped = process.handle is not None and process.handle.stopped()
-        state = NodeState.STOPPED if stopped else NodeState.WEDGED
-        self._event(process, state.value, self.name, f"no {_STATUS}" if nodes == [_STATUS] else (
-            f"no heartbeat from {', '.join(name for name in nodes if name != _STATUS)}"))
-        self._lost(process, state)
-
-    def _lost(self, process: _Process, state: NodeState) -> None:
-        process.state = state
-        self._publish_table()
-        if self._owns(process) or process.policy.attempts or process.requested_by:
-            self._respawn(process, process.requested_by or self.name)
-
-    def _exited(self, process: _Process, pid: int) -> None:
-        if process.pid != pid:  # it was replaced while the news waited in the mailbox
-            return
-        self._process_ended(process)
-
-    def _process_ended(self, process: _Process, detail: str = "") -> None:
-        self._unwatch(process)
-        if process.next_step is not None or process.state is NodeState.GIVEN_UP:
-            return
-        self._event(process, "crashed", self.name, detail)
-        if process.state is NodeState.STARTING:
-            # Never heard: another life that nobody holds may have its port.
-            process.searched_s = -math.inf
-            if self._look_for(process):
-                return
-        self._lost(process, NodeState.CRASHED)
+    def _ended(self, process: _Process, pid: int, detail: str = "") -> None:
+        if process.pid == pid:  # else it was replaced while the news waited in the mailbox
+            process.hold.let_go()
+            self._on(process, Event.ENDED, detail=detail)
 
     def _owns(self, process: _Process) -> bool:
         """Whether the supervisor itself brings the process back."""
@@ -354,100 +268,84 @@ class Supervisor(Actor):
 
     # -- acting ---------------------------------------------------------------------------------
 
-    def _respawn(self, process: _Process, by: str) -> None:
-        if process.next_step is not None:
-            if process.state is NodeState.GIVEN_UP:
-                self._event(process, "given up", by, "an attempt will follow by itself")
+    def _on(self, process: _Process, event: Event, by: str = "", detail: str = "") -> None:
+        """Take a process's transition, and do what follows from it."""
+        step, by = process.step(event), by or self.name
+        if step is None:
             return
-        delay_s = process.policy.delay_s(self._loop.time())
-        if process.handle is not None:
-            process.handle.ignore()
-            process.handle.kill()
-        if delay_s is None:
-            self._give_up(process, by)
-            return
-        if process.state in _HEALTHY:
-            process.state = NodeState.CRASHED
-        if delay_s > 0 or not _is_gone(process):
-            # The port is free only when the old process is: a few more milliseconds.
-            self._go_on(process, max(delay_s, 0.002), lambda: self._finish_respawn(process, by))
-        else:
-            self._finish_respawn(process, by)
+        for action in step.actions:
+            if process.state is not step.state:  # the action before has led elsewhere
+                return
+            match action:
+                case Action.TELL:
+                    self._tell(process, step.word, by, detail)
+                case Action.PUBLISH:
+                    self._publish_table()
+                case Action.SEARCH:
+                    process.searched_s = -math.inf
+                    self._look_for(process)
+                case Action.RECOVER:
+                    self._recover(process)
+                case Action.KILL:
+                    process.hold.kill()
+                case Action.FORK:
+                    self._fork(process, by)
+                case Action.FORK_WHEN_GONE:  # the attempts of one given up are the supervisor's
+                    by = self.name if process.state is State.GIVEN_UP else by
+                    self._fork_when_gone(process, by, process.delay_s)
+                case Action.HOLD:
+                    self._hold(process, process.pid)
 
-    def _give_up(self, process: _Process, by: str) -> None:
-        policy, failed = process.policy, process.policy.attempts
-        wait_s = policy.attempt_in_s(self._loop.time())
-        process.state = NodeState.GIVEN_UP
-        self._event(process, "given up", by, (
-            f"attempt {failed} failed" if failed else
-            f"{policy.intensity} restarts in {policy.period_s:.0f} s"
-        ) + f", the next attempt is in {wait_s:.0f} s")
-        self._publish_table()
-        self._go_on(process, wait_s, lambda: self._finish_respawn(process, self.name))
+    def _recover(self, process: _Process) -> None:
+        if self._owns(process) or process.policy.attempts or process.requested_by:
+            self._restart(process, process.requested_by or self.name)
 
-    def _anew(self, process: _Process) -> None:
-        """Forget that it was given up: it will be another one, and may do better."""
-        if process.state is NodeState.GIVEN_UP and process.next_step is not None:
-            process.next_step.cancel()
-            process.next_step, process.policy = None, RestartPolicy()
+    def _restart(self, process: _Process, by: str) -> None:
+        event, why_not = process.ask(self._loop.time())
+        self._on(process, event, by, why_not)
 
-    def _go_on(self, process: _Process, delay_s: float, step: Callable[[], None]) -> None:
+    def _fork_in(self, process: _Process, delay_s: float, step: Callable[[], None]) -> None:
         process.next_step = self.call_later(delay_s * self.clock.rate, step)
 
-    def _finish_respawn(self, process: _Process, by: str) -> None:
-        if not _is_gone(process):
-            self._go_on(process, 0.002, lambda: self._finish_respawn(process, by))
+    def _fork_when_gone(self, process: _Process, by: str, delay_s: float = 0.0) -> None:
+        # The socket is free only when the old process is gone: a few more milliseconds.
+        if delay_s > 0 or not process.hold.is_gone():
+            self._fork_in(process, max(delay_s, _GONE_S),
+                          lambda: self._fork_when_gone(process, by))
             return
         process.policy.restarted(self._loop.time())
-        self._spawn(process, by)
+        self._fork(process, by)
 
-    def _spawn(self, process: _Process, by: str) -> None:
+    def _fork(self, process: _Process, by: str) -> None:
         incarnation = process.highest + 1
         try:
             pid = self._machine.fork(process.names, incarnation)
-        except SpawnerBusyError:
-            self._go_on(process, _ASK_AGAIN_S, lambda: self._spawn(process, by))
-            return
         except (SpawnerUnavailableError, OSError) as error:
-            self.report_diagnostic("fork", str(error), process.unit.name)
-            self._go_on(process, _RETRY_S, lambda: self._spawn(process, by))
+            is_busy = isinstance(error, SpawnerBusyError)
+            if not is_busy:
+                self.report_diagnostic("fork", str(error), process.unit.name)
+            self._fork_in(process, _ASK_AGAIN_S if is_busy else _RETRY_S,
+                          lambda: self._fork(process, by))
             return
-        first = process.highest == 0
-        self._take(process, pid, incarnation)
-        process.state = NodeState.STARTING
+        event = Event.FORKED if process.highest else Event.STARTED
+        process.take(pid, incarnation)
         process.started_s = self._loop.time()
         attempt = process.policy.attempts
-        self._event(process, "started" if first else "respawned", by, (
-            f"attempt {attempt} since it was given up" if attempt else ""))
-        self._publish_table()
-        self._hold(process, pid)
+        self._on(process, event, by, f"attempt {attempt} since it was given up" if attempt else "")
 
-    def _adopt(self, process: _Process, pid: int, incarnation: int) -> None:
-        self._take(process, pid, incarnation)
-        process.state = NodeState.RUNNING
-        now = self._loop.time()
-        process.heard_s = dict.fromkeys(process.names, now)
-        self._event(process, "adopted", self.name)
-        self._hold(process, pid)
-
-    def _look_for(self, process: _Process) -> bool:
-        """Adopt what lives and was not known, as the kernel knows it: a message may name any pid.
-
-        Returns:
-            Whether there is one.
-        """
+    def _look_for(self, process: _Process) -> None:
+        """Adopt what runs and was not known, as the kernel knows it: a message may name any pid."""
         now = self._loop.time()
         if now - process.searched_s < _SEARCH_S:
-            return False
+            return
         process.searched_s = now
         try:
-            return self._adopt_living(process, self._machine.living())
+            self._adopt_living(process, self._machine.living())
         except OSError as error:  # no descriptor left to look with
             self.report_diagnostic("search", str(error), process.unit.name)
-            return False
 
     def _adopt_living(self, process: _Process, living: Sequence[Living]) -> bool:
-        """Adopt the highest life that is there and end the others; False if there is none."""
+        """Adopt the highest incarnation that is there and end the others; False without any."""
         found = sorted((p for p in living if p.names == process.names),
                        key=lambda p: p.incarnation, reverse=True)
         for other in found[1:]:
@@ -455,60 +353,41 @@ class Supervisor(Actor):
                 handle = self._machine.hold(other.pid, lambda: None)
                 handle.kill()
                 handle.close()
-        if found and (found[0].pid != process.pid or process.state in _DEAD):
-            self._adopt(process, found[0].pid, found[0].incarnation)
+        if found and (found[0].pid != process.pid or process.is_dead):
+            process.take(found[0].pid, found[0].incarnation)
+            process.heard_s = dict.fromkeys(process.names, self._loop.time())
+            self._on(process, Event.ADOPTED)
         return bool(found)
-
-    def _take(self, process: _Process, pid: int, incarnation: int) -> None:
-        if process.next_step is not None:
-            process.next_step.cancel()
-            process.next_step = None
-        self._unwatch(process)
-        process.pid, process.incarnation, process.heard_s = pid, incarnation, {}
-        process.highest = max(process.highest, incarnation)
 
     def _hold(self, process: _Process, pid: int) -> None:
         if process.pid != pid:  # it was replaced while this waited
             return
         try:
-            process.handle = self._machine.hold(pid, lambda: self._mailbox.put_latest(
-                f"exit {pid}", lambda: self._exited(process, pid)))
+            process.hold.take(self._machine, pid, lambda: self._dispatcher.put(
+                f"exit {pid}", lambda: self._ended(process, pid)))
         except ProcessLookupError:
-            self._process_ended(process, "it ended before it could be watched")
-            return
+            self._ended(process, pid, "it ended before it could be watched")
         except OSError as error:  # no descriptor left: perhaps later
-            process.unheld = True
             self.report_diagnostic("hold", str(error), process.unit.name)
             self.call_later(_RETRY_S * self.clock.rate, lambda: self._hold(process, pid))
-            return
-        process.unheld = False
-        if process.next_step is not None or process.state is NodeState.GIVEN_UP:
-            process.handle.ignore()
-            process.handle.kill()
-
-    def _unwatch(self, process: _Process) -> None:
-        process.unheld = False
-        if process.handle is not None:
-            process.handle.close()
-            process.handle = None
+        else:
+            if process.waits:
+                process.hold.kill()
 
     # -- what it says ---------------------------------------------------------------------------
 
-    def _event(self, process: _Process, event: str, by: str, detail: str = "") -> None:
+    def _tell(self, process: _Process, event: str, by: str, detail: str = "") -> None:
         for node in process.unit.nodes:
-            self.publish(topics.PROCESS_EVENT, ProcessEvent(
+            self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
                 node.name, event, process.pid, process.incarnation, by, clip(detail)))
 
     def _publish_table(self) -> None:
-        rows = [NodeInfo(self.name, Kind.SUPERVISION.value, self.context.pid, NodeState.RUNNING,
-                         self.context.incarnation, self.context.incarnation - 1)]
+        rows = [fm.NodeInfo(
+            self.name, Kind.SUPERVISION.value, self.context.pid, fm.NodeState.RUNNING,
+            self.context.incarnation, self.context.incarnation - 1)]
         rows += [
-            NodeInfo(node.name, node.kind.value, p.pid, p.state, p.incarnation,
+            fm.NodeInfo(node.name, node.kind.value, p.pid, p.shown, p.incarnation,
                      max(0, p.incarnation - 1))
             for p in self._processes.values() for node in p.unit.nodes
         ]
-        self.publish(topics.NODES, NodeTable(tuple(rows)))
-
-
-def _is_gone(process: _Process) -> bool:
-    return not process.unheld and (process.handle is None or process.handle.gone())
+        self.publish(topics.NODES, fm.NodeTable(tuple(rows)))

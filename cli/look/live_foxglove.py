@@ -8,6 +8,7 @@ loop. Nothing is encoded for a channel that nobody looks at, and clients can onl
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from typing import Any
 
 import foxglove
@@ -15,7 +16,7 @@ from foxglove.websocket import ChannelView, Client, ServerListener
 
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.json_schema import plain_schema
-from rampart.actors.recording.views import CHANNELS, encode
+from rampart.actors.recording.views import encode
 from rampart.actors.run.run_info import RunInfo
 
 
@@ -34,21 +35,24 @@ class FoxgloveViewer(ServerListener):
         self._context = context = foxglove.Context()  # the server does not keep it alive
         self._loop: asyncio.AbstractEventLoop | None = None
         self._last: dict[str, tuple[fg.Record, int]] = {}
-        self._channels = {
-            name: foxglove.Channel(
-                f"/{name}", message_encoding="json", context=context, schema=foxglove.Schema(
-                    name=fg.schema_name(kind), encoding="jsonschema", data=plain_schema(kind)))
-            for name, kind in CHANNELS.items()}
-        self._names = {channel.id(): name for name, channel in self._channels.items()}
+        self._channels: dict[str, foxglove.Channel] = {}
+        self._names: dict[int, str] = {}
         self._server = foxglove.start_server(
             name="Rampart", host=host, port=port, server_listener=self, context=context)
         self.port: int = self._server.port
 
-    def begin(self, run: RunInfo) -> None:
-        """Have viewers forget an earlier run."""
+    def begin(self, run: RunInfo, channels: Mapping[str, type[fg.Record]]) -> None:
+        """Have viewers forget an earlier run, and tell them of the channels of this one."""
         self._loop = asyncio.get_running_loop()
         self._last.clear()
         self._server.clear_session(run.run_id)
+        for name, kind in channels.items():
+            if name not in self._channels:
+                self._channels[name] = made = foxglove.Channel(
+                    f"/{name}", message_encoding="json", context=self._context,
+                    schema=foxglove.Schema(name=fg.schema_name(kind), encoding="jsonschema",
+                                           data=plain_schema(kind)))
+                self._names[made.id()] = name
 
     def show(self, channel: str, record: Any, at_ns: int) -> None:
         """Send a view to those who look at its channel."""

@@ -16,13 +16,10 @@ from prometheus_client.core import (
     GaugeMetricFamily,
     InfoMetricFamily,
     Metric,
-    StateSetMetricFamily,
 )
 
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
 from rampart.actors.run.run_info import RunInfo
 from rampart.actors.supervision.process_usage import ProcessCount
 from rampart.cli.run_picture import RunPicture
@@ -50,30 +47,31 @@ class Exposition:
 
 def families(now: Exposition | None) -> Iterator[Metric]:
     """Yield all families; without a run only that there is none."""
-    yield _gauge("up", "Whether there is a run.", (), [((), float(now is not None))])
+    yield gauge("up", "Whether there is a run.", (), [((), float(now is not None))])
     if now is None:
         return
     run = now.run
     yield InfoMetricFamily("rampart_run", "What runs.", value={
         "run_id": run.run_id, "title": run.title, "port": str(run.base_port),
         "rate": f"{run.rate:g}"})
-    yield _gauge("simulated_seconds", "Simulated time of the run.", (), [((), now.time_s)])
+    yield gauge("simulated_seconds", "Simulated time of the run.", (), [((), now.time_s)])
     yield from _nodes(now)
     yield from _mechanisms(now.picture)
-    yield from _mission(now.picture)
-    yield from _safety(now.picture.latest(topics.TRUTH))
+    yield from now.picture.lines.families(now.picture.latest)
     yield from _messages(now.picture)
     yield from _processes(now.processes)
 
 
-def _gauge(name: str, doc: str, labels: tuple[str, ...], rows: Iterable[Row]) -> Metric:
+def gauge(name: str, doc: str, labels: tuple[str, ...], rows: Iterable[Row]) -> Metric:
+    """Return a gauge with a row for each value of its labels."""
     family = GaugeMetricFamily(f"rampart_{name}", doc, labels=labels)
     for values, value in rows:
         family.add_metric(values, value)
     return family
 
 
-def _counter(name: str, doc: str, labels: tuple[str, ...], rows: Iterable[Row]) -> Metric:
+def counter(name: str, doc: str, labels: tuple[str, ...], rows: Iterable[Row]) -> Metric:
+    """Return a counter with a row for each value of its labels."""
     family = CounterMetricFamily(f"rampart_{name}", doc, labels=labels)
     for values, value in rows:
         family.add_metric(values, value)
@@ -84,21 +82,21 @@ def _nodes(now: Exposition) -> Iterator[Metric]:
     table: fm.NodeTable | None = now.picture.latest(ftm_topics.NODES)
     nodes = table.nodes if table else ()
     beats = sorted(now.picture.beats.items())
-    yield _gauge("node_up", "Whether a node runs, as the supervisor sees it.", ("node", "kind"), [
+    yield gauge("node_up", "Whether a node runs, as the supervisor sees it.", ("node", "kind"), [
         ((n.name, n.kind), float(n.state is fm.NodeState.RUNNING)) for n in nodes])
-    yield _gauge("node_incarnation", "Which life of a node this is.", ("node",), [
+    yield gauge("node_incarnation", "Which life of a node this is.", ("node",), [
         ((n.name,), n.incarnation) for n in nodes])
-    yield _counter("node_restarts", "How often a node was restarted in this run.", ("node",), [
+    yield counter("node_restarts", "How often a node was restarted in this run.", ("node",), [
         ((n.name,), n.restarts) for n in nodes])
-    yield _gauge("heartbeat_age_seconds", "Simulated seconds since a node's last heartbeat.",
+    yield gauge("heartbeat_age_seconds", "Simulated seconds since a node's last heartbeat.",
                  ("node",), [((name,), max(0.0, now.time_s - beat.heard_s))
                              for name, beat in beats])
-    yield _counter("rejected_payloads", "Payloads that a node refused, in this life.", ("node",), [
+    yield counter("rejected_payloads", "Payloads that a node refused, in this life.", ("node",), [
         ((name,), beat.message.rejected_payloads) for name, beat in beats])
-    yield _counter("overflowed_commands", "Commands that found a node's mailbox full, in this "
+    yield counter("overflowed_commands", "Commands that found a node's mailbox full, in this "
                    "life.", ("node",), [
                        ((name,), beat.message.overflowed) for name, beat in beats])
-    yield _counter("process_events", "What happened to processes.", ("node", "event"), [
+    yield counter("process_events", "What happened to processes.", ("node", "event"), [
         (key, count) for key, count in sorted(now.picture.process_events_total.items())])
 
 
@@ -106,72 +104,36 @@ def _mechanisms(picture: RunPicture) -> Iterator[Metric]:
     detections = sorted(picture.detections.items())
     recoveries = sorted(picture.recoveries.items())
     manager: fm.ManagerStatus | None = picture.latest(ftm_topics.MANAGER_STATUS)
-    yield _gauge("detection_active", "Whether a module detects.", ("module",), [
+    yield gauge("detection_active", "Whether a module detects.", ("module",), [
         ((name,), float(report.state is fm.DetectionState.ACTIVE)) for name, report in detections])
-    yield _counter("detections", "How often a module began to detect.", ("module",), [
+    yield counter("detections", "How often a module began to detect.", ("module",), [
         ((name,), picture.detections_total[name]) for name, _ in detections])
-    yield _gauge("recovery_activated", "Whether a recovery is in force.", ("module",), [
+    yield gauge("recovery_activated", "Whether a recovery is in force.", ("module",), [
         ((name,), float(report.state is fm.RecoveryState.ACTIVATED))
         for name, report in recoveries])
-    yield _counter("recoveries", "How often a recovery was activated.", ("module",), [
+    yield counter("recoveries", "How often a recovery was activated.", ("module",), [
         ((name,), picture.recoveries_total[name]) for name, _ in recoveries])
-    yield _counter("decisions", "Decisions of the FTM Manager.", ("strategy",), [
+    yield counter("decisions", "Decisions of the FTM Manager.", ("strategy",), [
         ((name,), count) for name, count in sorted(picture.decisions_total.items())])
     if manager is not None:
-        yield _gauge("recovery_latched", "Recoveries that wait for the operator's reset.", (), [
+        yield gauge("recovery_latched", "Recoveries that wait for the operator's reset.", (), [
             ((), len(manager.latched))])
         yield InfoMetricFamily("rampart_strategy", "Strategy in force.",
                                value={"strategy": manager.strategy})
 
 
-def _mission(picture: RunPicture) -> Iterator[Metric]:
-    status: m.MissionStatus | None = picture.latest(topics.MISSION_STATUS)
-    pilot: m.PilotStatus | None = picture.latest(topics.PILOT_STATUS)
-    if status is not None:
-        yield StateSetMetricFamily("rampart_mission_phase", "State of the mission.", value={
-            phase.value: phase is status.phase for phase in m.MissionPhase})
-        yield _gauge("mission_step", "Goals reached.", ("mission",), [
-            ((status.name,), status.step)])
-        yield _gauge("mission_steps", "Goals of the mission.", ("mission",), [
-            ((status.name,), len(status.goals))])
-        yield _gauge("lights_measured", "Lights measured, by verdict.", ("verdict",), [
-            ((verdict.value,), sum(light.verdict is verdict for light in status.lights))
-            for verdict in m.LightVerdict])
-    if pilot is not None:
-        yield StateSetMetricFamily("rampart_pilot_mode", "Whose commands pass.", value={
-            mode.value: mode is pilot.mode for mode in m.PilotMode})
-        yield _gauge("pilot_stopped", "Whether the Safety Pilot holds the robot.", (), [
-            ((), float(pilot.stopped))])
-        yield _counter("pilot_refused_commands", "Commands that the Safety Pilot refused.", (), [
-            ((), pilot.refused_commands)])
-
-
-def _safety(truth: m.GroundTruth | None) -> Iterator[Metric]:
-    if truth is None:
-        return
-    for name, doc, value in (
-            ("obstacle_clearance_meters", "Footprint to the nearest obstacle.",
-             truth.obstacle_clearance_m),
-            ("prohibited_clearance_meters", "Footprint to the prohibited area.",
-             truth.prohibited_clearance_m)):
-        yield _gauge(name, doc, (), [((), value)])
-    yield _counter("collisions", "Collisions, by ground truth.", (), [((), truth.collisions)])
-    yield _counter("prohibited_seconds", "Time in the prohibited area, by ground truth.", (), [
-        ((), truth.prohibited_s)])
-
-
 def _messages(picture: RunPicture) -> Iterator[Metric]:
-    yield _counter("messages", "Messages heard, a family's members together.", ("topic",), [
+    yield counter("messages", "Messages heard, a family's members together.", ("topic",), [
         ((key,), count) for key, count in sorted(picture.messages.items())])
-    yield _gauge("message_rate_hertz", "Messages a simulated second, over the last seconds.",
+    yield gauge("message_rate_hertz", "Messages a simulated second, over the last seconds.",
                  ("topic",), [((key,), hz) for key, hz in picture.rates().items()])
 
 
 def _processes(processes: Mapping[str, ProcessCount]) -> Iterator[Metric]:
     found = sorted(processes.items())
-    yield _counter("process_cpu_seconds", "Processor time, real seconds.", ("process",), [
+    yield counter("process_cpu_seconds", "Processor time, real seconds.", ("process",), [
         ((name,), count.cpu_s) for name, count in found])
-    yield _gauge("process_resident_memory_bytes", "Resident set; most of it is shared.",
+    yield gauge("process_resident_memory_bytes", "Resident set; most of it is shared.",
                  ("process",), [((name,), count.memory_bytes) for name, count in found])
 
 

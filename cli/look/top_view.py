@@ -16,10 +16,8 @@ from rich.text import Text
 
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
-from rampart.cli.run_picture import RunPicture
-from rampart.cli.state_words import manager_in_words, mission_in_words, pilot_in_words
+from rampart.cli.robot_lines import Row
+from rampart.cli.run_picture import RunPicture, manager_in_words
 from rampart.files.plain_text import printable
 from rampart.manager.strategies.decision_words import decision_in_words
 
@@ -27,7 +25,6 @@ _LABEL = 10
 _PROCESS_WIDTH = 57
 _RATES_WIDTH = 28
 _LEAST_PROCESSES = 6
-_BAR = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +72,8 @@ def picture_json(frame: Frame) -> dict[str, Any]:
     return {
         "title": frame.title, "port": frame.port, "rate": frame.rate,
         "time_s": round(frame.time_s, 3),
-        "mission": picture.latest(topics.MISSION_STATUS),
-        "pose": picture.latest(topics.POSE),
-        "control": picture.latest(topics.CONTROL_STATUS),
-        "pilot": picture.latest(topics.PILOT_STATUS),
+        **picture.lines.data(picture.latest),
         "manager": picture.latest(ftm_topics.MANAGER_STATUS),
-        "safety": _safety(picture.latest(topics.TRUTH)) or None,
         "detections": dict(sorted(picture.detections.items())),
         "recoveries": dict(sorted(picture.recoveries.items())),
         "decisions": [
@@ -111,17 +104,11 @@ def _title(frame: Frame, width: int) -> Text:
 
 def _state(frame: Frame, width: int) -> list[Text]:
     picture, now_s = frame.picture, frame.time_s
-    mission = picture.latest(topics.MISSION_STATUS)
-    manager = picture.latest(ftm_topics.MANAGER_STATUS)
-    safety = _safety(picture.latest(topics.TRUTH))
-    rows: list[tuple[str, str, str, Any]] = [
-        ("mission", _mission(mission, width), "", topics.MISSION_STATUS),
-        ("robot", _robot(picture), "", topics.POSE),
-        ("pilot", *_pilot(picture.latest(topics.PILOT_STATUS)), topics.PILOT_STATUS),
-        ("safety", safety or "not known: nobody tells the ground truth",
-         "bold red" if "UNSAFE" in safety else "", topics.TRUTH),
-        ("manager", *_manager(manager), ftm_topics.MANAGER_STATUS),
-        ("detection", *_detections(picture), None),
+    rows = [
+        *picture.lines.rows(picture.latest, width),
+        Row("manager", *_manager(picture.latest(ftm_topics.MANAGER_STATUS)),
+            ftm_topics.MANAGER_STATUS),
+        Row("detection", *_detections(picture)),
     ]
     shown = []
     for label, text, style, topic in rows:
@@ -131,42 +118,6 @@ def _state(frame: Frame, width: int) -> list[Text]:
             line.append(f"SILENT for {silent_s:.0f} s; last: ", style="bold yellow")
         shown.append(line.append(printable(text), style=style))
     return shown
-
-
-def _mission(status: m.MissionStatus | None, width: int) -> str:
-    words = mission_in_words(status)
-    if status is None or not status.goals or width < 100:
-        return words
-    steps = len(status.goals)
-    done = round(_BAR * min(status.step, steps) / steps)
-    return f"[{'#' * done}{'.' * (_BAR - done)}] {words}"
-
-
-def _robot(picture: RunPicture) -> str:
-    pose: m.Pose | None = picture.latest(topics.POSE)
-    if pose is None:
-        return "no pose"
-    text = f"x {pose.x_m:.2f} m  y {pose.y_m:.2f} m  heading {math.degrees(pose.yaw_rad):.0f} deg"
-    control: m.ControlStatus | None = picture.latest(topics.CONTROL_STATUS)
-    if control is not None:
-        text += f"  {control.phase.value}, {control.distance_to_go_m:.1f} m to go"
-    return text
-
-
-def _pilot(status: m.PilotStatus | None) -> tuple[str, str]:
-    return pilot_in_words(status), "yellow" if status and status.stopped else ""
-
-
-def _safety(truth: m.GroundTruth | None) -> str:
-    """Return what the ground truth says, as the judge judges it; "" if nobody tells it."""
-    if truth is None:
-        return ""
-    harm = [text for text, there in (
-        (f"{truth.collisions} collisions", truth.collisions > 0),
-        (f"{truth.prohibited_s:.1f} s in the prohibited area", truth.prohibited_s > 0)) if there]
-    near = (f"nearest obstacle {truth.obstacle_clearance_m:.2f} m, "
-            f"prohibited area {truth.prohibited_clearance_m:.2f} m")
-    return f"UNSAFE: {', '.join(harm)}; {near}" if harm else f"safe so far; {near}"
 
 
 def _manager(status: fm.ManagerStatus | None) -> tuple[str, str]:

@@ -14,7 +14,6 @@ from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.layout.layout import OBSERVER_CLASS, SUPERVISOR_CLASS
 from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.layout.wiring import load_class, topics_of
-from rampart.actors.osmosis import topics
 from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
@@ -56,7 +55,7 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
             for topic in systems.topics_of(spec)]
 
 
-def resolve(key: str, known: Sequence[Topic[Any]] = topics.ALL) -> tuple[Topic[Any], str]:
+def resolve(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str]:
     """Return topic and full key expression for a key as a user types it.
 
     A family may be given as `detection/DM1`, `detection/{name}` or `detection/*`; the leading
@@ -76,24 +75,29 @@ def resolve(key: str, known: Sequence[Topic[Any]] = topics.ALL) -> tuple[Topic[A
 
 
 def topics_for(key: str, port: int | None) -> tuple[Topic[Any], ...]:
-    """Return the topics among which to look for a key: where it is none that ships, the run's.
+    """Return the topics among which to look for a key: those of the run's system.
 
-    So a run of which the actors cannot be loaded here is no obstacle to what is known without.
+    The actors of a system are loaded only for a key that neither the engine nor its application
+    declares. Without a run the shipped system is meant, as for one that cannot be read here.
 
     Args:
         key: as typed.
-        port: base port of the run, if there are several; without a run only what ships is known.
+        port: base port of the run, if there are several.
 
     Raises:
         UsageError: the system of the run, or one of its actors, cannot be loaded.
     """
-    if _match(key, topics.ALL) is not None:
-        return topics.ALL
+    shipped = systems.declared(systems.load(None))
     try:
-        run = find_run(port)
+        spec = systems.load(find_run(port).system_file)
+        known = systems.declared(spec)
     except NoRunError:
-        return topics.ALL
-    return systems.topics_of(systems.load(run.system_file))
+        return shipped
+    except UsageError:
+        if _match(key, shipped) is None:
+            raise
+        return shipped
+    return known if _match(key, known) is not None else systems.topics_of(spec)
 
 
 def _match(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str] | None:
@@ -115,8 +119,9 @@ def markdown(spec: SystemSpec) -> str:
     lines = [
         "# Topics",
         "",
-        "The contract of every Zenoh key. Written from `actors/osmosis/topics.py` and the actors "
-        f"of `systems/{spec.name}.toml` by `rampart topic list --markdown`; a test keeps it true.",
+        "The contract of every Zenoh key. Written from the topics of the engine and of the "
+        f"application and the actors of `systems/{spec.name}.toml` by `rampart topic list "
+        "--markdown`; a test keeps it true.",
         "",
         f"All keys are below `{ROOT}/`. A payload is a msgpack array `[source, incarnation, "
         "sequence, stamp, body]`: which node, which life of it, how many-th message of that life, "

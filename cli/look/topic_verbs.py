@@ -17,7 +17,7 @@ from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
+from rampart.actors.ftm import topics
 from rampart.cli import systems
 from rampart.cli.following import LOOK_S, is_over
 from rampart.cli.look.topic_catalogue import MAILBOX, fields, markdown, resolve, topics_for, uses

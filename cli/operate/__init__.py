@@ -1,1 +1,1 @@
-"""Commands that act on a run: inject, adapt, reset, mission, joystick."""
+"""Commands that act on a run: inject, adapt, reset, trigger."""

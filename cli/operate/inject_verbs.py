@@ -11,7 +11,6 @@ import msgspec
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.layout.system_topics import published_keys
-from rampart.actors.osmosis import topics
 from rampart.actors.runtime.corruption import InjectionError, field_type, is_array
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.cli import systems
@@ -142,7 +141,7 @@ def _known_fault(options: argparse.Namespace) -> Fault:
                              "FAULT of the catalogue")
     try:
         _, colon, key = options.fault.partition(":")
-        known = topics_for(key, options.port) if colon else topics.ALL
+        known = topics_for(key, options.port) if colon else ()
         return find_fault(options.fault, options.seed or 0, known)
     except UnknownFaultError as error:
         raise UsageError(str(error)) from None

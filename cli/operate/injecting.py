@@ -14,8 +14,8 @@ from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.messages import Injection, InjectionReport
+from rampart.actors.ftm import topics
 from rampart.actors.layout.system_topics import find_topic
-from rampart.actors.osmosis import topics
 from rampart.cli.output import NoEffectError, print_json, say, unknown
 from rampart.cli.session import Session, connect
 from rampart.sim.faults.faults import Fault

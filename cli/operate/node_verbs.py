@@ -6,16 +6,18 @@ import argparse
 import asyncio
 from typing import Any
 
+from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
+from rampart.actors.run.run_info import RunInfo
+from rampart.cli import systems
 from rampart.cli.holdings import Holdings
-from rampart.cli.output import NoEffectError, print_json, print_table, say
+from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say
+from rampart.cli.robot_lines import RobotLines
+from rampart.cli.run_picture import manager_in_words
 from rampart.cli.session import Session, connect
-from rampart.cli.state_words import manager_in_words, mission_in_words, pilot_in_words
 
-_STATUS = (topics.MISSION_STATUS, topics.PILOT_STATUS, ftm_topics.MANAGER_STATUS, ftm_topics.NODES)
+_STATUS = (ftm_topics.MANAGER_STATUS, ftm_topics.NODES)
 _WAIT_S = 1.5
 """Simulated seconds to collect states; the rarest comes twice a second."""
 
@@ -65,12 +67,15 @@ async def node_list(options: argparse.Namespace) -> int:
 async def status(options: argparse.Namespace) -> int:
     """Print the state of the run."""
     async with connect(options.port) as session:
-        held = Holdings(session)
+        held, lines = Holdings(session), _lines(session.run)
         found, _ = await asyncio.gather(
-            session.latest(_STATUS, session.real_s(_WAIT_S)), held.settle())
+            session.latest((*lines.status_read, *_STATUS), session.real_s(_WAIT_S)),
+            held.settle())
         time_s = session.clock.now()
-    mission: m.MissionStatus | None = found.get(topics.MISSION_STATUS.key)
-    pilot: m.PilotStatus | None = found.get(topics.PILOT_STATUS.key)
+
+    def latest(topic: Topic[Any]) -> Any:
+        return found.get(topic.key)
+
     manager: fm.ManagerStatus | None = found.get(ftm_topics.MANAGER_STATUS.key)
     nodes: fm.NodeTable | None = found.get(ftm_topics.NODES.key)
     if options.json:
@@ -78,15 +83,13 @@ async def status(options: argparse.Namespace) -> int:
         print_json({
             "run_id": run.run_id, "title": run.title, "port": run.base_port, "pid": run.pid,
             "rate": run.rate, "system": run.system_file, "time_s": round(time_s, 3),
-            "mission": mission, "pilot": pilot, "manager": manager, "holders": held.holders,
+            **lines.status_data(latest), "manager": manager, "holders": held.holders,
             "nodes": nodes.nodes if nodes else None})
         return 0
     _print_run(session, time_s)
     kinds = {n.kind for n in nodes.nodes} if nodes else {"pilot", "manager"}
-    if mission is not None or session.run.plan.get("mission", True):
-        say(f"mission   {mission_in_words(mission)}")
-    if pilot is not None or "pilot" in kinds:
-        say(f"pilot     {pilot_in_words(pilot)}")
+    for label, text in lines.status(latest, session.run.plan, kinds):
+        say(f"{label:<9} {text}")
     if manager is not None or "manager" in kinds:
         say(f"manager   {manager_in_words(manager)}")
     for name, what in held.holders.items():
@@ -94,6 +97,13 @@ async def status(options: argparse.Namespace) -> int:
             f"rampart reset {name} lets go")
     say(f"nodes     {_nodes(nodes)}")
     return 0
+
+
+def _lines(run: RunInfo) -> RobotLines:
+    try:
+        return systems.lines_of(systems.load(run.system_file))
+    except UsageError:  # of a run from elsewhere, say: what the engine tells is there
+        return RobotLines()
 
 
 def _print_run(session: Session, time_s: float) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.process import stop_pipe, told
 from rampart.actors.recording.recorder import Recorder
@@ -75,7 +74,7 @@ def record(options: argparse.Namespace) -> int:
         run = find_run(options.port)
     except NoRunError as error:
         raise UsageError(str(error)) from None
-    wants = _wishes(options.topics, run)
+    wants = _wanted(options.topics, run)
     path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
     try:
         check_target(path, overwrite=options.overwrite)
@@ -143,12 +142,15 @@ def matcher(globs: list[str], known: Iterable[str]) -> Callable[[str], bool]:
         fnmatch.fnmatchcase(key.removeprefix(f"{ROOT}/"), pattern) for pattern in patterns)
 
 
-def _wishes(globs: list[str], run: RunInfo) -> Callable[[str], bool]:
-    """Return the wish for topics; the robot's own count where those that ship do not do."""
+def _wanted(globs: list[str], run: RunInfo) -> Callable[[str], bool]:
+    """Return whether a key is wanted; all actors are loaded only if the declared ones do not do."""
+    if not globs:
+        return matcher(globs, ())
+    spec = systems.load(run.system_file)
     try:
-        return matcher(globs, keys_of(run, topics.ALL))
+        return matcher(globs, keys_of(run, systems.declared(spec)))
     except UsageError:
-        return matcher(globs, keys_of(run, systems.topics_of(systems.load(run.system_file))))
+        return matcher(globs, keys_of(run, systems.topics_of(spec)))
 
 
 def keys_of(run: RunInfo, known: Iterable[Topic[Any]]) -> list[str]:
@@ -158,7 +160,7 @@ def keys_of(run: RunInfo, known: Iterable[Topic[Any]]) -> list[str]:
 
 
 def _late(options: argparse.Namespace) -> Callable[[str], bool]:
-    """Return the wish for topics, checked against what is in the file."""
+    """Return whether a key is wanted, checked against what is in the file."""
     if not options.topics:
         return lambda _key: True
     from rampart.actors.recording.bag_reader import BagReader, Summary  # noqa: PLC0415 only here

@@ -13,12 +13,13 @@ import os
 import socket
 import tempfile
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import tomli_w
 
 from rampart.actors.bus import run_folder, topics
 from rampart.actors.bus.bus import BusError
@@ -29,22 +30,22 @@ from rampart.actors.bus.tap import Tap
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
-from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.layout.layout import application_class
+from rampart.actors.layout.wiring import load_class
+from rampart.actors.operator.hmi import Hmi
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
-from rampart.actors.recording.message_form import form_of, header_of, renumbered
-from rampart.actors.recording.run_documents import SYSTEM, restore
+from rampart.actors.recording.message_form import Forms, header_of, renumbered
+from rampart.actors.recording.run_documents import NOT_CHOSEN, SYSTEM, File, Known, restore
 from rampart.actors.run import run_info
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.process_title import find_processes
+from rampart.cli import systems
 from rampart.cli.output import UsageError
-from rampart.cli.record.replay_page import NAME, ReplayPage
-from rampart.files import toml
-from rampart.files.reading import read_text
-from rampart.manager.spec.specification import check_document, read_document
+from rampart.cli.record.replay_page import NAME, replay_page
+from rampart.manager.spec.specification import Kind, SystemSpec, check_document, read_document
 
 DEFAULT_PORT = 7400
 GAP_S = 0.1
@@ -81,6 +82,8 @@ class Replay:
                  wants: Callable[[str], bool] = lambda _key: True, hmi_port: int = 0,
                  said: Callable[[str], None] = lambda _line: None) -> None:
         self.summary = Summary(BagReader(path))
+        self._document, self._known = recorded_system(self.summary.files)
+        self._forms = Forms(self._known.topics)
         self.played = 0
         self.refused = 0
         self._path = path
@@ -174,7 +177,7 @@ class Replay:
                 if at_s < self._start_s or key is None or not self._wants(key):
                     continue
                 try:
-                    payload = form_of(key).payload(message.data)
+                    payload = self._forms.of(key).payload(message.data)
                 except (ValueError, RecursionError):  # of another version of this program
                     self.refused += 1
                     continue
@@ -192,7 +195,7 @@ class Replay:
             elif header is not None:
                 lives = lap * self._lives.get(header.source, header.incarnation)
                 payload = renumbered(payload, lives, lap * self._lap_s)
-        bus.publish(form_of(key).topic or _STRANGE, key, payload)
+        bus.publish(self._forms.of(key).topic or _STRANGE, key, payload)
         self.played += 1
 
     def _page_ended(self, page: asyncio.Task[None]) -> None:
@@ -239,12 +242,10 @@ class Replay:
             head = topics.HEARTBEAT.at("")
             nodes = [key.removeprefix(head) for key in self.summary.keys if key.startswith(head)]
         system = folder / SYSTEM
-        for name, _, data in self.summary.files:
-            if name == SYSTEM:
-                system.write_bytes(data)
+        if self._document:
+            system.write_text(tomli_w.dumps(self._document), encoding="utf-8")
         page = f"http://127.0.0.1:{self._hmi_port}/" if self._hmi_port else ""
-        told = {name: run.get(name, "") for name in (
-            "airport", "mission", "strategy", "shadow", "seed", "obstacles", "ftm")}
+        told = {name: value for name, value in run.items() if name not in NOT_CHOSEN}
         return run_info.RunInfo(
             os.getpid(), self._port, self._rate, clock.source_time(0.0),
             str(system) if system.exists() else "", self._sockets, tuple(nodes or ["replay"]),
@@ -252,18 +253,46 @@ class Replay:
             f"replay of {self._path.name}: {run.get('title', '')}", page,
             {**told, "system_file": str(system)}, str(self._path))
 
-    def _page(self, bus: ZenohBus, clock: Clock, folder: Path) -> ReplayPage | None:
+    def _page(self, bus: ZenohBus, clock: Clock, folder: Path) -> Hmi | None:
         if not self._hmi_port:
             return None
-        run = RunContext(RunPlan(f"replay of {self._path.name}", hmi_port=self._hmi_port))
-        with contextlib.suppress(ValueError, OSError):
-            text = read_text(folder / SYSTEM, toml.MAX_SIZE)
-            document = read_document(text, SYSTEM)
-            run = replace(run, document=document, system=check_document(document, SYSTEM))
+        run = RunContext(RunPlan(f"replay of {self._path.name}", hmi_port=self._hmi_port),
+                         self._known.system, self._document)
         with contextlib.suppress(ValueError, OSError):  # a page without a map shows the rest
-            if found := restore(self.summary.files, folder):
-                run = replace(run, application=Osmosis.on_map(load_airport(found)))
-        return ReplayPage(Context(NAME, 1, clock, SharedBus(bus), run=run))
+            restore(self.summary.files, folder)
+            run = replace(run, application=self._known.kind.restored(folder))
+        kind = replay_page(page_of(self._known.system))
+        return kind(Context(NAME, 1, clock, SharedBus(bus), run=run))
+
+
+def recorded_system(files: Sequence[File]) -> tuple[dict[str, Any], Known]:
+    """Return the system of a recording, as TOML and read; without an application the shipped one's.
+
+    The former is empty, and the latter the shipped system, if the recorded one cannot be read: a
+    recording of before 0.7 says no application, and one of long ago has another schema.
+    """
+    shipped = systems.load(None)
+    document: dict[str, Any] = {}
+    found = shipped
+    with contextlib.suppress(StopIteration, ValueError):
+        text = next(data for name, _, data in files if name == SYSTEM).decode()
+        document = {"application": dict(shipped.application), **read_document(text, SYSTEM)}
+        found = check_document(document, SYSTEM)
+    try:
+        return document, Known(found, application_class(found))
+    except ValueError:  # somebody's own, which is not installed here
+        return document, Known(found)
+
+
+def page_of(system: SystemSpec) -> type[Hmi]:
+    """Return the class of the operator's page of a system; before 0.7 it was the shipped one's."""
+    for spec in (system, systems.load(None)):
+        for node in spec.nodes:
+            with contextlib.suppress(ValueError):
+                if node.kind is Kind.NON_CONTROL and issubclass(
+                        found := load_class(node.actor), Hmi):
+                    return found
+    return Hmi
 
 
 def claim_port(port: int) -> None:

@@ -27,6 +27,7 @@ from rampart.manager.spec.tables import (
     Name,
     OptionalName,
     Positive,
+    Supervision,
     Table,
     Timing,
 )
@@ -222,6 +223,7 @@ class SystemSpec(Table, frozen=True):
     order: Name | tuple[Name, ...] = "safer"
     timing: Timing = Timing()
     layers: Layers = Layers()
+    supervision: Supervision = Supervision()
     nodes: tuple[NodeSpec, ...] = msgspec.field(name="node", default=())
     detections: tuple[DetectionSpec, ...] = msgspec.field(name="detection", default=())
     recoveries: tuple[RecoverySpec, ...] = msgspec.field(name="recovery", default=())

@@ -39,18 +39,19 @@ from rampart.manager.spec.schema import (
     SystemSpec,
     Within,
 )
-from rampart.manager.spec.tables import Layers, SpecificationError, Table, Timing
+from rampart.manager.spec.tables import Layers, SpecificationError, Supervision, Table, Timing
 
 __all__ = [
     "AtLeast", "DetectionSpec", "EventSpec", "Hazard", "Kind", "Layers", "MechanismSpec",
-    "NodeSpec", "RecoverySpec", "Robot", "SpecificationError", "SystemSpec", "Timing",
-    "check_document", "check_modules", "parse_specification", "read_document",
+    "NodeSpec", "RecoverySpec", "Robot", "SpecificationError", "Supervision", "SystemSpec",
+    "Timing", "check_document", "check_modules", "parse_specification", "read_document",
 ]
 
 TABLES: dict[str, type[Table]] = {
-    "": SystemSpec, "robot": Robot, "timing": Timing, "layers": Layers, "node": NodeSpec,
-    "detection": DetectionSpec, "recovery": RecoverySpec, "mechanism": MechanismSpec,
-    "event": EventSpec, "gate": AtLeast, "against": Within,
+    "": SystemSpec, "robot": Robot, "timing": Timing, "layers": Layers,
+    "supervision": Supervision, "node": NodeSpec, "detection": DetectionSpec,
+    "recovery": RecoverySpec, "mechanism": MechanismSpec, "event": EventSpec, "gate": AtLeast,
+    "against": Within,
 }
 
 ENUMS: dict[tuple[str, str], Iterable[Enum]] = {

@@ -124,3 +124,24 @@ class Finding(NamedTuple):
 def unknown(path: str, value: str, what: str, known: Collection[str]) -> Finding:
     """Return the finding for a name that is none; it lists those that are."""
     return Finding(path, f"unknown {what}; known: {', '.join(known) or 'none'}", (value,))
+
+
+class Supervision(Table, frozen=True):
+    """How often a process is restarted; wall seconds. See `actors.supervision.supervised_process`.
+
+    Attributes:
+        intensity: Restarts of one process within `period_s`; one more, and it is given up.
+        period_s: The window in which they are counted.
+        backoff_s: Before the first restart that comes after half of `intensity` in the window; each
+            further one waits twice as long ...
+        backoff_max_s: ... up to this.
+        attempt_s: Between being given up and the next attempt; each that fails doubles it ...
+        attempt_max_s: ... up to this.
+    """
+
+    intensity: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 50
+    period_s: Positive = 60.0
+    backoff_s: Positive = 0.05
+    backoff_max_s: Positive = 2.0
+    attempt_s: Positive = 10.0
+    attempt_max_s: Positive = 60.0

@@ -29,6 +29,12 @@ def find_wrong_times(spec: SystemSpec) -> Iterator[Finding]:
                       f"{timing.release_hold_s}", (timing.release_hold_max_s,))
     for path, value, problem in find_false_alarms(spec.timing):
         yield Finding(path, problem, (value,))
+    for first in ("backoff", "attempt"):
+        first_s = getattr(spec.supervision, f"{first}_s")
+        most_s = getattr(spec.supervision, f"{first}_max_s")
+        if most_s < first_s:
+            yield Finding(f"$.supervision.{first}_max_s",
+                          f"must be no less than {first}_s = {first_s:g}", (most_s,))
 
 
 def find_wrong_budget(spec: SystemSpec) -> Iterator[Finding]:

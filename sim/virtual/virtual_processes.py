@@ -26,17 +26,15 @@ from rampart.actors.runtime.checkpoint import (
     Shelf,
 )
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.guard import PERIOD_S, SUPERVISOR_PATIENCE_S
 from rampart.actors.supervision.patience import AT_LEISURE, Usage
 from rampart.actors.supervision.processes import Living, ProcessHandle, SpawnerUnavailableError
+from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.supervision.supervisor import Supervisor
 from rampart.sim.virtual.timing import Timing, draw, measured
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 
 FIRST_PID = 1000
-SUPERVISOR_PATIENCE_S = 1.5
-"""A supervisor whose table was not heard for so long is replaced, as by the launcher."""
-
-_PATIENCE_CHECK_S = 0.25
 
 
 class Condition(Enum):
@@ -130,6 +128,7 @@ class VirtualMachine:
         self._slow: dict[str, float] = {}
         self._known: dict[str, int] = {}
         self._supervisor = 0
+        self._policy = RestartPolicy(layout.spec.supervision)
         self._supervisor_heard_s = 0.0
         self._down = False
 
@@ -138,7 +137,7 @@ class VirtualMachine:
     def start(self) -> None:
         """Start the supervisor, which starts the rest."""
         self._start_supervisor()
-        self._loop.call_later(_PATIENCE_CHECK_S, self._guard)
+        self._loop.call_later(PERIOD_S, self._guard)
 
     def supervisor_heard(self, table: NodeTable) -> None:
         """Note that the supervisor lives, and which incarnations it has reached."""
@@ -152,15 +151,27 @@ class VirtualMachine:
         self.fork((SUPERVISOR,), self._supervisor)
         self._supervisor_heard_s = self._loop.time()
 
+    def _bring_supervisor_back(self) -> None:
+        if self._down:
+            return
+        delay_s = self._policy.delay_s(self._loop.time())
+        if delay_s is None:  # too often: see again later, as the launcher's guard does
+            self._loop.call_later(PERIOD_S, self._bring_supervisor_back)
+        elif delay_s > 0:
+            self._loop.call_later(delay_s, self._supervisor_back)
+        else:
+            self._supervisor_back()
+
     def _supervisor_back(self) -> None:
         if not self._down:
+            self._policy.restarted(self._loop.time())
             self._start_supervisor()
             self.on_restart(SUPERVISOR)
 
     def _guard(self) -> None:
         if self._down:
             return
-        self._loop.call_later(_PATIENCE_CHECK_S, self._guard)
+        self._loop.call_later(PERIOD_S, self._guard)
         if self._loop.time() - self._supervisor_heard_s > SUPERVISOR_PATIENCE_S:
             self.kill(SUPERVISOR)
 
@@ -265,7 +276,7 @@ class VirtualMachine:
         self._loop.call_later(exit_s, self._exited, process)
         if SUPERVISOR in process.names:
             self._loop.call_later(
-                draw(self._timing.supervisor_back_ms, self._rng), self._supervisor_back)
+                draw(self._timing.supervisor_back_ms, self._rng), self._bring_supervisor_back)
         self._loop.call_later(max(death_s, exit_s), self._token_gone, process)
 
     # -- inside ---------------------------------------------------------------------------------

@@ -269,13 +269,13 @@ def test_a_nested_field_can_be_ramped():
     ("recovery/{name}/command", ftm_topics.RECOVERY_COMMAND, "rampart/recovery/*/command"),
 ])
 def test_a_key_is_found_however_it_is_written(key, topic, full):
-    assert resolve(key) == (topic, full)
+    assert resolve(key, topics.ALL) == (topic, full)
 
 
 @pytest.mark.parametrize("key", ["", "detection", "detection/", "detection/a/b", "rampart", "x/y"])
 def test_a_key_of_no_topic_is_refused(key):
     with pytest.raises(UsageError, match="unknown topic"):
-        resolve(key)
+        resolve(key, topics.ALL)
 
 
 def test_rates_are_measured_like_ros2_does():

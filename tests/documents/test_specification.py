@@ -24,6 +24,7 @@ from rampart.manager.spec.schema import (
     NodeSpec,
     RecoverySpec,
     Robot,
+    Supervision,
     SystemSpec,
     Timing,
     Within,
@@ -43,8 +44,8 @@ EXAMPLE = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 MODULES = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 
 
-@pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, NodeSpec, DetectionSpec,
-                                   RecoverySpec, MechanismSpec, EventSpec, Within])
+@pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, Supervision, NodeSpec,
+                                   DetectionSpec, RecoverySpec, MechanismSpec, EventSpec, Within])
 def test_every_field_is_described(table):
     missing = [f.encode_name for f in msgspec.structs.fields(table)
                if not re.search(rf"[`\[ ]{f.encode_name}\b", DOCUMENT)]
@@ -55,7 +56,7 @@ def toml(value: object) -> str:
     """A default as the document writes it; "" if it is none, or derived."""
     if isinstance(value, bool):
         return str(value).lower()
-    if isinstance(value, float):
+    if isinstance(value, int | float):
         return "" if math.isnan(value) else f"{value:g}"
     if isinstance(value, str):
         return json.dumps(value)
@@ -66,7 +67,8 @@ def toml(value: object) -> str:
     ("Top level", SystemSpec, set()), ("`[robot]`", Robot, set()),
     ("`[timing]`", Timing, {f.name for f in msgspec.structs.fields(Timing)
                             if f.name.endswith("timeout_s")}),
-    ("`[layers]`", Layers, set()), ("`[[node]]`", NodeSpec, set()),
+    ("`[layers]`", Layers, set()), ("`[supervision]`", Supervision, set()),
+    ("`[[node]]`", NodeSpec, set()),
     ("`[[detection]]`", DetectionSpec, {"within_s"}), ("`[[recovery]]`", RecoverySpec, set()),
     ("`[[mechanism]]`", MechanismSpec, set()), ("`[[event]]`", EventSpec, {"gate"})])
 def test_what_is_required_and_what_is_the_default_are_as_in_the_code(heading, table, also):

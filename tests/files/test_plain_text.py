@@ -18,6 +18,7 @@ from rampart.actors.runtime.actor import Header
 from rampart.actors.supervision.node_process import _complain
 from rampart.cli.look import top_view
 from rampart.cli.look.topic_verbs import in_line
+from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.output import print_json, print_table, say, say_text, warn
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.files.plain_text import one_line, printable
@@ -81,13 +82,13 @@ def test_a_forged_line_stays_within_the_line_of_who_sent_it(capsys):
 def test_a_console_shows_what_it_is_told_and_obeys_nothing_of_it(topic):
     stream = Terminal()
     console = Console(stream)
-    picture = RunPicture()
+    picture = RunPicture(OsmosisLines())
     for number, text in enumerate((*HOSTILE, *TEXTS)):
         body = convert(hostile(inspect.type_info(topic.type), number, text), topic.type,
                        builtin_types=(bytes,))
         header = Header(text[:200], 1, number, float(number))
         console.take(topic, body, header)
-        if topic in DECODED:
+        if topic in (*DECODED, *OsmosisLines.read):
             picture.heard(topic, header, body, 0.0)
     console.close()
     assert harmless(stream.getvalue())

@@ -14,15 +14,17 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from PIL import Image
 
+from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.errors import AirportError
 from rampart.actors.osmosis.airport.formats import load_airport, load_mission
 from rampart.actors.osmosis.airport.mask import allowed_area
 from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.actors.recording.bag_repair import repair
 from rampart.actors.recording.bag_writer import BagError, BagWriter
-from rampart.actors.recording.message_form import MessageForm, header_of, renumbered, topic_of
-from rampart.actors.recording.run_documents import footprint_m, restore
+from rampart.actors.recording.message_form import Forms, header_of, renumbered
+from rampart.actors.recording.run_documents import restore
 from rampart.cli.record.bag_verbs import described
+from rampart.cli.record.replaying import recorded_system
 from rampart.files import toml
 from rampart.files.reading import FileError
 from rampart.manager.analysis.formula import formula_of
@@ -306,7 +308,7 @@ def _foreign(compression: CompressionType) -> bytes:
 def mcap_info(data: bytes) -> None:
     summary = Summary(BagReader(written("bag.mcap", data)))
     msgspec.json.encode(described(summary))
-    footprint_m(summary.files)
+    recorded_system(summary.files)
     restore([file for file in summary.files if len(file[2]) < 1 << 16], folder())
 
 
@@ -332,7 +334,7 @@ def recorded_json(data: bytes) -> None:
     refused = None
     for key in _KEYS:
         try:
-            payload = MessageForm(topic_of(key)).payload(data)
+            payload = Forms(topics.ALL).of(key).payload(data)
         except (ValueError, RecursionError) as error:
             refused = error
         else:

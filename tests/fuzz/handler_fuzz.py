@@ -35,7 +35,7 @@ from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.layout.layout import Layout, load_run
 from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.recording.views import Views
+from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor, Context
@@ -45,6 +45,7 @@ from rampart.cli import systems
 from rampart.cli.look import top_view
 from rampart.cli.look.metrics_families import families
 from rampart.cli.look.topic_verbs import in_line
+from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.runs.console import Console
@@ -299,8 +300,8 @@ def fuzz_tools(seed: int) -> Finding | None:
     """Tell what the tools show of a run whatever the types allow; return what went wrong."""
     of = system("osmosis")
     stranger = Stranger(f"tools {seed}", of)
-    picture = RunPicture()
-    views = Views(of.run.application.airport, (0.7, 0.6))
+    picture = RunPicture(OsmosisLines())
+    views = OsmosisViews(of.run.application, of.run.system)
     run = _Run()
     try:
         with _patience():
@@ -309,7 +310,7 @@ def fuzz_tools(seed: int) -> Finding | None:
                 header = stranger.header(1.0, wild=0.6)
                 found, body = decode(topic, stranger.payload(topic, header))
                 now_s = stranger.dice.choice((0.0, 1.0, 1.0 + number, 1e12))
-                if topic in DECODED:
+                if topic in (*DECODED, *OsmosisLines.read):
                     picture.heard(topic, found, body, now_s)
                 picture.sample(now_s)
                 in_line(body)

@@ -22,11 +22,12 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.recording.views import Views
+from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, on
-from rampart.actors.runtime.injection_desk import MAX_DELAYED, MAX_IN_FORCE
+from rampart.actors.runtime.injected_faults import MAX_DELAYED, MAX_IN_FORCE
 from rampart.actors.runtime.mailbox import Mailbox
+from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, Motor
 from rampart.sim.osmosis.scene import WorldError
@@ -160,7 +161,7 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
     of = system("osmosis")
     run = MissionRun(of.plan, of.run.application.airport, of.run.application.mission, strategy="x",
                      patience_s=60.0, console=Console(io.StringIO()))
-    picture, views = RunPicture(), Views()
+    picture, views = RunPicture(OsmosisLines()), OsmosisViews()
     clock = type("Clock", (), {"now": staticmethod(lambda: 0.0)})()
     for topic in all_topics():
         kind = inspect.type_info(topic.type)
@@ -169,7 +170,7 @@ def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkey
             body = msgspec.convert(told(kind, number), topic.type, builtin_types=(bytes,))
             for sink in run.sinks(clock) if number < FLOOD else ():
                 sink(topic, body, header)
-            if topic in DECODED:
+            if topic in (*DECODED, *OsmosisLines.read):
                 picture.heard(topic, header, body, 0.0)
             views.of(topic, topic.at(f"n{number}") if topic.is_family else topic.at(), header,
                      body, 0)
@@ -287,7 +288,7 @@ def order(number):
 def test_injections_of_one_node_are_bounded_and_so_is_what_they_hold_back():
     def act(actor, _):
         for number in range(MAX_IN_FORCE + 5):
-            actor._injections.order(order(number))
+            actor._injections.order(order(number), topics.POSE)
         assert len(actor._injections.gate.in_force) == MAX_IN_FORCE
         for _ in range(MAX_DELAYED + 100):
             actor.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))

@@ -8,7 +8,7 @@ import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE, ArrivalGuard, Header, encode
 from rampart.actors.bus.tap import frame, parse_frame
-from rampart.actors.operator.requests import WishError, read_wish
+from rampart.actors.operator.requests import RequestError, RequestReader
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE
 from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE
@@ -19,7 +19,8 @@ from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     StickDecoder,
     StickMapping,
 )
-from rampart.actors.recording.message_form import form_of
+from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS
+from rampart.actors.recording.message_form import Forms
 from rampart.actors.run.run_info import RunInfo, read_info
 from rampart.actors.runtime.checkpoint import StateError
 from rampart.actors.supervision.process_title import parse_title
@@ -58,8 +59,8 @@ def envelope(data: bytes) -> None:
 def recorded(data: bytes) -> None:
     """A payload on its way into a recording, and back."""
     for key in (*TOPICS, "rampart/world/strange"):
-        text, header, _ = form_of(key).recorded(data)
-        if header is not None and form_of(key).payload(text) != data:
+        text, header, _ = _FORMS.of(key).recorded(data)
+        if header is not None and _FORMS.of(key).payload(text) != data:
             raise AssertionError(f"{key}: another payload came back")
 
 
@@ -112,14 +113,18 @@ def joystick(data: bytes) -> None:
             raise AssertionError(f"beyond the end of the stick: {stick}")
 
 
-@target("page-wish", refuses=(WishError,), kind="json", samples=lambda: [
+_FORMS = Forms(topics.ALL)
+_READER = RequestReader(OSMOSIS_REQUESTS)
+
+
+@target("page-request", refuses=(RequestError,), kind="json", samples=lambda: [
         b'{"type":"reset","recovery":"RM1"}', b'{"type":"order","action":"pause","reason":"x"}',
         b'{"type":"stick","held":true,"ticket":3,"forward":0.5,"left":-1}',
         b'{"type":"inject","fault":"gps-bias","duration_s":5,"permanent":false}',
         b'{"type":"signal","node":"hmi","signal":"KILL"}', b'{"type":"strategy","name":"x"}'])
-def page_wish(data: bytes) -> None:
-    read_wish(data)
-    read_wish(data.decode(errors="replace"))
+def page_request(data: bytes) -> None:
+    _READER.read(data)
+    _READER.read(data.decode(errors="replace"))
 
 
 _ACCESS = (Access("127.0.0.1", 8080), Access("0.0.0.0", 8080, "t" * 20, ("robot",)))

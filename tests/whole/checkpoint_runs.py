@@ -115,6 +115,13 @@ def write_short_mission(directory: Path) -> Path:
     return file
 
 
+def write_near_mission(directory: Path) -> Path:
+    """Write a mission of half a minute: three goals near the start, no lights."""
+    file = directory / "NEAR.miss"
+    file.write_text("x=-28.5,y=4,taxi=1\nx=-29.5,y=-3,taxi=1\nx=-28.8,y=-11.5,taxi=1\n")
+    return file
+
+
 SHORT_LIGHTS = {"A01": "ok", "A02": "ok", "A03": "out"}
 
 

@@ -41,6 +41,7 @@ from tests.whole.checkpoint_runs import (
     assert_nothing_lost_or_doubled,
     fly,
     with_checkpoints,
+    write_near_mission,
     write_short_mission,
 )
 
@@ -387,10 +388,10 @@ def test_real_nodes_come_back_on_damaged_checkpoints_and_keep_new_ones(tmp_path)
     files = tmp_path / "report" / "checkpoints"
     nodes = {"mission_manager": nulls, "graph_planner": fifo, "osmosis_control": noise,
              "ftm_manager": nulls}
-    with RealRun(tmp_path, "paper", "--system", str(with_checkpoints(tmp_path)), "--mission",
-                 str(write_short_mission(tmp_path)), "--rate", "2") as run:
+    with RealRun(tmp_path, with_checkpoints(tmp_path), "--mission",
+                 str(write_near_mission(tmp_path)), "--rate", "2") as run:
         for index, (node, damage) in enumerate(nodes.items()):
-            run.sleep_until(10.0 + 5 * index)
+            run.sleep_until(5.0 + 4 * index)
             damage(files / f"{node}.sqlite")
             run.kill(node)
         code, result = run.result(120)
@@ -409,7 +410,7 @@ def test_real_nodes_come_back_on_damaged_checkpoints_and_keep_new_ones(tmp_path)
 def test_real_control_nodes_are_killed_and_nothing_is_lost_or_doubled(tmp_path):
     dice = random.Random(os.getpid())
     moments = sorted(dice.uniform(2, 50) for _ in range(6))
-    with RealRun(tmp_path, "paper", "--system", str(with_checkpoints(tmp_path)), "--mission",
+    with RealRun(tmp_path, with_checkpoints(tmp_path), "--mission",
                  str(write_short_mission(tmp_path)), "--rate", "2") as run:
         for index, moment in enumerate(moments):
             run.sleep_until(moment)

@@ -126,7 +126,7 @@ def test_hazards_are_in_the_user_s_own_words():
 
 @pytest.mark.processes
 def test_it_runs_its_dead_nodes_come_back_and_what_is_triggered_is_recovered_from(tmp_path):
-    with RealRun(tmp_path, "paper", "--system", "cell", "--duration", "40") as run:
+    with RealRun(tmp_path, "cell", "--duration", "40") as run:
         run.wait_for("ctrl-C ends it")
         run.sleep_until(1.0)
         run.kill("arm_controller")
@@ -155,7 +155,7 @@ def test_it_runs_its_dead_nodes_come_back_and_what_is_triggered_is_recovered_fro
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    (["--system", "cell", "--mission", "A"], "--mission A: cell has no [robot] and drives nowhere"),
+    (["--system", "cell", "--mission", "A"], "--mission: no option of the launcher or of cell"),
     (["--system", "cell", "--duration", "-1"], "--duration -1: must be above 0"),
     (["--duration", "5"], "--duration 5: a mission ends by itself"),
     (["--shadow", "bold"], "--shadow bold: unknown strategy; known: safety-first"),

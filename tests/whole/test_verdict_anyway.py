@@ -24,7 +24,7 @@ from rampart.sim.osmosis.report import RunRecorder, try_report
 from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port
 from tests import ROOT
 from tests.actors.recording.samples import pose
-from tests.whole.checkpoint_runs import with_checkpoints, write_short_mission
+from tests.whole.checkpoint_runs import with_checkpoints, write_near_mission, write_short_mission
 
 UNSAFE = 3
 
@@ -243,12 +243,12 @@ def test_a_real_unsafe_run_is_unsafe_though_its_folder_is_gone_and_nobody_listen
 @pytest.mark.processes
 @pytest.mark.timeout(180)
 def test_a_real_mission_succeeds_though_its_folder_goes_and_its_recording_stops(tmp_path):
-    with RealRun(tmp_path, "paper", "--system", str(with_checkpoints(tmp_path)), "--mission",
-                 str(write_short_mission(tmp_path)), "--rate", "2", "--record", "/dev/full",
+    with RealRun(tmp_path, with_checkpoints(tmp_path), "--mission",
+                 str(write_near_mission(tmp_path)), "--rate", "2", "--record", "/dev/full",
                  "--overwrite") as run:
-        run.sleep_until(8.0)
+        run.sleep_until(5.0)
         in_the_way(tmp_path / "report")
-        run.sleep_until(12.0)
+        run.sleep_until(9.0)
         run.kill("graph_planner")
         code, result = run.result(120)
     assert (code, result["mission"], result["safety"]) == (0, "success", "safe"), run.story

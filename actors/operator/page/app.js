@@ -129,21 +129,24 @@ function toast(text) {
 
 // ---- showing ----------------------------------------------------------------------------------
 
+/** Begin a connection; of a robot, what the HMI does not tell is not offered. */
 function hello(message) {
   retryMs = 500;
+  $("map-panel").hidden = !("map" in message);
+  $("mission-panel").hidden = !("missions" in message);
   picture = {};
   fresh = { decisions: [], events: [] };
   changed.clear();
   memory.forget();
   for (const log of Object.values(logs)) log.begin();
-  map.begin(message.map, message.track, message.footprint_m);
+  map.begin(message.map || null, message.track || [], message.footprint_m);
   camera.begin(message.camera);
   system(null);
   notOnMap = message.left_out || {};
   leftOut({});
   $("airport").textContent = message.map ? message.map.name : "";
   $("rate").textContent = message.rate === 1 ? "" : `× ${message.rate}`;
-  $("mission-name").replaceChildren(...message.missions.map((name) => {
+  $("mission-name").replaceChildren(...(message.missions || []).map((name) => {
     const option = element("option", "", name);
     option.value = name;
     return option;
@@ -295,6 +298,7 @@ function lights(measured) {
 
 function safety(s) {
   const pilot = s.pilot && s.pilot.value;
+  $("pilot-mode").hidden = $("pilot-reason").hidden = s.pilot === undefined;
   if (!pilot) pill("pilot-mode", "warn", "Safety Pilot not heard");
   else if (s.pilot.stale) pill("pilot-mode", "warn", "Safety Pilot silent");
   else pill("pilot-mode", pilot.stopped ? "bad" : pilot.mode === "auto" ? "good" : "warn",

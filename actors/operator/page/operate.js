@@ -1,4 +1,4 @@
-// What the operator does, but for missions: drives, chooses the strategy, breaks things.
+// What the operator does, but for missions: drives where that is offered, chooses the strategy, breaks things.
 
 import { $, say } from "./dom.js";
 import { Drive } from "./drive.js";
@@ -18,7 +18,9 @@ export class Operating {
   /** Take a message of the HMI; tell whether it was for this part of the page. */
   receive(message) {
     if (message.type === "operating") {
-      this.drive.introduced(message.page);
+      const drives = "silence_s" in message;
+      $("drive-panel").hidden = !drives;
+      this.drive.introduced(drives ? message.page : null);
       this.faults.introduced(message);
       $("strategy-name").replaceChildren(...message.strategies.map((name) => new Option(name, name)));
       this.current = null;
@@ -32,7 +34,7 @@ export class Operating {
 
   /** Show the section "operating" of the picture. */
   show(operating) {
-    this.drive.show(operating);
+    if ("works" in operating) this.drive.show(operating);
     this.faults.show(operating);
     say($("strategy-now"), operating.strategy ? `in force: ${operating.strategy}` : "FTM Manager not heard");
     $("strategy-set").disabled = operating.strategy_asked || !operating.strategy;

@@ -12,22 +12,12 @@ from typing import Any
 import msgspec
 import shapely
 
-from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.airport.model import Airport, Light
 
 FRAME_M = 4.0
 """Strip of prohibited ground that is drawn round the airport."""
 
 _DECIMALS = 2
-
-
-class DrawnLight(msgspec.Struct, frozen=True):
-    """An inset light and the intensity it should have."""
-
-    name: str
-    row: str
-    x_m: float
-    y_m: float
-    nominal_cd: float
 
 
 class AirportDrawing(msgspec.Struct, frozen=True):
@@ -52,7 +42,7 @@ class AirportDrawing(msgspec.Struct, frozen=True):
     buildings: tuple[tuple[str, str], ...]
     nodes: dict[str, tuple[float, float]]
     edges: tuple[tuple[float, float, float, float], ...]
-    lights: tuple[DrawnLight, ...]
+    lights: tuple[Light, ...]
     start: tuple[float, float]
 
 
@@ -68,8 +58,7 @@ def draw(airport: Airport, tolerance_m: float = 0.02) -> AirportDrawing:
         buildings=tuple((b.name, svg_path(b.polygon, tolerance_m)) for b in airport.buildings),
         nodes={name: (float(x), float(y)) for name, (x, y) in airport.nodes.items()},
         edges=tuple((*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges),
-        lights=tuple(DrawnLight(light.name, light.row, light.x_m, light.y_m, light.nominal_cd)
-                     for light in airport.lights),
+        lights=airport.lights,
         start=(airport.start.x_m, airport.start.y_m),
     )
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
-from rampart.files.reading import plain_line
+from rampart.files.reading import FileError, plain_line
 
 
 class AirportError(ValueError):
@@ -33,3 +36,21 @@ class Problem:
     def line(self, file: str) -> str:
         """Return the one-line message for `file`."""
         return plain_line(f"{file}: {self.field}: {self.value}: {self.remedy}")
+
+
+@contextlib.contextmanager
+def readable(file: str | Path, remedy: str, what: str = "file") -> Iterator[None]:
+    """Have a file that cannot be read, or is not what it should be, refused like all else.
+
+    Args:
+        file: for the message.
+        remedy: for what is not as it should be.
+        what: is read.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise AirportError(f"{file}: cannot be read: {error.strerror}: give a readable file"
+                           ) from None
+    except FileError as error:
+        raise AirportError(f"{file}: {what}: {error}: {remedy}") from None

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import difflib
-from collections.abc import Iterator
 from pathlib import Path
 
 from rampart.actors.osmosis.airport import graph_format as foreign
 from rampart.actors.osmosis.airport import toml_format
 from rampart.actors.osmosis.airport.checks import mission_problems, problems
-from rampart.actors.osmosis.airport.errors import AirportError
+from rampart.actors.osmosis.airport.errors import AirportError, readable
 from rampart.actors.osmosis.airport.limits import MAX_WARNINGS
 from rampart.actors.osmosis.airport.mask import MaskScale
 from rampart.actors.osmosis.airport.model import Airport, Mission
@@ -19,8 +17,6 @@ from rampart.actors.osmosis.airport.world import WorldTruth
 
 SHIPPED = Path(__file__).resolve().parents[3] / "systems" / "airports"
 """Folder of the shipped airports."""
-
-DEFAULT_AIRPORT = "vallombre"
 
 
 def shipped_airports() -> tuple[str, ...]:
@@ -79,8 +75,21 @@ def load_mission(name_or_path: str | Path, airport: Airport) -> Mission:
     return mission
 
 
+def files_of(source: Path) -> list[Path]:
+    """Return all files that an airport is read from: itself, and of a graph what lies beside it.
+
+    Args:
+        source: the airport's file.
+    """
+    if source.suffix != ".graph":
+        return [source]
+    images = [p for p in source.parent.iterdir() if p.suffix.lower() in foreign.IMAGE_SUFFIXES]
+    own = [p for p in images if p.stem.startswith(source.stem)]  # as `graph_format` chooses
+    return [source, *sorted([*(own or images), *source.parent.glob("*.miss")])]
+
+
 def _load(name_or_path: str | Path, scale: MaskScale | None) -> tuple[Airport, WorldTruth]:
-    with _readable(name_or_path):
+    with readable(name_or_path, "give a file that exists"):
         path = _find(name_or_path)
         if path.suffix == ".toml":
             airport, truth = toml_format.read_airport(path)
@@ -99,16 +108,6 @@ def _load(name_or_path: str | Path, scale: MaskScale | None) -> tuple[Airport, W
     if not airport.lights:
         warnings.append(f"{path.name}: lights: none: nothing will be measured")
     return dataclasses.replace(airport, warnings=tuple(warnings), source=str(path)), truth
-
-
-@contextlib.contextmanager
-def _readable(name: str | Path) -> Iterator[None]:
-    """Have a name that is too long, or a folder that cannot be listed, refused like the rest."""
-    try:
-        yield
-    except OSError as error:
-        raise AirportError(f"{name}: cannot be read: {error.strerror}: give a file that exists"
-                           ) from None
 
 
 def _find(name_or_path: str | Path) -> Path:

@@ -20,7 +20,7 @@ from typing import Any
 import shapely
 from shapely.geometry import MultiPoint, MultiPolygon
 
-from rampart.actors.osmosis.airport.errors import AirportError
+from rampart.actors.osmosis.airport.errors import AirportError, readable
 from rampart.actors.osmosis.airport.limits import (
     MAX_COUNTS,
     MAX_GOALS,
@@ -30,7 +30,7 @@ from rampart.actors.osmosis.airport.limits import (
 )
 from rampart.actors.osmosis.airport.mask import MaskScale, allowed_area
 from rampart.actors.osmosis.airport.model import Airport, Mission, MissionGoal, StartPose, Surface
-from rampart.files.reading import FileError, read_text, shown
+from rampart.files.reading import read_text, shown
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 MAX_TEXT_BYTES = 1 << 20
@@ -194,11 +194,5 @@ def _image_beside(graph: Path) -> Path:
 
 
 def _text(path: Path) -> str:
-    try:
+    with readable(path, "give a text like the format's sample"):
         return read_text(path, MAX_TEXT_BYTES)
-    except OSError as error:
-        raise AirportError(
-            f"{path}: cannot be read: {error.strerror}: give a readable file"
-        ) from None
-    except FileError as error:
-        raise AirportError(f"{path}: file: {error}: give a text like the format's sample") from None

@@ -21,8 +21,8 @@ import shapely
 from PIL import Image
 from shapely.geometry import MultiPolygon, Polygon
 
-from rampart.actors.osmosis.airport.errors import AirportError
-from rampart.files.reading import FileError, read_bytes
+from rampart.actors.osmosis.airport.errors import AirportError, readable
+from rampart.files.reading import read_bytes
 
 RED_THRESHOLD = 250
 """A pixel with R above this is prohibited (authors' code)."""
@@ -87,13 +87,8 @@ def allowed_area(path: Path, scale: MaskScale) -> Any:
 
 def _decoded(path: Path) -> tuple[npt.NDArray[np.uint8], bool]:
     """Return the image as rows x columns x RGB, and whether it was compressed with loss."""
-    try:
+    with readable(path, "give a smaller one", "area image"):
         data = read_bytes(path, MAX_IMAGE_BYTES)
-    except OSError as error:
-        raise AirportError(f"{path}: cannot be read: {error.strerror}: give a readable file"
-                           ) from None
-    except FileError as error:
-        raise AirportError(f"{path}: area image: {error}: give a smaller one") from None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of its size, which is looked at here

@@ -1,4 +1,4 @@
-"""Light sensor and inset lights: the forward formula and its inverse.
+"""Light sensor and inset lights: what the sensor sees of a light.
 
 An inset light lies flush in the pavement and shines upwards; near the zenith its intensity I
 (candela) is taken as constant. The sensor is a horizontal receiver that looks down, at height h
@@ -15,6 +15,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 SENSOR_FORWARD_M = 0.45
 """The sensor sits on a bracket this far ahead of `base_link`, on the robot's centre line."""
 
@@ -30,24 +33,7 @@ def sensor_position(x_m: float, y_m: float, yaw_rad: float) -> tuple[float, floa
     )
 
 
-def illuminance_per_candela(distance_m: float, height_m: float = SENSOR_HEIGHT_M) -> float:
-    """Return E / I, in lux per candela, at horizontal distance `distance_m`."""
-    square = distance_m * distance_m + height_m * height_m
-    return height_m / (square * math.sqrt(square))
-
-
-def illuminance_lux(
-    intensity_cd: float, distance_m: float, height_m: float = SENSOR_HEIGHT_M
-) -> float:
-    """Return the illuminance that one light gives at horizontal distance `distance_m`."""
-    return intensity_cd * illuminance_per_candela(distance_m, height_m)
-
-
-def intensity_from_illuminance(
-    illuminance: float, distance_m: float, height_m: float = SENSOR_HEIGHT_M
-) -> float:
-    """Return the intensity, cd, of the one light seen; the inverse of `illuminance_lux`.
-
-    Errors grow with distance: use samples taken nearer than about two sensor heights.
-    """
-    return illuminance / illuminance_per_candela(distance_m, height_m)
+def illuminance_per_candela(distance_m: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return E / I, in lux per candela, at horizontal distances `distance_m`."""
+    square = distance_m**2 + SENSOR_HEIGHT_M**2
+    return np.asarray(SENSOR_HEIGHT_M / (square * np.sqrt(square)))

@@ -18,13 +18,11 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from rampart.actors.bus.plausible import is_sane
 from rampart.actors.osmosis.airport.model import Airport
 
 Point = tuple[float, float]
 Points = npt.NDArray[np.float64]
-
-_ABSURD_M = 1e7
-"""No coordinate is as large."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +80,7 @@ class RouteCheck:
         """
         if not waypoints:
             return "the route has no waypoints"
-        if not all(abs(value) < _ABSURD_M for value in itertools.chain.from_iterable(waypoints)):
+        if not all(is_sane(*waypoint) for waypoint in waypoints):
             return "a waypoint is not finite, or farther away than anything can be"
         limits = self._limits
         if goal is not None and not math.dist(waypoints[-1], goal) <= limits.end_m:

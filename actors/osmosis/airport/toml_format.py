@@ -14,7 +14,7 @@ import shapely
 from shapely.geometry import LineString, Polygon
 from shapely.validation import explain_validity
 
-from rampart.actors.osmosis.airport.errors import AirportError, Problem
+from rampart.actors.osmosis.airport.errors import AirportError, Problem, readable
 from rampart.actors.osmosis.airport.limits import (
     MAX_COUNTS,
     MAX_CROSSINGS,
@@ -44,7 +44,7 @@ from rampart.actors.osmosis.airport.model import (
 )
 from rampart.actors.osmosis.airport.world import WorldTruth
 from rampart.files import toml
-from rampart.files.reading import FileError, read_text, shown
+from rampart.files.reading import read_text, shown
 
 Name = Annotated[str, msgspec.Meta(max_length=MAX_NAME)]
 Point = tuple[float, float]
@@ -131,16 +131,13 @@ def read_airport(path: Path) -> tuple[Airport, WorldTruth]:
     ]
     if file.fillet_radius_m < 0:
         raise _error(name, "fillet_radius_m", file.fillet_radius_m, "must not be negative")
-    _unique(name, "surface", [part.name for part in file.surface])
-    _unique(name, "prohibited", [area.name for area in file.prohibited])
-    _unique(name, "building", [building.name for building in file.building])
-    _unique(name, "row", [row.name for row in file.row])
-    buildings = tuple(file.building)
-    for building in buildings:
+    for table in ("surface", "prohibited", "building", "row"):
+        _unique(name, table, [part.name for part in getattr(file, table)])
+    for building in file.building:
         if min(building.length_m, building.width_m, building.height_m) <= 0:
             raise _error(name, f"building.{building.name}", "size", "sides must be positive")
     # A building stands on no pavement the robot may use, wherever it stands.
-    solid = [building.polygon for building in buildings]
+    solid = [building.polygon for building in file.building]
     pavement = [part.polygon for part in surfaces]
     check_nearness(name, "surface, prohibited and building", [*pavement, *prohibited, *solid], 0.0,
                    MAX_CROSSINGS)
@@ -158,7 +155,7 @@ def read_airport(path: Path) -> tuple[Airport, WorldTruth]:
         allowed=allowed,
         start=file.start,
         surfaces=surfaces,
-        buildings=buildings,
+        buildings=tuple(file.building),
         lights=lights,
         missions={
             key: Mission(key, tuple(mission.goals)) for key, mission in file.missions.items()
@@ -180,14 +177,8 @@ def read_mission(path: Path) -> Mission:
 
 
 def _convert(path: Path, kind: Any) -> Any:
-    try:
+    with readable(path, "see https://toml.io"):
         table = toml.parse(read_text(path, toml.MAX_SIZE))
-    except OSError as error:
-        raise AirportError(
-            f"{path}: cannot be read: {error.strerror}: give a readable file"
-        ) from None
-    except FileError as error:
-        raise AirportError(f"{path}: file: {error}: see https://toml.io") from None
     _check_numbers(table, "", str(path))
     try:
         return msgspec.convert(table, kind)

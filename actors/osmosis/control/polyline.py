@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Point = tuple[float, float]
+Pose2 = tuple[float, float, float]
+"""Planar pose: x m, y m, yaw rad."""
 Array = NDArray[np.float64]
 
 NO_POINTS: Array = np.zeros((0, 2))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -27,16 +25,12 @@ class ActuatorFailure(DetectionModule):
         super().__init__(context)
         system = context.run.system
         usual = MotionLimits()
-        self.monitor = ActuatorMonitor(
+        self.monitor = self.judged_by(ActuatorMonitor(
             MotionLimits(
                 wheel_radius_m=amount(self.parameters, "wheel_radius_m", usual.wheel_radius_m),
                 hold_s=amount(self.parameters, "hold_s", usual.hold_s),
                 braking_mps2=system.robot.braking_mps2),
-            -math.inf if self.first_life else self.clock.now() + _FIRST_STATUS_S)
-
-    def on_start(self) -> None:
-        """Start waiting for the base."""
-        self.follow(self.monitor)
+            self.known_after_s(_FIRST_STATUS_S)))
 
     @on(topics.BASE_COMMAND)
     def command(self, message: m.BaseCommand, _header: Header) -> None:
@@ -53,4 +47,4 @@ class ActuatorFailure(DetectionModule):
         """Hear how the wheels turn, and judge."""
         self.monitor.status(message.wheel_speeds_radps, braking=message.brake_engaged,
                             now_s=self.clock.now())
-        self.follow(self.monitor)
+        self.follow()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -32,14 +31,10 @@ class Bounds(DetectionModule):
         super().__init__(context)
         system = context.run.system
         self._suspects = suspects_of(self.parameters)
-        self.monitor = BoundsCheck(
+        self.monitor = self.judged_by(BoundsCheck(
             system.robot.top_speed_mps, system.robot.top_turn_rate_radps,
             amount(self.parameters, "hold_s", 0.5),
-            -math.inf if self.first_life else self.clock.now() + _FIRST_COMMAND_S)
-
-    def on_start(self) -> None:
-        """Start waiting for the first command."""
-        self.follow(self.monitor)
+            self.known_after_s(_FIRST_COMMAND_S)))
 
     @on(topics.COMMAND)
     def command(self, message: m.Twist, header: Header) -> None:
@@ -50,7 +45,7 @@ class Bounds(DetectionModule):
             self.monitor.nodes = ()
         elif not was_active or not self.monitor.good:
             self.monitor.nodes = tuple(f"{n}#{header.incarnation}" for n in self._suspects)
-        self.follow(self.monitor)
+        self.follow()
 
 
 def suspects_of(parameters: Mapping[str, Any]) -> tuple[str, ...]:

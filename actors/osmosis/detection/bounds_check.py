@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from rampart.actors.detection.lasting import Lasting
+
 _ROUNDING = 1e-6
 """A command clamped to the limit elsewhere, in float32 perhaps, is within it."""
 
@@ -24,18 +26,17 @@ class BoundsCheck:
                  known_after_s: float = -math.inf) -> None:
         self.max_linear_mps = max_linear_mps
         self.max_angular_radps = max_angular_radps
-        self.hold_s = hold_s
         self.active = False
         self.reason = ""
         self.nodes: tuple[str, ...] = ()
         self.known = known_after_s == -math.inf
         self._known_after_s = known_after_s
-        self._good_since_s: float | None = None
+        self._good = Lasting(hold_s)
 
     @property
     def good(self) -> bool:
         """Whether the last command was good."""
-        return not self.active or self._good_since_s is not None
+        return not self.active or self._good.since_s < math.inf
 
     @property
     def due_s(self) -> float:
@@ -50,17 +51,13 @@ class BoundsCheck:
         """Check a command."""
         self.known = True
         fault = self._fault(linear_mps, angular_radps)
+        cured = self._good.note(not fault, now_s)
         if fault:
             self.reason = self.reason or fault
             self.active = True
-            self._good_since_s = None
-        elif self.active:
-            if self._good_since_s is None:
-                self._good_since_s = now_s
-            if now_s >= self._good_since_s + self.hold_s - 1e-9:
-                self.active = False
-                self.reason = ""
-                self._good_since_s = None
+        elif self.active and cured:
+            self.active = False
+            self.reason = ""
 
     def _fault(self, linear_mps: float, angular_radps: float) -> str:
         for what, value, limit, unit in (

@@ -14,7 +14,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from rampart.actors.detection.plausible import is_possible
+from rampart.actors.bus.plausible import is_possible
+from rampart.actors.detection.lasting import Lasting
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,19 +52,6 @@ class _Source:
     incarnation: int = 0
 
 
-@dataclass(slots=True)
-class _Apart:
-    """Since when one component differs, and how long it may."""
-
-    patience_s: float
-    since_s: float = math.inf
-
-    def note(self, apart: bool, now_s: float) -> bool:
-        """Return whether it has differed for too long."""
-        self.since_s = min(self.since_s, now_s) if apart else math.inf
-        return now_s - self.since_s >= self.patience_s - 1e-9
-
-
 class CommandComparison:
     """Active while two sources of one command disagree; accuses them in turn.
 
@@ -84,9 +72,9 @@ class CommandComparison:
         self._sources = {name: _Source() for name in sources}
         self._order = sources
         self._accused = -1
-        self._linear = _Apart(self.limits.linear_s)
-        self._angular = _Apart(self.limits.angular_s)
-        self._agreed_since_s = math.inf
+        self._linear = Lasting(self.limits.linear_s)
+        self._angular = Lasting(self.limits.angular_s)
+        self._agreed = Lasting(self.limits.hold_s)
         self._compared_s = -math.inf
 
     @property
@@ -109,7 +97,8 @@ class CommandComparison:
         one = self._sources[source]
         if incarnation != one.incarnation:
             one.incarnation = incarnation
-            self._linear.since_s = self._angular.since_s = math.inf
+            self._linear.forget()
+            self._angular.forget()
         if not all(map(math.isfinite, command)) or not is_possible(stamp_s, now_s):
             return  # the subject of others
         one.linear_mps, one.angular_radps = command
@@ -128,11 +117,7 @@ class CommandComparison:
         too_long = [self._linear.note(faster, now_s), self._angular.note(turning, now_s)]
         if any(too_long):
             self._disagree(a, b)
-        if faster or turning:
-            self._agreed_since_s = math.inf
-            return
-        self._agreed_since_s = min(self._agreed_since_s, now_s)
-        if self.active and now_s >= self._agreed_since_s + limits.hold_s - 1e-9:
+        if self._agreed.note(not (faster or turning), now_s) and self.active:
             self._clear()
 
     def _disagree(self, a: _Source, b: _Source) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -35,16 +33,12 @@ class CommandDisagreement(DetectionModule):
         first, second = map(str, names)
         self._standby = second if first == "osmosis_control" else first
         usual = ComparisonLimits()
-        self.monitor = CommandComparison(
+        self.monitor = self.judged_by(CommandComparison(
             (first, second),
             ComparisonLimits(**{
                 name: amount(self.parameters, name, getattr(usual, name))
                 for name in ("linear_mps", "angular_radps", "linear_s", "angular_s", "hold_s")}),
-            -math.inf if self.first_life else self.clock.now() + _FIRST_PAIR_S)
-
-    def on_start(self) -> None:
-        """Start waiting for commands."""
-        self.follow(self.monitor)
+            self.known_after_s(_FIRST_PAIR_S)))
 
     @on(topics.COMMAND)
     def command(self, message: m.Twist, header: Header) -> None:
@@ -59,4 +53,4 @@ class CommandDisagreement(DetectionModule):
     def _heard(self, source: str, message: m.Twist, header: Header) -> None:
         self.monitor.heard(source, (message.linear_mps, message.angular_radps), header.stamp,
                            header.incarnation, self.clock.now())
-        self.follow(self.monitor)
+        self.follow()

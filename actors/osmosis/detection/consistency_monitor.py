@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from rampart.actors.detection.plausible import is_possible, is_sane
+from rampart.actors.bus.plausible import is_possible, is_sane
 from rampart.actors.osmosis.messages import (
     ControlPhase,
     ControlStatus,

@@ -8,8 +8,6 @@ message went wrong is found out by the first route.
 
 from __future__ import annotations
 
-import math
-
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -34,14 +32,10 @@ class ErroneousRoute(DetectionModule):
         super().__init__(context)
         airport = Osmosis.of(context).airport
         check = RouteCheck(airport)
-        self.monitor = RouteMonitor(
+        self.monitor = self.judged_by(RouteMonitor(
             lambda waypoints, goal: check.fault(waypoints, None, goal),
             amount(self.parameters, "hold_s", 0.5),
-            -math.inf if self.first_life else self.clock.now() + _FIRST_ROUTE_S)
-
-    def on_start(self) -> None:
-        """Start waiting for the first route."""
-        self.follow(self.monitor)
+            self.known_after_s(_FIRST_ROUTE_S)))
 
     @on(topics.MISSION_STATUS)
     def mission(self, message: m.MissionStatus, _header: Header) -> None:
@@ -57,4 +51,4 @@ class ErroneousRoute(DetectionModule):
     def route(self, message: m.Route, header: Header) -> None:
         """Check a route."""
         self.monitor.route(message, header.source, header.incarnation, self.clock.now())
-        self.follow(self.monitor)
+        self.follow()

@@ -36,15 +36,11 @@ class Freshness(DetectionModule):
             raise ValueError(f"{self.name}: actor Freshness hears no topic; name a subclass, "
                              "CommandFreshness or LocalizationFreshness")
         timeout_s = amount(self.parameters, "timeout_s", self.default_timeout_s)
-        self.monitor = FreshnessMonitor(
+        self.monitor = self.judged_by(FreshnessMonitor(
             self.subject, timeout_s, amount(self.parameters, "hold_s", 0.2), self.clock.now(),
-            self.grace_s(timeout_s), known=self.first_life)
+            self.grace_s(timeout_s), known=self.first_life))
         self._suspects = names(self.parameters, "suspects")
         self.monitor.nodes = self._suspects
-
-    def on_start(self) -> None:
-        """Start waiting for the first sample."""
-        self.follow(self.monitor)
 
     def sample(self, header: Header) -> None:
         """Take note of a sample."""
@@ -55,7 +51,7 @@ class Freshness(DetectionModule):
             monitor.nodes = tuple(
                 f"{name}#{header.incarnation}" if name == header.source else name
                 for name in self._suspects)
-        self.follow(monitor)
+        self.follow()
 
 
 class CommandFreshness(Freshness):

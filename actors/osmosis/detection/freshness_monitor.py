@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from rampart.actors.detection.plausible import is_possible
+from rampart.actors.bus.plausible import is_possible
 
 
 class FreshnessMonitor:

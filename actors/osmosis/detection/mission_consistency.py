@@ -30,42 +30,23 @@ class MissionConsistency(DetectionModule):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         limits = ConsistencyLimits()
-        self.monitor = ConsistencyMonitor(
+        self.monitor = self.judged_by(ConsistencyMonitor(
             ConsistencyLimits(amount(self.parameters, "patience_s", limits.patience_s),
                               amount(self.parameters, "silence_s", limits.silence_s)),
-            self.clock.now(), known=self.first_life)
-
-    def on_start(self) -> None:
-        """Start listening."""
-        self.follow(self.monitor)
+            self.clock.now(), known=self.first_life))
 
     @on(topics.MISSION_STATUS)
-    def mission(self, message: m.MissionStatus, header: Header) -> None:
-        """Hear how the mission stands."""
-        self._hear(message, header)
-
     @on(topics.GOAL)
-    def goal(self, message: m.GoalOrder, header: Header) -> None:
-        """Hear the current goal."""
-        self._hear(message, header)
-
     @on(topics.ROUTE)
-    def route(self, message: m.Route, header: Header) -> None:
-        """Hear the route."""
-        self._hear(message, header)
-
     @on(topics.CONTROL_STATUS)
-    def control(self, message: m.ControlStatus, header: Header) -> None:
-        """Hear how far the robot is."""
-        self._hear(message, header)
+    def hear(self, message: bm.Message, header: Header) -> None:
+        """Hear how the mission stands, its goal, the route, or how far the robot is."""
+        self.monitor.heard(message, header.source, header.incarnation, header.stamp,
+                           self.clock.now())
+        self.follow()
 
     @on(topics.POSE)
     def pose(self, message: m.Pose, _header: Header) -> None:
         """Hear where the robot is."""
         self.monitor.pose(message.x_m, message.y_m, self.clock.now())
-        self.follow(self.monitor)
-
-    def _hear(self, message: bm.Message, header: Header) -> None:
-        self.monitor.heard(message, header.source, header.incarnation, header.stamp,
-                           self.clock.now())
-        self.follow(self.monitor)
+        self.follow()

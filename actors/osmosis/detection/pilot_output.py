@@ -36,13 +36,9 @@ class PilotOutput(DetectionModule):
             timeout_s=amount(self.parameters, "timeout_s", usual.timeout_s),
             wrong_s=amount(self.parameters, "wrong_s", usual.wrong_s),
             hold_s=amount(self.parameters, "hold_s", usual.hold_s))
-        self.monitor = PilotOutputMonitor(
+        self.monitor = self.judged_by(PilotOutputMonitor(
             str(self.parameters.get("pilot", "safety_pilot")), self.clock.now(),
-            self.grace_s(limits.timeout_s), limits, known=self.first_life)
-
-    def on_start(self) -> None:
-        """Start waiting for the first output."""
-        self.follow(self.monitor)
+            self.grace_s(limits.timeout_s), limits, known=self.first_life))
 
     @on(topics.COMMAND)
     def command(self, message: m.Twist, _header: Header) -> None:
@@ -69,4 +65,4 @@ class PilotOutput(DetectionModule):
         """Hear what the base gets."""
         self.monitor.sent(message.linear_mps, message.angular_radps, header.stamp,
                           header.incarnation, self.clock.now())
-        self.follow(self.monitor)
+        self.follow()

@@ -19,7 +19,8 @@ from collections import deque
 from dataclasses import dataclass
 from itertools import chain, takewhile
 
-from rampart.actors.detection.plausible import is_possible
+from rampart.actors.bus.plausible import is_possible
+from rampart.actors.detection.lasting import Lasting
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +71,8 @@ class PilotOutputMonitor:
         self._newest_s = -math.inf
         self._first_due_s = start_s + grace_s
         self._last: tuple[float, float, float] | None = None
-        self._wrong_since_s = math.inf
-        self._well_since_s = math.inf
+        self._wrong = Lasting(self.limits.wrong_s)
+        self._well = Lasting(self.limits.hold_s)
         self._says_stop = False
         self._says_unchanged = False
         self._said_s = -math.inf
@@ -117,7 +118,7 @@ class PilotOutputMonitor:
         """Take a command for the base, sent at `stamp_s`."""
         if incarnation != self._incarnation:
             self._incarnation = incarnation
-            self._wrong_since_s = math.inf
+            self._wrong.forget()
             self._said_s = now_s
             self._last = None
         if is_possible(stamp_s, now_s):
@@ -126,16 +127,9 @@ class PilotOutputMonitor:
         self._known = self._known or (fresh and self._newest_s > -math.inf)
         last, self._last = self._last, (now_s, linear_mps, angular_radps)
         wrong = self._unexplained(*last) if last is not None else ""
-        self._wrong_since_s = min(self._wrong_since_s, now_s) if wrong else math.inf
-        if wrong or not fresh:
-            self._well_since_s = math.inf
-            if not self.active and now_s - self._wrong_since_s >= self.limits.wrong_s - 1e-9:
-                self._accuse(wrong)
-            elif self.active and self._is_later_life():
-                self._wait_for_it(now_s, wrong)
-            return
-        self._well_since_s = min(self._well_since_s, now_s)
-        if self.active and now_s >= self._well_since_s + self.limits.hold_s - 1e-9:
+        if self._wrong.note(bool(wrong), now_s) and not self._is_accused:
+            self._accuse(wrong)  # a later life as well, if that is wrong for long enough too
+        elif self._well.note(fresh and not wrong, now_s) and self.active:
             self.active = False
             self.reason = ""
             self.nodes = ()
@@ -170,15 +164,11 @@ class PilotOutputMonitor:
         self.active = True
         self.reason = reason
         self.nodes = (f"{self._pilot}#{self._incarnation}",)
-        self._well_since_s = math.inf
+        self._well.forget()
 
-    def _is_later_life(self) -> bool:
-        return self.nodes != (f"{self._pilot}#{self._incarnation}",)
-
-    def _wait_for_it(self, now_s: float, wrong: str) -> None:
-        """Accuse the next life as well, if that is wrong for long enough too."""
-        if wrong and now_s - self._wrong_since_s >= self.limits.wrong_s - 1e-9:
-            self._accuse(wrong)
+    @property
+    def _is_accused(self) -> bool:
+        return self.nodes == (f"{self._pilot}#{self._incarnation}",)
 
 
 def _shown(linear_mps: float, angular_radps: float) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from rampart.actors.detection.lasting import Lasting
 from rampart.actors.osmosis.messages import GoalOrder, MissionPhase, MissionStatus, Route
 
 RouteFault = Callable[[tuple[tuple[float, float], ...], tuple[float, float] | None], str]
@@ -30,13 +31,12 @@ class RouteMonitor:
 
     def __init__(self, fault: RouteFault, hold_s: float, known_after_s: float = -math.inf) -> None:
         self._fault = fault
-        self._hold_s = hold_s
         self._known_after_s = known_after_s
         self._goal: GoalOrder | None = None
         self._giver = ("", 0)
         self._status: MissionStatus | None = None
         self._blamed: tuple[str, int] = ("", 0)
-        self._good_since_s: float | None = None
+        self._good = Lasting(hold_s)
         self.known = known_after_s == -math.inf
         self.reason = ""
 
@@ -71,18 +71,15 @@ class RouteMonitor:
         """Check a route and remember who gave it."""
         self.known = True
         fault = self._fault_of(route)
+        cured = self._good.note(not fault, now_s)
         if fault:
             self.reason = self.reason or fault
             self._blamed = self._giver if self._wrong_goal(route) else (source, incarnation)
-            self._good_since_s = None
         elif self.active:
-            if self._good_since_s is None:
-                self._good_since_s = now_s
             reborn = any(node == self._blamed[0] and life > self._blamed[1]
                          for node, life in ((source, incarnation), self._giver))
-            if reborn or now_s >= self._good_since_s + self._hold_s - 1e-9:
+            if reborn or cured:
                 self.reason = ""
-                self._good_since_s = None
 
     def _fault_of(self, route: Route) -> str:
         if not route.active or not route.waypoints:

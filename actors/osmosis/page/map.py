@@ -11,8 +11,7 @@ from itertools import islice
 import msgspec
 
 from rampart.actors.operator.bounds import MAX_NAME, clip
-from rampart.actors.operator.state import MAX_LIGHTS
-from rampart.actors.osmosis.airport.drawing import AirportDrawing, DrawnLight, draw
+from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
 from rampart.actors.osmosis.airport.model import Airport, Light
 
 MAX_PATHS_BYTES = 100_000
@@ -22,6 +21,9 @@ MAX_GRAPH = 1500
 """Nodes, and edges."""
 
 MAX_BUILDINGS = 300
+MAX_LIGHTS = 1500
+"""So many lights are shown of an airport: an SVG with more is slow on a telephone."""
+
 _TOLERANCES_M = (0.02, 0.1, 0.5, 2.0)
 
 
@@ -68,7 +70,7 @@ def lights_shown(airport: Airport) -> frozenset[str]:
     return frozenset(light.name for light in islice(filter(_is_plain, airport.lights), MAX_LIGHTS))
 
 
-def _is_plain(light: Light | DrawnLight) -> bool:
+def _is_plain(light: Light) -> bool:
     """Tell whether the page can show a light's name as it is: by that the light is known."""
     return light.name == clip(light.name, MAX_NAME) and light.row == clip(light.row, MAX_NAME)
 

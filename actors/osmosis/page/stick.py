@@ -19,7 +19,7 @@ import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from rampart.actors.operator.requests import StickWish
+from rampart.actors.osmosis.page.requests import StickRequest
 
 SILENCE_S = 0.3
 """A page that was not heard for so long has let go (real seconds)."""
@@ -88,13 +88,13 @@ class StickDesk:
             return None
         return self._at
 
-    def move(self, page: int, wish: StickWish, now_s: float) -> StickAnswer:
+    def move(self, page: int, request: StickRequest, now_s: float) -> StickAnswer:
         """Take a page's message."""
         self.expire(now_s)
-        grip, text = self._grip(page, wish, now_s) if wish.held else (Grip.FREE, "")
+        grip, text = self._grip(page, request, now_s) if request.held else (Grip.FREE, "")
         if grip is Grip.DRIVES:
             self._holder, self._heard_s = page, now_s
-            self._at = (min(max(wish.forward, -1.0), 1.0), min(max(wish.left, -1.0), 1.0))
+            self._at = (min(max(request.forward, -1.0), 1.0), min(max(request.left, -1.0), 1.0))
         elif self._holder == page:
             self._holder = None
         if grip in (Grip.LATE, Grip.REFUSED, Grip.TAKEN):
@@ -123,8 +123,8 @@ class StickDesk:
         self._tickets.pop(page, None)
         return had
 
-    def _grip(self, page: int, wish: StickWish, now_s: float) -> tuple[Grip, str]:
-        for name, value in (("forward", wish.forward), ("left", wish.left)):
+    def _grip(self, page: int, request: StickRequest, now_s: float) -> tuple[Grip, str]:
+        for name, value in (("forward", request.forward), ("left", request.left)):
             if not abs(value) <= 1.0 + _ROUNDING:
                 return Grip.REFUSED, (f"{name} = {value:g}: must be between -1 and 1; "
                                       "the stick was taken from you, let go first")
@@ -133,7 +133,7 @@ class StickDesk:
         if page in self._lapsed:
             return Grip.LAPSED, "let go of the stick and press again"
         tickets = self._tickets.get(page)
-        if tickets is None or not tickets.fresh(wish.ticket, now_s):
+        if tickets is None or not tickets.fresh(request.ticket, now_s):
             if self._holder == page:
                 return Grip.LATE, (f"the connection is slower than {TICKET_S:g} s; "
                                    "the stick was taken from you, let go first")

@@ -2,35 +2,57 @@
 
 from __future__ import annotations
 
+from rampart.actors.ftm.messages import RecoveryCommand
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import PilotMode, PilotOrder, PilotStatus
-from rampart.actors.recovery.holding import HoldingRecovery
+from rampart.actors.recovery.holding import HeldOrder
 from rampart.actors.recovery.module import RecoveryModule
-from rampart.actors.runtime.actor import Header, on
+from rampart.actors.runtime.actor import Context, Header, on
 
 
-class PilotRecovery(HoldingRecovery):
-    """Orders the Safety Pilot into a mode: base of RM2 and RM5.
+class PilotRecovery(RecoveryModule):
+    """Orders the Safety Pilot into a mode: base of RM2, RM5 and RM8.
 
     Class attributes:
         mode: what is ordered.
         confirming: modes of the Safety Pilot by which the order is fulfilled.
+        top_speed_mps: bound that is ordered with it, 0 for none.
     """
 
     outputs = (*RecoveryModule.outputs, topics.PILOT_ORDER)
     mode = PilotMode.STOP
     confirming: tuple[PilotMode, ...] = (PilotMode.STOP,)
+    top_speed_mps = 0.0
 
-    def give_order(self, *, engaged: bool) -> None:
-        """Order the mode, or end the order."""
-        self.publish(topics.PILOT_ORDER,
-                     PilotOrder(engaged, self.mode, self.why if engaged else ""))
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.order = HeldOrder(self, self._give, inherits=context.incarnation > 1)
+
+    def _give(self, engaged: bool, why: str) -> None:
+        self.publish(topics.PILOT_ORDER, PilotOrder(
+            engaged, self.mode, why, self.top_speed_mps if engaged else 0.0))
+
+    def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
+        """Order the mode."""
+        self.order.act(command, renewed=renewed)
+
+    def let_go(self) -> None:
+        """End the order."""
+        self.order.let_go()
+
+    def stay_idle(self) -> None:
+        """End an order that an earlier life may have left behind."""
+        self.order.stay_idle()
+
+    def repeat(self) -> None:
+        """Repeat the order or its end."""
+        self.order.repeat()
 
     @on(topics.PILOT_STATUS)
     def pilot_status(self, message: PilotStatus, header: Header) -> None:
         """See which mode the Safety Pilot is in."""
-        self.status(in_force=message.mode in self.confirming,
-                    reason=f"safety pilot in mode {message.mode}", stamp_s=header.stamp)
+        self.order.status(in_force=message.mode in self.confirming,
+                          reason=f"safety pilot in mode {message.mode}", stamp_s=header.stamp)
 
 
 class ControlledStop(PilotRecovery):

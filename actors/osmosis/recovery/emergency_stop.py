@@ -5,7 +5,7 @@ from __future__ import annotations
 from rampart.actors.ftm.messages import RecoveryCommand
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import BaseStatus, BrakeCommand
-from rampart.actors.recovery.holding import HoldingRecovery
+from rampart.actors.recovery.holding import HeldOrder
 from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context, Header, on
 
@@ -14,7 +14,7 @@ _PATIENCE_S = 0.5
 """How long a respawned module waits to see the brake before it says that it is idle."""
 
 
-class EmergencyStop(HoldingRecovery):
+class EmergencyStop(RecoveryModule):
     """Engages the brake of the Summit XL layer, past the Safety Pilot and all control nodes.
 
     The brake itself remembers. When this module and the manager die in the same moment, the
@@ -26,6 +26,8 @@ class EmergencyStop(HoldingRecovery):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
+        # If the brake is found engaged this module is not idle, so it inherits nothing to end.
+        self._order = HeldOrder(self, self._brake, inherits=False)
         self._looking = context.incarnation > 1
 
     def on_start(self) -> None:
@@ -39,17 +41,21 @@ class EmergencyStop(HoldingRecovery):
             self._looking = False
             self._tell_change()
 
-    def give_order(self, *, engaged: bool) -> None:
-        """Engage or release the brake."""
-        self.publish(topics.BRAKE, BrakeCommand(engaged, self.why if engaged else ""))
+    def _brake(self, engaged: bool, why: str) -> None:
+        self.publish(topics.BRAKE, BrakeCommand(engaged, why))
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Engage the brake."""
         self._looking = False
-        super().act(command, renewed=renewed)
+        self._order.act(command, renewed=renewed)
 
-    def stay_idle(self) -> None:
-        """Leave the brake alone: if it was engaged, this module is not idle."""
+    def let_go(self) -> None:
+        """Release the brake."""
+        self._order.let_go()
+
+    def repeat(self) -> None:
+        """Repeat that the brake is to be engaged, or that it is to be released."""
+        self._order.repeat()
 
     @on(topics.BASE_STATUS)
     def base_status(self, message: BaseStatus, header: Header) -> None:
@@ -57,14 +63,14 @@ class EmergencyStop(HoldingRecovery):
         if self._looking:
             self._looking = False
             if message.brake_engaged:
-                self.why = _FOUND_ENGAGED
+                self._order.why = _FOUND_ENGAGED
                 self.ordered_s = header.stamp
                 self.resume(_FOUND_ENGAGED)
             else:
                 self._tell_change()
-        self.status(in_force=message.brake_engaged,
-                    reason="brake engaged" if message.brake_engaged else "brake not engaged",
-                    stamp_s=header.stamp)
+        self._order.status(
+            in_force=message.brake_engaged, stamp_s=header.stamp,
+            reason="brake engaged" if message.brake_engaged else "brake not engaged")
 
     def _tell(self) -> None:
         if not self._looking:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import PilotMode, PilotOrder, PilotStatus
+from rampart.actors.osmosis.messages import PilotMode, PilotStatus
 from rampart.actors.osmosis.recovery.controlled_stop import PilotRecovery
 from rampart.actors.runtime.actor import Context, Header
 
@@ -37,15 +36,9 @@ class ReducedSpeed(PilotRecovery):
             raise ValueError(f"parameters.top_speed_mps = {bound!r}: must be a speed above 0")
         self.top_speed_mps = float(bound)
 
-    def give_order(self, *, engaged: bool) -> None:
-        """Order the bound, or end the order."""
-        self.publish(topics.PILOT_ORDER, PilotOrder(
-            engaged, self.mode, self.why if engaged else "",
-            self.top_speed_mps if engaged else 0.0))
-
     def pilot_status(self, message: PilotStatus, header: Header) -> None:
         """See which bound the Safety Pilot keeps."""
         in_force = 0.0 < message.top_speed_mps <= self.top_speed_mps
-        self.status(in_force=in_force, stamp_s=header.stamp,
-                    reason=f"at most {message.top_speed_mps:g} m/s" if in_force
-                    else "the safety pilot does not bound the speed")
+        self.order.status(in_force=in_force, stamp_s=header.stamp,
+                          reason=f"at most {message.top_speed_mps:g} m/s" if in_force
+                          else "the safety pilot does not bound the speed")

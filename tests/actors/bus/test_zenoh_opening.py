@@ -8,7 +8,6 @@ import multiprocessing
 import os
 import signal
 import socket
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -17,6 +16,7 @@ import pytest
 from rampart.actors.bus.run_folder import socket_path
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
 from rampart.actors.osmosis import topics
+from rampart.testing import eventually
 
 FORK = multiprocessing.get_context("spawn")
 
@@ -67,10 +67,7 @@ async def newcomer(folder: str, *dial: str):
 
 
 async def hears(heard: list[bytes], name: bytes) -> None:
-    deadline = time.monotonic() + 20
-    while name not in heard:
-        assert time.monotonic() < deadline, f"{name!r} was not heard"
-        await asyncio.sleep(0.01)
+    await eventually(lambda: name in heard, 20, f"{name!r} was not heard")
 
 
 async def test_a_stopped_partner_is_not_waited_for_and_linked_when_it_goes_on(sockets):

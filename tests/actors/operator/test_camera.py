@@ -16,10 +16,10 @@ from PIL import Image
 
 from rampart.actors.operator import camera_eye
 from rampart.actors.operator.camera_eye import CameraError, CameraEye, renderer
-from rampart.actors.operator.hmi import Hmi
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, Building, StartPose, Surface
+from rampart.actors.osmosis.page.hmi import OsmosisHmi
 from rampart.sim.osmosis.camera import MARGIN_M, MAX_PIXELS, View, ground_image
 from rampart.testing import free_port
 from tests.actors.operator.browser import browser
@@ -150,7 +150,7 @@ def test_a_large_airport_has_a_picture_of_its_ground_that_fits_into_a_texture():
     assert max(colour) - min(colour) < 20, "grey"
 
 
-class Seen(Hmi):
+class Seen(OsmosisHmi):
     """An HMI with the camera of the shipped systems, or another."""
 
     def __init__(self, context, module: str = "rampart.sim.osmosis.camera") -> None:

@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.bounds import SHOWN, Bounds, clip
-from rampart.actors.operator.hmi import Hmi
-from rampart.actors.operator.state import MAX_LIGHTS, HmiState
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Light, Mission
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
-from rampart.actors.osmosis.page.map import MAX_GRAPH, MAX_PATHS_BYTES, page_map
+from rampart.actors.osmosis.page.hmi import OsmosisHmi
+from rampart.actors.osmosis.page.map import MAX_GRAPH, MAX_LIGHTS, MAX_PATHS_BYTES, page_map
+from rampart.actors.osmosis.page.state import OsmosisState
 from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import browser
 from tests.actors.operator.extremes import DOCUMENTS, LONG, MARKUP, messages
@@ -32,7 +32,7 @@ from tests.actors.operator.test_operating import open_page
 from tests.actors.operator.world import AIRPORT, hear, served
 
 FRAME_BYTES = 512_000
-HANDLED = [(kind, topic, method) for kind in (Hmi, Teleoperation)
+HANDLED = [(kind, topic, method) for kind in (OsmosisHmi, Teleoperation)
            for topic, method in kind._handlers]
 
 
@@ -52,19 +52,19 @@ async def test_a_handler_of_the_operators_nodes_survives_every_extreme(world, ki
         for number, message in enumerate(messages(topic.type)):
             for stamp in (0.0, -1e308, -float("inf")):
                 handler(message, Header("x" * (number % 3), number, number, stamp))
-        if kind is Hmi:
-            actor._submit()
+        if kind is OsmosisHmi:
+            actor._repeat()
             actor._look()
             actor._state.grow_old(1e9)
             assert len(actor._server._feed.frame(0)) < FRAME_BYTES
         await asyncio.sleep(0.05)
-        assert not actor._ended.done()
+        assert not actor._dispatcher._ended.done()
     diagnosed = {d.context for d in world.others.diagnostics}
     assert "handler failed" not in diagnosed
 
 
 async def test_all_extremes_together_make_a_frame_that_a_page_can_take(world):
-    async with world.running(node(world, Hmi, hmi_port=free_port())) as hmi:
+    async with world.running(node(world, OsmosisHmi, hmi_port=free_port())) as hmi:
         for topic, method in hmi._handlers:
             for number, message in enumerate(messages(topic.type)):
                 getattr(hmi, method)(message, Header("somebody", 1, number, 0.0))
@@ -79,7 +79,7 @@ async def test_all_extremes_together_make_a_frame_that_a_page_can_take(world):
 
 @pytest.mark.parametrize("document", DOCUMENTS)
 async def test_a_system_that_is_none_is_reported_and_the_one_before_stays(world, document):
-    async with world.running(node(world, Hmi, hmi_port=free_port())) as hmi:
+    async with world.running(node(world, OsmosisHmi, hmi_port=free_port())) as hmi:
         drawn = hmi._state.picture.value("system")
         hmi._adapted(fm.AdaptedSystem(7, "a change", "somebody", document),
                      Header("ftm_manager", 1, 1, 0.0))
@@ -148,19 +148,19 @@ async def test_the_page_draws_so_many_lights_and_says_how_many_it_leaves_out(wor
 
 
 def test_lights_that_no_airport_has_are_not_kept():
-    state = HmiState({"A01"})
+    state = OsmosisState({"A01"})
     for i in range(10_000):
         state.light(m.LightMeasurement(f"forged {i}", 1.0, 1.0, m.LightVerdict.OK))
     state.light(m.LightMeasurement("A01", 1.0, 1.0, m.LightVerdict.OK))
     assert set(state.picture.rows("lights")) == {"A01"}
-    anywhere = HmiState()
+    anywhere = OsmosisState()
     for i in range(10_000):
         anywhere.light(m.LightMeasurement(f"forged {i}", 1.0, 1.0, m.LightVerdict.OK))
     assert len(anywhere.picture.rows("lights")) == MAX_LIGHTS
 
 
 def test_a_page_that_missed_a_new_mission_is_told_which_lights_are_unmeasured_again():
-    state = HmiState()
+    state = OsmosisState()
     state.light(m.LightMeasurement("A01", 1.0, 1.0, m.LightVerdict.OK))
     seen = state.picture.version
     state.mission(m.MissionStatus("2", "A", m.MissionPhase.RUNNING, 0, (), (), (), ""), 3.0)

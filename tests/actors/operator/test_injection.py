@@ -13,7 +13,7 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.ftm import messages as fm
-from rampart.actors.operator.adaptation import GIVE_UP_S, ChoiceError, StrategyChoice
+from rampart.actors.operator.adaptation import GIVE_UP_S, StrategyChoice
 from rampart.actors.operator.injection import (
     FIRST_EFFECT_S,
     LATE_END_S,
@@ -24,6 +24,7 @@ from rampart.actors.operator.injection import (
     places,
 )
 from rampart.actors.operator.operating import places_of
+from rampart.actors.operator.requests import RefusedError
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.injection import MODES, flaw
@@ -262,7 +263,7 @@ def test_a_strategy_is_asked_for_until_the_manager_answers():
     assert (request.action, request.name, request.values) == (
         "set", "strategy", '{"value":"mission-first"}')
     assert choice.pending is request
-    with pytest.raises(ChoiceError, match="waits for its answer"):
+    with pytest.raises(RefusedError, match="waits for its answer"):
         choice.ask("mission-first", "safety-first", 0.1)
     assert choice.answer(fm.AdaptationAnswer("another's", True, "", 1)) == ""
     told = choice.answer(answer(request))
@@ -290,5 +291,5 @@ def test_a_strategy_that_nobody_sets_is_withdrawn():
     ("safety-first", "is in force already"), ("luck", "there are: safety-first, mission-first"),
     ("x" * 500, "no strategy 'x{40}'")])
 def test_a_strategy_that_makes_no_sense_is_refused(name, why):
-    with pytest.raises(ChoiceError, match=why):
+    with pytest.raises(RefusedError, match=why):
         StrategyChoice("p", "operator", NAMES).ask(name, "safety-first", 0.0)

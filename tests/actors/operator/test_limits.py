@@ -10,8 +10,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rampart.actors.operator.limits import BURST, PATIENCE, RATE_HZ, MessageBudget, Verdict
-from rampart.actors.operator.requests import InjectWish, StickWish, WishError, read_wish
+from rampart.actors.operator.requests import InjectRequest, RequestError, RequestReader
+from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS, StickRequest
 
+READ = RequestReader(OSMOSIS_REQUESTS).read
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
@@ -54,9 +56,9 @@ def test_no_more_is_read_than_the_rate_allows(pauses):
 
 @BUSY
 @given(st.binary(max_size=200) | st.text(max_size=200))
-def test_garbage_is_no_wish_and_nothing_worse(garbage):
-    with pytest.raises(WishError, match="not understood"):
-        read_wish(garbage)
+def test_garbage_is_no_request_and_nothing_worse(garbage):
+    with pytest.raises(RequestError, match="not understood"):
+        READ(garbage)
 
 
 SCALARS = st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=10)
@@ -65,16 +67,16 @@ SCALARS = st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_
 @BUSY
 @given(st.dictionaries(st.sampled_from(
     ["held", "ticket", "forward", "left", "extra"]), SCALARS))
-def test_a_stick_message_of_any_content_is_a_sound_wish_or_none(fields):
+def test_a_stick_message_of_any_content_is_a_sound_request_or_none(fields):
     clean = {k: v for k, v in fields.items() if not (isinstance(v, float) and not math.isfinite(v))}
     try:
-        wish = read_wish(msgspec.json.encode({"type": "stick", **clean}) if all(
+        request = READ(msgspec.json.encode({"type": "stick", **clean}) if all(
             not isinstance(v, int) or abs(v) < 2**63 for v in clean.values()) else b"")
-    except WishError:
+    except RequestError:
         return
-    assert isinstance(wish, StickWish)
-    assert type(wish.held) is bool
-    assert math.isfinite(wish.forward + wish.left)
+    assert isinstance(request, StickRequest)
+    assert type(request.held) is bool
+    assert math.isfinite(request.forward + request.left)
 
 
 @pytest.mark.parametrize("text", [
@@ -86,10 +88,10 @@ def test_a_stick_message_of_any_content_is_a_sound_wish_or_none(fields):
     '{"type":"signal","node":"' + "x" * 201 + '","signal":"KILL"}',
     '{"type":"end-fault"}', '{"type":"sudo"}',
 ])
-def test_a_wish_with_a_wrong_field_is_refused(text):
-    with pytest.raises(WishError):
-        read_wish(text)
+def test_a_request_with_a_wrong_field_is_refused(text):
+    with pytest.raises(RequestError):
+        READ(text)
 
 
 def test_what_is_left_out_of_a_fault_is_its_own():
-    assert read_wish('{"type":"inject","fault":"gps-bias"}') == InjectWish("gps-bias", 0.0, None)
+    assert READ('{"type":"inject","fault":"gps-bias"}') == InjectRequest("gps-bias", 0.0, None)

@@ -13,11 +13,11 @@ import websockets
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator import feed as hmi_feed
 from rampart.actors.operator import server as hmi_server
-from rampart.actors.operator.hmi import Hmi
-from rampart.actors.operator.requests import OrderWish
 from rampart.actors.operator.server import MAX_MESSAGE_BYTES, Visitor
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.page.hmi import OsmosisHmi
+from rampart.actors.osmosis.page.requests import OrderRequest
 from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import browser
 from tests.actors.operator.world import AIRPORT, RATE, hear, repeated, served
@@ -146,7 +146,7 @@ async def test_an_order_without_an_answer_is_repeated_to_a_mission_manager_that_
     async with world.hmi() as hmi:
         world.say(m.MissionPhase.RUNNING, *m.MissionAction)
         await eventually(lambda: hmi._orders._status is not None)
-        hmi._fulfil(OrderWish(m.MissionAction.HOME), Visitor(1))
+        hmi._fulfil(OrderRequest(m.MissionAction.HOME), Visitor(1))
         sent = []
         hmi.publish = lambda topic, body, *_: topic is topics.MISSION_ORDER and sent.append(body)
         await eventually(lambda: len(sent) >= 2)
@@ -169,7 +169,8 @@ async def test_a_huge_message_closes_that_page_only(world):
 async def test_a_page_that_takes_nothing_gives_its_place_back(world, monkeypatch):
     monkeypatch.setattr(hmi_feed, "SEND_TIMEOUT_S", 0.1)
     monkeypatch.setattr(hmi_server, "CLOSE_TIMEOUT_S", 0.1)
-    monkeypatch.setattr(Hmi, "_hello", lambda _hmi: {"type": "hello", "much": "x" * (1 << 25)})
+    monkeypatch.setattr(OsmosisHmi, "_hello", lambda _hmi: {
+        "type": "hello", "much": "x" * (1 << 25)})
     async with world.hmi(hmi_port=free_port()) as hmi:
         host, port = (await served(hmi)).split(":")
         with socket.create_connection((host, int(port))) as mute:

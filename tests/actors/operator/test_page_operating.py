@@ -21,6 +21,7 @@ from rampart.sim.faults.offered_faults import offered_faults
 from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import browser
 from tests.actors.operator.world import World, hear, repeated, served
+from tests.osmosis_system import shipped_system
 
 pytestmark = pytest.mark.page
 
@@ -332,7 +333,8 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, monk
 
 async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world):
     async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), faults=offered_faults()) as hmi):
+                world.hmi(hmi_port=free_port(), faults=offered_faults(),
+                          system=shipped_system()) as hmi):
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until("!document.getElementById('strategy-set').disabled")
         assert await tab.value("document.getElementById('strategy-name').value") == "safety-first"

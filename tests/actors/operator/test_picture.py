@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from rampart.actors.operator import feed as hmi_feed
 from rampart.actors.operator.feed import Feed
 from rampart.actors.operator.picture import JOURNAL_LINES, Picture
-from rampart.actors.operator.state import STALE_S, HmiState
+from rampart.actors.operator.state import STALE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.page.laser import POINTS, thin
+from rampart.actors.osmosis.page.state import OsmosisState
 
 
 def as_json(value: object) -> dict:
@@ -104,7 +105,7 @@ def test_whatever_frames_a_page_missed_it_ends_up_with_the_whole_picture(steps):
 
 
 def test_silence_is_shown_once_and_the_next_message_ends_it():
-    state = HmiState()
+    state = OsmosisState()
     state.pose(m.Pose(1.0, 2.0, 0.0), 5.0, 5.0)
     state.grow_old(5.0 + STALE_S + 0.1)
     version = state.picture.version
@@ -179,7 +180,7 @@ class Pushing:
     """A feed with one page on it."""
 
     def __init__(self) -> None:
-        self.state = HmiState()
+        self.state = OsmosisState()
         self.looks = 0
         self.feed = Feed(self.state, lambda: 1.0, lambda: {"type": "hello"}, self._look)
         self.line = Line()
@@ -291,5 +292,5 @@ async def test_with_no_page_nothing_is_looked_at_and_no_timer_is_left():
     b'{"type":"seen","version":1e9}', '{"type": "reset", "recovery": "RM1"}',
 ])
 def test_what_is_no_answer_is_left_to_others(text):
-    feed = Feed(HmiState(), lambda: 0.0, dict)
+    feed = Feed(OsmosisState(), lambda: 0.0, dict)
     assert feed.heard(hmi_feed.PageFeed(), text) is False

@@ -6,33 +6,34 @@ import math
 import msgspec
 
 from rampart.actors.ftm import messages as fm
-from rampart.actors.operator.state import STALE_S, TRACK_POINTS, HmiState
+from rampart.actors.operator.state import STALE_S
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.drawing import draw
 from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.page.state import TRACK_POINTS, OsmosisState
 from rampart.manager.strategies.decision_words import decision_in_words
 
 
-def shown(state: HmiState, now_s: float = 0.0) -> dict:
+def shown(state: OsmosisState, now_s: float = 0.0) -> dict:
     return json.loads(msgspec.json.encode(state.snapshot(now_s)))
 
 
 def test_a_snapshot_of_nothing_heard_is_complete():
-    snapshot = shown(HmiState(), 1.0)
+    snapshot = shown(OsmosisState(), 1.0)
     assert snapshot["time_s"] == 1.0
     assert snapshot["pose"] is snapshot["mission"] is snapshot["nodes"] is None
     assert snapshot["events"] == snapshot["detections"] == snapshot["route"] == []
 
 
 def test_a_state_not_heard_for_a_while_is_stale():
-    state = HmiState()
+    state = OsmosisState()
     state.keep("pilot", m.PilotStatus(m.PilotMode.AUTO, False, "", 0), 10.0)
     assert shown(state, 10.0 + STALE_S)["pilot"]["stale"] is False
     assert shown(state, 10.1 + STALE_S)["pilot"]["stale"] is True
 
 
 def test_the_track_has_a_point_where_the_robot_has_moved_and_a_limit():
-    state = HmiState()
+    state = OsmosisState()
     for i in range(3 * TRACK_POINTS):
         state.pose(m.Pose(i * 0.1, 0.0, 0.0), 0.05 * i, 0.05 * i)
     assert len(state.track) == TRACK_POINTS
@@ -41,14 +42,14 @@ def test_the_track_has_a_point_where_the_robot_has_moved_and_a_limit():
 
 
 def test_a_corrupt_pose_neither_breaks_the_track_nor_the_json():
-    state = HmiState()
+    state = OsmosisState()
     state.pose(m.Pose(math.nan, math.inf, 0.0), 1.0, 1.0)
     assert not state.track
     assert shown(state, 1.0)["pose"]["value"]["x_m"] is None
 
 
 def test_a_detection_is_logged_when_it_begins_and_when_it_ends():
-    state = HmiState()
+    state = OsmosisState()
     active, idle = True, False
     for at_s, which in enumerate([idle, idle, active, active, idle, idle]):
         view = fm.DetectionView("DM2", which, "stale" if which else "", ())
@@ -58,14 +59,14 @@ def test_a_detection_is_logged_when_it_begins_and_when_it_ends():
 
 
 def test_that_all_nodes_start_at_the_start_is_no_news_but_a_crash_is():
-    state = HmiState()
+    state = OsmosisState()
     for event in ("started", "running", "crashed", "respawned"):
         state.process_event(fm.ProcessEvent("hmi", event, 1, 1, "RM4", ""), 1.0)
     assert [e["text"] for e in shown(state)["events"]] == ["hmi crashed", "hmi respawned by RM4"]
 
 
 def test_lights_come_from_the_status_and_from_passing_and_a_new_mission_forgets_them():
-    state = HmiState()
+    state = OsmosisState()
     light = m.LightMeasurement("A01", 100.0, 0.5, m.LightVerdict.OK)
     state.mission(m.MissionStatus("1", "A", m.MissionPhase.RUNNING, 0, (), (), (light,), ""), 1.0)
     state.light(m.LightMeasurement("A02", 0.0, 0.0, m.LightVerdict.OUT))
@@ -78,7 +79,7 @@ def test_lights_come_from_the_status_and_from_passing_and_a_new_mission_forgets_
 
 
 def test_a_decision_is_told_with_its_certificate():
-    state = HmiState()
+    state = OsmosisState()
     state.decision(fm.DecisionRecord(
         4, "safety-first", ("FTM1", "FTM6"), 2, ("RM1",), ("FTM1 > FTM6",),
         (("RM5", "FTM6 is dominated by FTM1"),), 1.0), 1.1)

@@ -10,10 +10,10 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.operator.hmi import Hmi
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.page.hmi import OsmosisHmi
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.clock import Clock
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
@@ -102,7 +102,7 @@ class World:
 
     @asynccontextmanager
     async def hmi(self, incarnation: int = 1, **shared: object):
-        async with self.running(Hmi(self.context("hmi", incarnation, **shared))) as hmi:
+        async with self.running(OsmosisHmi(self.context("hmi", incarnation, **shared))) as hmi:
             yield hmi
 
     def say_running(self, request: m.MissionRequest) -> None:
@@ -134,7 +134,7 @@ async def repeated(say, period_s: float = 0.02):
         task.cancel()
 
 
-async def served(hmi: Hmi) -> str:
+async def served(hmi: OsmosisHmi) -> str:
     await eventually(lambda: hmi._starting is not None and hmi._starting.done())
     return f"127.0.0.1:{hmi.page_port}"
 

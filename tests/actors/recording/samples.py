@@ -14,10 +14,8 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.recording.bag_writer import BagWriter
 from rampart.actors.recording.run_documents import Documents, collect
-from rampart.actors.recording.views import Views
 from rampart.actors.run import run_info
 from tests import ROOT
 
@@ -53,7 +51,7 @@ def sample(count: int = 20) -> list[Sent]:
 
 
 def write(path: Path, sent: list[Sent], *, close: bool = True, flush_every: int = 4) -> BagWriter:
-    writer = BagWriter(path.open("wb"), documents(), views=Views(load_airport("vallombre")),
+    writer = BagWriter(path.open("wb"), documents(), views=documents().known.views(),
                        from_start=True)
     for number, one in enumerate(sent):
         writer.take(*one)

@@ -20,18 +20,22 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.bag_repair import repair
 from rampart.actors.recording.bag_writer import BagError, BagWriter, check_target, open_target
 from rampart.actors.recording.json_schema import plain_schema
-from rampart.actors.recording.message_form import form_of
-from rampart.actors.recording.run_documents import AIRPORT, footprint_m, restore
+from rampart.actors.recording.message_form import Forms
+from rampart.actors.recording.run_documents import collect, restore
 from rampart.actors.recording.sequence_gaps import SequenceGaps
-from rampart.actors.recording.views import CHANNELS, Views
 from rampart.actors.recording.virtual import VirtualRecording
 from rampart.cli.main import main
+from rampart.systems import SHIPPED
 from tests.actors.recording.samples import NAN, PLAN, documents, pose, sample, write
+
+form_of = Forms(topics.ALL).of
 
 
 def played(reader):
@@ -99,14 +103,15 @@ def test_time_is_simulated_and_begins_before_zero_where_the_run_does(tmp_path):
 def test_the_airport_in_a_recording_is_all_that_its_map_needs(tmp_path):
     write(tmp_path / "run.mcap", sample())
     files = Summary(BagReader(tmp_path / "run.mcap")).files
-    again = load_airport(restore(files, tmp_path))
+    restore(files, tmp_path)
+    again = Osmosis.restored(tmp_path).airport
     assert again.lights == load_airport("vallombre").lights
 
 
 def test_files_of_a_recording_cannot_be_written_elsewhere(tmp_path):
-    evil = [(f"{AIRPORT}../out.toml", "", b"x"), ("/etc/out.toml", "", b"x"),
-            (f"{AIRPORT}..", "", b"x"), ("airport/a/b.toml", "", b"x")]
-    assert restore(evil, tmp_path) is None
+    evil = [("airport/../out.toml", "", b"x"), ("/etc/out.toml", "", b"x"),
+            ("airport/..", "", b"x"), ("airport/a/b.toml", "", b"x")]
+    restore(evil, tmp_path)
     assert list(tmp_path.parent.rglob("out.toml")) == list(tmp_path.iterdir()) == []
 
 
@@ -144,7 +149,7 @@ def test_fields_are_those_of_the_viewers_own_library(kind):
 
 
 def test_odometry_and_pose_make_a_chain_of_frames_from_map_to_base_link():
-    views = Views()
+    views = OsmosisViews()
     odometry = m.Odometry(m.Pose(2.0, 1.0, 0.5), m.Twist(0.0, 0.0))
     header = Header("localization", 1, 1, 0.0)
     assert views.of(topics.ODOMETRY, "", header, odometry, 0) == []
@@ -159,20 +164,21 @@ def test_odometry_and_pose_make_a_chain_of_frames_from_map_to_base_link():
 
 
 def test_a_pose_that_is_no_number_is_not_shown():
-    assert Views().of(topics.POSE, "", Header("x", 1, 1, 0.0), m.Pose(NAN, 0.0, 0.0), 0) == []
+    header = Header("x", 1, 1, 0.0)
+    assert OsmosisViews().of(topics.POSE, "", header, m.Pose(NAN, 0.0, 0.0), 0) == []
 
 
 def test_a_lost_echo_is_no_ring_of_obstacles():
     import struct
 
     sweep = m.LaserScan(-1.0, 0.5, 30.0, struct.pack("<5f", 1.0, 30.0, 2.5, float("inf"), NAN))
-    [(channel, scan)] = Views().of(topics.SCAN, "", Header("x", 1, 1, 0.0), sweep, 0)
+    [(channel, scan)] = OsmosisViews().of(topics.SCAN, "", Header("x", 1, 1, 0.0), sweep, 0)
     assert channel == "view/scan"
     assert (scan.start_angle, scan.end_angle, scan.ranges) == (-1.0, 1.0, [1.0, 0.0, 2.5, 0.0, 0.0])
 
 
 def test_the_scene_shows_map_lights_by_verdict_and_obstacles_while_they_are_there():
-    views = Views(load_airport("vallombre"))
+    views = OsmosisViews(Osmosis.on_map(load_airport("vallombre")))
     shown = dict(views.start(0))
     assert set(shown) == {"view/robot", "view/map", "view/lights"}
     assert [e.id for e in shown["view/map"].entities] == [
@@ -190,17 +196,19 @@ def test_the_scene_shows_map_lights_by_verdict_and_obstacles_while_they_are_ther
 
 
 @pytest.mark.parametrize(("text", "size"), [
-    (b"[robot]\nlength_m = 1.5\nwidth_m = 0.9\n", (1.5, 0.9)), (b"[robot]\nlength_m = 1.5\n", None),
-    (b"not = [toml", None), (b"\xff", None), (b"robot = 3\n", None)])
-def test_the_robot_is_as_large_as_the_system_says(text, size):
-    footprint = footprint_m([("system.toml", "application/toml", text)])
-    assert footprint == size
-    shown = dict(Views(None, footprint).start(0))["view/robot"].entities[0].cubes[0].size
-    assert (shown.x, shown.y) == (size or (0.72, 0.614))
+    (None, (0.72, 0.614)), (b"not = [toml", (0.72, 0.614)), (b"\xff", (0.72, 0.614)),
+    ((SHIPPED / "paper.toml").read_bytes().replace(b"length_m = 0.72", b"length_m = 0.8"),
+     (0.8, 0.614))])
+def test_the_robot_is_as_large_as_the_system_says(tmp_path, text, size):
+    (tmp_path / "system.toml").write_bytes(text or b"")
+    system = collect({"system_file": str(tmp_path / "system.toml")}, run_id="", title="", rate=1.0,
+                     nodes=(), started="").known.system
+    shown = dict(OsmosisViews(None, system).start(0))["view/robot"].entities[0].cubes[0].size
+    assert (shown.x, shown.y) == size
 
 
 def test_the_log_tells_decisions_detections_and_processes_once_each():
-    views = Views()
+    views = OsmosisViews()
     header = Header("ftm_manager", 1, 4, 0.0)
     decision = fm.DecisionRecord(3, "safety-first", ("FTM1",), 1, ("RM1",), (), (), 0.0)
     lines = [view for _ in range(2)
@@ -224,7 +232,7 @@ def test_every_view_is_of_the_type_that_its_channel_announces(tmp_path):
     list(reader.records())
     views = {c.topic: reader.schemas[c.schema_id].name for c in reader.channels.values()
              if c.topic.startswith("view/")}
-    assert views == {name: f"foxglove.{CHANNELS[name].__name__}" for name in views}
+    assert views == {name: f"foxglove.{OsmosisViews.channels[name].__name__}" for name in views}
     assert len(views) >= 6
 
 

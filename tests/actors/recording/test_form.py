@@ -20,13 +20,14 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.recording.json_schema import plain_schema
 from rampart.actors.recording.message_form import (
+    Forms,
     MessageForm,
     Recorded,
-    form_of,
     header_of,
     renumbered,
-    topic_of,
 )
+
+form_of = Forms(topics.ALL).of
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
 WHOLE = st.integers(-(2**63), 2**64 - 1)
@@ -155,8 +156,8 @@ def test_what_is_no_recorded_message_is_refused(text):
 
 def test_every_key_is_known_by_its_topic_and_strange_ones_are_not():
     for topic in topics.ALL:
-        assert topic_of(topic.at("DM1") if topic.is_family else topic.at()) is topic
-    assert [topic_of(key) for key in (
+        assert form_of(topic.at("DM1") if topic.is_family else topic.at()).topic is topic
+    assert [form_of(key).topic for key in (
         "rampart/detection", "rampart/detection/", "rampart/detection/a/b", "x")] == [None] * 4
 
 

@@ -23,9 +23,10 @@ from mcap.stream_reader import StreamReader
 
 from rampart.actors.bus import tap as taps
 from rampart.actors.bus.tap import Tap, frame, parse_frame
+from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.bag_writer import BagError
-from rampart.actors.recording.message_form import form_of, header_of
+from rampart.actors.recording.message_form import Forms, header_of
 from rampart.actors.recording.process import Order, RecorderProcess
 from rampart.actors.recording.recorder import FLUSH_S, PERIOD_S, Recorder
 from rampart.actors.run.run_info import RunInfo
@@ -40,7 +41,7 @@ def numbers(path):
     """The numbers of the messages that are in a file so far."""
     if not path.exists() or not path.stat().st_size:
         return []
-    return [header_of(form_of(key).payload(message.data)).sequence
+    return [header_of(Forms(topics.ALL).of(key).payload(message.data)).sequence
             for channel, message in BagReader(path).messages() if (key := key_of(channel))]
 
 
@@ -474,7 +475,7 @@ def test_a_real_run_is_recorded_whole_with_a_node_killed_on_the_way(tmp_path):
     lives = {}
     for channel, message in BagReader(path).messages():
         if (key := key_of(channel)) is not None:
-            header = header_of(form_of(key).payload(message.data))
+            header = header_of(Forms(topics.ALL).of(key).payload(message.data))
             lives.setdefault((header.source, header.incarnation), set()).add(header.sequence)
     assert ("localization", 2) in lives
     gaps = {life for life, heard in lives.items() if heard != set(range(1, len(heard) + 1))}

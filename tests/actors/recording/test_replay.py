@@ -23,12 +23,13 @@ from rampart.actors.bus.topic import ROOT
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.operator.requests import Wish
+from rampart.actors.operator.requests import ResetRequest
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.page.state import OsmosisState
 from rampart.actors.recording.bag_reader import BagReader, key_of
 from rampart.actors.recording.bag_writer import BagWriter
-from rampart.actors.recording.message_form import MessageForm, form_of
+from rampart.actors.recording.message_form import Forms, MessageForm
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.run import run_info
 from rampart.actors.supervision.process_title import RunProcess
@@ -37,9 +38,11 @@ from rampart.cli.output import UsageError
 from rampart.cli.record import replaying
 from rampart.cli.record.replaying import Replay
 from rampart.cli.session import connect
-from rampart.testing import HEEDS_SIGNALS, free_base_port
+from rampart.testing import HEEDS_SIGNALS, eventually, free_base_port, wait_until
 from tests import ROOT as HERE
 from tests.actors.recording.samples import AnsweringLauncher, documents, pose, sample, write
+
+form_of = Forms(topics.ALL).of
 
 STRANGE = f"{ROOT}/no/such/topic"
 
@@ -74,11 +77,12 @@ async def playing(player, delay_s=0.5):
 async def reading(port, *keys):
     """All that can be heard on keys meanwhile: key and payload in order."""
     heard = []
-    deadline = time.monotonic() + 10
-    while not (found := [run for run in run_info.find_runs() if run.base_port == port]):
-        assert time.monotonic() < deadline
-        await asyncio.sleep(0.01)
-    bus = ZenohBus("", 0, None, found[0].endpoints)
+
+    def found():
+        return [run for run in run_info.find_runs() if run.base_port == port]
+
+    await eventually(lambda: bool(found()))
+    bus = ZenohBus("", 0, None, found()[0].endpoints)
     await bus.open()
     for key in keys:
         bus.subscribe(topics.POSE, key, lambda key, payload: heard.append((key, payload)))
@@ -134,10 +138,7 @@ async def test_every_lap_passes_the_guard_that_drops_copies(tmp_path, port):
                              lambda key, reason: refused.append(reason))
     player = Replay(tmp_path / "run.mcap", port=port, loop=True, rate=2.0)
     async with playing(player), reading(port, topics.POSE.at()) as heard:
-        deadline = time.monotonic() + 15
-        while len(heard) < 30:
-            assert time.monotonic() < deadline
-            await asyncio.sleep(0.01)
+        await eventually(lambda: len(heard) >= 30, 15)
     for key, payload in heard[:30]:
         receive(key, payload)
     assert refused == []
@@ -218,7 +219,7 @@ async def test_a_start_before_the_beginning_is_the_beginning(tmp_path, port):
 async def test_a_recording_of_which_nothing_can_be_read_ends_also_in_a_loop(
         tmp_path, port, monkeypatch):
     write(tmp_path / "run.mcap", sample())
-    monkeypatch.setattr(replaying, "form_of", lambda _key: form_of("rampart/no/topic"))
+    monkeypatch.setattr(Forms, "of", lambda *_: MessageForm(None))
     monkeypatch.setattr(MessageForm, "payload", lambda *_: int("no payload"))
     player = Replay(tmp_path / "run.mcap", port=port, loop=True)
     async with asyncio.timeout(30):
@@ -231,7 +232,7 @@ async def test_a_page_that_fails_is_said_to_have_ended(tmp_path, port, monkeypat
         raise RuntimeError("it is\nbroken")
 
     write(tmp_path / "run.mcap", sample())
-    monkeypatch.setattr(replaying.ReplayPage, "_pose", fail)
+    monkeypatch.setattr(OsmosisState, "pose", fail)
     said = []
     player = Replay(tmp_path / "run.mcap", port=port, hmi_port=port + 30, rate=4.0,
                     said=said.append)
@@ -250,10 +251,7 @@ def test_a_replay_leaves_nothing_behind_when_its_terminal_is_closed(tmp_path, po
          "--loop", "--port", str(port)], cwd=HERE, stdout=subprocess.PIPE, text=True,
         env={**os.environ, "TMPDIR": str(folder)})
     assert "playing" in verb.stdout.readline()
-    deadline = time.monotonic() + 30
-    while not list(folder.iterdir()):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until(lambda: any(folder.iterdir()), 30)
     verb.send_signal(signal.SIGHUP)
     told = verb.communicate(timeout=30)[0]
     assert (verb.returncode in (0, 1), "played" in told) == (True, True), told
@@ -393,13 +391,12 @@ async def test_the_page_shows_the_past_and_obeys_nobody(tmp_path, port):
     write(tmp_path / "run.mcap", sorted(sent))
     page_port = port + 30
     player = Replay(tmp_path / "run.mcap", port=port, loop=True, hmi_port=page_port)
-    wish = next(kind for kind in Wish.__args__ if kind.__name__ == "ResetWish")
     async with playing(player), reading(port, ftm_topics.RESET.at()) as heard:
         url = f"http://127.0.0.1:{page_port}/"
         document = await asyncio.to_thread(lambda: urllib.request.urlopen(url).read())
         assert b"<html" in document
         async with open_socket(f"ws://127.0.0.1:{page_port}/ws") as page:
-            await page.send(msgspec.json.encode(wish(recovery="RM1")).decode())
+            await page.send(msgspec.json.encode(ResetRequest("RM1")).decode())
             told, airport, seen = "", None, ""
             deadline = time.monotonic() + 15
             while not (told and airport and "FTM1" in seen):

@@ -25,9 +25,11 @@ from rampart.actors.layout.layout import OBSERVER_CLASS, SUPERVISOR_CLASS, Layou
 from rampart.actors.layout.wiring import load_class
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.declaration import Declared
 from rampart.actors.supervision.node_process import make_actor
 from rampart.cli import systems
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
@@ -93,7 +95,7 @@ async def running(cls: type[Actor], name: str, make_bus: MakeBus, incarnation: i
     clock = Clock(0.0, rate, loop.time)  # one for all actors
     actor = cls(Context(name, incarnation, clock, make_bus(name, incarnation)))
     task = asyncio.create_task(actor.run())
-    await eventually(lambda: actor._progress > 0 or task.done() or bool(actor._timers))
+    await eventually(lambda: actor._dispatcher.progress > 0 or task.done() or bool(actor._timers))
     try:
         yield actor
     finally:
@@ -297,16 +299,18 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
                if issubclass(base, Actor) and base is not Actor}
     classes |= {load_class(name) for name in (SUPERVISOR_CLASS, OBSERVER_CLASS)}
     assert len(classes) > 15
-    own = assigned(Actor) | {name for name in vars(Actor) if name.startswith("_")
-                             and not name.startswith("__")}
+    own = assigned(Actor) | {name for base in (Actor, Declared) for name in vars(base)
+                             if name.startswith("_") and not name.startswith("__")}
+    own -= {"_handlers", "_periodic"}  # of each class its own
     taken = {cls.__name__: names for cls in classes if (names := assigned(cls) & own)}
     assert taken == {}
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
-    ("rampart.actors.operator.hmi:Hmi", "rampart.actors.operator.hmi:Hm",
-     "$.node[4].actor = 'rampart.actors.operator.hmi:Hm': no such actor class; known: Hmi"),
-    ("rampart.actors.operator.hmi:Hmi", "rampart.actors.operator.himi:Hmi",
+    ("rampart.actors.osmosis.page.hmi:OsmosisHmi", "rampart.actors.osmosis.page.hmi:Hm",
+     "$.node[4].actor = 'rampart.actors.osmosis.page.hmi:Hm': no such actor class; "
+     "known: OsmosisHmi"),
+    ("rampart.actors.osmosis.page.hmi:OsmosisHmi", "rampart.actors.operator.himi:Hmi",
      "$.node[4].actor = 'rampart.actors.operator.himi:Hmi': No module named "
      "'rampart.actors.operator.himi'"),
     ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.runtime.stub_node:StubNode",
@@ -350,6 +354,6 @@ def test_a_process_is_given_the_heartbeat_period_of_the_spec():
     timing = msgspec.structs.replace(spec.timing, heartbeat_period_s=0.123)
     layout = Layout(plan, msgspec.structs.replace(spec, timing=timing))
     loop = asyncio.new_event_loop()
-    node = make_actor(layout, "DM2", 1, {"system": layout.spec}, loop)
+    node = make_actor(layout, "DM2", 1, RunContext(plan, layout.spec), loop)
     loop.close()
     assert node.context.heartbeat_period_s == 0.123

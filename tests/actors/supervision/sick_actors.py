@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import os
-from functools import partial
 from pathlib import Path
+
+import msgspec
 
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
 from rampart.actors.osmosis.detection.freshness import CommandFreshness
 from rampart.actors.runtime.actor import Actor
-from rampart.actors.supervision import supervisor
-from rampart.actors.supervision.restart_policy import RestartPolicy
 from rampart.manager.actor import FtmManager
+from rampart.manager.spec.tables import Supervision
 from tests import ROOT
 from tests.stub_actors import Idler, write_stub_system
 
 SICK_S = (14.0, 40.0)
 """Simulated seconds, far longer than it takes to be given up."""
 
-SOON = partial(RestartPolicy, intensity=8, period_s=6.0, backoff_max_s=0.2, attempt_s=1.0,
-               attempt_max_s=4.0)
-"""A policy that gives up sooner than the real one."""
+SOON = Supervision(intensity=8, period_s=6.0, backoff_max_s=0.2, attempt_s=1.0, attempt_max_s=4.0)
+"""A supervisor that gives up sooner than the usual one."""
+
+_SOON = "\n[supervision]\n" + "".join(
+    f"{name} = {value}\n" for name, value in msgspec.structs.asdict(SOON).items())
 
 WELL = "RAMPART_TEST_WELL"
 """Of the environment: names a file; as long as there is none, a `SickIdler` fails."""
@@ -35,15 +37,11 @@ class Sick(Actor):
 
 
 class SickIdler(Idler):
-    """For real processes. Whoever imports this has a supervisor that gives up soon."""
+    """For real processes."""
 
     def on_start(self) -> None:
         if self.context.incarnation > 1 and not Path(os.environ[WELL]).exists():
             raise RuntimeError("sick")
-
-
-if WELL in os.environ:
-    supervisor.RestartPolicy = SOON  # type: ignore[misc,assignment]
 
 
 class SickControl(Sick, OsmosisControl):
@@ -72,23 +70,23 @@ ACTORS = {
 
 
 def write_sick_system(directory: Path, node: str) -> Path:
-    """Write the paper's system in which one node is sick for a while."""
+    """Write the paper's system in which one node is sick for a while, and soon given up."""
     text = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
     usual, sick = ACTORS[node]
     assert text.count(f'"{usual}"') == 1
     file = directory / "sick.toml"
-    file.write_text(text.replace(f'"{usual}"', f'"{sick.__module__}:{sick.__name__}"'),
-                    encoding="utf-8")
+    file.write_text(text.replace(f'"{usual}"', f'"{sick.__module__}:{sick.__name__}"')
+                    + _SOON, encoding="utf-8")
     return file
 
 
 def write_sick_stubs(directory: Path, *nodes: str) -> Path:
-    """Write the stub system in which some nodes are sick."""
+    """Write the stub system in which some nodes are sick, and soon given up."""
     text = write_stub_system(directory).read_text(encoding="utf-8")
     for node in nodes:
         at = text.index(f'"{node}"')
         text = text[:at] + text[at:].replace("tests.stub_actors:Idler",
                                                f"{SickIdler.__module__}:SickIdler", 1)
     file = directory / "sick.toml"
-    file.write_text(text, encoding="utf-8")
+    file.write_text(text + _SOON, encoding="utf-8")
     return file

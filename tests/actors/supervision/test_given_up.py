@@ -7,12 +7,14 @@ import os
 import signal
 from itertools import pairwise
 
+import msgspec
 import pytest
 
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import RespawnRequest
-from rampart.actors.supervision import supervisor
-from rampart.actors.supervision.restart_policy import RestartPolicy
+from rampart.actors.ftm.messages import AdaptedSystem, RespawnRequest
+from rampart.actors.run.run_plan import load_document
+from rampart.actors.supervision.supervised_process import RestartPolicy
+from rampart.manager.spec.adaptation import Action, Change, adapt
 from rampart.sim.campaign.job import Job, run_virtually
 from rampart.sim.faults.scenario import parse_fault
 from rampart.testing import eventually, run
@@ -25,10 +27,14 @@ from tests.actors.supervision.sick_actors import (
     write_sick_system,
 )
 from tests.actors.supervision.test_supervision import running
+from tests.actors.supervision.test_supervisor import PLAN
 from tests.actors.supervision.test_supervisor import running as played
+from tests.whole.checkpoint_runs import write_short_mission
 
 
-def lives(policy: RestartPolicy, until_s: float, lasts_s: float = 0.0) -> list[tuple[float, bool]]:
+def restarts_of(
+    policy: RestartPolicy, until_s: float, lasts_s: float = 0.0
+) -> list[tuple[float, bool]]:
     """Return when a process that always lasts so long is restarted, and whether by an attempt."""
     now_s, restarts = 0.0, []
     while now_s < until_s:
@@ -42,7 +48,7 @@ def lives(policy: RestartPolicy, until_s: float, lasts_s: float = 0.0) -> list[t
 
 
 def test_attempts_begin_when_the_window_has_room_and_come_further_and_further_apart():
-    restarts = lives(RestartPolicy(), 24 * 3600)
+    restarts = restarts_of(RestartPolicy(), 24 * 3600)
     free = [at_s for at_s, is_attempt in restarts if not is_attempt]
     attempts = [at_s for at_s, is_attempt in restarts if is_attempt]
     assert len(free) == 50
@@ -57,7 +63,7 @@ def test_attempts_begin_when_the_window_has_room_and_come_further_and_further_ap
 
 def test_one_that_lasts_for_a_whole_period_is_as_good_as_any_other_again():
     policy = RestartPolicy()
-    lives(policy, 100)
+    restarts_of(policy, 100)
     assert policy.attempts
     assert policy.delay_s(130) is None
     policy.restarted(200)
@@ -67,12 +73,9 @@ def test_one_that_lasts_for_a_whole_period_is_as_good_as_any_other_again():
 
 
 @pytest.mark.parametrize("name", ["DM2", "osmosis_control"])
-def test_a_process_that_fails_at_its_start_is_given_up_tried_again_and_comes_back(
-        monkeypatch, name):
-    monkeypatch.setattr(supervisor, "RestartPolicy", SOON)
-
+def test_a_process_that_fails_at_its_start_is_given_up_tried_again_and_comes_back(name):
     async def scenario() -> None:
-        async with played() as world:
+        async with played(SOON) as world:
             add, well = world.machine.add, []
 
             def sick(names, incarnation, **how):
@@ -111,30 +114,28 @@ def test_a_process_that_fails_at_its_start_is_given_up_tried_again_and_comes_bac
     run(scenario)
 
 
-def test_a_node_that_is_adapted_is_not_held_to_what_it_was_given_up_for(monkeypatch):
-    monkeypatch.setattr(supervisor, "RestartPolicy", SOON)
-
+def test_a_node_that_is_adapted_is_not_held_to_what_it_was_given_up_for():
     async def scenario() -> None:
-        async with played() as world:
+        async with played(SOON) as world:
             process = world.supervisor._processes["DM2"]
             for _ in range(20):
                 process.policy.restarted(asyncio.get_running_loop().time())
             world.kill("DM2")
             await eventually(lambda: world.row("DM2")[0] == "given up")
-            world.supervisor._anew(process)
-            world.supervisor._respawn(process, "supervisor")
+            document, _ = adapt(load_document(PLAN), Change(
+                Action.RETUNE, "DM2", {"timeout_s": 0.995}), PLAN.system_file)
+            world.say(topics.ADAPTED_SYSTEM, AdaptedSystem(
+                2, "retune DM2", "somebody", msgspec.json.encode(document).decode()))
             await eventually(lambda: world.row("DM2")[0] == "running", 0.3)
 
     run(scenario)
 
 
 @pytest.mark.parametrize("node", ACTORS)
-def test_the_robot_stands_until_what_was_given_up_is_back_and_then_goes_on(
-        tmp_path, monkeypatch, node):
-    monkeypatch.setattr(supervisor, "RestartPolicy", SOON)
+def test_the_robot_stands_until_what_was_given_up_is_back_and_then_goes_on(tmp_path, node):
     result = run_virtually(Job(
-        row="x", system=str(write_sick_system(tmp_path, node)), mission="A", patience_s=120,
-        faults=(parse_fault(f"kill:{node}@15"),)))
+        row="x", system=str(write_sick_system(tmp_path, node)), patience_s=120,
+        mission=str(write_short_mission(tmp_path)), faults=(parse_fault(f"kill:{node}@15"),)))
     record = result.record
     assert (record.mission, record.safety, record.reasons) == ("success", "safe", ())
     given_up = [e.t_s for e in record.events if f"{node} given up" in e.text]

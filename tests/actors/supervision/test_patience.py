@@ -6,11 +6,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
 from rampart.actors.supervision.patience import AT_LEISURE, Patience, Usage, usage
+from rampart.testing import wait_until
 
 
 def rounds(state: str, ran_s: float, waited_s: float, count: int = 100, every_s: float = 0.25
@@ -65,12 +65,9 @@ def test_an_answer_and_another_process_begin_anew():
 def test_the_kernel_tells_who_runs_and_who_is_stopped():
     child = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
-        deadline = time.monotonic() + 20
-        while usage(child.pid).ran_s < 0.05:
-            assert time.monotonic() < deadline
+        wait_until(lambda: usage(child.pid).ran_s >= 0.05, 20)
         child.send_signal(signal.SIGSTOP)
-        while usage(child.pid).state != "T":
-            assert time.monotonic() < deadline
+        wait_until(lambda: usage(child.pid).state == "T", 20)
         assert usage(child.pid).ran_s == usage(child.pid).ran_s
     finally:
         child.kill()

@@ -32,9 +32,10 @@ from rampart.actors.supervision import node_process
 from rampart.actors.supervision.kill_node import main as kill_node
 from rampart.actors.supervision.launcher import Launcher, LaunchError
 from rampart.actors.supervision.process_title import find_processes
-from rampart.actors.supervision.restart_policy import RestartPolicy
 from rampart.actors.supervision.spawner import address
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
+from rampart.actors.supervision.supervised_process import RestartPolicy
+from rampart.manager.spec.tables import Supervision
 from rampart.testing import eventually
 from tests import ROOT
 from tests.stub_actors import launched, stub_plan, write_stub_system
@@ -449,7 +450,7 @@ async def test_a_supervisor_that_ends_whenever_it_starts_is_not_started_without_
     async with running(tmp_path) as (launcher, witness):
         told, lives = [], set()
         launcher.guard.report = told.append
-        launcher.guard.policy = RestartPolicy(intensity=6, period_s=6.0)
+        launcher.guard.policy = RestartPolicy(Supervision(intensity=6, period_s=6.0))
         while not told:
             pid = process(launcher.plan.base_port, "supervisor")
             if pid is not None:
@@ -469,7 +470,8 @@ async def test_a_supervisor_that_ends_whenever_it_starts_is_not_started_without_
 async def test_spawners_are_looked_after_while_a_supervisor_that_keeps_ending_has_to_wait(tmp_path):
     async with running(tmp_path) as (launcher, witness):
         port = launcher.plan.base_port
-        launcher.guard.policy = RestartPolicy(intensity=4, backoff_s=4.0, backoff_max_s=4.0)
+        launcher.guard.policy = RestartPolicy(
+            Supervision(intensity=4, backoff_s=4.0, backoff_max_s=4.0))
         for life in (1, 2, 3):
             await eventually(lambda life=life: (process(port, "supervisor") is not None
                                                 and launcher.guard.supervisor_incarnation == life))
@@ -589,7 +591,8 @@ async def test_kill_node_signals_one_node_and_names_what_it_does_not_know(tmp_pa
 
 
 def test_restarts_are_free_at_first_then_slower_then_given_up():
-    policy = RestartPolicy(intensity=6, period_s=10.0, backoff_s=0.1, backoff_max_s=0.25)
+    policy = RestartPolicy(
+        Supervision(intensity=6, period_s=10.0, backoff_s=0.1, backoff_max_s=0.25))
     delays = []
     for _ in range(6):
         delays.append(policy.delay_s(0.0))

@@ -26,11 +26,13 @@ from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.patience import Usage
 from rampart.actors.supervision.processes import Living, SpawnerUnavailableError
 from rampart.actors.supervision.supervisor import Supervisor
+from rampart.manager.spec.tables import Supervision
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.testing import eventually, run, turns
 from tests import ROOT
 
 PLAN = RunPlan("r", 20000, system_file=str(ROOT / "systems" / "paper.toml"))
+USUAL = Supervision()
 EXIT_S = 0.005
 """From a SIGKILL to the moment when the last thread has let go of the port."""
 
@@ -149,7 +151,7 @@ class Machine:
 class World:
     """A supervisor, its machine, and the bus between them."""
 
-    def __init__(self) -> None:
+    def __init__(self, supervision: Supervision) -> None:
         loop = asyncio.get_running_loop()
         self.machine = Machine()
         self.clock = Clock(loop.time(), source=loop.time)
@@ -158,7 +160,7 @@ class World:
         self.events: list[tuple[str, str, int]] = []
         self.silent: set[int] = set()
         self.hub.taps.append(self.see)
-        self.spec = load_system(PLAN)
+        self.spec = msgspec.structs.replace(load_system(PLAN), supervision=supervision)
         self.lives = 0
         self._sequence = 0
         self.supervisor, self.task = self.start()
@@ -199,10 +201,10 @@ class World:
 
     def row(self, name: str) -> tuple[str, int, int]:
         process = self.supervisor._processes[name]
-        return process.state.value, process.incarnation, process.pid
+        return process.shown.value, process.incarnation, process.pid
 
     def all_run(self) -> bool:
-        return all(p.state is NodeState.RUNNING for p in self.supervisor._processes.values())
+        return all(p.shown is NodeState.RUNNING for p in self.supervisor._processes.values())
 
     def kill(self, name: str) -> Process:
         (process,) = self.machine.of(name)
@@ -214,8 +216,8 @@ class World:
 
 
 @asynccontextmanager
-async def running() -> AsyncIterator[World]:
-    world = World()
+async def running(supervision: Supervision = USUAL) -> AsyncIterator[World]:
+    world = World(supervision)
     await world.bus.open()
     beats = asyncio.create_task(world.beats())
     await eventually(world.all_run)

@@ -12,8 +12,7 @@ import pytest
 
 from rampart.actors.osmosis.airport.formats import load_airport, load_mission
 from rampart.actors.run.run_plan import load_system
-from rampart.actors.supervision.descriptors import needed_descriptors
-from rampart.actors.supervision.launcher import Launcher
+from rampart.actors.supervision.launcher import Launcher, needed_descriptors
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
 from rampart.sim.runs.console import Console

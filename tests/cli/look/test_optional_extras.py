@@ -17,16 +17,12 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.recording.views import Views
 from rampart.actors.run.run_info import RunInfo
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.process_usage import ProcessCount
 from rampart.actors.web.guests import ROOM
 from rampart.actors.web.server import WebServer
-from rampart.cli.look.live_verb import SHOWN, _watch
+from rampart.cli.look.live_verb import _watch
 from rampart.cli.main import main
 from tests import ROOT
 from tests.cli.look.test_top_view import busy
@@ -36,7 +32,7 @@ RUN = RunInfo(1, 7450, 1.0, 0.0, "paper.toml", "", (), "run", 0, 'a "title"\\ an
 
 @pytest.mark.parametrize(("module", "arguments", "extra"), [
     ("prometheus_client.exposition", ["metrics"], "prometheus"),
-    ("foxglove", ["live", "foxglove"], "foxglove"), ("rerun", ["live", "rerun"], "rerun")])
+    ("foxglove", ["live", "foxglove"], "foxglove")])
 def test_a_missing_extra_is_one_line_that_says_what_to_install(
         module, arguments, extra, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, module, None)
@@ -57,10 +53,6 @@ def test_an_address_that_is_none_is_named(arguments, capsys):
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1
     assert arguments[-1] in told[0]
-
-
-def test_what_is_listened_to_for_viewers_is_what_is_translated_for_them():
-    assert {t.key for t in SHOWN} == set(Views()._translators)
 
 
 def exposed(now):
@@ -184,48 +176,18 @@ async def test_prometheus_is_answered_however_many_connections_idle_at_its_port(
 
 
 def test_live_views_show_the_robot_as_large_as_the_system_says(tmp_path):
+    paper = (ROOT / "systems" / "paper.toml").read_text()
     system = tmp_path / "system.toml"
-    system.write_text("[robot]\nlength_m = 1.5\nwidth_m = 0.9\n")
-    for file, size in ((system, (1.5, 0.9)), (tmp_path / "none.toml", (0.72, 0.614))):
+    system.write_text(paper.replace("length_m = 0.72", "length_m = 0.8"))
+    for file, views in ((system, {"view/robot", "view/map", "view/lights"}),
+                        (tmp_path / "none.toml", set())):
         shown = {}
-        viewer = SimpleNamespace(begin=lambda _run: None,
+        viewer = SimpleNamespace(begin=lambda _run, _channels: None,
                                  show=lambda channel, record, _at, to=shown: to.update(
                                      {channel: record}))
         _watch(SimpleNamespace(run=msgspec.structs.replace(RUN, system_file=str(file)),
                                clock=Clock(0.0), listen=lambda *_: None), viewer)
-        box = shown["view/robot"].entities[0].cubes[0].size
-        assert (box.x, box.y) == size
-
-
-@pytest.mark.parametrize(("option", "value"), [("--save", "/nowhere/run.rrd"), ("--connect", "http://x")])
-def test_a_place_for_rerun_that_is_none_is_named(option, value, capsys):
-    pytest.importorskip("rerun")
-    assert main(["live", "rerun", option, value]) == 2
-    assert f"{option} {value}: " in capsys.readouterr().err
-
-
-def test_rerun_writes_a_file_with_map_robot_laser_and_log(tmp_path):
-    pytest.importorskip("rerun")
-    from rampart.cli.look.live_rerun import RerunViewer
-
-    airport = load_airport("vallombre")
-    views = Views(airport)
-    file = tmp_path / "run.rrd"
-    viewer = RerunViewer(save=str(file))
-    viewer.begin(RUN)
-    header = Header("somebody", 1, 1, 1.0)
-    sweep = m.LaserScan(-1.0, 0.5, 10.0, b"\0\0\x80?" * 5)
-    found = [*views.start(0)]
-    for topic, body in (
-            (topics.POSE, m.Pose(1.0, 2.0, 0.5)), (topics.SCAN, sweep),
-            (topics.OBSTACLES, m.ObstacleList((m.ObstacleCommand("c", True, 1.0, 1.0, 0.4),))),
-            (topics.LIGHT_MEASURED, m.LightMeasurement(
-                airport.lights[0].name, 100.0, 0.4, m.LightVerdict.DIM)),
-            (ftm_topics.PROCESS_EVENT, fm.ProcessEvent("hmi", "crashed", 1, 1, "", ""))):
-        found += views.of(topic, f"rampart/{topic.key}", header, body, 1_000_000_000)
-    for channel, record in found:
-        viewer.show(channel, record, 1_000_000_000)
-    viewer.close()
-    data = file.read_bytes()
-    assert data.startswith(b"RRF2")
-    assert len(data) > 10_000
+        assert set(shown) == views
+        for robot in [shown[v] for v in shown if v == "view/robot"]:
+            box = robot.entities[0].cubes[0].size
+            assert (box.x, box.y) == (0.8, 0.614)

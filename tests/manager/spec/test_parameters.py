@@ -19,7 +19,7 @@ from rampart.sim.virtual.virtual_bus import VirtualBus
 from rampart.testing import run
 from tests.osmosis_system import System, run_context, shipped_system
 
-BASES = {"Freshness", "HoldingRecovery", "PilotRecovery"}
+BASES = {"Freshness", "PilotRecovery"}
 NODES = ("osmosis_control", "standby_control", "safety_pilot")
 STARTABLE = {"watch": ["osmosis_control"], "nodes": ["osmosis_control"]}
 FOR_THE_ANALYSES = {"rampart.actors.detection.stub:StubDetection":

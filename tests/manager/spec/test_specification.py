@@ -57,8 +57,8 @@ def test_each_actor_has_a_process_of_its_own_unless_told_otherwise():
         name: len(actors) for name, actors in paper().processes().items()}
     assert len(paper().actors()) == 9 + 7 + 5
     shared = parse_specification(edit((
-        'actor = "rampart.actors.operator.hmi:Hmi"',
-         'actor = "rampart.actors.operator.hmi:Hmi"\nprocess = "desk"'),
+        'actor = "rampart.actors.osmosis.page.hmi:OsmosisHmi"',
+         'actor = "rampart.actors.osmosis.page.hmi:OsmosisHmi"\nprocess = "desk"'),
         ('name = "teleoperation"', 'name = "teleoperation"\nprocess = "desk"')), FILE)
     assert [n.name for n in shared.processes()["desk"]] == ["hmi", "teleoperation"]
 
@@ -119,7 +119,7 @@ def test_modules_of_other_people_take_what_they_like():
 
 
 FTM2 = 'name = "FTM2"\ndetect = "DM2"\nrecover = "RM2"\nevent = "command_not_updated"\n'
-HMI = ('name = "hmi"\nactor = "rampart.actors.operator.hmi:Hmi"\nkind = "non-control"\n'
+HMI = ('name = "hmi"\nactor = "rampart.actors.osmosis.page.hmi:OsmosisHmi"\nkind = "non-control"\n'
        'respawn = "RM4"')
 RM4 = 'claims = ["other_nodes"]'
 MANAGER = """[[node]]
@@ -169,9 +169,9 @@ REFUSED = {
                                    "or { within_s = ..., hazard = '...' }"]),
     "unknown gate": ([(STALE, STALE.replace('"or"', '"xor"'))],
                      ["$.event[8].gate = 'xor': unknown gate; known: 'or', 'and', { at_least"]),
-    "actor without class": ([('"rampart.actors.operator.hmi:Hmi"',
-                               '"rampart.actors.operator.hmi"')],
-                            ["$.node[4].actor = 'rampart.actors.operator.hmi': expected "
+    "actor without class": ([('"rampart.actors.osmosis.page.hmi:OsmosisHmi"',
+                               '"rampart.actors.osmosis.page.hmi"')],
+                            ["$.node[4].actor = 'rampart.actors.osmosis.page.hmi': expected "
                               "'module:Class'"]),
     "a name with a slash": ([('name = "hmi"', 'name = "h/mi"')],
                             ["$.node[4].name = 'h/mi': expected a name"]),

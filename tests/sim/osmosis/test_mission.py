@@ -11,7 +11,7 @@ import math
 import pytest
 
 from rampart.actors.osmosis.airport.formats import load_airport, load_world
-from rampart.actors.osmosis.airport.photometry import intensity_from_illuminance, sensor_position
+from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
 from rampart.sim.osmosis.judge import Judge, Sample
 from rampart.sim.osmosis.sensors import LightSensor
 from rampart.sim.osmosis.world import World
@@ -39,7 +39,7 @@ def drive(sim: World, judge: Judge, cruise_mps: float = 0.9):
                 off_m = math.dist(at, (light.x_m, light.y_m))
                 if off_m < min(0.3, best.get(light.name, (math.inf, 0))[0]):
                     clean = max(0.0, lux - LightSensor.AMBIENT_LUX)
-                    best[light.name] = (off_m, intensity_from_illuminance(clean, off_m))
+                    best[light.name] = (off_m, clean / illuminance_per_candela(off_m))
             judge.see(Sample(sim.time_s, truth.x_m, truth.y_m, truth.collisions,
                              truth.prohibited_s, truth.obstacle_clearance_m,
                              truth.prohibited_clearance_m, mode))  # fmt: skip

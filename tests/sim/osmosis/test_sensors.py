@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from rampart.actors.osmosis.airport.model import Airport, Building, Light, ObstaclePreset, StartPose
-from rampart.actors.osmosis.airport.photometry import SENSOR_FORWARD_M, illuminance_lux
+from rampart.actors.osmosis.airport.photometry import SENSOR_FORWARD_M, illuminance_per_candela
 from rampart.actors.osmosis.airport.world import WorldTruth
 from rampart.sim.osmosis.sensors import LaserSpec, LightSensor, WheelOdometry, wrap
 from rampart.sim.osmosis.world import World
@@ -172,7 +172,7 @@ ROW = (Light("L1", "L", 2.0, 0.0, 200), Light("L2", "L", 6.0, 0.0, 200))
 def test_illuminance_is_the_sum_over_the_lights_seen_from_the_bracket():
     sensor = LightSensor(field(lights=ROW), WorldTruth(), np.random.default_rng(0))
     pose = (2.0 - SENSOR_FORWARD_M - 0.3, 0.0, 0.0)
-    expected = illuminance_lux(200, 0.3) + illuminance_lux(200, 4.3)
+    expected = 200 * (illuminance_per_candela(0.3) + illuminance_per_candela(4.3))
     assert sensor.illuminance_lux(pose) == pytest.approx(expected)
 
 
@@ -181,7 +181,7 @@ def test_a_dark_light_gives_nothing_and_a_dim_one_its_share():
     sensor = LightSensor(field(lights=ROW), truth, np.random.default_rng(0))
     assert sensor.illuminance_lux((2.0 - SENSOR_FORWARD_M, 0.0, 0.0)) < 1.0
     over = sensor.illuminance_lux((6.0 - SENSOR_FORWARD_M, 0.0, 0.0))
-    assert over == pytest.approx(illuminance_lux(60, 0.0))
+    assert over == pytest.approx(60 * illuminance_per_candela(0.0))
 
 
 def test_readings_scatter_by_a_percent_and_are_never_negative():

@@ -14,10 +14,8 @@ from bisect import bisect_right
 from collections import deque
 from operator import itemgetter
 
-from rampart.actors.osmosis.control.plausible import is_possible, is_sane
-
-Pose2 = tuple[float, float, float]
-"""x m, y m, yaw rad."""
+from rampart.actors.bus.plausible import is_possible, is_sane
+from rampart.actors.osmosis.control.polyline import Pose2
 
 AFTER_S = 0.15
 """Three periods of the pose: an older one is stale."""

@@ -22,34 +22,16 @@ from operator import attrgetter
 
 import numpy as np
 
-from rampart.actors.osmosis.airport.photometry import SENSOR_HEIGHT_M, sensor_position
+from rampart.actors.osmosis.airport.model import Light
+from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
 from rampart.actors.osmosis.control.polyline import Array, Point
+from rampart.actors.osmosis.messages import LightMeasurement, LightVerdict
 
 DIM_BELOW = 0.5
 """Ratio of measured to nominal intensity below which a light is dim (ICAO Annex 14, 10.4)."""
 
 OUT_BELOW = 0.05
 """Ratio below which it is out."""
-
-
-@dataclass(frozen=True, slots=True)
-class RowLight:
-    """A light to be measured: name, place in `map`, and the intensity it should have."""
-
-    name: str
-    x_m: float
-    y_m: float
-    nominal_cd: float
-
-
-@dataclass(frozen=True, slots=True)
-class Measurement:
-    """Result for one light: `ratio` is measured by nominal intensity, `verdict` follows."""
-
-    light: str
-    intensity_cd: float
-    ratio: float
-    verdict: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +74,11 @@ class _Pose:
 _stamp_s = attrgetter("stamp_s")
 
 
-def verdict(ratio: float) -> str:
-    """Return "ok", "dim" or "out" for a ratio of measured to nominal intensity."""
+def verdict(ratio: float) -> LightVerdict:
+    """Return the verdict for a ratio of measured to nominal intensity."""
     if ratio < OUT_BELOW:
-        return "out"
-    return "dim" if ratio < DIM_BELOW else "ok"
+        return LightVerdict.OUT
+    return LightVerdict.DIM if ratio < DIM_BELOW else LightVerdict.OK
 
 
 class LightInspection:
@@ -110,7 +92,7 @@ class LightInspection:
 
     def __init__(
         self,
-        lights: Iterable[RowLight],
+        lights: Iterable[Light],
         limits: InspectionLimits | None = None,
         judged: Iterable[str] = (),
     ) -> None:
@@ -133,7 +115,7 @@ class LightInspection:
         if math.isfinite(illuminance_lux):
             self._waiting.append((stamp_s, illuminance_lux))
 
-    def take(self, *, ended: bool = False) -> list[Measurement]:
+    def take(self, *, ended: bool = False) -> list[LightMeasurement]:
         """Return the measurements of lights passed since the last call.
 
         Args:
@@ -156,7 +138,7 @@ class LightInspection:
                 continue
             ratio = intensity_cd / light.nominal_cd
             self.judged.add(light.name)
-            found.append(Measurement(light.name, intensity_cd, ratio, verdict(ratio)))
+            found.append(LightMeasurement(light.name, intensity_cd, ratio, verdict(ratio)))
         return found
 
     def _sensor_now(self) -> Point | None:
@@ -228,7 +210,7 @@ class LightInspection:
         for shift_m in np.linspace(-limits.shift_m, limits.shift_m, 31):
             moved = places + shift_m * along
             offsets = moved[:, None, :] - self._places[None, columns, :]
-            kernel = _per_candela(np.hypot(offsets[:, :, 0], offsets[:, :, 1]))
+            kernel = illuminance_per_candela(np.hypot(offsets[:, :, 0], offsets[:, :, 1]))
             # Neighbours farther off than the fit's radius hardly show: damping keeps them sane.
             normal = kernel.T @ kernel + np.diag([0.0] + [1e-4] * (len(columns) - 1))
             solution = np.linalg.solve(normal, kernel.T @ lux)
@@ -244,9 +226,3 @@ class LightInspection:
         _, _, axes = np.linalg.svd(centred, full_matrices=False)
         along: Array = axes[0]
         return along if (places[-1] - places[0]) @ along >= 0 else -along
-
-
-def _per_candela(distance_m: Array) -> Array:
-    """Illuminance per candela, as `photometry.illuminance_per_candela`, on arrays."""
-    square = distance_m**2 + SENSOR_HEIGHT_M**2
-    return np.asarray(SENSOR_HEIGHT_M / (square * np.sqrt(square)))

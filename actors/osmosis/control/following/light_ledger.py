@@ -25,8 +25,9 @@ from collections.abc import Iterable, Sequence
 import msgspec
 import numpy as np
 
+from rampart.actors.osmosis.airport.model import Light
 from rampart.actors.osmosis.airport.photometry import SENSOR_FORWARD_M
-from rampart.actors.osmosis.control.following.light_inspection import InspectionLimits, RowLight
+from rampart.actors.osmosis.control.following.light_inspection import InspectionLimits
 from rampart.actors.osmosis.control.polyline import Polyline
 from rampart.actors.osmosis.messages import LightMeasurement, MissionStatus
 
@@ -68,7 +69,7 @@ class LightLedger:
         limits: those of the inspection.
     """
 
-    def __init__(self, lights: Sequence[RowLight], limits: InspectionLimits | None = None) -> None:
+    def __init__(self, lights: Sequence[Light], limits: InspectionLimits | None = None) -> None:
         self._lights = tuple(lights)
         self._limits = limits or InspectionLimits()
         self._places = np.array([(li.x_m, li.y_m) for li in self._lights]).reshape(-1, 2)

@@ -22,19 +22,16 @@ import numpy as np
 
 from rampart.actors.osmosis.control.following.escape import EscapeLimits
 from rampart.actors.osmosis.control.following.path_follower import (
-    STANDSTILL,
+    Follower,
     Motion,
     MotionLimits,
     PathFollower,
-    Ramp,
     braking_speed,
-    find_place,
 )
 from rampart.actors.osmosis.control.polyline import (
     Array,
     Hull,
     Point,
-    Polyline,
     Projection,
     to_map,
     wrap_angle,
@@ -76,7 +73,7 @@ class RowLimits:
     give_up_s: float = 4.0
 
 
-class LightRow:
+class LightRow(Follower):
     """Follows one row.
 
     State: progress, how long it has waited, how long the way has been free, and the follower of
@@ -102,25 +99,14 @@ class LightRow:
         *,
         near_s_m: float | None = None,
     ) -> None:
-        self.line = self._line = Polyline(waypoints)
-        self._hull = hull or Hull()
-        self._motion = motion or MotionLimits()
+        super().__init__(waypoints, hull, motion, near_s_m)
         self._limits = limits or RowLimits()
-        self._ramp = Ramp(self._motion)
-        self._s_m: float | None = None
         self._free_for_s = math.inf
-        self._arrived = False
         self._edge_m = edge_m
         self._waited_s = 0.0
         self._stood_s = 0.0
         self._passing: PathFollower | None = None
-        self._resumed_at_m = near_s_m
         self._back: LightRow | None = None
-
-    @property
-    def progress_m(self) -> float | None:
-        """Arc length at which the robot is; None before the first step."""
-        return self._s_m
 
     @property
     def is_off_course(self) -> bool:
@@ -137,18 +123,14 @@ class LightRow:
 
         Given up if something stands in the way for `give_up_s`.
         """
-        if self._s_m is None:
+        if self.progress_m is None:
             return
         self._arrived = False
         self._passing = None
         self._stood_s = 0.0
-        self._back = LightRow(self._line.part(self._s_m, to_s_m), self._hull, self._motion,
+        self._back = LightRow(self.line.part(self.progress_m, to_s_m), self._hull, self._motion,
                               replace(self._limits, pass_after_s=math.inf))
         self._back._ramp = self._ramp  # it is the same robot
-
-    def go_on(self) -> None:
-        """Go back no further."""
-        self._back = None
 
     @property
     def is_passing(self) -> bool:
@@ -157,25 +139,21 @@ class LightRow:
 
     def adopt(self, back_to: Point | None, *, passing: bool) -> None:
         """Go back, drive round, or neither, as another follower of the same row does."""
-        if self._s_m is None:
+        if self.progress_m is None:
             return
         if back_to is None:
             self._back = None
         elif self.back_to is None or math.dist(self.back_to, back_to) > _SAME_PLACE_M:
-            self.go_back(self._line.project(*back_to).s_m)
+            self.go_back(self.line.project(*back_to).s_m)
         if passing and self._passing is None and self._back is None:
-            self._begin_to_pass(self._s_m)
+            self._begin_to_pass(self.progress_m)
         elif not passing:
             self._passing = None
 
     def step(self, x_m: float, y_m: float, yaw_rad: float, points: Array, dt_s: float) -> Motion:
         """Return the command for now; arguments as for `PathFollower.step`."""
-        line, limits = self._line, self._limits
-        if self._s_m is None:
-            foot = find_place(line, x_m, y_m, self._resumed_at_m)
-        else:
-            foot = line.project(x_m, y_m, self._s_m)
-        self._s_m = foot.s_m
+        line, limits = self.line, self._limits
+        foot = self._advance(x_m, y_m)
         to_go_m = line.length_m - foot.s_m
         if self._back is not None:
             back = self._back.step(x_m, y_m, yaw_rad, points, dt_s)
@@ -184,11 +162,9 @@ class LightRow:
                 return Motion(back.linear_mps, back.angular_radps, False, back.waiting,
                               foot.segment, to_go_m)
             self._back = None
-        if to_go_m <= limits.overrun_m and abs(foot.n_m) <= limits.goal_reach_m:
-            self._arrived = True
-        if self._arrived:
-            self._ramp.last = STANDSTILL
-            return Motion(0.0, 0.0, True, False, len(line.points) - 1, 0.0)
+        if self._arrived or (
+                to_go_m <= limits.overrun_m and abs(foot.n_m) <= limits.goal_reach_m):
+            return self._arrive()
         if self._passing is not None:
             return self._pass(self._passing, (x_m, y_m, yaw_rad), foot, points, dt_s)
 
@@ -223,12 +199,12 @@ class LightRow:
             return
         usual = EscapeLimits()
         ahead_m = range(math.ceil(usual.range_m + usual.depth_m) + 2)
-        room_m = min(self._edge_m(*self._line.point_at(min(s_m + far_m, self._line.length_m)))
+        room_m = min(self._edge_m(*self.line.point_at(min(s_m + far_m, self.line.length_m)))
                      for far_m in ahead_m) - self._limits.edge_m
         if room_m > self._hull.half_width_m:
             self._stood_s = 0.0
             self._passing = PathFollower(
-                self._line.points, self._hull, self._motion,
+                self.line.points, self._hull, self._motion,
                 escape=replace(usual, max_deviation_m=min(usual.max_deviation_m, room_m)))
 
     def _pass(
@@ -240,7 +216,7 @@ class LightRow:
         self._ramp.last = (motion.linear_mps, motion.angular_radps)
         self._arrived = motion.arrived
         self._stood_s = self._stood_s + dt_s if motion.waiting else 0.0
-        heading_off = wrap_angle(self._line.heading_at(foot.s_m) - pose[2])
+        heading_off = wrap_angle(self.line.heading_at(foot.s_m) - pose[2])
         back = (follower.aside_m == 0.0 and abs(foot.n_m) < 0.1 and abs(heading_off) < 0.2
                 and self._free(*pose, points, foot.s_m) > self._limits.stop_distance_m + 0.5)
         if back or self._stood_s >= self._limits.give_up_s:
@@ -249,7 +225,7 @@ class LightRow:
         return motion
 
     def _bearing(self, x_m: float, y_m: float, yaw_rad: float, s_m: float) -> float:
-        x_to, y_to = self._line.point_at(s_m + self._limits.lookahead_m)
+        x_to, y_to = self.line.point_at(s_m + self._limits.lookahead_m)
         return wrap_angle(math.atan2(y_to - y_m, x_to - x_m) - yaw_rad)
 
     def _free(
@@ -259,7 +235,7 @@ class LightRow:
         if len(points) == 0:
             return math.inf
         reach_m = 2.0 * self._limits.stop_distance_m + 4.0
-        echoes = self._line.coordinates(
+        echoes = self.line.coordinates(
             to_map(points, x_m, y_m, yaw_rad), s_m - 1.0, s_m + reach_m
         )
         half_m = self._hull.half_width_m + self._limits.lane_margin_m

@@ -22,6 +22,7 @@ from rampart.actors.osmosis.control.polyline import (
     Hull,
     Point,
     Polyline,
+    Pose2,
     Projection,
     to_map,
     wrap_angle,
@@ -75,9 +76,6 @@ class Motion(msgspec.Struct, frozen=True, gc=False):
     distance_to_go_m: float
 
 
-Pose2 = tuple[float, float, float]
-"""Planar pose (x, y, yaw) in `map`."""
-
 _ASTRAY_M = 1.0
 
 STANDSTILL = (0.0, 0.0)
@@ -103,19 +101,6 @@ class Ramp:
         return self.last
 
 
-def find_place(line: Polyline, x_m: float, y_m: float, near_s_m: float | None) -> Projection:
-    """Return where on a route a follower begins.
-
-    Where the robot was last known to be says which leg it is on, if the route comes near itself;
-    it is not believed if another leg is much nearer, for the robot may have moved since.
-    """
-    anywhere = line.project(x_m, y_m)
-    if near_s_m is None:
-        return anywhere
-    near = line.project(x_m, y_m, near_s_m)
-    return near if abs(near.n_m) <= abs(anywhere.n_m) + _ASTRAY_M else anywhere
-
-
 def free_ahead(points: Array, hull: Hull, margin_m: float) -> float:
     """Free distance in metres straight ahead of the hull, in a lane `margin_m` wider a side."""
     lane = (np.abs(points[:, 1]) < hull.half_width_m + margin_m) & (points[:, 0] > 0.0)
@@ -128,7 +113,52 @@ def braking_speed(distance_m: float, deceleration_mps2: float) -> float:
     return math.sqrt(2.0 * deceleration_mps2 * max(distance_m, 0.0))
 
 
-class PathFollower:
+class Follower:
+    """What following in either mode has in common: the line, the robot, and how far it is.
+
+    Args:
+        waypoints: the route in `map`, at least one point.
+        hull: footprint of the robot.
+        motion: speeds and distances.
+        near_s_m: arc length at which the robot was last known to be, for one that resumes.
+
+    Attributes:
+        line: the route.
+        progress_m: arc length at which the robot is; None before the first step.
+    """
+
+    def __init__(self, waypoints: tuple[Point, ...], hull: Hull | None,
+                 motion: MotionLimits | None, near_s_m: float | None) -> None:
+        self.line = Polyline(waypoints)
+        self.progress_m: float | None = None
+        self._hull = hull or Hull()
+        self._motion = motion or MotionLimits()
+        self._ramp = Ramp(self._motion)
+        self._resumed_at_m = near_s_m
+        self._arrived = False
+
+    def _advance(self, x_m: float, y_m: float) -> Projection:
+        """Return where on the route the robot is.
+
+        Where it was last known to be says which leg it is on, if the route comes near itself; of
+        one that resumes it is not believed if another leg is much nearer: it may have moved since.
+        """
+        line = self.line
+        foot = line.project(x_m, y_m, self.progress_m)
+        if self.progress_m is None and self._resumed_at_m is not None:
+            near = line.project(x_m, y_m, self._resumed_at_m)
+            foot = near if abs(near.n_m) <= abs(foot.n_m) + _ASTRAY_M else foot
+        self.progress_m = foot.s_m
+        return foot
+
+    def _arrive(self) -> Motion:
+        """Stand at the end of the route."""
+        self._arrived = True
+        self._ramp.last = STANDSTILL
+        return Motion(0.0, 0.0, True, False, len(self.line.points) - 1, 0.0)
+
+
+class PathFollower(Follower):
     """Follows one route in taxi mode.
 
     Args:
@@ -150,21 +180,10 @@ class PathFollower:
         *,
         near_s_m: float | None = None,
     ) -> None:
-        self._line = Polyline(waypoints)
-        self._hull = hull or Hull()
-        self._limits = limits or MotionLimits()
+        super().__init__(waypoints, hull, limits, near_s_m)
         self._gains = gains or FieldGains()
         self._room = escape or EscapeLimits()
         self._escape = Escape(self._hull, self._room)
-        self._ramp = Ramp(self._limits)
-        self._s_m: float | None = None
-        self._resumed_at_m = near_s_m
-        self._arrived = False
-
-    @property
-    def progress_m(self) -> float | None:
-        """Arc length at which the robot is; None before the first step."""
-        return self._s_m
 
     @property
     def aside_m(self) -> float:
@@ -188,21 +207,14 @@ class PathFollower:
             points: laser echoes in `base_link`, shape (n, 2), in the order of the sweep.
             dt_s: time since the last step, for the acceleration limits.
         """
-        line, limits = self._line, self._limits
-        if self._s_m is None:
-            foot = find_place(line, x_m, y_m, self._resumed_at_m)
-        else:
-            foot = line.project(x_m, y_m, self._s_m)
-        self._s_m = foot.s_m
+        line, limits = self.line, self._motion
+        foot = self._advance(x_m, y_m)
         to_go_m = line.length_m - foot.s_m + abs(foot.n_m if foot.s_m >= line.length_m else 0.0)
         direct_m = math.dist((x_m, y_m), line.end)
         passed = line.length_m - foot.s_m < 1e-3 and direct_m <= limits.abeam_m
         last_leg = line.length_m - foot.s_m <= limits.arrival_radius_m
-        if passed or (last_leg and direct_m <= limits.arrival_radius_m):
-            self._arrived = True
-        if self._arrived:
-            self._ramp.last = STANDSTILL
-            return Motion(0.0, 0.0, True, False, len(line.points) - 1, 0.0)
+        if self._arrived or passed or (last_leg and direct_m <= limits.arrival_radius_m):
+            return self._arrive()
 
         echoes = line.coordinates(
             to_map(points, x_m, y_m, yaw_rad), foot.s_m - 2.0, foot.s_m + 5.0
@@ -219,20 +231,20 @@ class PathFollower:
         """Direction of the field, relative to the robot's heading."""
         (x_m, y_m, yaw_rad), s_m, n_m = pose, foot.s_m, foot.n_m
         aside_m = abs(way.offset_m - n_m)
-        reach_m = self._limits.lookahead_m
+        reach_m = self._motion.lookahead_m
         if aside_m > 0.05:
             # Be aside before the obstacle begins: the nearer it is, the steeper the way there.
             room_m = way.gap_m - self._hull.half_length_m - 0.2
             reach_m = min(reach_m, max(room_m, 0.6 - aside_m, 0.15))
-        heading = self._line.smooth_heading_at(s_m)
+        heading = self.line.smooth_heading_at(s_m)
         while reach_m > 0.3:
             # Outside a bend the way aside is longer than the route: look less far ahead on it.
-            bend = wrap_angle(self._line.smooth_heading_at(s_m + reach_m) - heading)
-            if reach_m - way.offset_m * bend <= self._limits.lookahead_m + 0.1:
+            bend = wrap_angle(self.line.smooth_heading_at(s_m + reach_m) - heading)
+            if reach_m - way.offset_m * bend <= self._motion.lookahead_m + 0.1:
                 break
             reach_m -= 0.1
         dx, dy = self._beside(s_m + reach_m, way.offset_m, x_m, y_m)
-        while math.hypot(dx, dy) < 0.5 and reach_m < 2.0 * self._limits.lookahead_m:
+        while math.hypot(dx, dy) < 0.5 and reach_m < 2.0 * self._motion.lookahead_m:
             reach_m += 0.1  # inside a bend it is shorter: never aim at one's own feet
             dx, dy = self._beside(s_m + reach_m, way.offset_m, x_m, y_m)
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -247,20 +259,20 @@ class PathFollower:
 
     def _beside(self, s_m: float, n_m: float, x_m: float, y_m: float) -> tuple[float, float]:
         """Vector in `map` from (x, y) to the point (s, n) of the route, at most to its end."""
-        s_m = min(s_m, self._line.length_m)
-        x_line, y_line = self._line.point_at(s_m)
-        heading = self._line.smooth_heading_at(s_m)
+        s_m = min(s_m, self.line.length_m)
+        x_line, y_line = self.line.point_at(s_m)
+        heading = self.line.smooth_heading_at(s_m)
         return x_line - n_m * math.sin(heading) - x_m, y_line + n_m * math.cos(heading) - y_m
 
     def _speed(self, bearing: float, s_m: float, direct_m: float, points: Array) -> float:
         """The lowest of the speeds that heading, curve, goal and obstacles allow."""
-        limits = self._limits
+        limits = self._motion
         if abs(bearing) > limits.turn_in_place_rad:
             return 0.0
         top, braking = limits.max_linear_mps, limits.deceleration_mps2
         curve = abs(wrap_angle(
-            self._line.heading_at(min(s_m + 1.2 * limits.lookahead_m, self._line.length_m))
-            - self._line.heading_at(s_m)
+            self.line.heading_at(min(s_m + 1.2 * limits.lookahead_m, self.line.length_m))
+            - self.line.heading_at(s_m)
         ))
         speeds = [
             top * math.cos(bearing) ** 2,

@@ -14,19 +14,13 @@ standby drives, the mission's state waits; a light that is passed in that moment
 
 from __future__ import annotations
 
-import math
 from typing import Any, ClassVar
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.following.light_row import LightRow
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
-from rampart.actors.osmosis.control.following.path_follower import Motion, PathFollower
-from rampart.actors.osmosis.messages import ControlPhase, ControlStatus, LightSample, MissionStatus
+from rampart.actors.osmosis.messages import ControlStatus
 from rampart.actors.runtime.actor import Header, on
-
-_ACTIVE_SILENT_S = 0.6
-"""After so long without a status, three periods, the standby is the one in the loop."""
 
 
 class StandbyControl(OsmosisControl):
@@ -38,28 +32,10 @@ class StandbyControl(OsmosisControl):
     @on(topics.CONTROL_STATUS)
     def active(self, message: ControlStatus, header: Header) -> None:
         """Do as the active one does."""
-        if self._loop is not None and math.isfinite(message.turn_added_radps):
-            self._loop.adopt(message.turn_added_radps, header.stamp + _ACTIVE_SILENT_S)
-        route, follower = self._route, self._follower
-        if route is None or (route.mission_id, route.step) != (message.mission_id, message.step):
-            return
-        if isinstance(follower, LightRow):
-            follower.adopt(message.back_to[0] if message.back_to else None,
-                           passing=message.passing)
-        elif isinstance(follower, PathFollower) and message.phase is ControlPhase.FOLLOWING:
-            follower.adopt_aside(message.aside_m)
+        self.core.adopt(message, header.stamp)
+
+    def inform(self, now_s: float) -> None:
+        """Say nothing: the lights and the status are the active one's."""
 
     def repeat(self) -> None:
-        """Say nothing: the status is the active one's."""
-
-    def light(self, message: LightSample, header: Header) -> None:
-        """Leave the lights to the active one."""
-
-    def mission(self, message: MissionStatus, header: Header) -> None:
-        """Leave the lights to the active one."""
-
-    def _inspect(self, motion: Motion | None) -> None:
-        pass
-
-    def _report(self, motion: Motion | None) -> None:
-        pass
+        """Say nothing."""

@@ -13,7 +13,7 @@ from dataclasses import replace
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits
-from rampart.actors.osmosis.messages import GpsFix, Imu, LocalizationStatus, Odometry, Pose
+from rampart.actors.osmosis.messages import GpsFix, Imu, Odometry, Pose
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.parameters import amount
 
@@ -78,10 +78,7 @@ class FusedLocalization(Actor):
     @every(0.2)
     def repeat(self) -> None:
         """Say what the pose rests on."""
-        status = self._filter.status(self.clock.now())
-        self.publish(topics.LOCALIZATION_STATUS, LocalizationStatus(
-            status.in_use, status.excluded, status.position_sd_m, status.heading_sd_rad,
-            status.bridged_m))
+        self.publish(topics.LOCALIZATION_STATUS, self._filter.status(self.clock.now()))
 
     def _tell_first(self) -> None:
         """Publish the first pose at once, so that a respawn costs no extra period."""

@@ -15,10 +15,10 @@ A device that has failed is believed again when it has been without a flaw for a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from rampart.actors.osmosis.control.localization.planar_ekf import wrap
-from rampart.actors.osmosis.control.plausible import is_possible, is_sane
+from rampart.actors.bus.plausible import is_possible, is_sane
+from rampart.actors.osmosis.control.polyline import wrap_angle
 
 BACK_AFTER_S = 1.0
 """How long a device must have been without a flaw to be believed again."""
@@ -80,18 +80,46 @@ class Trust:
             self.reason = ""
 
 
-class OdometryCheck:
+@dataclass(slots=True)
+class Source:
+    """What is known of any source.
+
+    Attributes:
+        name: for people.
+        fresh_s: greatest age of a reading that counts as present.
+        trust: whether it is believed.
+        stamp_s: of the newest reading.
+    """
+
+    name: str
+    fresh_s: float
+    trust: Trust = field(default_factory=Trust, init=False)
+    stamp_s: float = field(default=-math.inf, init=False)
+
+    def fresh(self, now_s: float) -> bool:
+        """Whether there is a present reading."""
+        return now_s - self.stamp_s <= self.fresh_s
+
+    def usable(self, now_s: float) -> bool:
+        """Whether there is one, and it is believed."""
+        return not self.trust.reason and now_s - self.stamp_s <= self.fresh_s
+
+    def why_not(self, now_s: float) -> str:
+        """Return why it is not in use, or ""."""
+        if self.trust.reason or self.usable(now_s):
+            return self.trust.reason
+        return "never heard" if self.stamp_s == -math.inf else "silent or late"
+
+
+class OdometryCheck(Source):
     """Takes odometry messages and gives the way made since the last one.
 
     Attributes:
-        trust: whether it is believed.
-        stamp_s: of the newest message.
         speed_mps: of the newest message.
     """
 
     def __init__(self) -> None:
-        self.trust = Trust()
-        self.stamp_s = -math.inf
+        super().__init__("odometry", fresh_s=0.15)
         self.speed_mps = 0.0
         self._pose = (0.0, 0.0, 0.0)
         self._sum = (0.0, 0.0)
@@ -118,7 +146,7 @@ class OdometryCheck:
         if dt_s > LONGEST_STEP_S:
             return None
         limits = ODOMETRY_PARITY
-        turn = wrap(yaw_rad - was[2])
+        turn = wrap_angle(yaw_rad - was[2])
         middle = was[2] + turn / 2
         cos, sin = math.cos(middle), math.sin(middle)
         dx, dy = x_m - was[0], y_m - was[1]
@@ -137,19 +165,16 @@ class OdometryCheck:
         return dt_s, forward_m, turn
 
 
-class ImuCheck:
+class ImuCheck(Source):
     """Takes IMU messages and gives the heading at any time near the newest one.
 
     Attributes:
-        trust: whether it is believed.
-        stamp_s: of the newest message.
         yaw_rad: heading of the newest message.
         rate_radps: turning rate of the newest message.
     """
 
     def __init__(self) -> None:
-        self.trust = Trust()
-        self.stamp_s = -math.inf
+        super().__init__("IMU", fresh_s=0.1)
         self.yaw_rad = 0.0
         self.rate_radps = 0.0
         self._acceleration = (0.0, 0.0)
@@ -172,7 +197,7 @@ class ImuCheck:
         if dt_s > LONGEST_STEP_S:
             return
         limits = IMU_PARITY
-        off = wrap(yaw_rad - then_yaw - rate_radps * dt_s)
+        off = wrap_angle(yaw_rad - then_yaw - rate_radps * dt_s)
         self._sum = self._sum * max(0.0, 1.0 - dt_s / limits.forget_s) + off
         if abs(rate_radps) > limits.fastest or not -limits.step < off < limits.step:
             self._sum = 0.0

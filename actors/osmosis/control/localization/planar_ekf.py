@@ -13,10 +13,7 @@ from __future__ import annotations
 
 import math
 
-
-def wrap(angle_rad: float) -> float:
-    """Return the angle in [-pi, pi]."""
-    return math.remainder(angle_rad, math.tau)
+from rampart.actors.osmosis.control.polyline import wrap_angle
 
 
 class PlanarEkf:
@@ -39,7 +36,7 @@ class PlanarEkf:
 
     def __init__(self, x_m: float, y_m: float, yaw_rad: float, position_sd_m: float,
                  heading_sd_rad: float) -> None:
-        self.x_m, self.y_m, self.yaw_rad = x_m, y_m, wrap(yaw_rad)
+        self.x_m, self.y_m, self.yaw_rad = x_m, y_m, wrap_angle(yaw_rad)
         self._xx = self._yy = position_sd_m**2
         self._ww = heading_sd_rad**2
         self._xy = self._xw = self._yw = 0.0
@@ -55,12 +52,6 @@ class PlanarEkf:
         """Standard deviation of the heading, rad."""
         return math.sqrt(self._ww)
 
-    @property
-    def covariance(self) -> tuple[tuple[float, float, float], ...]:
-        """The covariance of (x, y, yaw)."""
-        return ((self._xx, self._xy, self._xw), (self._xy, self._yy, self._yw),
-                (self._xw, self._yw, self._ww))
-
     def predict(self, forward_m: float, turn_rad: float, variance_m2: float,
                 variance_rad2: float) -> tuple[float, float]:
         """Move by a measured way; return it in `map`.
@@ -75,7 +66,7 @@ class PlanarEkf:
         dx, dy = forward_m * math.cos(middle), forward_m * math.sin(middle)
         self.x_m += dx
         self.y_m += dy
-        self.yaw_rad = wrap(self.yaw_rad + turn_rad)
+        self.yaw_rad = wrap_angle(self.yaw_rad + turn_rad)
         # P <- F P F' + Q with F = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]].
         xw, yw, ww = self._xw, self._yw, self._ww
         self._xx += -2 * dy * xw + dy * dy * ww + variance_m2
@@ -105,7 +96,7 @@ class PlanarEkf:
         dx, dy = x_m - self.x_m, y_m - self.y_m
         self.x_m += kxx * dx + kxy * dy
         self.y_m += kyx * dx + kyy * dy
-        self.yaw_rad = wrap(self.yaw_rad + kwx * dx + kwy * dy)
+        self.yaw_rad = wrap_angle(self.yaw_rad + kwx * dx + kwy * dy)
         self._xx = xx - kxx * xx - kxy * xy
         self._xy = xy - kxx * xy - kxy * yy
         self._yy = yy - kyx * xy - kyy * yy
@@ -115,16 +106,16 @@ class PlanarEkf:
 
     def heading_nis(self, yaw_rad: float, variance_rad2: float) -> float:
         """Return the normalised innovation squared of a heading: chi-square of 1 degree."""
-        return wrap(yaw_rad - self.yaw_rad) ** 2 / (self._ww + variance_rad2)
+        return wrap_angle(yaw_rad - self.yaw_rad) ** 2 / (self._ww + variance_rad2)
 
     def update_heading(self, yaw_rad: float, variance_rad2: float) -> None:
         """Take a heading in `map`."""
         total = self._ww + variance_rad2
-        off = wrap(yaw_rad - self.yaw_rad)
+        off = wrap_angle(yaw_rad - self.yaw_rad)
         xw, yw, ww = self._xw, self._yw, self._ww
         self.x_m += xw / total * off
         self.y_m += yw / total * off
-        self.yaw_rad = wrap(self.yaw_rad + ww / total * off)
+        self.yaw_rad = wrap_angle(self.yaw_rad + ww / total * off)
         self._xx -= xw * xw / total
         self._xy -= xw * yw / total
         self._yy -= yw * yw / total

@@ -26,12 +26,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from rampart.actors.bus.envelope import AHEAD_S
+from rampart.actors.bus.plausible import is_sane
+from rampart.actors.osmosis.control.localization.first_pose import (
+    COURSE_FROM_MPS,
+    GPS_VELOCITY_SD_MPS,
+    SIDESLIP_RAD,
+    find_first,
+)
 from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck, Trust
-from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf, wrap
+from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits, PositionSource
-from rampart.actors.osmosis.control.plausible import AHEAD_S, is_sane
-
-ABSOLUTE_POSE, GPS, ODOMETRY, IMU = "absolute pose", "GPS", "odometry", "IMU"
+from rampart.actors.osmosis.control.polyline import wrap_angle
+from rampart.actors.osmosis.messages import LocalizationStatus
 
 _MAX_AGE_S = 0.3
 """A reading that arrives later is not used: the robot has moved on."""
@@ -45,17 +52,6 @@ class Estimate:
     x_m: float
     y_m: float
     yaw_rad: float
-
-
-@dataclass(frozen=True, slots=True)
-class FilterStatus:
-    """What the estimate rests on; standard deviations are infinite before there is one."""
-
-    in_use: tuple[str, ...]
-    excluded: tuple[tuple[str, str], ...]
-    position_sd_m: float
-    heading_sd_rad: float
-    bridged_m: float
 
 
 class PoseFilter:
@@ -75,8 +71,8 @@ class PoseFilter:
         self._wheels = OdometryCheck()
         self._gyro = ImuCheck()
         self.imu = self._gyro.take  # at 50 Hz a call of its own would show
-        self._pose = PositionSource(ABSOLUTE_POSE, fresh_s=0.2, patience=4)
-        self._gps = PositionSource(GPS, fresh_s=0.35, patience=3)
+        self._pose = PositionSource("absolute pose", fresh_s=0.2, patience=4)
+        self._gps = PositionSource("GPS", fresh_s=0.35, patience=3)
         self._time_s = -math.inf
         self._speed_mps = 0.0
         self._track = (0.0, 0.0)
@@ -96,23 +92,19 @@ class PoseFilter:
             return None
         return Estimate(self._time_s, ekf.x_m, ekf.y_m, ekf.yaw_rad)
 
-    def status(self, now_s: float) -> FilterStatus:
+    def status(self, now_s: float) -> LocalizationStatus:
         """Return which sources are in use, which not and why, and how sure the estimate is."""
-        found = {
-            **{source.name: _state(source.trust, source.stamp_s, source.fresh_s, now_s)
-               for source in (self._pose, self._gps)},
-            ODOMETRY: _state(self._wheels.trust, self._wheels.stamp_s, _WHEELS_FRESH_S, now_s),
-            IMU: _state(self._gyro.trust, self._gyro.stamp_s, _GYRO_FRESH_S, now_s),
-        }
+        why_not = {source.name: source.why_not(now_s)
+                   for source in (self._pose, self._gps, self._wheels, self._gyro)}
         ekf = self._ekf
-        return FilterStatus(
-            tuple(name for name, reason in found.items() if not reason),
-            tuple((name, reason) for name, reason in found.items() if reason),
+        return LocalizationStatus(
+            tuple(name for name, reason in why_not.items() if not reason),
+            tuple((name, reason) for name, reason in why_not.items() if reason),
             ekf.position_sd_m if ekf else math.inf, ekf.heading_sd_rad if ekf else math.inf,
             self._bridged_m)
 
     def _lost(self, ekf: PlanarEkf) -> bool:
-        blind = not self._wheels_usable(self._time_s) and not (
+        blind = not self._wheels.usable(self._time_s) and not (
             self._pose.usable(self._time_s) or self._gps.usable(self._time_s))
         return (blind or self._bridged_m > self.limits.bridge_m
                 or ekf.position_sd_m > self.limits.largest_sd_m)
@@ -137,18 +129,12 @@ class PoseFilter:
         rest_s = stamp_s - self._time_s
         if rest_s <= 0:
             return
-        if rest_s > dt_s + _WHEELS_FRESH_S:  # what was in between nobody has seen
+        if rest_s > dt_s + wheels.fresh_s:  # what was in between nobody has seen
             self._ekf.doubt_position(_TOP_SPEED_MPS * (rest_s - dt_s))
             self._bridged_m += _TOP_SPEED_MPS * (rest_s - dt_s)
         # After a while without wheels the filter may be part of the way along this step.
         share = rest_s / dt_s if rest_s < dt_s else 1.0
         self._move(self._ekf, stamp_s, forward_m * share, turn_rad * share)
-
-    def _wheels_usable(self, now_s: float) -> bool:
-        return not self._wheels.trust.reason and now_s - self._wheels.stamp_s <= _WHEELS_FRESH_S
-
-    def _gyro_usable(self, now_s: float) -> bool:
-        return not self._gyro.trust.reason and now_s - self._gyro.stamp_s <= _GYRO_FRESH_S
 
     def _move(self, ekf: PlanarEkf, stamp_s: float, forward_m: float, turn_rad: float | None
               ) -> None:
@@ -156,10 +142,10 @@ class PoseFilter:
         limits = self.limits
         dt_s = stamp_s - self._time_s
         wheels = turn_rad is not None
-        if self._gyro_usable(stamp_s):
+        if self._gyro.usable(stamp_s):
             heading = self._gyro.heading_at(stamp_s)
             before = self._gyro_used
-            turn = turn_rad or 0.0 if before is None else wrap(heading - before)
+            turn = turn_rad or 0.0 if before is None else wrap_angle(heading - before)
             self._gyro_used = heading
             turn_variance = _GYRO_RAD2_PER_S * dt_s
         else:
@@ -174,7 +160,7 @@ class PoseFilter:
         self._track = (self._track[0] + dx, self._track[1] + dy)
         self._time_s = stamp_s
         witnesses = (self._pose.usable(stamp_s) + self._gps.usable(stamp_s)
-                     + (wheels or self._wheels_usable(stamp_s)))
+                     + (wheels or self._wheels.usable(stamp_s)))
         if witnesses >= 2:
             self._bridged_m = 0.0
         else:
@@ -183,7 +169,7 @@ class PoseFilter:
     def _catch_up(self, ekf: PlanarEkf, stamp_s: float) -> None:
         """Without wheels, go on with the last known speed up to a reading."""
         dt_s = stamp_s - self._time_s
-        if dt_s > 0 and not self._wheels_usable(stamp_s):
+        if dt_s > 0 and not self._wheels.usable(stamp_s):
             self._move(ekf, stamp_s, self._speed_mps * dt_s, None)
 
     # -- positions ------------------------------------------------------------------------------
@@ -204,7 +190,7 @@ class PoseFilter:
         limits = self.limits
         self._catch_up(ekf, stamp_s)
         x_m, y_m = self._bring_up(ekf, source, stamp_s - then_s)
-        yaw_rad += self._gyro.rate_radps * (self._time_s - stamp_s) if self._gyro_usable(
+        yaw_rad += self._gyro.rate_radps * (self._time_s - stamp_s) if self._gyro.usable(
             stamp_s) else 0.0
         self._weigh_gyro(ekf, stamp_s)
         variance, heading_variance = limits.absolute_sd_m**2, limits.absolute_sd_rad**2
@@ -214,7 +200,7 @@ class PoseFilter:
             ekf.update_position(x_m, y_m, variance)
             ekf.update_heading(yaw_rad, heading_variance)
             dt_s = stamp_s - then_s
-            if dt_s <= _MAX_AGE_S and not self._wheels_usable(stamp_s) \
+            if dt_s <= _MAX_AGE_S and not self._wheels.usable(stamp_s) \
                     and not self._gps.usable(stamp_s):
                 made = source.reading[0] - was[0], source.reading[1] - was[1]
                 self._speed_mps = (made[0] * math.cos(ekf.yaw_rad)
@@ -253,14 +239,14 @@ class PoseFilter:
                        ) -> None:
         """Take the speed if the wheels are out, and the course if the absolute pose is."""
         along = velocity[0] * math.cos(ekf.yaw_rad) + velocity[1] * math.sin(ekf.yaw_rad)
-        if not self._wheels_usable(stamp_s):
+        if not self._wheels.usable(stamp_s):
             self._speed_mps = along
-        turning = abs(self._gyro.rate_radps) > _STRAIGHT_RADPS or not self._gyro_usable(stamp_s)
-        if abs(along) < _COURSE_FROM_MPS or turning or self._pose.usable(stamp_s):
+        turning = abs(self._gyro.rate_radps) > _STRAIGHT_RADPS or not self._gyro.usable(stamp_s)
+        if abs(along) < COURSE_FROM_MPS or turning or self._pose.usable(stamp_s):
             return
         sign = math.copysign(1.0, along)
         course = math.atan2(sign * velocity[1], sign * velocity[0])
-        variance = (_GPS_VELOCITY_SD_MPS / along) ** 2 + _SIDESLIP_RAD**2
+        variance = (GPS_VELOCITY_SD_MPS / along) ** 2 + SIDESLIP_RAD**2
         if ekf.heading_nis(course, variance) <= self.limits.gate:
             ekf.update_heading(course, variance)
 
@@ -303,7 +289,7 @@ class PoseFilter:
             return
         if excluded:
             return
-        clear = self._wheels_usable(stamp_s)
+        clear = self._wheels.usable(stamp_s)
         if clear and by_pose > _CLEARLY * by_gps:
             self._exclude(ekf, pose, apart_m, stamp_s)
         elif clear and by_gps > _CLEARLY * by_pose:
@@ -327,7 +313,7 @@ class PoseFilter:
         apart_m = math.hypot(*self._apart)
         if source.deviation_m > _WHEELS_ASTRAY_M and not trust.reason \
                 and not other.usable(stamp_s) \
-                and self._wheels_usable(stamp_s) and self._gyro_usable(stamp_s):
+                and self._wheels.usable(stamp_s) and self._gyro.usable(stamp_s):
             # One against one. Who is wrong is not known; dead reckoning is wrong more slowly.
             self._exclude(ekf, source, source.deviation_m, stamp_s)
         if fits:
@@ -353,7 +339,7 @@ class PoseFilter:
     def _believe_both(self, ekf: PlanarEkf, stamp_s: float) -> None:
         """Neither position fits the filter, and they agree: it was the prediction that failed."""
         pose, gps = self._pose, self._gps
-        if abs(wrap(pose.reading[2] - ekf.yaw_rad)) > _GYRO_ASTRAY_RAD:
+        if abs(wrap_angle(pose.reading[2] - ekf.yaw_rad)) > _GYRO_ASTRAY_RAD:
             self._gyro.trust.flaw("its turns do not fit the positions", stamp_s)
             self._gyro_used = None
         else:
@@ -372,84 +358,41 @@ class PoseFilter:
         """Keep an excluded gyro excluded while it turns otherwise than the robot."""
         trust = self._gyro.trust
         if trust.reason:
-            off = wrap(self._gyro.yaw_rad - ekf.yaw_rad)
-            if abs(wrap(off - self._gyro_off)) > _GYRO_ASTRAY_RAD:
+            off = wrap_angle(self._gyro.yaw_rad - ekf.yaw_rad)
+            if abs(wrap_angle(off - self._gyro_off)) > _GYRO_ASTRAY_RAD:
                 self._gyro_off = off
                 trust.flaw(trust.reason, stamp_s)
 
     # -- start ----------------------------------------------------------------------------------
 
     def _try_to_start(self, now_s: float) -> None:
-        """Start from both positions if they agree, or from the only one after a short wait."""
         pose, gps, limits = self._pose, self._gps, self.limits
-        first_s = self._first_s = now_s if self._first_s is None else self._first_s
-        by_pose, by_gps = pose.fresh(now_s), gps.fresh(now_s)
-        if not (by_pose or by_gps):  # what came is late already, on a machine that is busy
+        self._first_s = now_s if self._first_s is None else self._first_s
+        first = find_first(pose, gps, self._wheels, self._gyro, now_s=now_s,
+                           waited_s=now_s - self._first_s)
+        if first is None:
             return
-        x_m, y_m, yaw_rad = pose.reading
-        heading_sd_rad: float | None = limits.absolute_sd_rad
-        if by_pose and by_gps:
-            dt_s = pose.stamp_s - gps.stamp_s
-            there = [at + v * dt_s for at, v in zip(gps.reading, gps.velocity, strict=False)]
-            if math.dist(there, (x_m, y_m)) > _START_APART_M:
-                return
-        elif now_s - first_s < _START_ALONE_S:
-            return
-        elif by_gps:
-            x_m, y_m, _ = gps.reading
-            yaw_rad, heading_sd_rad = self._heading_without_pose(now_s)
-        if heading_sd_rad is None:
-            return
-        self._time_s = pose.stamp_s if by_pose else gps.stamp_s
-        sd_m = limits.absolute_sd_m if by_pose else limits.gps_sd_m
-        self._ekf = PlanarEkf(x_m, y_m, yaw_rad, sd_m, heading_sd_rad)
-        self._speed_mps = gps.velocity[0] * math.cos(yaw_rad) + gps.velocity[1] * math.sin(yaw_rad)
+        by_pose = first.source is pose
+        self._time_s = first.source.stamp_s
+        self._ekf = PlanarEkf(
+            *first.source.reading[:2], first.yaw_rad,
+            limits.absolute_sd_m if by_pose else limits.gps_sd_m,
+            limits.absolute_sd_rad if first.heading_sd_rad is None else first.heading_sd_rad)
+        self._speed_mps = (gps.velocity[0] * math.cos(first.yaw_rad)
+                           + gps.velocity[1] * math.sin(first.yaw_rad))
         for source in (pose, gps):
-            source.usual = None
-            source.offset = source.reading[:2]
-
-    def _heading_without_pose(self, now_s: float) -> tuple[float, float | None]:
-        """Return the heading and its standard deviation, None if it is not known.
-
-        The IMU's, which was aligned before the mission, or else the course over ground of a
-        robot that moves forward.
-        """
-        if self._gyro_usable(now_s):
-            return wrap(self._gyro.yaw_rad), _IMU_HEADING_SD_RAD
-        vx, vy = self._gps.velocity
-        speed_mps = math.hypot(vx, vy)
-        if speed_mps > _COURSE_FROM_MPS and self._wheels.speed_mps > 0:
-            return math.atan2(vy, vx), _GPS_VELOCITY_SD_MPS / speed_mps + _SIDESLIP_RAD
-        return 0.0, None
+            source.usual, source.offset = None, source.reading[:2]
 
 
-_WHEELS_FRESH_S, _GYRO_FRESH_S = 0.15, 0.1
 _OTHER_SPEED_MPS = 0.3
 _GYRO_RAD2_PER_S = 1e-6
 _WHEEL_TURN_SHARE, _WHEEL_RAD2_PER_S = 0.15, 1e-5
 _UNKNOWN_TURN_RADPS, _UNKNOWN_SPEED_MPS = 1.0, 0.3
-_CREEP_MPS = 0.05
-_TOP_SPEED_MPS = 1.0
-_FASTEST_MPS = 100.0
-_GPS_REPEATS = 2
-_GPS_VELOCITY_SD_MPS, _SIDESLIP_RAD = 0.03, 0.03
-_COURSE_FROM_MPS, _STRAIGHT_RADPS = 0.4, 0.1
-_APART_GAIN = 0.3
-_MORE_THAN_CHANCE = 3
-_CLEARLY = 2.0
+_CREEP_MPS, _TOP_SPEED_MPS, _FASTEST_MPS = 0.05, 1.0, 100.0
+_GPS_REPEATS, _STRAIGHT_RADPS = 2, 0.1
+_APART_GAIN, _CLEARLY, _MORE_THAN_CHANCE = 0.3, 2.0, 3
 _WHEELS_ASTRAY_M, _GYRO_ASTRAY_RAD = 0.25, 0.1
-_START_APART_M, _START_ALONE_S = 0.3, 0.15
-_IMU_HEADING_SD_RAD = 0.05
 
 
 def _timely(stamp_s: float, now_s: float) -> bool:
     return -AHEAD_S <= now_s - stamp_s <= _MAX_AGE_S
-
-
-def _state(trust: Trust, stamp_s: float, fresh_s: float, now_s: float) -> str:
-    """Return why a source is not in use, or ""."""
-    if trust.reason:
-        return trust.reason
-    if stamp_s == -math.inf:
-        return "never heard"
-    return "silent or late" if now_s - stamp_s > fresh_s else ""

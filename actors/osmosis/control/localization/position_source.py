@@ -8,9 +8,9 @@ of the last seconds is the source's *deviation*.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from rampart.actors.osmosis.control.localization.motion_check import Trust
+from rampart.actors.osmosis.control.localization.motion_check import Source
 
 _TOO_LONG_S = 1.0
 """After such a silence what was usual says nothing."""
@@ -48,15 +48,11 @@ class FilterLimits:
 
 
 @dataclass(slots=True)
-class PositionSource:
-    """What is known of one source.
+class PositionSource(Source):
+    """What is known of a source of positions.
 
     Attributes:
-        name: for people.
-        fresh_s: greatest age of a reading that counts as present.
         patience: readings in a row that fail the gate before the source is excluded.
-        trust: whether it is believed.
-        stamp_s: of the newest reading.
         reading: the newest: x m, y m, yaw rad.
         velocity: over ground in `map`, m/s, of a source that measures it.
         offset: from the dead-reckoned track to the newest reading, m.
@@ -65,25 +61,13 @@ class PositionSource:
         repeats: readings in a row that were the same to the last bit.
     """
 
-    name: str
-    fresh_s: float
     patience: int
-    trust: Trust = field(default_factory=Trust)
-    stamp_s: float = -math.inf
     reading: tuple[float, float, float] = (0.0, 0.0, 0.0)
     velocity: tuple[float, float] = (0.0, 0.0)
     offset: tuple[float, float] = (0.0, 0.0)
     usual: tuple[float, float] | None = None
     fails: int = 0
     repeats: int = 0
-
-    def fresh(self, now_s: float) -> bool:
-        """Whether there is a present reading."""
-        return now_s - self.stamp_s <= self.fresh_s
-
-    def usable(self, now_s: float) -> bool:
-        """Whether there is one, and it is believed."""
-        return not self.trust.reason and now_s - self.stamp_s <= self.fresh_s
 
     def see(self, offset: tuple[float, float], dt_s: float, average_s: float) -> None:
         """Take note of an offset from the track, `dt_s` after the last one."""

@@ -13,8 +13,8 @@ import math
 import msgspec
 import numpy as np
 
+from rampart.actors.bus.plausible import is_possible
 from rampart.actors.osmosis.control.pilot.laser_check import LaserCheck, LaserReach
-from rampart.actors.osmosis.control.plausible import is_possible
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Array, scan_points
 from rampart.actors.osmosis.messages import LaserScan
 

@@ -21,11 +21,11 @@ from typing import NamedTuple
 
 import msgspec
 
+from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.ftm.holders import Holders
 from rampart.actors.osmosis.control.pilot.command_pair import CommandPair, PairLimits
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
-from rampart.actors.osmosis.control.plausible import AHEAD_S
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Array
 from rampart.actors.osmosis.messages import PilotMode
 
@@ -47,17 +47,12 @@ class Checks:
     """Which checks are in force; the system spec's layers switch them.
 
     Args:
-        bounds: refuse commands beyond the limits or not finite.
-        freshness: refuse and drop stale commands.
-        sequence: refuse commands older than one already taken.
-        scan: stop without a fresh scan.
+        inputs: refuse commands that are beyond the limits, stale, or older than one already
+            taken, and stop without a fresh scan.
         manager: stop without the manager's sign of life.
     """
 
-    bounds: bool = True
-    freshness: bool = True
-    sequence: bool = True
-    scan: bool = True
+    inputs: bool = True
     manager: bool = True
 
 
@@ -221,7 +216,7 @@ class SafetyGate:
 
     def _take(self, line: _Line, command: Stamped, now: float) -> str:
         position = (command.incarnation, command.sequence)
-        if self._checks.sequence:
+        if self._checks.inputs:
             newest = line.newest.get(command.source)
             if newest is not None and position <= newest:
                 # The newer one that was taken before stays valid.
@@ -232,7 +227,7 @@ class SafetyGate:
         line.fault = self._fault(command, now) or self._reverse_fault(line, command)
         if line.fault:
             self.refused += 1
-            if self._checks.bounds:
+            if self._checks.inputs:
                 line.twist = (0.0, 0.0)
             return line.fault
         line.twist = (command.linear_mps, command.angular_radps)
@@ -246,14 +241,13 @@ class SafetyGate:
         if not (math.isfinite(linear) and math.isfinite(angular)):
             # Also in the baseline: no base can execute it, the last command goes on instead.
             return f"command ({linear}, {angular}) is not finite"
-        if self._checks.bounds:
+        if self._checks.inputs:
             slack = 1.0 + 1e-6
             if abs(linear) > limits.max_linear_mps * slack:
                 return f"command of {linear:.2f} m/s is beyond {limits.max_linear_mps:.2f} m/s"
             if abs(angular) > limits.max_angular_radps * slack:
                 return (f"command of {angular:.2f} rad/s is beyond"
                         f" {limits.max_angular_radps:.2f} rad/s")
-        if self._checks.freshness:
             age_s = now - command.stamp_s
             if not age_s <= limits.command_timeout_s:
                 return f"command is {age_s:.2f} s old, limit {limits.command_timeout_s:.2f} s"
@@ -262,7 +256,7 @@ class SafetyGate:
         return ""
 
     def _reverse_fault(self, line: _Line, command: Stamped) -> str:
-        if self._checks.bounds and line is not self._stick and command.linear_mps < -_STANDING_MPS:
+        if self._checks.inputs and line is not self._stick and command.linear_mps < -_STANDING_MPS:
             return f"command of {command.linear_mps:.2f} m/s is backwards, where no laser looks"
         return ""
 
@@ -309,7 +303,7 @@ class SafetyGate:
                  ) -> tuple[tuple[float, float], str]:
         """Return a command no faster than orders and eyes allow; the turn rate is kept."""
         top_mps, reverse_mps = self.top_speed_mps, self._limits.reverse_mps
-        if self._checks.scan and wanted[0] < -reverse_mps:
+        if self._checks.inputs and wanted[0] < -reverse_mps:
             wanted, passing = (-reverse_mps, wanted[1]), passing or "slowly: no laser looks back"
         if not top_mps or abs(wanted[0]) <= top_mps:
             return wanted, passing
@@ -337,17 +331,18 @@ class SafetyGate:
                 return "the manager is silent"
             if now - self._started_s < limits.settling_s:
                 return "just started, orders may not have arrived yet"
-        if self._checks.scan and self._scan_fault:
-            return self._scan_fault
-        if self._checks.scan and not -AHEAD_S <= now - self._scan_s <= limits.scan_timeout_s:
-            return "no fresh laser scan"  # nor is one with a stamp from the future, or none
+        if self._checks.inputs:
+            if self._scan_fault:
+                return self._scan_fault
+            if not -AHEAD_S <= now - self._scan_s <= limits.scan_timeout_s:
+                return "no fresh laser scan"  # nor is one with a stamp from the future, or none
         return ""
 
     def _unusable(self, line: _Line, now: float) -> str:
         """Why a line's last command may not be executed, or ""."""
-        if line.fault and self._checks.bounds:
+        if line.fault and self._checks.inputs:
             return line.fault
-        if self._checks.freshness and line.twist is not None:
+        if self._checks.inputs and line.twist is not None:
             age_s = now - line.stamp_s
             if age_s > self._limits.command_timeout_s:
                 return "no fresh command"

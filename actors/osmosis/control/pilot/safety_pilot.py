@@ -8,9 +8,9 @@ from rampart.actors.bus.bounds import clip
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import Holds, ManagerStatus, Reset
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.control.limits_from_spec import checks_of, gate_of, reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair
 from rampart.actors.osmosis.control.pilot.safety_gate import GateOutput, SafetyGate, Stamped
-from rampart.actors.osmosis.control.settings import checks_of, gate_of, reach_of
 from rampart.actors.osmosis.messages import (
     BaseCommand,
     LaserScan,

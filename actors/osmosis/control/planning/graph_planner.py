@@ -7,11 +7,11 @@ import math
 import msgspec
 
 from rampart.actors.bus.bounds import clip
+from rampart.actors.bus.plausible import is_sane
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.planning.closures import Closures, without
 from rampart.actors.osmosis.control.planning.route_search import PlannedRoute, plan_route
-from rampart.actors.osmosis.control.plausible import is_sane
 from rampart.actors.osmosis.messages import Blockage, ControlStatus, GoalOrder, Mode, Pose, Route
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat

@@ -175,11 +175,6 @@ class JoystickDevice:
         self._file: int | None = None
 
     @property
-    def is_open(self) -> bool:
-        """Whether there is a device to read from."""
-        return self._file is not None
-
-    @property
     def stick(self) -> Joystick:
         """Where the stick is; in the middle and let go while there is no device."""
         return self._decoder.stick

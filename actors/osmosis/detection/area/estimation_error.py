@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import math
 
+from rampart.actors.bus.plausible import is_sane
 from rampart.actors.detection.module import DetectionModule
-from rampart.actors.detection.plausible import is_sane
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.detection.area.geofence import Fix
 from rampart.actors.osmosis.detection.area.position_vote import PositionVote
 from rampart.actors.runtime.actor import Context, Header, on
 
@@ -73,13 +72,13 @@ class EstimationMonitor:
             self.nodes = (suspect,)
         self._yaw_rad = pose.yaw_rad
 
-    def gps(self, fix: Fix, stamp_s: float, now_s: float) -> None:
+    def gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> None:
         """Take a fix."""
         if self.vote.see_gps(fix, stamp_s, now_s):
             self._hold_heading(fix, now_s)
             self._judge()
 
-    def _hold_heading(self, fix: Fix, now_s: float) -> None:
+    def _hold_heading(self, fix: m.GpsFix, now_s: float) -> None:
         vote = self.vote
         if vote.track.straight and vote.wheels_fresh(now_s) and vote.position.fresh(now_s):
             course = math.atan2(fix.velocity_y_mps, fix.velocity_x_mps)
@@ -103,12 +102,8 @@ class EstimationError(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.monitor = EstimationMonitor(
-            known=self.first_life, wait_until_s=self.clock.now() + self.grace_s(1.0))
-
-    def on_start(self) -> None:
-        """Start waiting for something to compare."""
-        self.follow(self.monitor)
+        self.monitor = self.judged_by(EstimationMonitor(
+            known=self.first_life, wait_until_s=self.clock.now() + self.grace_s(1.0)))
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
@@ -125,14 +120,12 @@ class EstimationError(DetectionModule):
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:
         """Hear a fix, and compare."""
-        self.monitor.gps(
-            Fix(message.x_m, message.y_m, message.velocity_x_mps, message.velocity_y_mps,
-                message.accuracy_m), header.stamp, self.clock.now())
-        self.follow(self.monitor)
+        self.monitor.gps(message, header.stamp, self.clock.now())
+        self.follow()
 
     @on(topics.POSE)
     def pose(self, message: m.Pose, header: Header) -> None:
         """Hear the pose under test."""
         self.monitor.pose(message, header.stamp, self.clock.now(),
                           f"{header.source}#{header.incarnation}")
-        self.follow(self.monitor)
+        self.follow()

@@ -6,16 +6,18 @@ number counts the same: after the timeout the monitor is active.
 
 from __future__ import annotations
 
-from rampart.actors.detection.plausible import is_possible
+from rampart.actors.bus.plausible import is_possible
+from rampart.actors.detection.lasting import Lasting
 from rampart.actors.osmosis.detection.area.geofence import (
     DistanceBound,
     FenceLimits,
-    Fix,
     ProhibitedDistance,
     intrusion,
+    is_usable,
     reach_m,
 )
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.osmosis.messages import GpsFix
 
 
 class FenceMonitor:
@@ -36,9 +38,8 @@ class FenceMonitor:
         self._bound = DistanceBound(distance_m)
         self._limits = limits
         self._freshness = freshness
-        self._hold_s = hold_s
         self._intrusion = ""
-        self._safe_since_s: float | None = None
+        self._safe = Lasting(hold_s)
 
     @property
     def active(self) -> bool:
@@ -64,21 +65,16 @@ class FenceMonitor:
         """Conclude from the time without a fix."""
         self._freshness.expire(now_s)
 
-    def fix(self, fix: Fix, stamp_s: float, now_s: float) -> None:
+    def fix(self, fix: GpsFix, stamp_s: float, now_s: float) -> None:
         """Take note of a fix in `map`, measured at `stamp_s`."""
-        if not fix.is_usable or not is_possible(stamp_s, now_s):
+        if not is_usable(fix) or not is_possible(stamp_s, now_s):
             return
         self._freshness.heard(stamp_s, now_s)
         extra_m = self._limits.hysteresis_m if self._intrusion else 0.0
         needed_m = reach_m(fix, self._limits, extra_m)
         found = "" if self._bound.exceeds(fix.x_m, fix.y_m, needed_m) else intrusion(
             fix, self._distance_m, self._limits, extra_m)
-        if found:
+        if self._safe.note(not found, now_s):
+            self._intrusion = ""
+        elif found:
             self._intrusion = self._intrusion or found
-            self._safe_since_s = None
-        elif self._intrusion:
-            if self._safe_since_s is None:
-                self._safe_since_s = now_s
-            if now_s >= self._safe_since_s + self._hold_s - 1e-9:
-                self._intrusion = ""
-                self._safe_since_s = None

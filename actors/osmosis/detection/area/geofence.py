@@ -17,9 +17,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import msgspec
-
-from rampart.actors.detection.plausible import is_sane
+from rampart.actors.bus.plausible import is_sane
+from rampart.actors.osmosis.messages import GpsFix
 
 ProhibitedDistance = Callable[[float, float], float]
 """Signed distance (m) from a point in `map` to the prohibited area, negative inside it."""
@@ -51,21 +50,10 @@ class FenceLimits:
     hysteresis_m: float = 0.1
 
 
-class Fix(msgspec.Struct, frozen=True, gc=False):
-    """Position and velocity over ground in `map`, with the bound of the position's error."""
-
-    x_m: float
-    y_m: float
-    velocity_x_mps: float
-    velocity_y_mps: float
-    accuracy_m: float
-
-    @property
-    def is_usable(self) -> bool:
-        """Whether all of it are numbers, and ones that can be."""
-        return self.accuracy_m >= 0 \
-            and is_sane(self.x_m, self.y_m, self.accuracy_m) \
-            and math.hypot(self.velocity_x_mps, self.velocity_y_mps) <= _FASTEST_MPS
+def is_usable(fix: GpsFix) -> bool:
+    """Whether all of a fix are numbers, and ones that can be."""
+    return fix.accuracy_m >= 0 and is_sane(fix.x_m, fix.y_m, fix.accuracy_m) \
+        and math.hypot(fix.velocity_x_mps, fix.velocity_y_mps) <= _FASTEST_MPS
 
 
 class DistanceBound:
@@ -97,14 +85,14 @@ def stopping_distance_m(speed_mps: float, limits: FenceLimits) -> float:
     return speed_mps * limits.reaction_s + speed_mps**2 / (2 * limits.braking_mps2)
 
 
-def reach_m(fix: Fix, limits: FenceLimits, extra_m: float = 0.0) -> float:
+def reach_m(fix: GpsFix, limits: FenceLimits, extra_m: float = 0.0) -> float:
     """Return how far from the position the capsule ends, m: beyond, all is well for certain."""
     speed_mps = math.hypot(fix.velocity_x_mps, fix.velocity_y_mps)
     return (limits.half_diagonal_m + fix.accuracy_m + extra_m
             + stopping_distance_m(speed_mps, limits))
 
 
-def intrusion(fix: Fix, distance_m: ProhibitedDistance, limits: FenceLimits,
+def intrusion(fix: GpsFix, distance_m: ProhibitedDistance, limits: FenceLimits,
               extra_m: float = 0.0) -> str:
     """Return why the robot will not stop in time, or "" if it will.
 

@@ -21,8 +21,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from rampart.actors.detection.plausible import AHEAD_S, is_possible, is_sane
-from rampart.actors.osmosis.detection.area.geofence import Fix
+from rampart.actors.bus.envelope import AHEAD_S
+from rampart.actors.bus.plausible import is_possible, is_sane
+from rampart.actors.osmosis.detection.area.geofence import is_usable
+from rampart.actors.osmosis.messages import GpsFix
 
 GPS = "GPS"
 WHEELS = "dead reckoning"
@@ -208,9 +210,9 @@ class PositionVote:
         self.position.see(stamp_s, place, self.track, self._forget_s(self.position))
         return True
 
-    def see_gps(self, fix: Fix, stamp_s: float, now_s: float) -> bool:
+    def see_gps(self, fix: GpsFix, stamp_s: float, now_s: float) -> bool:
         """Take a fix and compare; return whether it could be used."""
-        if not fix.is_usable or not self._usable(self.gps, stamp_s, (fix.x_m, fix.y_m), now_s):
+        if not is_usable(fix) or not self._usable(self.gps, stamp_s, (fix.x_m, fix.y_m), now_s):
             return False
         track = self.track
         self.gps.see(stamp_s, (fix.x_m, fix.y_m), track, self._forget_s(self.gps))

@@ -13,7 +13,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
-from rampart.actors.osmosis.detection.area.geofence import FenceLimits, Fix
+from rampart.actors.osmosis.detection.area.geofence import FenceLimits
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import amount
@@ -38,13 +38,13 @@ class ProhibitedArea(DetectionModule):
         system = context.run.system
         airport = Osmosis.of(context).airport
         timeout_s = amount(self.parameters, "gps_timeout_s", 5 * GPS_PERIOD_S)
-        self.monitor = FenceMonitor(
+        self.monitor = self.judged_by(FenceMonitor(
             airport.prohibited_distance_m,
             FenceLimits(half_diagonal_m(system.robot), self._reaction_s(system),
                         system.robot.braking_mps2),
             FreshnessMonitor("GPS", timeout_s, 2 * GPS_PERIOD_S, self.clock.now(),
                              self.grace_s(timeout_s), known=self.first_life),
-            amount(self.parameters, "hold_s", 0.5))
+            amount(self.parameters, "hold_s", 0.5)))
 
     def _reaction_s(self, system: SystemSpec) -> float:
         needed_s = GPS_PERIOD_S + system.timing.arbitration_s + system.timing.actuation_s
@@ -53,17 +53,11 @@ class ProhibitedArea(DetectionModule):
         margin_m = amount(self.parameters, "margin_m", 0.0)
         return max(needed_s, time_to_intrusion_s(system.robot, margin_m))
 
-    def on_start(self) -> None:
-        """Start waiting for the first fix."""
-        self.follow(self.monitor)
-
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:
         """Look where the robot is and where it is going."""
-        self.monitor.fix(
-            Fix(message.x_m, message.y_m, message.velocity_x_mps, message.velocity_y_mps,
-                message.accuracy_m), header.stamp, self.clock.now())
-        self.follow(self.monitor)
+        self.monitor.fix(message, header.stamp, self.clock.now())
+        self.follow()
 
 
 def half_diagonal_m(robot: Robot) -> float:

@@ -16,7 +16,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
-from rampart.actors.osmosis.detection.area.geofence import FenceLimits, Fix
+from rampart.actors.osmosis.detection.area.geofence import FenceLimits
 from rampart.actors.osmosis.detection.area.position_vote import GPS, PositionVote
 from rampart.actors.osmosis.detection.area.prohibited_area import GPS_PERIOD_S, half_diagonal_m
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
@@ -46,19 +46,19 @@ class VotedPosition:
         self._anchor: tuple[float, float] | None = None
         self._trusted_s = -math.inf
         self._since_m = 0.0
-        self._fix: Fix | None = None
+        self._fix: m.GpsFix | None = None
         self.by_gps = False
 
     def odometry(self, stamp_s: float, yaw_rad: float, linear_mps: float, now_s: float) -> None:
         """Take the way that the wheels made."""
         self._since_m += self.vote.track.odometry(stamp_s, yaw_rad, linear_mps, now_s)
 
-    def gps(self, fix: Fix, stamp_s: float, now_s: float) -> None:
+    def gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> None:
         """Take a GPS fix."""
         if self.vote.see_gps(fix, stamp_s, now_s):
             self._fix = fix
 
-    def look(self, now_s: float) -> tuple[Fix, float] | None:
+    def look(self, now_s: float) -> tuple[m.GpsFix, float] | None:
         """Return where the robot is, as far as is known, and when that was; None if it is not."""
         vote = self.vote
         two = vote.agreeing(now_s)
@@ -74,7 +74,7 @@ class VotedPosition:
             return None
         track = vote.track
         heading = track.heading_rad
-        return Fix(self._anchor[0] + track.place[0], self._anchor[1] + track.place[1],
+        return m.GpsFix(self._anchor[0] + track.place[0], self._anchor[1] + track.place[1],
                    track.speed_mps * math.cos(heading), track.speed_mps * math.sin(heading),
                    self._accuracy_m + _ERROR_PER_M * self._since_m), track.stamp_s
 
@@ -100,23 +100,19 @@ class VotedArea(DetectionModule):
         self._where = VotedPosition(robot.gps_accuracy_m,
                                     amount(self.parameters, "blind_s", 10.0),
                                     amount(self.parameters, "blind_m", 5.0))
-        self.monitor = FenceMonitor(
+        self.monitor = self.judged_by(FenceMonitor(
             airport.prohibited_distance_m,
             FenceLimits(half_diagonal_m(robot), self._reaction_s(system, robot),
                         robot.braking_mps2),
             FreshnessMonitor("position that two sources agree on", timeout_s, 2 * GPS_PERIOD_S,
                              self.clock.now(), self.grace_s(timeout_s), known=self.first_life),
-            amount(self.parameters, "hold_s", 0.5))
+            amount(self.parameters, "hold_s", 0.5)))
 
     def _reaction_s(self, system: SystemSpec, robot: Robot) -> float:
         needed_s = GPS_PERIOD_S + system.timing.arbitration_s + system.timing.actuation_s
         if "margin_m" not in self.parameters:
             return needed_s
         return max(needed_s, time_to_intrusion_s(robot, amount(self.parameters, "margin_m", 0.0)))
-
-    def on_start(self) -> None:
-        """Start waiting for the first position."""
-        self.follow(self.monitor)
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
@@ -133,9 +129,7 @@ class VotedArea(DetectionModule):
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:
         """Hear a fix, and look where the robot is and where it is going."""
-        fix = Fix(message.x_m, message.y_m, message.velocity_x_mps, message.velocity_y_mps,
-                  message.accuracy_m)
-        self._where.gps(fix, header.stamp, self.clock.now())
+        self._where.gps(message, header.stamp, self.clock.now())
         self._look()
 
     @on(topics.ODOMETRY)
@@ -152,4 +146,4 @@ class VotedArea(DetectionModule):
         found = self._where.look(now_s)
         if found is not None:
             self.monitor.fix(*found, now_s)
-        self.follow(self.monitor)
+        self.follow()

@@ -13,7 +13,7 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.osmosis.airport.photometry import illuminance_lux, sensor_position
+from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.osmosis.control.localization.localization import Localization
 from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
@@ -93,7 +93,7 @@ class Base(Actor):
             -0.75 * math.pi, 1.5 * math.pi / 180, 5.0, ranges.astype("<f4").tobytes()))
         sensor = sensor_position(world.x_m, world.y_m, world.yaw_rad)
         self.publish(topics.LIGHT, m.LightSample(sum(
-            illuminance_lux(BROKEN.get(li.name, 0.95) * li.nominal_cd, d)
+            BROKEN.get(li.name, 0.95) * li.nominal_cd * float(illuminance_per_candela(d))
             for li in AIRPORT.lights if (d := math.dist(sensor, (li.x_m, li.y_m))) < 6.0)))
         self.publish(ftm_topics.MANAGER_STATUS, fm.ManagerStatus((), (), (), (), "safety-first", 0))
 

@@ -12,10 +12,10 @@ from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.osmosis.detection.area.geofence import (
     DistanceBound,
     FenceLimits,
-    Fix,
     intrusion,
     reach_m,
 )
+from rampart.actors.osmosis.messages import GpsFix
 
 AIRPORT = Airport(
     name="L", nodes={}, edges=(), start=StartPose(0.0, 0.0, 0.0),
@@ -54,7 +54,7 @@ def test_a_robot_farther_away_than_its_reach_intrudes_nowhere(walk, extra_m):
     (x_m, y_m), steps = walk
     for dx_m, dy_m, vx_mps, vy_mps in steps:
         x_m, y_m = x_m + dx_m, y_m + dy_m
-        fix = Fix(x_m, y_m, vx_mps, vy_mps, 0.05)
+        fix = GpsFix(x_m, y_m, vx_mps, vy_mps, 0.05)
         if bound.exceeds(x_m, y_m, reach_m(fix, LIMITS, extra_m)):
             assert not intrusion(fix, AIRPORT.prohibited_distance_m, LIMITS, extra_m)
 

@@ -14,7 +14,6 @@ from rampart.actors.osmosis.detection.area.estimation_error import (
     EstimationError,
     EstimationMonitor,
 )
-from rampart.actors.osmosis.detection.area.geofence import Fix
 from rampart.actors.runtime.actor import Actor
 from rampart.sim.faults.faults import SENSOR_FAULTS
 from rampart.testing import Ear, run
@@ -72,8 +71,7 @@ def feed(monitor: EstimationMonitor, item: Reading, now_s: float) -> None:
     elif item.topic is topics.ODOMETRY:
         track.odometry(item.stamp_s, body.pose.yaw_rad, body.twist.linear_mps, now_s)
     elif item.topic is topics.GPS:
-        monitor.gps(Fix(body.x_m, body.y_m, body.velocity_x_mps, body.velocity_y_mps,
-                        body.accuracy_m), item.stamp_s, now_s)
+        monitor.gps(body, item.stamp_s, now_s)
 
 
 def lying(x_m=0.0, y_m=0.0, yaw_rad=0.0, *, per_s=False, to_s=math.inf):
@@ -176,7 +174,7 @@ def test_what_is_no_number_is_not_heard(bad):
     monitor = EstimationMonitor(known=True, wait_until_s=0.0)
     monitor.pose(m.Pose(bad, 0.0, 0.0), 1.0, 1.0, "localization#1")
     monitor.pose(m.Pose(0.0, 0.0, bad), 1.0, 1.0, "localization#1")
-    monitor.gps(Fix(bad, 0.0, 0.0, 0.0, 0.1), 1.0, 1.0)
+    monitor.gps(m.GpsFix(bad, 0.0, 0.0, 0.0, 0.1), 1.0, 1.0)
     assert not monitor.vote.compared
     assert monitor.vote.position.stamp_s == monitor.vote.gps.stamp_s == -math.inf
 

@@ -17,13 +17,14 @@ from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
 from rampart.actors.osmosis.detection.area.geofence import (
     FenceLimits,
-    Fix,
     intrusion,
+    is_usable,
     stopping_distance_m,
 )
 from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea, half_diagonal_m
 from rampart.actors.osmosis.detection.bounds import Bounds
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.osmosis.messages import GpsFix
 from rampart.actors.runtime.actor import Actor
 from rampart.testing import Ear, play, run, table
 from tests.actors.osmosis.detection.sources import Source
@@ -39,9 +40,9 @@ def lane(_x_m: float, y_m: float) -> float:
     return HALF_LANE_M - abs(y_m)
 
 
-def fix(y_m: float, speed_mps: float, course_deg: float, x_m: float = 0.0) -> Fix:
+def fix(y_m: float, speed_mps: float, course_deg: float, x_m: float = 0.0) -> GpsFix:
     course = math.radians(course_deg)
-    return Fix(x_m, y_m, speed_mps * math.cos(course), speed_mps * math.sin(course), ACCURACY_M)
+    return GpsFix(x_m, y_m, speed_mps * math.cos(course), speed_mps * math.sin(course), ACCURACY_M)
 
 
 @pytest.mark.parametrize(("y_m", "speed_mps", "course_deg", "alarm"), **table({
@@ -110,9 +111,9 @@ def fence() -> FenceMonitor:
 # in the middle with a wrong stamp: + far ahead, i infinite, t no number
 FIXES = {
     "m": fix(0.0, 1.0, 0.0), "o": fix(0.0, 1.0, 0.0), "e": fix(2.0, 0.0, 0.0),
-    "c": fix(1.95, 0.0, 0.0), "n": Fix(math.nan, 0.0, 0.0, 0.0, 0.05),
-    "b": Fix(0.0, 0.0, 0.0, 0.0, 4.0), "w": Fix(0.0, 0.0, 0.0, 0.0, -1.0),
-    "v": Fix(0.0, 0.0, 1e200, 0.0, 0.05),
+    "c": fix(1.95, 0.0, 0.0), "n": GpsFix(math.nan, 0.0, 0.0, 0.0, 0.05),
+    "b": GpsFix(0.0, 0.0, 0.0, 0.0, 4.0), "w": GpsFix(0.0, 0.0, 0.0, 0.0, -1.0),
+    "v": GpsFix(0.0, 0.0, 1e200, 0.0, 0.05),
 }
 STAMPS = {"o": 0.0, "+": 1e9, "i": math.inf, "t": math.nan}
 
@@ -150,10 +151,10 @@ def test_fence_timeline(events, expected):
 
 @pytest.mark.parametrize("speed_mps", [1e6, 1e155, 1.7e308, math.inf, math.nan])
 def test_a_velocity_that_cannot_be_makes_a_fix_unusable_and_raises_nothing(speed_mps):
-    assert not Fix(0.0, 0.0, speed_mps, 0.0, 0.05).is_usable
-    assert not Fix(0.0, 0.0, 0.0, -speed_mps, 0.05).is_usable
+    assert not is_usable(GpsFix(0.0, 0.0, speed_mps, 0.0, 0.05))
+    assert not is_usable(GpsFix(0.0, 0.0, 0.0, -speed_mps, 0.05))
     monitor = fence()
-    monitor.fix(Fix(0.0, 0.0, speed_mps, speed_mps, 0.05), 0.0, 0.0)
+    monitor.fix(GpsFix(0.0, 0.0, speed_mps, speed_mps, 0.05), 0.0, 0.0)
     assert not monitor.active
 
 

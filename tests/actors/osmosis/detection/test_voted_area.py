@@ -12,7 +12,6 @@ from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
-from rampart.actors.osmosis.detection.area.geofence import Fix
 from rampart.actors.osmosis.detection.area.position_vote import GPS, WHEELS, PositionVote
 from rampart.actors.osmosis.detection.area.voted_area import VotedArea, VotedPosition
 from rampart.actors.runtime.actor import Actor
@@ -73,8 +72,7 @@ def feed(where: VotedPosition, item: Reading, now_s: float) -> None:
     elif item.topic is topics.ODOMETRY:
         where.odometry(stamp_s, body.pose.yaw_rad, body.twist.linear_mps, now_s)
     elif item.topic is topics.GPS:
-        where.gps(Fix(body.x_m, body.y_m, body.velocity_x_mps, body.velocity_y_mps,
-                      body.accuracy_m), stamp_s, now_s)
+        where.gps(body, stamp_s, now_s)
     else:
         where.vote.see_position(stamp_s, (body.x_m, body.y_m), now_s)
 
@@ -170,7 +168,7 @@ def vote(a, gps, wheels_mps, seconds=3.0, start=0.0):
         if i % 5 == 0 and a is not None:
             it.see_position(t, (t, a(t)), t)
         if i % 5 == 0 and gps is not None:
-            it.see_gps(Fix(t, gps(t), 1.0, 0.0, 0.02), t, t)
+            it.see_gps(m.GpsFix(t, gps(t), 1.0, 0.0, 0.02), t, t)
     return it, start + 0.02 * (round(seconds * 50) - 1)
 
 

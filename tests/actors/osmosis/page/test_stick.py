@@ -6,7 +6,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rampart.actors.operator.requests import StickWish
+from rampart.actors.osmosis.page.requests import StickRequest
 from rampart.actors.osmosis.page.stick import SILENCE_S, TICKET_S, Grip, StickDesk, effect
 
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -14,11 +14,11 @@ PERIOD_S = 0.05
 
 
 def hold(desk: StickDesk, page: int, now_s: float, ticket: int = 0, at=(0.5, 0.0)):
-    return desk.move(page, StickWish(True, ticket, *at), now_s)
+    return desk.move(page, StickRequest(True, ticket, *at), now_s)
 
 
 def let_go(desk: StickDesk, page: int, now_s: float):
-    return desk.move(page, StickWish(False), now_s)
+    return desk.move(page, StickRequest(False), now_s)
 
 
 def drive(desk: StickDesk, page: int, begin_s: float, end_s: float) -> int:
@@ -155,7 +155,7 @@ def test_whatever_pages_send_one_drives_at_most_and_only_with_fresh_news(message
         choice = {"newest": mine[-1:], "old": mine[:1], "another's": others[-1:], "none": []}
         number, at_s = (choice[which] or [(0, -9.0)])[0]
         holder = desk.holder
-        answer = desk.move(page, StickWish(held, number, forward, 0.0), now_s)
+        answer = desk.move(page, StickRequest(held, number, forward, 0.0), now_s)
         if not held:
             must_let_go.discard(page)
         if answer.grip in (Grip.LATE, Grip.REFUSED, Grip.TAKEN):

@@ -2,6 +2,7 @@
 
 import pytest
 
+from rampart.actors.operator.requests import RefusedError
 from rampart.actors.osmosis.messages import (
     Goal,
     MissionAction,
@@ -12,11 +13,10 @@ from rampart.actors.osmosis.messages import (
     Mode,
 )
 from rampart.actors.osmosis.page import orders as hmi_orders
-from rampart.actors.osmosis.page.orders import NoSenseError, Orders
+from rampart.actors.osmosis.page.orders import Orders
 from rampart.actors.osmosis.page.submission import (
     GIVE_UP_S,
     RESPAWN_WINDOW_S,
-    BusyError,
     Submission,
     first_request,
 )
@@ -44,7 +44,7 @@ def test_a_mission_once_taken_is_not_sent_again_when_the_mission_manager_forgets
     submission.hear(status(FIRST))
     submission.hear(IDLE)
     assert submission.pending is None
-    assert submission.expire(1000.0) is None
+    assert submission.expire(1000.0) == ""
 
 
 def test_the_first_mission_is_settled_when_the_mission_manager_has_another_one():
@@ -93,23 +93,24 @@ def test_missions_from_the_page_have_ids_of_their_own_in_every_life():
 def test_a_mission_is_refused_while_another_one_is_under_way(phase):
     submission = Submission("r7", 1, 0.0, FIRST)
     submission.hear(status(FIRST, phase))
-    with pytest.raises(BusyError, match=f"mission AB is {phase.value}"):
+    with pytest.raises(RefusedError, match=f"mission AB is {phase.value}"):
         submission.ask("A", GOALS, 10.0)
 
 
 def test_a_mission_is_refused_while_another_one_waits_to_be_taken():
-    with pytest.raises(BusyError, match="waits"):
+    with pytest.raises(RefusedError, match="waits"):
         Submission("r7", 1, 0.0, FIRST).ask("A", GOALS, 0.0)
 
 
 def test_a_mission_from_the_page_is_withdrawn_when_nobody_takes_it_but_the_first_is_not():
     submission = Submission("r7", 2, 50.0, None)
-    request = submission.ask("A", GOALS, 50.0)
-    assert submission.expire(50.0 + GIVE_UP_S - 0.1) is None
-    assert submission.expire(50.0 + GIVE_UP_S) == request
+    submission.ask("A", GOALS, 50.0)
+    assert submission.expire(50.0 + GIVE_UP_S - 0.1) == ""
+    assert submission.expire(50.0 + GIVE_UP_S) == (
+        "mission A was not taken: the Mission Manager does not answer")
     assert submission.pending is None
     first = Submission("r7", 1, 0.0, FIRST)
-    assert first.expire(1e6) is None
+    assert first.expire(1e6) == ""
     assert first.pending == FIRST
 
 
@@ -143,14 +144,14 @@ def test_a_refusal_comes_with_its_reason_and_the_next_order_has_another_id():
 
 def test_an_order_that_makes_no_sense_in_the_present_phase_is_not_passed_on():
     orders = Orders("r7/hmi.1", "operator")
-    with pytest.raises(NoSenseError, match="the Mission Manager was not heard yet"):
+    with pytest.raises(RefusedError, match="the Mission Manager was not heard yet"):
         orders.give(MissionAction.PAUSE, "", 1.0)
     orders = under_way(MissionAction.PAUSE, MissionAction.SKIP)
-    with pytest.raises(NoSenseError, match="resume makes no sense while the mission is running; "
+    with pytest.raises(RefusedError, match="resume makes no sense while the mission is running; "
                                            "possible: pause, skip"):
         orders.give(MissionAction.RESUME, "", 1.0)
     orders.give(MissionAction.PAUSE, "", 1.0)
-    with pytest.raises(NoSenseError, match="pause waits for its answer"):
+    with pytest.raises(RefusedError, match="pause waits for its answer"):
         orders.give(MissionAction.SKIP, "", 1.1)
 
 

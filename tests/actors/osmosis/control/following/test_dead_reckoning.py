@@ -9,16 +9,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.following.bridged_control import BridgedControl, BridgedStandby
 from rampart.actors.osmosis.control.following.dead_reckoning import AFTER_S, DeadReckoning
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
+from rampart.actors.osmosis.control.following.standby_control import StandbyControl
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.testing import run
 from tests.actors.osmosis.control.laser_sweeps import full_sweep
 from tests.actors.osmosis.control.localization_drive import Reading, Truth, disturbed
+from tests.actors.osmosis.control.test_actors import AIRPORT
 from tests.actors.osmosis.control.world import World
 from tests.osmosis_system import System, shipped_system
 
@@ -205,7 +205,7 @@ def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
 
     async def scenario(system: System) -> list[tuple[float, float]]:
         robot = system.start("robot", Robot)
-        system.start("control", BridgedControl, bridge_m=2.0)
+        system.start("control", OsmosisControl, bridge_m=2.0)
         await system.settle()
         world, seen = World(), []
         robot.publish(topics.ROUTE, m.Route("m", 0, m.Mode.TAXI, True, ((0.0, 0.0), (30.0, 0.0)),
@@ -227,8 +227,6 @@ def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
         return seen
 
     async def whole() -> list[tuple[float, float]]:
-        from tests.actors.osmosis.control.test_actors import AIRPORT
-
         async with System(system=shipped_system(), airport=AIRPORT) as system:
             return await scenario(system)
 
@@ -238,9 +236,14 @@ def test_osmosis_control_drives_on_for_the_bound_and_then_stops(mis_stamped):
     assert 2.0 < seen[-1][0] < 2.8
 
 
-def test_the_papers_control_does_not_make_the_base_publish_odometry():
-    key = topics.ODOMETRY.key
-    assert key not in heard(Member("osmosis_control", OsmosisControl, {}))
-    assert key in heard(Member("osmosis_control", BridgedControl, {}))
-    assert key in heard(Member("standby", BridgedStandby, {}))
-    assert BridgedStandby.outputs == (topics.STANDBY_COMMAND,)
+@pytest.mark.parametrize("actor", [OsmosisControl, StandbyControl])
+@pytest.mark.parametrize("bridge_m", [0.0, 2.0])
+def test_who_does_not_bridge_does_not_make_the_base_publish_odometry(actor, bridge_m):
+    async def whole() -> bool:
+        async with System(system=shipped_system(), airport=AIRPORT) as system:
+            robot = system.start("robot", Robot)
+            system.start("control", actor, bridge_m=bridge_m)
+            await system.settle()
+            return robot.has_readers(topics.ODOMETRY)
+
+    assert run(whole) == (bridge_m > 0.0)

@@ -3,10 +3,10 @@ import math
 import numpy as np
 import pytest
 
-from rampart.actors.osmosis.airport.photometry import illuminance_lux, sensor_position
+from rampart.actors.osmosis.airport.model import Light
+from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
 from rampart.actors.osmosis.control.following.light_inspection import (
     LightInspection,
-    RowLight,
     verdict,
 )
 from rampart.actors.osmosis.control.following.light_row import LightRow
@@ -16,7 +16,7 @@ ROW = ((0.0, 0.0), (20.0, 0.0))
 
 
 def light_row(count=6, spacing_m=3.0):
-    return [RowLight(f"L{i}", 2.0 + spacing_m * i, 0.0, 200.0) for i in range(count)]
+    return [Light(f"L{i}", "L", 2.0 + spacing_m * i, 0.0, 200.0) for i in range(count)]
 
 
 def inspect(lights, factors, *, seed=0, pose_delay_s=0.0, noise=0.03, blind=(), start_m=0.0,
@@ -36,8 +36,8 @@ def inspect(lights, factors, *, seed=0, pose_delay_s=0.0, noise=0.03, blind=(), 
                         world.yaw_rad)
         if not (blind and blind[0] < world.x_m < blind[1]):
             sensor = sensor_position(world.x_m, world.y_m, world.yaw_rad)
-            lux = sum(illuminance_lux(factors[li.name] * li.nominal_cd,
-                                      math.dist(sensor, (li.x_m, li.y_m))) for li in lights)
+            lux = sum(factors[li.name] * li.nominal_cd * illuminance_per_candela(
+                math.dist(sensor, (li.x_m, li.y_m))) for li in lights)
             inspection.sample(now, lux * (1 + rng.normal(0, noise)) + rng.normal(0, 5.0))
         found += inspection.take(ended=motion.arrived)
         if motion.arrived:

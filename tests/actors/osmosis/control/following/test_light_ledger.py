@@ -7,11 +7,11 @@ import random
 import pytest
 
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis.control.following.light_inspection import RowLight
+from rampart.actors.osmosis.airport.model import Light
 from rampart.actors.osmosis.control.following.light_ledger import LightLedger, LightsKept
 from rampart.actors.osmosis.control.polyline import Polyline
 
-LIGHTS = tuple(RowLight(f"L{i}", 4.0 * i, 0.0, 100.0) for i in range(1, 6))
+LIGHTS = tuple(Light(f"L{i}", "L", 4.0 * i, 0.0, 100.0) for i in range(1, 6))
 ROW = Polyline([(0.0, 0.0), (24.0, 0.0)])
 
 
@@ -32,8 +32,8 @@ def ledger() -> LightLedger:
 
 
 def test_the_lights_of_a_row_are_those_that_it_passes_over():
-    lights = (*LIGHTS, RowLight("aside", 8.0, 0.5, 1.0), RowLight("before", -1.0, 0.0, 1.0),
-              RowLight("beyond", 24.3, 0.0, 1.0))
+    lights = (*LIGHTS, Light("aside", "L", 8.0, 0.5, 1.0), Light("before", "L", -1.0, 0.0, 1.0),
+              Light("beyond", "L", 24.3, 0.0, 1.0))
     row = LightLedger(lights).on_row(ROW)
     assert [name for _, name in row] == ["L1", "L2", "L3", "L4", "L5"]
     assert [s for s, _ in row] == pytest.approx([4, 8, 12, 16, 20])

@@ -186,7 +186,7 @@ def test_whatever_comes_what_drives_lies_between_zero_and_what_one_of_the_two_wa
 
 @pytest.mark.parametrize("fresh", [True, False], ids=["checked", "baseline"])
 def test_without_a_standby_the_pair_has_no_say(fresh):
-    checks = Checks() if fresh else Checks(False, False, False, False, False)
+    checks = Checks() if fresh else Checks(False, False)
     bench = Bench(checks).tick((0.8, 0.0), ticks=3)
     assert not bench.gate.standby_drives(bench.now)
     assert (bench.out, bench.reason) == ((0.8, 0.0), "")

@@ -159,12 +159,12 @@ def test_a_wrong_route_is_refused_and_the_good_one_driven_on():
         await house.kill("graph_planner")
         control.route(m.Route(good.mission_id, good.step, good.mode, True, bad, ""), None)
         await asyncio.sleep(0.5)
-        assert "crosses the prohibited area" in control._status.reason
-        assert control._status.phase is m.ControlPhase.FOLLOWING
+        assert "crosses the prohibited area" in control.core.status.reason
+        assert control.core.status.phase is m.ControlPhase.FOLLOWING
         assert operator.command.linear_mps > 0.2
         control.route(good, None)
         await asyncio.sleep(0.1)
-        assert control._status.reason == ""
+        assert control.core.status.reason == ""
 
     play(scenario)
 
@@ -178,7 +178,7 @@ def test_without_a_good_route_for_the_goal_the_robot_stands_and_control_says_why
             (-29.0, 5.0), (20.0, 5.0)), ""), None)
         await asyncio.sleep(1.5)
         assert standing(house)
-        told = control._status
+        told = control.core.status
         assert (told.phase, told.step) == (m.ControlPhase.REFUSED, 1)
         assert "crosses the prohibited area" in told.reason
 

@@ -12,7 +12,7 @@ from rampart.actors.osmosis.messages import PilotMode
 from tests.actors.osmosis.control.world import DT_S, Circle, World
 
 LIMITS = GateLimits()
-BASELINE = Checks(bounds=False, freshness=False, sequence=False, scan=False, manager=False)
+BASELINE = Checks(inputs=False, manager=False)
 ROOM = StoppingRoom()
 
 

@@ -14,10 +14,13 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.mission import mission_state
 from rampart.actors.osmosis.control.mission.mission_manager import MissionManager
 from rampart.actors.osmosis.control.mission.mission_state import MissionState, obey, status
 from rampart.actors.osmosis.messages import MissionAction, MissionPhase
+from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_info import RunInfo
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.clock import Clock
@@ -47,7 +50,8 @@ async def run(monkeypatch, sockets):
     for name, cls in (("mission_manager", MissionManager), ("planner", Planner)):
         bus = ZenohBus(name, 1, endpoint(sockets, name),
                        [endpoint(sockets, n) for n in names if n != name])
-        node = cls(Context(name, 1, clock, bus, {"held_by": ["RM2"]}))
+        node = cls(Context(name, 1, clock, bus, {"held_by": ["RM2"]},
+                           run=RunContext(application=Osmosis.on_map(load_airport("vallombre")))))
         tasks.append(asyncio.create_task(node.run()))
         nodes.append((node, bus))
     await asyncio.sleep(0.1)
@@ -116,7 +120,7 @@ async def test_a_robot_that_a_recovery_holds_is_not_released_by_an_order(run, ca
 
 async def test_without_an_answer_the_verb_says_so(run, capsys, monkeypatch):
     monkeypatch.setattr(MissionManager, "publish", lambda *_: None)
-    monkeypatch.setattr("rampart.cli.operate.mission_verb._ANSWER_S", 0.5)
+    monkeypatch.setattr("rampart.cli.osmosis.mission_verb._ANSWER_S", 0.5)
     code, out, err = await run.call(capsys, "mission", "pause")
     assert (code, out) == (1, "")
     assert err == "rampart: no effect: the Mission Manager did not answer within 0.5 s\n"

@@ -61,11 +61,5 @@ def reach_of(system: SystemSpec) -> LaserReach:
 
 def checks_of(system: SystemSpec) -> Checks:
     """Return which of the Safety Pilot's checks the spec's layers leave in force."""
-    checks = system.layers.safety_pilot_checks
-    return Checks(
-        bounds=checks,
-        freshness=checks,
-        sequence=checks,
-        scan=checks,
-        manager=system.layers.manager_watch and system.layers.ftm,
-    )
+    layers = system.layers
+    return Checks(layers.safety_pilot_checks, layers.manager_watch and layers.ftm)

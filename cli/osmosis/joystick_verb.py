@@ -13,6 +13,7 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.application import TELEOPERATION
 from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     AUTO,
     JoystickDevice,
@@ -20,7 +21,7 @@ from rampart.actors.osmosis.control.teleoperation.joystick_device import (
 )
 from rampart.cli import systems
 from rampart.cli.following import is_over, stopped_by_signals
-from rampart.cli.operate.keyboard_stick import KeyboardStick
+from rampart.cli.osmosis.keyboard_stick import KeyboardStick
 from rampart.cli.output import NoEffectError, UsageError, say
 from rampart.cli.session import Session, connect
 from rampart.cli.terminal import END, keys
@@ -35,7 +36,6 @@ _ANSWER_S = 1.0
 """Real seconds within which teleoperation has to answer a stick that is held."""
 
 _RELEASES = 3
-_TELEOPERATION = "rampart.actors.osmosis.control.teleoperation.teleoperation:Teleoperation"
 
 
 def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
@@ -91,7 +91,7 @@ async def joystick(options: argparse.Namespace) -> int:
 
 def _open(name: str, session: Session, drive: _Drive) -> JoystickDevice:
     spec = systems.load(session.run.system_file)
-    parameters = next((n.parameters for n in spec.nodes if n.actor == _TELEOPERATION), {})
+    parameters = next((n.parameters for n in spec.nodes if n.actor == TELEOPERATION), {})
     try:
         mapping = mapping_of(parameters)
     except ValueError as error:

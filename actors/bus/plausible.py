@@ -1,7 +1,8 @@
 """Which stamps and readings are possible at all: what is not must do no harm, now or later.
 
 A stamp from the future would shut out all honest ones after it and stay fresh for ever. A number
-beyond all measure would overflow in a square, or stay in a sum for good.
+beyond all measure would overflow in a square, or stay in a sum for good. The checked and
+those who check them share these lines, as they share the envelope that refuses such stamps first.
 """
 
 from __future__ import annotations
@@ -10,10 +11,8 @@ import math
 
 from rampart.actors.bus.envelope import AHEAD_S
 
-__all__ = ["AHEAD_S", "is_possible", "is_sane"]
-
 ABSURD = 1e7
-"""No coordinate in m, no angle in rad and no rate of this robot is as large."""
+"""No coordinate in m, no angle in rad and no rate of a robot is as large."""
 
 
 def is_possible(stamp_s: float, now_s: float) -> bool:

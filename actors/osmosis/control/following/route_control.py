@@ -1,0 +1,323 @@
+"""From route, pose and sweep to the velocity command, and what there is to say about it.
+
+The core of Osmosis Control and of its standby. It takes messages and the time, and gives commands,
+measurements and the status; no bus, no clock. What a system wants beyond the paper's is a part that
+it is given or not: a check of routes, dead reckoning, a loop on the turn rate, the lights.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import msgspec
+
+from rampart.actors.bus.bounds import clip
+from rampart.actors.bus.plausible import is_sane
+from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.airport.route_check import RouteCheck
+from rampart.actors.osmosis.control.following.blockage import BlockageWatch
+from rampart.actors.osmosis.control.following.control_checkpoint import ControlKept, whole_row
+from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
+from rampart.actors.osmosis.control.following.light_ledger import LightsKept
+from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
+from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
+from rampart.actors.osmosis.control.following.path_follower import Motion, PathFollower
+from rampart.actors.osmosis.control.following.row_inspection import RowInspection
+from rampart.actors.osmosis.control.limits_from_spec import hull_of, motion_of, reach_of
+from rampart.actors.osmosis.control.pilot.laser_pair import LaserPair
+from rampart.actors.osmosis.control.polyline import Array, Pose2
+from rampart.actors.osmosis.messages import (
+    Blockage,
+    ControlPhase,
+    ControlStatus,
+    GoalOrder,
+    LaserScan,
+    LightMeasurement,
+    Mode,
+    Odometry,
+    Pose,
+    Route,
+    Twist,
+)
+from rampart.manager.spec.schema import SystemSpec
+
+PERIOD_S = 0.05
+
+_ASIDE_M = 0.1
+"""A step of the way aside by this much is told at once, where a standby has to know."""
+_ACTIVE_SILENT_S = 0.6
+"""After so long without a status, three periods, the standby is the one in the loop."""
+
+
+class RouteControl:
+    """Follows the route that it is given. Times are simulated seconds.
+
+    It goes on computing from the last pose it has, however old, as the paper's does, unless it has
+    `bridge`: that a stale pose stops the robot is the business of FTM6, not something to hide here.
+
+    Args:
+        system: the robot, and whether states are kept.
+        airport: where it drives.
+        tell: reports what is wrong: context, reason, and of what.
+        now_s: now.
+        row: how rows of lights are followed.
+        lights: measures lights; None for a standby, which leaves them to the active one.
+        check: checks a route before it is followed. A bad one is refused: the robot stands, or
+            follows the good one that it has for the same goal.
+        bridge: knows where the robot is while the pose is stale; beyond its bound the robot stops.
+        loop: controls the turn rate; without it the base is trusted to turn as it is told.
+        has_standby: a standby listens, which is told at once where the robot means to be.
+
+    Attributes:
+        status: the newest.
+    """
+
+    def __init__(
+        self, system: SystemSpec, airport: Airport, tell: Callable[[str, str, str], None],
+        now_s: float, row: RowLimits, *, lights: RowInspection | None = None,
+        check: RouteCheck | None = None, bridge: DeadReckoning | None = None,
+        loop: MotionLoop | None = None, has_standby: bool = False,
+    ) -> None:
+        self._airport, self._tell = airport, tell
+        self._hull, self._limits, self._row = hull_of(system), motion_of(system), row
+        self._resumes = system.layers.checkpoints
+        self._lights, self._check, self._bridge, self._loop = lights, check, bridge, loop
+        self._has_standby = has_standby
+        self._lasers = LaserPair(reach_of(system))
+        self._watch = BlockageWatch()
+        self._pose: Pose2 | None = None
+        self._points: Array | None = None
+        self._goal: GoalOrder | None = None
+        self._route: Route | None = None
+        self._refused: Route | None = None
+        self._why_refused = ""
+        self._follower: PathFollower | LightRow | None = None
+        self._motion: Motion | None = None
+        self._blocked: Blockage | None = None
+        self._row_start: tuple[float, float] | None = None
+        self._last = ControlKept()
+        self._stepped_s = now_s
+        self._begun = False
+        self.status = ControlStatus("", 0, ControlPhase.IDLE, 0, 0.0)
+
+    # -- what survives a restart ----------------------------------------------------------------
+
+    @property
+    def kept(self) -> ControlKept | None:
+        """What a successor needs; None if there is nothing to keep."""
+        route = self._route
+        if route is None or not self._resumes:
+            return None
+        return ControlKept(
+            self._lights.ledger.kept if self._lights else LightsKept(route.mission_id), route,
+            self._follower.progress_m if self._follower else None, self._row_start)
+
+    def restore(self, kept: ControlKept) -> None:
+        """Know what a predecessor knew; the robot goes on when the route is there."""
+        self._last, self._row_start = kept, kept.row_start
+        if self._lights:
+            self._lights.ledger.restore(kept.lights)
+
+    # -- what it hears --------------------------------------------------------------------------
+
+    def pose(self, pose: Pose, stamp_s: float, now_s: float) -> None:
+        """Take a pose in `map`."""
+        place = (pose.x_m, pose.y_m, pose.yaw_rad)
+        if self._bridge:
+            self._bridge.pose(stamp_s, place, now_s)
+        if not is_sane(*place):
+            return
+        self._pose = place
+        if self._lights:
+            self._lights.pose(stamp_s, *place)
+        if self._loop:
+            self._loop.pose(stamp_s, *place)
+
+    def odometry(self, odometry: Odometry, stamp_s: float, now_s: float) -> None:
+        """Take the way that the wheels make."""
+        pose = odometry.pose
+        if self._bridge:
+            self._bridge.odometry(stamp_s, (pose.x_m, pose.y_m, pose.yaw_rad), now_s)
+
+    def scan(self, laser: int, sweep: LaserScan, stamp_s: float, now_s: float) -> None:
+        """Take a sweep of one laser."""
+        view = self._lasers.take(laser, sweep, stamp_s, now_s)
+        if view is not None and not view.fault:  # the Safety Pilot stops who sees nothing
+            self._points = view.points
+
+    def goal(self, order: GoalOrder) -> bool:
+        """Take the goal, to check the route's end by; a route refused for it is looked at again.
+
+        Returns:
+            As `route`.
+        """
+        if order == self._goal:
+            return False
+        self._goal = order
+        return self._refused is not None and self.route(self._refused)
+
+    def route(self, route: Route) -> bool:
+        """Take a route; the follower finds its place on it by itself.
+
+        Returns:
+            Whether it takes the place of the one before; a refused one may, and the robot stands.
+        """
+        previous = self._route
+        if route == previous:
+            self._why_refused, self._refused = "", None
+            return False
+        if not all(is_sane(*waypoint) for waypoint in route.waypoints):
+            self._tell("route", "a waypoint is not finite, or farther away than anything can be",
+                       route.mission_id)
+            return False
+        self._why_refused = clip(self._fault_of(route))
+        self._refused = route if self._why_refused else None
+        if self._refused is not None:
+            self._tell("route refused", self._why_refused, route.mission_id)
+            if previous is not None and previous.active and _same_goal(previous, route):
+                return False  # the way that is being followed leads there as well
+            # The mission and step are the new ones, and the robot stands.
+            route = msgspec.structs.replace(route, active=False, waypoints=())
+        before = previous or self._last.route
+        if before is None or not _same_goal(before, route):
+            self._row_start = None
+        if self._row_start is None and route.waypoints:
+            self._row_start = route.waypoints[0]
+        self._route = route
+        self._follower = self._follower_of(route)
+        if self._lights:
+            self._lights.begin(
+                route, self._follower if isinstance(self._follower, LightRow) else None)
+        self._watch.restart()
+        self._blocked = None
+        self._last = ControlKept()
+        return True
+
+    def _follower_of(self, route: Route) -> PathFollower | LightRow | None:
+        if not route.active or not route.waypoints:
+            return None
+        resumed_at_m = self._last.progress_m if route == self._last.route else None
+        if route.mode is Mode.TAXI:
+            return PathFollower(route.waypoints, self._hull, self._limits, near_s_m=resumed_at_m)
+        waypoints = whole_row(self._row_start, route.waypoints) if self._resumes \
+            else route.waypoints
+        return LightRow(waypoints, self._hull, self._limits, self._row,
+                        self._airport.prohibited_distance_m, near_s_m=resumed_at_m)
+
+    def _fault_of(self, route: Route) -> str:
+        """Return why a route must not be followed, or ""."""
+        if self._check is None or not route.active or not route.waypoints:
+            return ""
+        pose, order = self._pose, self._goal
+        known = order is not None and order.active and (
+            (order.mission_id, order.step) == (route.mission_id, route.step))
+        return self._check.fault(
+            route.waypoints, pose[:2] if pose else None,
+            (order.goal.x_m, order.goal.y_m) if known and order else None)
+
+    def adopt(self, active: ControlStatus, stamp_s: float) -> None:
+        """Do as the active one does, by its status of `stamp_s`."""
+        if self._loop and math.isfinite(active.turn_added_radps):
+            self._loop.adopt(active.turn_added_radps, stamp_s + _ACTIVE_SILENT_S)
+        route, follower = self._route, self._follower
+        if route is None or (route.mission_id, route.step) != (active.mission_id, active.step):
+            return
+        if isinstance(follower, LightRow):
+            follower.adopt(active.back_to[0] if active.back_to else None, passing=active.passing)
+        elif isinstance(follower, PathFollower) and active.phase is ControlPhase.FOLLOWING:
+            follower.adopt_aside(active.aside_m)
+
+    # -- what comes of it -----------------------------------------------------------------------
+
+    def begins(self) -> bool:
+        """Whether all inputs are there for the first time, so that a respawn costs no period."""
+        blind = self._pose is None or self._points is None
+        if self._begun or self._route is None or (self._follower is not None and blind):
+            return False
+        self._begun = True
+        return True
+
+    def step(self, now_s: float) -> Twist:
+        """Return the command for now: zero without a route, because silence is a failure."""
+        dt_s = min(max(now_s - self._stepped_s, PERIOD_S / 5), PERIOD_S * 4)
+        self._stepped_s = now_s
+        self._motion = motion = self._follow(dt_s, now_s)
+        if motion is None:
+            return Twist(0.0, 0.0)
+        turn_radps = motion.angular_radps
+        if self._loop:
+            turn_radps = self._loop.turn(motion.linear_mps, turn_radps, dt_s)
+        return Twist(motion.linear_mps, turn_radps)
+
+    def _follow(self, dt_s: float, now_s: float) -> Motion | None:
+        follower, points = self._follower, self._points
+        pose = self._bridge.estimate(now_s) if self._bridge else self._pose
+        if follower is None or pose is None or points is None:
+            return None
+        motion = follower.step(*pose, points, dt_s)
+        if isinstance(follower, LightRow) and follower.back_to is not None:
+            self._watch.restart()  # no progress is meant
+        self._blocked = None if motion.arrived else self._watch.update(
+            motion.distance_to_go_m, pose, points, now_s)
+        return motion
+
+    def measure(self, now_s: float) -> list[LightMeasurement]:
+        """Return the measurements of the last step, to be kept before they are sent.
+
+        They are sent before the arrival is, so that none comes too late.
+        """
+        if not self._lights or self._motion is None or not isinstance(self._follower, LightRow):
+            return []
+        return self._lights.measure(now_s, arrived=self._motion.arrived)
+
+    def report(self) -> bool:
+        """Bring the status up to date, and go back for a light that the last step has missed.
+
+        Returns:
+            Whether the status is to be told at once.
+        """
+        is_incomplete = self._look_back()
+        before, self.status = self.status, self._status(is_incomplete=is_incomplete)
+        return _news(before) != _news(self.status) or (
+            self._has_standby and abs(before.aside_m - self.status.aside_m) > _ASIDE_M)
+
+    def _look_back(self) -> bool:
+        """Go back for a light that was missed; return whether one of the row is missing yet."""
+        motion, row, lights = self._motion, self._follower, self._lights
+        if motion is None or lights is None or not isinstance(row, LightRow):
+            return False
+        light = lights.look_back(row, arrived=motion.arrived)
+        if light:
+            self._tell("light inspection", "passed without a measurement, going back", light)
+        return lights.is_incomplete
+
+    def _status(self, *, is_incomplete: bool) -> ControlStatus:
+        motion, follower, route = self._motion, self._follower, self._route
+        mission_id, step = (route.mission_id, route.step) if route else ("", 0)
+        if motion is None:
+            phase = ControlPhase.WAITING if follower else (
+                ControlPhase.REFUSED if self._why_refused else ControlPhase.IDLE)
+            return ControlStatus(mission_id, step, phase, 0, 0.0, reason=self._why_refused)
+        row = follower if isinstance(follower, LightRow) else None
+        phase = ControlPhase.FOLLOWING
+        if motion.waiting or is_incomplete:
+            phase = ControlPhase.WAITING
+        elif motion.arrived:
+            phase = ControlPhase.ARRIVED
+        return ControlStatus(
+            mission_id, step, phase, motion.waypoint, motion.distance_to_go_m,
+            (self._blocked,) if self._blocked else (), self._why_refused,
+            self._lights.missed if self._lights and motion.arrived else (),
+            (row.back_to,) if row and row.back_to is not None else (),
+            row.is_passing if row else False,
+            follower.aside_m if isinstance(follower, PathFollower) else 0.0,
+            round(self._loop.added_radps, 4) if self._loop else 0.0)
+
+
+def _same_goal(one: Route, other: Route) -> bool:
+    return (one.mission_id, one.step, one.mode) == (other.mission_id, other.step, other.mode)
+
+
+def _news(status: ControlStatus) -> tuple[object, ...]:
+    return status.mission_id, status.step, status.phase, status.back_to, status.passing

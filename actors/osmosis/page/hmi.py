@@ -1,0 +1,186 @@
+"""The operator's page of Osmosis: hands missions and orders to the controller, shows the airport.
+
+What it must not do after a respawn is decided in `submission`, which orders make sense in `orders`,
+who drives in `stick`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import msgspec
+
+from rampart.actors.operator.bounds import MAX_NAME, clip
+from rampart.actors.operator.camera_eye import CameraEye, renderer
+from rampart.actors.operator.hmi import Hmi
+from rampart.actors.operator.requests import RefusedError, Request
+from rampart.actors.operator.server import Visitor
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Airport, Mission
+from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.osmosis.page.driving import Driving
+from rampart.actors.osmosis.page.map import PageMap, lights_shown, page_map
+from rampart.actors.osmosis.page.orders import Orders
+from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS, OrderRequest, StartRequest
+from rampart.actors.osmosis.page.state import OsmosisState
+from rampart.actors.osmosis.page.submission import Submission, first_request, system_is_up
+from rampart.actors.runtime.actor import Context, Header, on
+
+
+class OsmosisHmi(Hmi):
+    """The operator's node of Osmosis.
+
+    Parameters: `camera`, the module that renders the picture of the robot
+        (`rampart.sim.osmosis.camera`), if any.
+    """
+
+    outputs = (*Hmi.outputs, topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.JOYSTICK,
+               topics.ACTUATOR_FAULT)
+    requests = OSMOSIS_REQUESTS
+    shown = (
+        *Hmi.shown, topics.POSE, topics.SCAN, topics.UPPER_SCAN, topics.ROUTE,
+        topics.CONTROL_STATUS, topics.PILOT_STATUS, topics.OBSTACLES, topics.LIGHT_MEASURED,
+        topics.BASE_STATUS)
+    _state: OsmosisState
+    _operating: Driving
+
+    def __init__(self, context: Context) -> None:
+        run, plan = context.run, context.run.plan
+        known = run.application if isinstance(run.application, Osmosis) else None
+        self._airport: Airport | None = known.airport if known else None
+        super().__init__(context)
+        mission: Mission | None = known.mission if known and known.mission.goals else None
+        self._missions: Mapping[str, Mission] = (
+            {mission.name: mission} if mission and plan.waits
+            else self._airport.missions if self._airport else {})
+        self._submission = Submission(
+            plan.run_id, context.incarnation, self.clock.now(),
+            first_request(plan.run_id, mission.name, _goals(mission))
+            if mission and not plan.waits else None)
+        self._orders = Orders(f"{plan.run_id}/{context.name}.{context.incarnation}", "operator")
+
+    def _make_state(self) -> OsmosisState:
+        return OsmosisState(lights_shown(self._airport) if self._airport else None)
+
+    def _make_operating(self) -> Driving:
+        return Driving(self, self._state)
+
+    def _make_camera(self) -> CameraEye | None:
+        module = str(self.parameters.get("camera", ""))
+        if not (module and self._port and self._airport and self._airport.source):
+            return None
+        return CameraEye(renderer(module), {"airport": self._airport.source}, self._camera_view)
+
+    def _camera_view(self) -> dict[str, Any] | None:
+        heard = self._state.picture.value("pose")
+        if heard is None:
+            return None
+        return {**msgspec.structs.asdict(heard.value), "obstacles": [
+            (o.name, o.x_m, o.y_m, o.radius_m) for o in self._state.picture.value("obstacles")]}
+
+    def _hello(self) -> dict[str, Any]:
+        robot = self.context.run.system.mobile
+        return {
+            **super()._hello(),
+            "map": self._map.encoded if self._map else None,
+            "left_out": self._map.left_out if self._map else {},
+            "footprint_m": (robot.length_m, robot.width_m) if robot else None,
+            "missions": [name for name in self._missions if name == clip(name, MAX_NAME)][:200],
+            "track": list(self._state.track),
+        }
+
+    @cached_property
+    def _map(self) -> PageMap | None:
+        return page_map(self._airport) if self._airport else None
+
+    # -- missions and orders --------------------------------------------------------------------
+
+    def _repeat(self) -> None:
+        now = self.clock.now()
+        if told := self._submission.expire(now):
+            self._state.log(now, "note", told)
+        if self._submission.pending is not None and system_is_up(self._table, now):
+            self.publish(topics.MISSION_REQUEST, self._submission.pending)
+        self._tell(self._orders.expire(now))
+        if self._orders.pending is not None:
+            self.publish(topics.MISSION_ORDER, self._orders.pending)
+        super()._repeat()
+
+    def _tell(self, outcome: str) -> None:
+        """Say what became of an order, if there is anything to say."""
+        if outcome:
+            self._state.announce(outcome, self.clock.now(), "order to the mission: ")
+
+    def _fulfil(self, request: Request, visitor: Visitor) -> str | dict[str, Any]:
+        match request:
+            case StartRequest():
+                return self._start(request.name)
+            case OrderRequest():
+                order = self._orders.give(request.action, request.reason, self.clock.now())
+                self.publish(topics.MISSION_ORDER, order)
+                return f"{request.action.value} asked for"
+        return super()._fulfil(request, visitor)
+
+    def _start(self, name: str) -> str:
+        if name not in self._missions:
+            raise RefusedError(f"no mission {name[:40]!r}; there are: "
+                               f"{', '.join(self._missions) or 'none'}")
+        self.publish(topics.MISSION_REQUEST, self._submission.ask(
+            name, _goals(self._missions[name]), self.clock.now()))
+        return f"mission {name} asked for"
+
+    # -- hearing --------------------------------------------------------------------------------
+
+    @on(topics.MISSION_STATUS)
+    def _mission_status(self, message: m.MissionStatus, _header: Header) -> None:
+        self._submission.hear(message)
+        self._orders.hear(message)
+        self._state.mission(message, self.clock.now())
+
+    @on(topics.MISSION_ORDER_ANSWER)
+    def _order_answer(self, message: m.MissionOrderAnswer, _header: Header) -> None:
+        self._tell(self._orders.answer(message))
+
+    @on(topics.POSE)
+    def _pose(self, message: m.Pose, header: Header) -> None:
+        self._state.pose(message, header.stamp, self.clock.now())
+
+    @on(topics.SCAN)
+    def _scan(self, message: m.LaserScan, _header: Header) -> None:
+        self._state.laser("laser", message, self.clock.now())
+
+    @on(topics.UPPER_SCAN)
+    def _upper_scan(self, message: m.LaserScan, _header: Header) -> None:
+        self._state.laser("upper_laser", message, self.clock.now())
+
+    @on(topics.ROUTE)
+    def _route(self, message: m.Route, _header: Header) -> None:
+        self._state.route(message)
+
+    @on(topics.CONTROL_STATUS)
+    def _control(self, message: m.ControlStatus, _header: Header) -> None:
+        self._state.keep("control", message, self.clock.now())
+
+    @on(topics.PILOT_STATUS)
+    def _pilot(self, message: m.PilotStatus, _header: Header) -> None:
+        self._operating.pilot(message)
+        self._state.keep("pilot", message, self.clock.now())
+
+    @on(topics.OBSTACLES)
+    def _obstacles(self, message: m.ObstacleList, _header: Header) -> None:
+        self._state.obstacles(message)
+
+    @on(topics.BASE_STATUS)
+    def _base(self, message: m.BaseStatus, _header: Header) -> None:
+        self._operating.base(message)
+
+    @on(topics.LIGHT_MEASURED)
+    def _light(self, message: m.LightMeasurement, _header: Header) -> None:
+        self._state.light(message)
+
+
+def _goals(mission: Mission) -> tuple[m.Goal, ...]:
+    return tuple(m.Goal(g.x_m, g.y_m, m.Mode(g.mode)) for g in mission.goals)

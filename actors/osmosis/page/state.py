@@ -1,0 +1,107 @@
+"""What the page of Osmosis shows besides what every page does: the airport, the mission. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Collection, Sequence
+from typing import Any
+
+from rampart.actors.operator.bounds import MAX_NAME, Bounds
+from rampart.actors.operator.state import Heard, HmiState, as_heard
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.page.laser import thin
+from rampart.actors.osmosis.page.map import MAX_LIGHTS
+
+TRACK_STEP_M = 0.25
+"""A track point is kept when the robot has moved this far."""
+
+TRACK_POINTS = 4000
+
+_ROUTE = Bounds(items=1000, room=30_000)
+
+
+class OsmosisState(HmiState):
+    """The operator's picture of Osmosis.
+
+    Args:
+        lights: names of the lights that are shown; None for any, up to `MAX_LIGHTS`.
+
+    Attributes:
+        track: where the robot was, (x, y) in `map`.
+    """
+
+    def __init__(self, lights: Collection[str] | None = None) -> None:
+        super().__init__()
+        self._lights = None if lights is None else frozenset(lights)
+        self._mission_id = ""
+        self.track: deque[tuple[float, float]] = deque(maxlen=TRACK_POINTS)
+        self.aged("control", "pilot")
+        self.aged("pose", show=_with_time)
+        self.aged("laser", "upper_laser", show=_sweep)
+        self.aged("mission", show=_mission)
+        self.picture.section("route", (), _route, _ROUTE)
+        self.picture.section("obstacles", ())
+        self.picture.table("lights", MAX_LIGHTS)
+
+    def pose(self, pose: m.Pose, stamp_s: float, now_s: float) -> None:
+        """Keep the pose, and a point of the track if the robot has moved."""
+        self.put("pose", Heard(pose, False, stamp_s), now_s)
+        at = (pose.x_m, pose.y_m)
+        if not all(map(math.isfinite, at)):
+            return
+        if not self.track or math.dist(self.track[-1], at) >= TRACK_STEP_M:
+            self.track.append((round(pose.x_m, 2), round(pose.y_m, 2)))
+
+    def laser(self, which: str, scan: m.LaserScan, now_s: float) -> None:
+        """Keep a sweep of "laser" or "upper_laser"; it may wait for the next pose."""
+        self.put(which, Heard(scan), now_s, urgent=False)
+
+    def route(self, route: m.Route) -> None:
+        """Keep the way to the goal; none while there is no goal."""
+        self.picture.put("route", route.waypoints if route.active else ())
+
+    def obstacles(self, obstacles: m.ObstacleList) -> None:
+        """Keep the obstacles that are there."""
+        self.picture.put("obstacles", tuple(o for o in obstacles.obstacles if o.present))
+
+    def mission(self, status: m.MissionStatus, now_s: float) -> None:
+        """Keep the mission's state; a new mission starts with unmeasured lights."""
+        if status.mission_id and status.mission_id != self._mission_id:
+            self._mission_id = status.mission_id
+            for name in self.picture.rows("lights"):
+                self.picture.put_row("lights", name, None)
+        self.keep("mission", status, now_s)
+        for light in status.lights:
+            self.light(light)
+
+    def light(self, measured: m.LightMeasurement) -> None:
+        """Keep the measurement of a light that is shown."""
+        name = measured.light
+        if len(name) <= MAX_NAME and (self._lights is None or name in self._lights):
+            self.picture.put_row("lights", name, {
+                "verdict": measured.verdict, "ratio": round(measured.ratio, 3),
+                "intensity_cd": round(measured.intensity_cd, 1)})
+
+
+def _with_time(heard: Heard | None) -> dict[str, Any] | None:
+    return None if heard is None else {**(as_heard(heard) or {}), "t": round(heard.t, 4)}
+
+
+def _sweep(heard: Heard | None) -> dict[str, Any] | None:
+    return None if heard is None or heard.stale else thin(heard.value)
+
+
+def _route(waypoints: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    return [(round(x, 2), round(y, 2)) for x, y in waypoints]
+
+
+def _mission(heard: Heard | None) -> dict[str, Any] | None:
+    if heard is None:
+        return None
+    status: m.MissionStatus = heard.value
+    return {
+        "name": status.name, "phase": status.phase, "step": status.step,
+        "goals": status.goals, "times_s": status.step_times_s, "reason": status.reason,
+        "stale": heard.stale, "orders": status.orders, "skipped": status.skipped,
+    }

@@ -1,0 +1,1 @@
+"""What viewers of recordings get to see of Osmosis."""

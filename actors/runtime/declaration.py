@@ -1,0 +1,103 @@
+"""What the class of an actor declares: the topics it hears and publishes, its timers, its peers.
+
+`rampart.actors.layout.wiring` computes from it who talks with whom, before any actor is made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, TypeVar
+
+from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
+
+F = TypeVar("F", bound=Callable[..., None])
+
+BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, HELLO, DIAGNOSTIC, INJECTION_REPORT)
+"""What every actor publishes besides its own outputs."""
+
+BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT, HELLO)
+"""What every actor hears besides its own inputs: injections from tools, hellos from partners."""
+
+
+def on(topic: Topic[Any]) -> Callable[[F], F]:
+    """Declare a method as the handler of a topic: `handler(self, message, header)`."""
+
+    def mark(function: F) -> F:
+        function.__dict__.setdefault("_rampart_topics", []).append(topic)
+        return function
+
+    return mark
+
+
+def every(period_s: float) -> Callable[[F], F]:
+    """Declare a method to be called each `period_s` simulated seconds, first after one period."""
+
+    def mark(function: F) -> F:
+        function.__dict__["_rampart_period_s"] = period_s
+        return function
+
+    return mark
+
+
+class Declared:
+    """Base of all actors, as far as their classes alone tell.
+
+    Class attributes:
+        outputs: topics it publishes; publishing another one raises.
+    """
+
+    outputs: ClassVar[tuple[Topic[Any], ...]] = ()
+    _handlers: ClassVar[tuple[tuple[Topic[Any], str], ...]] = ()
+    _periodic: ClassVar[tuple[tuple[float, str], ...]] = ()
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        handlers: dict[tuple[str, str], tuple[Topic[Any], str]] = {}
+        periodic: dict[str, float] = {}
+        for base in reversed(cls.__mro__):
+            for name, member in vars(base).items():
+                for topic in getattr(member, "_rampart_topics", ()):
+                    handlers[(topic.key, name)] = (topic, name)
+                if hasattr(member, "_rampart_period_s"):
+                    periodic[name] = member._rampart_period_s
+        cls._handlers = tuple(handlers.values())
+        cls._periodic = tuple((period, name) for name, period in periodic.items())
+
+    @classmethod
+    def names(
+        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+    ) -> tuple[str, ...] | None:
+        """Which members of an input family the node `name` hears; None for all."""
+        return None
+
+    @classmethod
+    def output_names(
+        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+    ) -> tuple[str, ...] | None:
+        """Which members of an output family the node `name` publishes; None for any."""
+        return (name,)
+
+    @classmethod
+    def watches(cls, name: str, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003
+        """Nodes of which `on_peer` reports that they appear and vanish."""
+        return ()
+
+    @classmethod
+    def inputs(cls) -> tuple[Topic[Any], ...]:
+        """Topics it has handlers for, those of every actor included."""
+        return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
+
+    @classmethod
+    def published(cls, key: str, name: str, parameters: Mapping[str, Any]) -> Topic[Any] | None:
+        """Return the topic of a key below `rampart/`, if the node `name` publishes it."""
+        for topic in (*cls.outputs, *BASE_OUTPUTS):
+            head, family, tail = topic.key.partition("{name}")
+            if not family:
+                if topic.key == key:
+                    return topic
+            elif key.startswith(head) and key.endswith(tail):
+                names = cls.output_names(topic, name, parameters)
+                if names is None or key[len(head):len(key) - len(tail)] in names:
+                    return topic
+        return None

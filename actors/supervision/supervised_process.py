@@ -1,0 +1,300 @@
+"""A process under supervision: its states, what moves it between them, what is then to be done.
+
+`TRANSITIONS` is the whole of it; what is not in the table changes nothing. Pure: time is an
+argument, and the actions are carried out by `rampart.actors.supervision.supervisor`.
+
+How often it may be restarted is OTP's restart intensity, with backoff; the numbers are those of
+`[supervision]` in the system spec. Up to half of `intensity` restarts within `period_s` happen at
+once; beyond that each waits longer, doubling from `backoff_s`; one more than `intensity` and the
+policy gives up. What has crashed so often may yet be well again later, when a disk has room or a
+device is plugged in. So giving up is no end: single attempts follow, further and further apart, and
+only if one of them lasts for a whole period is the process as good as any other again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import NamedTuple
+
+from rampart.actors.ftm.messages import NodeState
+from rampart.actors.layout.layout import Unit
+from rampart.actors.supervision.patience import Patience, Usage
+from rampart.manager.spec.tables import Supervision
+
+START_TIMEOUT_S = 3.0
+"""Wall seconds in which a new process must have sent its first heartbeat."""
+
+STATUS = "fresh status of the manager"
+"""Stands among the names of a process' nodes for what the Safety Pilot depends on."""
+
+_USUAL = Supervision()
+_MOST_DOUBLINGS = 60
+"""Beyond which no wait doubles; far longer than any is allowed to be."""
+
+
+class State(Enum):
+    """What a process is doing; all but `RESTARTING` are told to others, as `NodeState`."""
+
+    STARTING = "starting"
+    """It was forked and was not heard yet."""
+    RUNNING = "running"
+    STOPPED = "stopped"
+    WEDGED = "wedged"
+    CRASHED = "crashed"
+    """It has ended, or there was none yet, and nobody has asked for another one."""
+    RESTARTING = "restarting"
+    """It was killed if it was there, and another one is forked as soon as it is gone."""
+    GIVEN_UP = "given up"
+    """Like `RESTARTING`, much later."""
+
+
+class Event(Enum):
+    """What happens to a process."""
+
+    HEARD = auto()
+    SILENT = auto()
+    """It is not heard although it could be."""
+    SILENT_STOPPED = auto()
+    """Likewise, and the kernel says that it is stopped."""
+    ENDED = auto()
+    START = auto()
+    """The run begins, or the supervisor does and finds no process."""
+    RESTART = auto()
+    """Another process is wanted in its place, and may be had."""
+    TOO_OFTEN = auto()
+    """Likewise, but there were too many already."""
+    STARTED = auto()
+    """Its first process was forked."""
+    FORKED = auto()
+    """Another process was forked."""
+    ADOPTED = auto()
+    """A process was found that was not known."""
+    ADAPTED = auto()
+    """It is to run by other parameters from now on."""
+
+
+class Action(Enum):
+    """What is to be done about it."""
+
+    TELL = auto()
+    """Publish the transition's word."""
+    PUBLISH = auto()
+    """Publish the table of all nodes."""
+    SEARCH = auto()
+    """Adopt a process that nobody holds, if there is one."""
+    RECOVER = auto()
+    """Ask for a restart, if it is the supervisor's to ask."""
+    KILL = auto()
+    """End what is left of the process."""
+    FORK = auto()
+    """Fork another one now."""
+    FORK_WHEN_GONE = auto()
+    """Likewise after `delay_s`, and not before the old process is gone."""
+    HOLD = auto()
+    """Watch for its end."""
+
+
+class Transition(NamedTuple):
+    """Where an event leads, the word for it, and what is to be done, in this sequence.
+
+    An action may cause a transition itself; then those after it are left out.
+    """
+
+    state: State
+    word: str = ""
+    actions: tuple[Action, ...] = ()
+
+
+_A, _E, _S = Action, Event, State
+_PRESENT = (_S.STARTING, _S.RUNNING, _S.STOPPED, _S.WEDGED)
+_WAITING = (_S.RESTARTING, _S.GIVEN_UP)
+_LOST = (_A.TELL, _A.PUBLISH, _A.RECOVER)
+_NEW = (_A.TELL, _A.PUBLISH, _A.HOLD)
+
+TRANSITIONS: Mapping[tuple[State, Event], Transition] = {
+    (_S.STARTING, _E.HEARD): Transition(_S.RUNNING, "running", (_A.TELL, _A.PUBLISH)),
+    (_S.STOPPED, _E.HEARD): Transition(_S.RUNNING, "resumed", (_A.TELL, _A.PUBLISH)),
+    (_S.WEDGED, _E.HEARD): Transition(_S.RUNNING, "resumed", (_A.TELL, _A.PUBLISH)),
+    (_S.STARTING, _E.SILENT): Transition(_S.WEDGED, "wedged", _LOST),
+    (_S.RUNNING, _E.SILENT): Transition(_S.WEDGED, "wedged", _LOST),
+    (_S.RUNNING, _E.SILENT_STOPPED): Transition(_S.STOPPED, "stopped", _LOST),
+    # One that was never heard: another process that nobody holds may have its socket.
+    (_S.STARTING, _E.ENDED): Transition(
+        _S.CRASHED, "crashed", (_A.TELL, _A.SEARCH, _A.PUBLISH, _A.RECOVER)),
+    **{(state, _E.ENDED): Transition(_S.CRASHED, "crashed", _LOST)
+       for state in (_S.RUNNING, _S.STOPPED, _S.WEDGED)},
+    (_S.CRASHED, _E.START): Transition(_S.RESTARTING, "", (_A.FORK,)),
+    **{(state, _E.RESTART): Transition(_S.RESTARTING, "", (_A.KILL, _A.FORK_WHEN_GONE))
+       for state in (*_PRESENT, _S.CRASHED)},
+    (_S.GIVEN_UP, _E.RESTART): Transition(_S.GIVEN_UP, "given up", (_A.TELL,)),
+    **{(state, _E.TOO_OFTEN): Transition(
+        _S.GIVEN_UP, "given up", (_A.KILL, _A.TELL, _A.PUBLISH, _A.FORK_WHEN_GONE))
+       for state in (*_PRESENT, _S.CRASHED)},
+    (_S.RESTARTING, _E.STARTED): Transition(_S.STARTING, "started", _NEW),
+    **{(state, _E.FORKED): Transition(_S.STARTING, "respawned", _NEW) for state in _WAITING},
+    **{(state, _E.ADOPTED): Transition(_S.RUNNING, "adopted", (_A.TELL, _A.HOLD))
+       for state in State},
+    (_S.GIVEN_UP, _E.ADAPTED): Transition(_S.CRASHED),
+}
+
+
+@dataclass(slots=True)
+class RestartPolicy:
+    """Sliding window of restarts of one process. Times are in seconds of the caller's clock.
+
+    Attributes:
+        limits: Of the system spec.
+        attempts: Single ones since it gave up; 0 while it has not.
+    """
+
+    limits: Supervision = _USUAL
+    attempts: int = 0
+    _restarts: deque[float] = field(default_factory=deque)
+
+    @property
+    def spent(self) -> str:
+        """What it allows, in words."""
+        return f"{self.limits.intensity} restarts in {self.limits.period_s:.0f} s"
+
+    def delay_s(self, now_s: float) -> float | None:
+        """Return how long to wait before the next restart, or None to give up."""
+        limits = self.limits
+        while self._restarts and now_s - self._restarts[0] > limits.period_s:
+            self._restarts.popleft()
+        count, free = len(self._restarts), limits.intensity // 2
+        if count == 0:
+            self.attempts = 0
+        if count >= limits.intensity or self.attempts:
+            return None
+        return 0.0 if count < free else _doubled(
+            limits.backoff_s, count - free, limits.backoff_max_s)
+
+    def attempt_in_s(self, now_s: float) -> float:
+        """Return how long to wait before the next attempt of what was given up.
+
+        Until the window has room for it, and longer after each that failed.
+        """
+        limits = self.limits
+        pause_s = _doubled(limits.attempt_s, self.attempts, limits.attempt_max_s)
+        self.attempts += 1
+        if len(self._restarts) < limits.intensity:
+            return pause_s
+        return max(pause_s, self._restarts[-limits.intensity] + limits.period_s - now_s)
+
+    def restarted(self, now_s: float) -> None:
+        """Note a restart."""
+        self._restarts.append(now_s)
+
+
+def _doubled(first_s: float, times: int, most_s: float) -> float:
+    return min(first_s * 2.0 ** min(times, _MOST_DOUBLINGS), most_s)
+
+
+@dataclass(slots=True)
+class SupervisedProcess:
+    """One process of the run. Times are wall seconds of the caller's clock.
+
+    Attributes:
+        unit: What runs in it.
+        state: What it is doing.
+        shown: What others are told of that: of a `RESTARTING` one, what it was before.
+        incarnation: Of the present process.
+        highest: The highest incarnation that there was.
+        requested_by: The module that asked for it, until it was heard.
+        delay_s: How long to wait before the fork that was granted last.
+        heard_s: When each of its nodes was last heard, and the manager's status.
+    """
+
+    unit: Unit
+    policy: RestartPolicy
+    patience: Patience
+    state: State = State.CRASHED
+    shown: NodeState = NodeState.CRASHED
+    pid: int = 0
+    incarnation: int = 0
+    highest: int = 0
+    requested_by: str = ""
+    delay_s: float = 0.0
+    started_s: float = 0.0
+    searched_s: float = -math.inf
+    heard_s: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The actors in it."""
+        return tuple(n.name for n in self.unit.nodes)
+
+    @property
+    def waits(self) -> bool:
+        """Whether a fork is under way."""
+        return self.state in _WAITING
+
+    @property
+    def is_dead(self) -> bool:
+        """Whether others are told that there is none."""
+        return self.shown in (NodeState.CRASHED, NodeState.GIVEN_UP)
+
+    def step(self, event: Event) -> Transition | None:
+        """Change the state as an event demands; None if there is no transition for it."""
+        found = TRANSITIONS.get((self.state, event))
+        if found is not None:
+            self.state = found.state
+            if self.state is not State.RESTARTING:
+                self.shown = NodeState(self.state.value)
+            elif self.shown in (NodeState.STARTING, NodeState.RUNNING):
+                self.shown = NodeState.CRASHED
+        return found
+
+    def ask(self, now_s: float) -> tuple[Event, str]:
+        """Ask for a restart: return what comes of it, and in words why nothing does so far."""
+        if self.waits:
+            return Event.RESTART, "an attempt will follow by itself"
+        policy, failed = self.policy, self.policy.attempts
+        delay_s = policy.delay_s(now_s)
+        if delay_s is not None:
+            self.delay_s = delay_s
+            return Event.RESTART, ""
+        self.delay_s = policy.attempt_in_s(now_s)
+        why = f"attempt {failed} failed" if failed else policy.spent
+        return Event.TOO_OFTEN, f"{why}, the next attempt is in {self.delay_s:.0f} s"
+
+    def take(self, pid: int, incarnation: int) -> None:
+        """Note that another process is the present one."""
+        self.pid, self.incarnation, self.heard_s = pid, incarnation, {}
+        self.highest = max(self.highest, incarnation)
+
+    def silence(self, now_s: float, timeout_s: float, used: Callable[[], Usage]) -> str:
+        """Return in words what was not heard of it for too long although it could; "" if nothing.
+
+        Args:
+            now_s: Now.
+            timeout_s: Of a heartbeat.
+            used: Returns what the process has used; asked only if that matters.
+        """
+        if self.state is State.STARTING:
+            is_silent = self._could_have_been_heard(now_s, self.started_s, START_TIMEOUT_S, used)
+            return "no heartbeat after its start" if is_silent else ""
+        if self.state is not State.RUNNING:
+            return ""
+        since_s = min(self.heard_s.values(), default=now_s)
+        late = [name for name, at_s in self.heard_s.items() if now_s - at_s > timeout_s]
+        if not self._could_have_been_heard(now_s, since_s, timeout_s, used) or not late:
+            return ""
+        return f"no {STATUS}" if late == [STATUS] else (
+            f"no heartbeat from {', '.join(name for name in late if name != STATUS)}")
+
+    def _could_have_been_heard(self, now_s: float, since_s: float, limit_s: float,
+                               used: Callable[[], Usage]) -> bool:
+        if now_s - since_s <= limit_s / 2:  # not worth a look into /proc
+            self.patience.answered()
+            return False
+        return self.patience.look(now_s, self.pid, used(), since_s) > limit_s
+
+    def excuse(self, now_s: float, stall_s: float) -> None:
+        """Do not count as silence what the supervisor could not have heard."""
+        self.started_s = min(now_s, self.started_s + stall_s)
+        self.heard_s = {n: min(now_s, at_s + stall_s) for n, at_s in self.heard_s.items()}

@@ -1,0 +1,1 @@
+"""Commands for Osmosis: mission, joystick, obstacle; its lines of status, top and metrics."""

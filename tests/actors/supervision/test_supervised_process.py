@@ -1,0 +1,154 @@
+"""What moves a supervised process from state to state, and what is then to be done: as a table."""
+
+from __future__ import annotations
+
+import pytest
+
+from rampart.actors.ftm.messages import NodeState
+from rampart.actors.layout.layout import Unit
+from rampart.actors.supervision.patience import AT_LEISURE, Patience, Usage
+from rampart.actors.supervision.supervised_process import (
+    START_TIMEOUT_S,
+    STATUS,
+    TRANSITIONS,
+    Event,
+    RestartPolicy,
+    State,
+    SupervisedProcess,
+)
+from rampart.manager.spec.schema import Kind, NodeSpec
+from rampart.manager.spec.tables import Supervision
+
+TABLE = """
+starting   heard          running    running   tell publish
+stopped    heard          running    resumed   tell publish
+wedged     heard          running    resumed   tell publish
+starting   silent         wedged     wedged    tell publish recover
+running    silent         wedged     wedged    tell publish recover
+running    silent_stopped stopped    stopped   tell publish recover
+starting   ended          crashed    crashed   tell search publish recover
+running    ended          crashed    crashed   tell publish recover
+stopped    ended          crashed    crashed   tell publish recover
+wedged     ended          crashed    crashed   tell publish recover
+crashed    start          restarting -         fork
+starting   restart        restarting -         kill fork_when_gone
+running    restart        restarting -         kill fork_when_gone
+stopped    restart        restarting -         kill fork_when_gone
+wedged     restart        restarting -         kill fork_when_gone
+crashed    restart        restarting -         kill fork_when_gone
+given_up   restart        given_up   given_up  tell
+starting   too_often      given_up   given_up  kill tell publish fork_when_gone
+running    too_often      given_up   given_up  kill tell publish fork_when_gone
+stopped    too_often      given_up   given_up  kill tell publish fork_when_gone
+wedged     too_often      given_up   given_up  kill tell publish fork_when_gone
+crashed    too_often      given_up   given_up  kill tell publish fork_when_gone
+restarting started        starting   started   tell publish hold
+restarting forked         starting   respawned tell publish hold
+given_up   forked         starting   respawned tell publish hold
+starting   adopted        running    adopted   tell hold
+running    adopted        running    adopted   tell hold
+stopped    adopted        running    adopted   tell hold
+wedged     adopted        running    adopted   tell hold
+crashed    adopted        running    adopted   tell hold
+restarting adopted        running    adopted   tell hold
+given_up   adopted        running    adopted   tell hold
+given_up   adapted        crashed    -
+"""
+
+
+def process(state: State = State.CRASHED, **limits: float) -> SupervisedProcess:
+    unit = Unit("a", (NodeSpec("a", "m:A", Kind.CONTROL), NodeSpec("b", "m:B", Kind.CONTROL)))
+    made = SupervisedProcess(unit, RestartPolicy(Supervision(**limits)), Patience(0.2), state)
+    if state is not State.RESTARTING:
+        made.shown = NodeState(state.value)
+    return made
+
+
+def test_the_table_of_transitions():
+    written = {}
+    for line in TABLE.split("\n")[1:-1]:
+        state, event, after, word, *actions = line.split()
+        written[State[state.upper()], Event[event.upper()]] = (
+            State[after.upper()], word.replace("-", "").replace("_", " "), actions)
+    assert written == {
+        key: (step.state, step.word, [action.name.lower() for action in step.actions])
+        for key, step in TRANSITIONS.items()}
+
+
+@pytest.mark.parametrize("event", Event)
+@pytest.mark.parametrize("state", State)
+def test_an_event_does_what_the_table_says_and_else_nothing(state, event):
+    one = process(state)
+    shown, expected = one.shown, TRANSITIONS.get((state, event))
+    assert one.step(event) is expected
+    if expected is None:
+        assert (one.state, one.shown) == (state, shown)
+    elif expected.state is not State.RESTARTING:
+        assert (one.state, one.shown.value) == (expected.state, expected.state.value)
+
+
+@pytest.mark.parametrize(("before", "shown"), [
+    (State.STARTING, "crashed"), (State.RUNNING, "crashed"), (State.STOPPED, "stopped"),
+    (State.WEDGED, "wedged"), (State.CRASHED, "crashed")])
+def test_one_that_is_being_restarted_is_shown_as_what_it_was_and_never_as_well(before, shown):
+    one = process(before)
+    one.step(Event.RESTART)
+    assert (one.state, one.shown.value, one.waits) == (State.RESTARTING, shown, True)
+    assert one.is_dead == (shown == "crashed")
+
+
+def test_restarts_are_granted_at_once_then_later_then_not_and_then_one_by_one():
+    one = process(State.CRASHED, intensity=4, period_s=10.0, backoff_s=1.0, backoff_max_s=1.5,
+                  attempt_s=20.0, attempt_max_s=30.0)
+    granted = []
+    for _ in range(4):
+        assert one.ask(0.0) == (Event.RESTART, "")
+        granted.append(one.delay_s)
+        one.policy.restarted(0.0)
+    assert granted == [0.0, 0.0, 1.0, 1.5]
+    assert one.ask(0.0) == (
+        Event.TOO_OFTEN, "4 restarts in 10 s, the next attempt is in 20 s")
+    one.policy.restarted(1.0)
+    assert one.ask(1.0) == (Event.TOO_OFTEN, "attempt 1 failed, the next attempt is in 30 s")
+    one.step(Event.TOO_OFTEN)
+    assert one.ask(2.0) == (Event.RESTART, "an attempt will follow by itself")
+    assert one.policy.attempts == 2  # to ask changes nothing while one is due
+
+
+def usage() -> Usage:
+    return AT_LEISURE
+
+
+def test_a_new_process_is_silent_when_it_was_not_heard_for_as_long_as_it_may_take():
+    one = process(State.STARTING)
+    one.take(7, 1)
+    assert one.silence(START_TIMEOUT_S - 0.1, 1.0, usage) == ""
+    assert one.silence(START_TIMEOUT_S + 0.1, 1.0, usage) == "no heartbeat after its start"
+
+
+@pytest.mark.parametrize(("heard_s", "expected"), [
+    ({"a": 8.0, "b": 10.0}, "no heartbeat from a"), ({"a": 8.0, "b": 8.0, STATUS: 8.0},
+                                                     "no heartbeat from a, b"),
+    ({"a": 10.0, "b": 10.0, STATUS: 8.0}, f"no {STATUS}"), ({"a": 9.5, "b": 10.0}, ""), ({}, "")])
+def test_of_a_process_each_node_has_to_be_heard_and_of_the_manager_its_status(heard_s, expected):
+    one = process(State.RUNNING)
+    one.take(7, 1)
+    one.heard_s = heard_s
+    assert one.silence(10.0, 1.0, usage) == expected
+
+
+def test_silence_is_excused_for_as_long_as_the_supervisor_could_not_hear():
+    one = process(State.RUNNING)
+    one.take(7, 1)
+    one.heard_s = {"a": 8.0, "b": 9.9}
+    one.excuse(10.0, 1.5)
+    assert one.heard_s == {"a": 9.5, "b": 10.0}
+    assert one.silence(10.0, 1.0, usage) == ""
+
+
+def test_the_incarnations_of_a_process_never_go_back():
+    one = process()
+    one.take(7, 5)
+    one.heard_s["a"] = 1.0
+    one.take(8, 3)
+    assert (one.pid, one.incarnation, one.highest, one.heard_s) == (8, 3, 5, {})

@@ -1,0 +1,74 @@
+"""README, docs and the changelog's newest section: what they name is there.
+
+Files and folders of this repository, links with their anchors, modules and classes, programs that
+are run with `-m`, and verbs of `rampart`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import pkgutil
+import re
+from pathlib import Path
+
+import pytest
+
+from rampart.cli.main import build_parser
+from tests import ROOT
+
+TOPS = "actors|benchmarks|cli|docs|files|manager|rampart|sim|systems|tests"
+TO_COME = {"run"}
+"""Verbs that are documented and not there yet."""
+
+PAGES = {str(file.relative_to(ROOT)): file.read_text(encoding="utf-8")
+         for file in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))}
+PAGES["CHANGELOG.md"] = (ROOT / "CHANGELOG.md").read_text(
+    encoding="utf-8").partition("## Unreleased")[2].partition("\n## ")[0]
+KEYS = set(re.findall(r"^\| `([^`]+)` \|", (ROOT / "topics.md").read_text(encoding="utf-8"),
+                      re.MULTILINE))
+
+
+def anchors(page: Path) -> set[str]:
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def is_there(dotted: str) -> bool:
+    try:
+        pkgutil.resolve_name(dotted)
+    except (ImportError, AttributeError):
+        return False
+    return True
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_files_and_folders_are_there(page):
+    said = set(re.findall(rf"`((?:{TOPS})/[\w./-]*)`", PAGES[page])) - KEYS
+    assert [path for path in said if not (ROOT / path).exists() and path.lower() == path] == []
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page):
+    here, lost = ROOT / page, []
+    for target, anchor in re.findall(r"\]\((?!http)([^)#\s]*)(?:#([^)]+))?\)", PAGES[page]):
+        file = here.parent / target if target else here
+        if not file.exists() or (anchor and anchor not in anchors(file)):
+            lost.append(f"{target}#{anchor}")
+    assert lost == []
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_modules_and_classes_are_there(page):
+    said = set(re.findall(r"\brampart(?:\.[A-Za-z_]\w*)+(?::\w+)?", PAGES[page]))
+    said -= {"rampart.run", "rampart.end"}  # metadata of a recording
+    assert {name for name in said if not is_there(name)} == set()
+    run = re.findall(r"python -m ((?:tests|benchmarks)[.\w]+)", PAGES[page])
+    assert [m for m in run if not (ROOT / m.replace(".", "/")).with_suffix(".py").exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_verbs_are_there(page):
+    known = {verb for action in build_parser()._actions  # argparse has no other way
+             if isinstance(action, argparse._SubParsersAction) for verb in action.choices}
+    said = set(re.findall(r"(?:^|`|\$ |; |bin/)rampart ([a-z][a-z-]*)", PAGES[page], re.MULTILINE))
+    assert said - TO_COME <= known
