@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -22,7 +23,7 @@ from rampart.cli.main import build_parser, main
 from rampart.cli.operate.inject_verbs import choose
 from rampart.cli.output import UsageError
 from rampart.sim.campaign.job import _document
-from rampart.sim.faults.faults import find_fault
+from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
 from tests.porter_actors import write_porter_system
 
 
@@ -223,7 +224,7 @@ def test_a_fault_with_a_name_can_be_made_rarer_intermittent_and_random_in_anothe
         "inject", "gps-noise", "--share", "0.3", "--on", "1", "--off", "4", "--seed", "7"])
     (order,) = choose(options).orders("i")
     assert (order.share, order.on_s, order.off_s, order.seed) == (0.3, 1.0, 4.0, 7)
-    assert order.noise_fields == find_fault("gps-noise").disturbances[0].noise_fields
+    assert order.noise_fields == SENSOR_FAULTS["gps-noise"].disturbances[0].noise_fields
 
 
 def test_another_seed_corrupts_a_topic_with_other_numbers():
@@ -339,6 +340,20 @@ def verbs(parser, path=()):
             for name, sub in action.choices.items():
                 yield (*path, name), sub
                 yield from verbs(sub, (*path, name))
+
+
+def test_a_package_adds_verbs_and_one_that_is_broken_takes_no_other_along(monkeypatch, capsys):
+    def add(verbs, formatter, common) -> None:
+        verbs.add_parser("tank", parents=[common]).set_defaults(run=lambda options: options.port)
+
+    def broken():
+        raise ImportError("no tank")
+
+    monkeypatch.setattr("rampart.cli.main.entry_points", lambda group: [
+        SimpleNamespace(name="leak", value="leak:add", load=broken),
+        SimpleNamespace(name="tank", value="tank:add", load=lambda: add)])
+    assert main(["tank", "--port", "7"]) == 7
+    assert capsys.readouterr().err == "rampart: verb leak (leak:add): ImportError: no tank\n"
 
 
 @pytest.mark.parametrize(("path", "parser"), list(verbs(build_parser())),
