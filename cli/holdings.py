@@ -14,7 +14,7 @@ HEARD_S = 0.3
 """Simulated seconds within which it is repeated (nominally each 0.2 s)."""
 
 _NODES = 16
-"""Which can be made to stand: the base and the Safety Pilot, and more than there are."""
+"""Which can be made to stand: more than there are."""
 
 
 class Holdings:

@@ -30,8 +30,6 @@ _EPILOG = """examples:
   rampart topic echo localization/pose           see messages go by
   rampart inject command-not-updated             break something
   rampart reset RM1                              release the emergency stop
-  rampart mission pause                          give the mission an order
-  rampart joystick                               drive from the keyboard
   rampart adapt set strategy guarded-repair      change mechanisms while it runs
   rampart live foxglove                          see it in another viewer
   rampart record run.mcap                        keep all that is said; `rampart replay` it
@@ -71,7 +69,7 @@ def build_parser() -> argparse.ArgumentParser:
     decide_verbs.add(verbs, formatter)
     tree_verbs.add(verbs, formatter)
     verify_verb.add(verbs, formatter)
-    for found in sorted(entry_points(group="rampart.verbs")):
+    for found in sorted(entry_points(group="rampart.verbs"), key=lambda verb: verb.name):
         try:
             found.load()(verbs, formatter, common)
         except Exception as error:  # of somebody else's package: the other verbs are there

@@ -1,7 +1,7 @@
 """Pushes the picture to the open pages: what changed, at most 25 times a second, encoded once.
 
 A change that matters is on its way in the same turn of the event loop, unless the last frame is
-younger than `FRAME_GAP_S`; the laser rides along. Pages at the same version share one frame.
+younger than `FRAME_GAP_S`; what is not urgent rides along. Pages at the same version share a frame.
 
 *No backlog.* The buffers between here and a browser hold minutes of frames, so that a page that
 cannot keep up would show the past. A page therefore says which frame it has drawn, and has at most

@@ -6,7 +6,7 @@ seen nothing (version 0) is sent all. So nobody has to remember what a page miss
 was suspended, or could not keep up, gets the newest of everything and no backlog.
 
 A section is turned into JSON when it is sent for the first time, and that once for all pages; then
-it is also cut to its bounds (`hmi_bounds`). A table has rows of which those that changed are sent.
+it is also cut to its bounds (`bounds`). A table has rows of which those that changed are sent.
 """
 
 from __future__ import annotations

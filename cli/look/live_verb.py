@@ -25,9 +25,8 @@ def add(verbs: Any, formatter: Any) -> None:
     """Add the verb to the parser."""
     parser = verbs.add_parser(
         "live", formatter_class=formatter, help="see the run live in Foxglove",
-        description="Show the run in a viewer for robots: map, prohibited area, lights, obstacles,"
-                    "\nroute, robot, transforms, laser, and a log in words. Waits for a run, and\n"
-                    "for the next when one ends.",
+        description="Show the run in a viewer for robots: what its system shows of the robot,\n"
+                    "and a log in words. Waits for a run, and for the next when one ends.",
         epilog="examples:\n  rampart live foxglove")
     viewers = parser.add_subparsers(dest="subverb", required=True, metavar="VIEWER")
 

@@ -20,7 +20,7 @@ def add(verbs: Any, formatter: Any) -> None:
         "metrics", formatter_class=formatter, help="serve the run's figures to Prometheus",
         description="Serve http://HOST:PORT/metrics in Prometheus' text format, or in OpenMetrics\n"
                     "for who asks for it: nodes, heartbeats, detections, recoveries, decisions,\n"
-                    "mission, clearances, message counts and rates, processes. Waits for a run,\n"
+                    "message counts and rates, processes, what the robot adds. Waits for a run,\n"
                     "and for the next when one ends; meanwhile rampart_up is 0.\n"
                     "Needs the extra: pip install 'rampart[prometheus]'.",
         epilog="examples:\n  rampart metrics\n  rampart metrics --port 9100 --host 0.0.0.0\n"

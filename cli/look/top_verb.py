@@ -12,7 +12,7 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
     parser = verbs.add_parser(
         "top", parents=[common], formatter_class=formatter,
         help="the run in the terminal, refreshed four times a second",
-        description="Show mission, robot, safety, mechanisms, decisions, processes and topic rates"
+        description="Show the robot, mechanisms, decisions, processes and topic rates"
                     "\nof the run. Keys: q or Ctrl-C quits, c sorts by CPU, arrows scroll.\n"
                     "Processor time is in percent of one core; memory is resident, most of it "
                     "shared.",

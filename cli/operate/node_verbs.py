@@ -26,7 +26,7 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
     """Add the verbs to the parser."""
     parser = verbs.add_parser(
         "status", parents=[common], formatter_class=formatter, help="the run at a glance",
-        description="Show mission, Safety Pilot, FTM Manager and nodes of the run.\n"
+        description="Show the robot, the FTM Manager and the nodes of the run.\n"
                     "Whatever the system has and does not answer is shown as silent.",
         epilog="examples:\n  rampart status\n  rampart status --json")
     parser.add_argument("--json", action="store_true", help="print JSON")

@@ -28,8 +28,8 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
         help="release a latched recovery, e.g. the emergency stop",
         description="Release a recovery that stays in force until an operator resets it. Nothing\n"
                     "happens while its cause is still there; the verb then says so and exits 1.\n"
-                    "Also lets go of the brake, or ends an order to the Safety Pilot, in place of\n"
-                    "somebody who is no recovery module of the system; rampart status says who.",
+                    "Also lets go of what somebody holds, such as the brake, who is no recovery\n"
+                    "module of the system; rampart status says who.",
         epilog="examples:\n  rampart reset RM1\n  rampart reset rampart-4711")
     parser.add_argument("recovery", metavar="NAME", help="e.g. RM1")
     parser.set_defaults(run=lambda options: asyncio.run(reset(options)))

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -339,6 +340,20 @@ def verbs(parser, path=()):
             for name, sub in action.choices.items():
                 yield (*path, name), sub
                 yield from verbs(sub, (*path, name))
+
+
+def test_a_package_adds_verbs_and_one_that_is_broken_takes_no_other_along(monkeypatch, capsys):
+    def add(verbs, formatter, common) -> None:
+        verbs.add_parser("tank", parents=[common]).set_defaults(run=lambda options: options.port)
+
+    def broken():
+        raise ImportError("no tank")
+
+    monkeypatch.setattr("rampart.cli.main.entry_points", lambda group: [
+        SimpleNamespace(name="leak", value="leak:add", load=broken),
+        SimpleNamespace(name="tank", value="tank:add", load=lambda: add)])
+    assert main(["tank", "--port", "7"]) == 7
+    assert capsys.readouterr().err == "rampart: verb leak (leak:add): ImportError: no tank\n"
 
 
 @pytest.mark.parametrize(("path", "parser"), list(verbs(build_parser())),

@@ -7,8 +7,11 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.actors.operator.page import events, page, speaking_world
-from tests.actors.operator.world import repeated
+from rampart.actors.operator.hmi import Hmi
+from rampart.testing import free_port
+from tests.actors.operator.browser import browser
+from tests.actors.operator.page import SPEC, events, page, speaking_world
+from tests.actors.operator.world import repeated, served
 
 pytestmark = pytest.mark.page
 
@@ -134,6 +137,21 @@ async def test_by_keyboard_the_focus_is_seen_and_the_first_stop_skips_to_the_map
         await tab.until("location.hash === '#main'")
         await tab.until("document.getElementById('link').textContent === 'live'")
         assert await tab.value("window.still") is True  # and the connection was kept
+
+
+async def test_a_robot_that_offers_nothing_has_a_page_without_map_stick_and_mission(world):
+    plain = Hmi(world.context("hmi", 1, hmi_port=free_port(), system=SPEC))
+    async with world.running(plain), browser() as tab, repeated(world.others.busy):
+        await tab.show(f"http://{await served(plain)}/")
+        await tab.until(f"{events('active')} === 'FTM4'")
+        await tab.until("document.querySelectorAll('#nodes tr').length > 0")
+        shown = await tab.value("[...document.querySelectorAll('.panel > h2')]"
+                                ".filter((e) => e.checkVisibility()).map((e) => e.id).join()")
+        assert shown.split(",") == ["safety-title", "tree-title", "decisions-title", "nodes-title",
+                                    "order-title", "fault-heading", "events-title"]
+        width = "getComputedStyle(document.querySelector('.side')).gridColumnStart"
+        assert await tab.value(width) == "1"
+        assert tab.errors == []
 
 
 async def test_who_wants_no_motion_sees_none(world):

@@ -26,6 +26,8 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.operator.requests import ResetRequest
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.osmosis.page.hmi import OsmosisHmi
 from rampart.actors.osmosis.page.state import OsmosisState
 from rampart.actors.recording.bag_reader import BagReader, key_of
 from rampart.actors.recording.bag_writer import BagWriter
@@ -378,6 +380,18 @@ def test_messages_of_another_version_are_left_out_and_counted(tmp_path, port, ca
         writer.finish()
     assert main(["replay", str(path), "--port", str(port)]) == 0
     assert "played 1 messages, 1 of another version left out" in capsys.readouterr().out
+
+
+def test_the_system_of_a_recording_of_0_6_is_that_of_the_shipped_robot():
+    text = (HERE / "systems" / "paper.toml").read_text()
+    head, _, rest = text.partition("[application]")
+    old = head + rest[rest.index("\n["):].replace(
+        "rampart.actors.osmosis.page.hmi:OsmosisHmi", "actors.hmi:Hmi")
+    document, known = replaying.recorded_system([("system.toml", "", old.encode())])
+    assert document["node"][4]["actor"] == "actors.hmi:Hmi"
+    assert (known.kind, known.topics) == (Osmosis, topics.ALL)
+    assert replaying.page_of(known.system) is OsmosisHmi
+    assert replaying.recorded_system([("system.toml", "", b"name = 1")])[1].kind is Osmosis
 
 
 async def test_the_page_shows_the_past_and_obeys_nobody(tmp_path, port):
