@@ -15,6 +15,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +26,13 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.layout.layout import Layout, application_class, load_application
 from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.layout.wiring import load_class
-from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.process import Order, RecorderProcess
 from rampart.actors.recording.virtual import VirtualRecording
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import DEFAULT_PORT, RunPlan, load_document, load_system
-from rampart.actors.supervision.launcher import Launcher, LaunchError
+from rampart.actors.supervision.launcher import LaunchError
 from rampart.actors.web.access import Access, AccessError, is_loopback, new_token
 from rampart.actors.web.token_file import SecretError, read_secret
 from rampart.cli import application_options
@@ -41,16 +41,14 @@ from rampart.files import streams, working_folder
 from rampart.files.plain_text import one_line
 from rampart.manager.spec.specification import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
+from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
-from rampart.sim.faults.offered_faults import offered_faults
 from rampart.sim.faults.scenario import action_of, parse_fault
-from rampart.sim.osmosis.report import in_words, try_report
-from rampart.sim.osmosis.report_record import RunRecord
-from rampart.sim.runs.console import Console
-from rampart.sim.runs.mission_run import MissionRun, summary
 from rampart.sim.runs.process_run import ProcessRun
+from rampart.sim.runs.record import RunRecord
+from rampart.sim.runs.report import in_words
+from rampart.sim.runs.trial import trial_class
 from rampart.sim.runs.virtual_run import LEAD_S, VirtualRun
-from rampart.sim.runs.watched_run import WatchedRun
 from rampart.sim.virtual.network import NETWORKS, find_network
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -157,44 +155,42 @@ def parser(kind: type[Application] = Application, said: Mapping[str, Any] | None
 
 
 class Run:
-    """One mission from the parsed options to the exit code, on processes or in virtual time."""
+    """One run from the parsed options to the exit code, on processes or in virtual time."""
 
     def __init__(self, options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> None:
         self._options = options
-        self._spec = spec
-        if options.duration is not None:
+        kind = trial_class(spec)
+        if kind.judges and options.duration is not None:
             raise UsageError(f"--duration {options.duration:g}: a mission ends by itself; "
                              "--patience S ends one that makes no progress")
+        if not kind.judges:
+            _refuse(options, ("fault", "virtual", "wait", "patience"),
+                    f"{spec.name} has no mission: its [application] names no class with one")
         application = load_application(plan, spec)
-        if not isinstance(application, Osmosis):
-            raise UsageError(f"{spec.name} has no mission")
-        mission = application.mission
         if note := application.check(spec, virtual=options.virtual):
             _say(note)
-        self._context = RunContext(plan, spec, load_document(plan), application)
+        run = RunContext(plan, spec, load_document(plan), application)
+        self._directory = _directory(options, kind(run).name)
+        plan = msgspec.structs.replace(
+            plan,
+            error_log=str(self._directory.resolve() / ERROR_LOG),
+            checkpoints=str(self._directory.resolve() / "checkpoints"))
+        self._trial = kind(replace(run, plan=plan),
+                           options.patience if kind.judges else options.duration, sys.stderr)
+        self._plan = plan
         self._scenario = [parse_fault(text) for text in options.fault]
         known: Sequence[Topic[Any]] = ()
         if self._scenario:
             Layout(plan, spec)  # names file and path of an actor that cannot be had
             known = system_topics(spec)
         for i, planned in enumerate(self._scenario):
-            action_of(planned, f"f{i}", can_be_hit(spec), known)  # refused now, not in mid-run
-            if planned.goal > len(mission.goals):
-                raise UsageError(f"--fault {planned.text()}: mission {mission.name} has "
-                                 f"{len(mission.goals)} goals")
-        self._directory = _directory(options, mission.name)
-        self._plan = msgspec.structs.replace(
-            plan,
-            error_log=str(self._directory.resolve() / ERROR_LOG),
-            checkpoints=str(self._directory.resolve() / "checkpoints"))
-        self._console = Console(sys.stderr)
-        self._mission = MissionRun(
-            self._plan, application.airport, mission, strategy=spec.strategy,
-            patience_s=options.patience,
-            console=self._console)
+            action_of(planned, f"f{i}", can_be_hit(spec), known, faults_of(spec))  # not in mid-run
+            if planned.goal > self._trial.goals:
+                raise UsageError(f"--fault {planned.text()}: mission {self._trial.name} has "
+                                 f"{self._trial.goals} goals")
 
     def on_processes(self) -> int:
-        """Run the mission on processes and return the exit code.
+        """Run on processes and return the exit code.
 
         Raises:
             LaunchError: the system cannot be started.
@@ -202,40 +198,39 @@ class Run:
         return asyncio.run(self._on_processes())
 
     async def _on_processes(self) -> int:
-        title = f"{self._mission.mission.name} on {self._mission.airport.name}"
-        run = ProcessRun(Launcher(self._plan, title), self._spec, self._mission, self._scenario)
+        run = ProcessRun(self._trial, self._scenario)
         with _kept(self._directory), _recorded(self._options):
             _interruptible(run)
             record = await run.run()
-            return self._conclude(record)
+            return self._conclude(record, run.failure)
 
     def in_virtual_time(self) -> int:
-        """Run the mission in virtual time and return the exit code."""
+        """Run in virtual time and return the exit code."""
         with _kept(self._directory):
             return self._in_virtual_time()
 
     def _in_virtual_time(self) -> int:
         recording = None
         if self._options.record:
-            title = f"{self._mission.mission.name} on {self._mission.airport.name}"
             recording = VirtualRecording(
-                Path(self._options.record), self._plan.description, title,
-                nodes=Layout(self._plan, self._spec).members, lead_s=LEAD_S,
+                Path(self._options.record), self._plan.description, self._trial.title,
+                nodes=Layout(self._plan, self._trial.run.system).members, lead_s=LEAD_S,
                 overwrite=self._options.overwrite)
-        run = VirtualRun(self._plan, self._spec, self._mission, scenario=self._scenario,
-                         run=self._context,
+        run = VirtualRun(self._trial, scenario=self._scenario,
                          network=find_network(self._options.network),
                          taps=[recording.take] if recording else [])
-        self._console.virtual_banner(self._mission.airport.name, self._mission.mission,
-                                     self._plan, self._spec.strategy)
+        console = self._trial.console
+        if console is None:
+            raise TypeError("a run from the command line tells its story")
+        console.banner(self._trial.about, self._plan, self._trial.run.system, virtual=True)
         try:
             with _interruptible_between_bytecodes(run):
                 result = run.run()
         finally:
-            self._console.close()
+            console.close()
             if recording is not None:
                 _say(recording.close())
-        self._console.speed(result.speed, result.messages, result.trace)
+        console.speed(result.speed, result.messages, result.trace)
         for name, error in result.failures:
             _say(f"{name} failed: {one_line(error)}")
         if result.tracebacks:
@@ -246,20 +241,24 @@ class Run:
                 _say(f"{self._plan.error_log}: tracebacks are lost: {in_words(error)}")
         return self._conclude(result.record, trace=result.trace)
 
-    def _conclude(self, record: RunRecord, **more: str) -> int:
+    def _conclude(self, record: RunRecord, failure: str = "", **more: str | None) -> int:
         """Tell what came of the run; no disk and no reader that fails changes the verdict."""
-        report = try_report(record, self._directory)
-        self._console.conclusion(record, report.html)
+        report = self._trial.report(record, self._directory)
+        if self._trial.console:
+            self._trial.console.conclusion(record, report.html)
         if report.problem:
             _say(f"report: {report.problem}")
         for fault in record.faults:
             if not fault.effective:
                 _say(f"fault {fault.fault} had no effect: {one_line(fault.reason)}")
         if self._options.json:
-            _print_result(summary(
-                record, report=str(report.html) if report.html else None,
-                record=str(report.data) if report.data else None,
-                report_error=report.problem or None, **more))
+            if self._trial.judges:
+                more |= {"report": str(report.html) if report.html else None,
+                         "record": str(report.data) if report.data else None,
+                         "report_error": report.problem or None}
+            _print_result({**self._trial.summary(record), **more})
+        if not self._trial.judges:
+            return EXIT_FAILED if failure else EXIT_SUCCESS
         if record.safety != "safe":
             return EXIT_UNSAFE if record.safety == "unsafe" else EXIT_NOT_KNOWN
         return EXIT_SUCCESS if record.mission == "success" else EXIT_FAILED
@@ -323,7 +322,7 @@ def _recorded(options: argparse.Namespace) -> Iterator[None]:
             recorder.end()
 
 
-def _interruptible(run: ProcessRun | WatchedRun) -> None:
+def _interruptible(run: ProcessRun) -> None:
     """Have SIGINT, SIGTERM, and the end of the terminal, end a run; the second one is meant."""
 
     def interrupt(name: str) -> None:
@@ -399,8 +398,10 @@ def _plan(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPlan
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
         hmi_host=options.hmi_host, hmi_token=token,
         hmi_token_is_new=token_is_new,
-        faults=() if options.no_hmi else offered_faults(), waits=options.wait)
+        waits=options.wait)
     spec = load_system(plan)
+    if not options.no_hmi:
+        plan = msgspec.structs.replace(plan, faults=faults_of(spec).offered())
     return _fitting(options, plan, spec), spec
 
 
@@ -433,24 +434,6 @@ def _refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None
         shown = value[0] if isinstance(value, list) else value
         text = "" if value is True else f" {shown:g}" if isinstance(shown, float) else f" {shown}"
         raise UsageError(f"--{name.replace('_', '-')}{text}: {why}")
-
-
-async def _watch(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> int:
-    """Run a system without a mission, until its time is over or somebody ends it."""
-    _refuse(options, ("fault", "virtual", "wait", "patience"),
-            f"{spec.name} has no mission: its [application] names no class with one")
-    directory = _directory(options, spec.name)
-    plan = msgspec.structs.replace(
-        plan, error_log=str(directory.resolve() / ERROR_LOG),
-        checkpoints=str(directory.resolve() / "checkpoints"))
-    run = WatchedRun(plan, spec, options.duration, sys.stderr)
-
-    with _kept(directory), _recorded(options):
-        _interruptible(run)
-        await run.run()
-    if options.json:
-        _print_result(run.summary())
-    return EXIT_FAILED if run.failure else EXIT_SUCCESS
 
 
 def _directory(options: argparse.Namespace, name: str) -> Path:
@@ -530,8 +513,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options, kind = _parse(arguments)
         _check(options)
         plan, spec = _plan(options, kind)
-        if not issubclass(kind, Osmosis):
-            return asyncio.run(_watch(options, plan, spec))
         run = Run(options, plan, spec)
         return run.in_virtual_time() if options.virtual else run.on_processes()
     except (UsageError, LaunchError, BagError, ValueError, OSError) as error:

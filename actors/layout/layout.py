@@ -26,7 +26,6 @@ from rampart.manager.spec.specification import (
 )
 
 SUPERVISOR_CLASS = "rampart.actors.supervision.supervisor:Supervisor"
-OBSERVER_CLASS = "rampart.sim.runs.observer:Observer"
 
 
 class Unit(msgspec.Struct, frozen=True):
@@ -105,7 +104,7 @@ class Layout:
         known = application or Application()
         own = [
             Member(SUPERVISOR, load_class(SUPERVISOR_CLASS), {"nodes": tuple(self.unit_of)}),
-            Member(OBSERVER, load_class(OBSERVER_CLASS), {}),
+            Member(OBSERVER, load_class(application_class(spec).observer), {}),
         ]
         self.members: dict[str, Member] = {
             m.name: m for m in (*own, *(

@@ -52,6 +52,9 @@ class Osmosis(Application):
     topics = topics.ROBOT
     views = "rampart.actors.osmosis.recording.views:OsmosisViews"
     lines = "rampart.cli.osmosis.lines:OsmosisLines"
+    faults = "rampart.sim.osmosis.trial.faults:OsmosisFaults"
+    observer = "rampart.sim.osmosis.trial.observer:OsmosisObserver"
+    trial = "rampart.sim.osmosis.trial.mission_trial:MissionTrial"
     options: Options
 
     def __init__(self, options: Options) -> None:

@@ -37,6 +37,9 @@ class Application:
         topics: what its actors publish and hear besides the engine's topics.
         views: class that translates them for viewers, as `module:Class`, derived from this one.
         lines: class that tells of them in `rampart status`, `top` and `metrics`, likewise.
+        faults: class path of its `Faults`; "" if it has none of its own.
+        observer: class path of who hears a run for judge and report.
+        trial: class path of the `Trial` that its runs are; "" if nobody judges them.
 
     Attributes:
         options: what was chosen for this run.
@@ -51,6 +54,9 @@ class Application:
     topics: ClassVar[tuple[Topic[Any], ...]] = ()
     views: ClassVar[str] = "rampart.actors.recording.views:Views"
     lines: ClassVar[str] = "rampart.cli.robot_lines:RobotLines"
+    faults: ClassVar[str] = ""
+    observer: ClassVar[str] = "rampart.sim.runs.observer:Observer"
+    trial: ClassVar[str] = ""
 
     def __init__(self, options: Any = None) -> None:
         self.options = options or self.Options()
@@ -96,7 +102,12 @@ class Application:
         Raises:
             ValueError: it is another one.
         """
-        found = context.run.application
+        return cls.of_run(context.run)
+
+    @classmethod
+    def of_run(cls, run: Any) -> Self:
+        """Return the application of a run; arguments and errors as of `of`."""
+        found = run.application
         if not isinstance(found, cls):
             raise ValueError(f"needs an [application] of class {cls.__module__}:{cls.__name__}; "
                              f"this system has {type(found).__name__}")

@@ -32,7 +32,15 @@ from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
 from rampart.sim.campaign.execute import BackendError, JobError, execute
 from rampart.sim.campaign.job import Job, RunResult, run_virtually
-from rampart.sim.campaign.paper_tables import (
+from rampart.sim.campaign.plan import cross, fault_groups, sample
+from rampart.sim.campaign.report import Campaign, worth_showing, write_campaign_report
+from rampart.sim.campaign.statistics import Rate, Row, Spread, as_json, table, total
+from rampart.sim.campaign.store import Run, Store, StoreError
+from rampart.sim.faults.disturbance import UnknownFaultError
+from rampart.sim.faults.faults import faults_of
+from rampart.sim.faults.injector import can_be_hit
+from rampart.sim.faults.scenario import PlannedFault, ScenarioError, action_of, parse_fault
+from rampart.sim.osmosis.trial.paper_tables import (
     FULL_SYSTEM,
     PAPER_SYSTEM,
     Cell,
@@ -41,15 +49,9 @@ from rampart.sim.campaign.paper_tables import (
     paper_jobs,
     table_iii,
 )
-from rampart.sim.campaign.plan import cross, fault_groups, sample
-from rampart.sim.campaign.report import Campaign, worth_showing, write_campaign_report
-from rampart.sim.campaign.statistics import Rate, Row, Spread, as_json, table, total
-from rampart.sim.campaign.store import Run, Store, StoreError
-from rampart.sim.faults.disturbance import UnknownFaultError
-from rampart.sim.faults.injector import can_be_hit
-from rampart.sim.faults.scenario import PlannedFault, ScenarioError, action_of, parse_fault
-from rampart.sim.osmosis.report import in_words, write_report
-from rampart.sim.osmosis.report_record import RunRecord
+from rampart.sim.osmosis.trial.record import MissionRecord
+from rampart.sim.osmosis.trial.report import render
+from rampart.sim.runs.report import in_words, try_report
 from rampart.sim.virtual.network import NETWORKS
 
 
@@ -66,7 +68,7 @@ def campaign(options: argparse.Namespace) -> int:
         return _replay(options)
     _check(options)
     if options.search is not None:
-        return hunt(options, _groups(options, spec), _base_jobs(options))
+        return hunt(options, _groups(options, spec), _base_jobs(options), faults_of(spec))
     name, jobs = _choose(options, spec)
     directory = _directory(options, name)
     try:
@@ -160,7 +162,8 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
         groups = _groups(options, spec)
         together = f"-{options.together}" if options.together > 1 else ""
         return f"sample{together}", sample(
-            jobs, groups, options.runs, seed=options.seed, together=options.together)
+            jobs, groups, options.runs, seed=options.seed, faults=faults_of(spec),
+            together=options.together)
     faults = list(_planned(options.fault, spec, _all_groups(spec)))
     return "faults", cross(jobs, faults, range(options.seed, options.seed + options.seeds))
 
@@ -187,7 +190,7 @@ def _all_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
 def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str, ...]]
              ) -> Iterable[PlannedFault | None]:
     every = [name for names in groups.values() for name in names]
-    nodes, known = can_be_hit(spec), systems.topics_of(spec)
+    nodes, known, faults = can_be_hit(spec), systems.topics_of(spec), faults_of(spec)
     for text in texts:
         if text == "none":
             yield None
@@ -196,7 +199,7 @@ def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str
             planned = parse_fault(text)
             found = fnmatch.filter(every, planned.fault)
             if not found:
-                action_of(planned, "f1", nodes, known)
+                action_of(planned, "f1", nodes, known, faults)
                 found = [planned.fault]
         except (ScenarioError, UnknownFaultError) as error:
             raise UsageError(f"--fault {text}: {error}") from None
@@ -295,7 +298,9 @@ def _replay(options: argparse.Namespace) -> int:
     except ValueError as error:
         raise UsageError(f"--replay {options.replay}: {' '.join(str(error).split())}") from None
     same = again.trace == found.result.trace
-    html, data = write_report(again.record, directory / "replays")
+    html, data, problem = try_report(again.record, render, directory / "replays")
+    if problem:
+        raise UsageError(f"report: {problem}")
     if options.json:
         print_json({"run": found.job.key, "job": found.job, "same_trace": same,
                     "report": str(html), "record": str(data)})
@@ -422,11 +427,18 @@ def _list(spec: SystemSpec, *, as_json: bool) -> int:
 
 def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path,
                   runs: Sequence[Run]) -> Path:
-    worst: dict[str, RunRecord] = {
-        run.job.key: run_virtually(run.job).record for run in worth_showing(runs)}
+    worst: dict[str, MissionRecord] = {
+        run.job.key: _record_of(run) for run in worth_showing(runs)}
     title = "Fault-injection campaign"
     if options.paper:
         title = "The paper's rows on the full system" if options.full else "The paper's tables"
     about = Campaign(title=title, command=f"rampart {shlex.join(sys.argv[1:])}", seed=options.seed)
     decided = table_iii(spec) if options.paper and not options.full else ()
     return write_campaign_report(directory, about, runs, decided, worst)
+
+
+def _record_of(run: Run) -> MissionRecord:
+    found = run_virtually(run.job).record
+    if not isinstance(found, MissionRecord):
+        raise TypeError(f"{run.job.system}: no track to show")
+    return found

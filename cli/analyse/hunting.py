@@ -17,12 +17,13 @@ from rampart.cli.output import UsageError, print_json, print_table, say, warn
 from rampart.sim.campaign.job import Job, RunResult, run_job
 from rampart.sim.campaign.search import Space, margin, search, shrink
 from rampart.sim.campaign.store import Store, StoreError
+from rampart.sim.faults.faults import Faults
 
 _SHRUNK_AT_MOST = 3
 
 
-def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases: Sequence[Job]
-         ) -> int:
+def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases: Sequence[Job],
+         faults: Faults) -> int:
     """Search among the faults in `groups`, shrink what was found, and keep it."""
     directory = Path(options.out or "reports/campaign-search")
     try:
@@ -51,8 +52,8 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
             bar.update()
 
         try:
-            made = search(Space(tuple(bases), groups), options.search, run, seed=options.seed,
-                          at_once=workers, seen=seen)
+            made = search(Space(tuple(bases), groups, faults.intruder), options.search, run,
+                          seed=options.seed, at_once=workers, seen=seen)
         except ImportError:
             raise UsageError("--search: Optuna is not installed; pip install 'rampart[search]'"
                              ) from None

@@ -11,7 +11,7 @@ import msgspec
 
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES
 from rampart.actors.bus.topic import ROOT, Qos, Topic
-from rampart.actors.layout.layout import OBSERVER_CLASS, SUPERVISOR_CLASS
+from rampart.actors.layout.layout import SUPERVISOR_CLASS, application_class
 from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.layout.wiring import load_class, topics_of
 from rampart.actors.run.run_info import NoRunError, find_run
@@ -45,7 +45,7 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
         UsageError: the spec names an actor class that does not exist, or one of them declares a
             topic that makes no sense.
     """
-    members = [(SUPERVISOR, SUPERVISOR_CLASS), (OBSERVER, OBSERVER_CLASS),
+    members = [(SUPERVISOR, SUPERVISOR_CLASS), (OBSERVER, application_class(spec).observer),
                *((node.name, node.actor) for node in spec.actors())]
     wired: list[tuple[str, tuple[Topic[Any], ...], tuple[Topic[Any], ...]]] = []
     for name, path in members:

@@ -18,15 +18,9 @@ from rampart.cli.look.topic_catalogue import resolve, topics_for
 from rampart.cli.operate.injecting import run_fault
 from rampart.cli.output import UsageError, print_json, print_table, say
 from rampart.manager.spec.specification import SystemSpec
-from rampart.sim.faults.faults import (
-    PAPER_FAULTS,
-    SENSOR_FAULTS,
-    Disturbance,
-    Fault,
-    UnknownFaultError,
-    find_fault,
-)
+from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.topic_faults import modes_of, systematic_faults
+from rampart.sim.osmosis.trial.faults import PAPER_FAULTS, SENSOR_FAULTS, OsmosisFaults
 
 _DEFAULT_DURATION_S = 5.0
 
@@ -142,7 +136,7 @@ def _known_fault(options: argparse.Namespace) -> Fault:
     try:
         _, colon, key = options.fault.partition(":")
         known = topics_for(key, options.port) if colon else ()
-        return find_fault(options.fault, options.seed or 0, known)
+        return OsmosisFaults().find(options.fault, options.seed or 0, known)
     except UnknownFaultError as error:
         raise UsageError(str(error)) from None
 
@@ -219,7 +213,7 @@ def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
     keys = published_keys(spec)
     if as_json:
         everything = (*PAPER_FAULTS.values(), *SENSOR_FAULTS.values(),
-                      *systematic_faults(keys, known=known))
+                      *systematic_faults(keys, known))
         print_json([{"name": f.name, "title": f.title, "group": f.group,
                      "detected_by": f.detected_by, "duration_s": f.duration_s,
                      "topics": [d.topic for d in f.disturbances]} for f in everything])

@@ -18,7 +18,7 @@ from rampart.actors.ftm import topics
 from rampart.actors.layout.system_topics import find_topic
 from rampart.cli.output import NoEffectError, print_json, say, unknown
 from rampart.cli.session import Session, connect
-from rampart.sim.faults.faults import Fault
+from rampart.sim.faults.disturbance import Fault
 
 _TAKE_HOLD_S = 1.5
 """Real seconds within which a publisher answers, even when it is just being respawned."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rampart.sim.campaign import charts
-from rampart.sim.campaign.grouping import KINDS, by_kind
+from rampart.sim.campaign.defaults import EXACT_BELOW_M
+from rampart.sim.campaign.grouping import by_kind
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.wording import count
-from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 
 
 def distributions(runs: Sequence[Run]) -> list[charts.Chart]:
@@ -28,9 +28,9 @@ def distributions(runs: Sequence[Run]) -> list[charts.Chart]:
             values = [charts.Value(value, not run.result.safe) for run in there
                       if (value := getattr(run.result, name)) is not None]
             if values:
-                lanes.append((KINDS[kind], values, _beside(len(values), len(there), f"not {done}")))
+                lanes.append((kind, values, _beside(len(values), len(there), f"not {done}")))
             else:
-                never.append(f"{KINDS[kind]} ({count(len(there), 'run')})")
+                never.append(f"{kind} ({count(len(there), 'run')})")
         if lanes:
             more = f" Never {done}: {', '.join(never)}." if never else ""
             axis = charts.time_axis([each.value for _, values, _ in lanes for each in values])
@@ -45,7 +45,7 @@ def distributions(runs: Sequence[Run]) -> list[charts.Chart]:
                 title, "The smaller of the clearances to an obstacle and to the prohibited area; "
                 "below 0 is inside it. The simulator measures exactly below "
                 f"{EXACT_BELOW_M:g} m only.", charts.margin_axis(low_m, EXACT_BELOW_M),
-                [(KINDS[kind], there, count(len(there), "run"))
+                [(kind, there, count(len(there), "run"))
                  for kind, there in margins.items()]))
     return made
 

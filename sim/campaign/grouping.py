@@ -7,18 +7,9 @@ from dataclasses import dataclass
 
 import msgspec
 
-from rampart.sim.campaign.job import Job
-from rampart.sim.campaign.paper_tables import AS_THE_PAPER
+from rampart.sim.campaign.job import Job, faults_of_system
 from rampart.sim.campaign.store import Run
-from rampart.sim.faults.faults import PAPER_FAULTS, SENSOR_FAULTS
-from rampart.sim.faults.scenario import ACTUATOR_FAULTS, OBSTACLE, PROCESS_FAULTS
-
-KINDS = {
-    "none": "no fault", "paper": "paper's faults", "topic": "topics",
-    "sensor": "sensors", "process": "processes", "actuator": "actuators", "world": "the world",
-    "several": "several at once",
-}
-"""Kinds of faults, in the order in which they are shown, and how they are called."""
+from rampart.sim.osmosis.trial.paper_tables import AS_THE_PAPER
 
 
 @dataclass(frozen=True)
@@ -31,26 +22,19 @@ class Condition:
 
 
 def kind_of(job: Job) -> str:
-    """Return the kind of what goes wrong in a run: one of `KINDS`."""
-    if len(job.faults) != 1:
-        return "several" if job.faults else "none"
-    name = job.faults[0].fault
-    if name in PAPER_FAULTS:
-        return "paper"
-    if name in SENSOR_FAULTS:
-        return "sensor"
-    prefix = name.partition(":")[0]
-    if prefix in PROCESS_FAULTS:
-        return "process"
-    if prefix in ACTUATOR_FAULTS:
-        return "actuator"
-    return "world" if prefix == OBSTACLE else "topic"
+    """Return in words the kind of what goes wrong in a run."""
+    faults = faults_of_system(job.system)
+    if len(job.faults) == 1:
+        return faults.kinds[faults.kind_of(job.faults[0].fault)]
+    return faults.kinds["several" if job.faults else "none"]
 
 
 def by_kind(runs: Iterable[Run]) -> dict[str, list[Run]]:
-    """Return the runs by kind, in the order of `KINDS`; kinds without runs are left out."""
-    found: dict[str, list[Run]] = {kind: [] for kind in KINDS}
+    """Return the runs by kind, in the order of the robot's; kinds without runs are left out."""
+    found: dict[str, list[Run]] = {}
     for run in runs:
+        for kind in faults_of_system(run.job.system).kinds.values():
+            found.setdefault(kind, [])
         found[kind_of(run.job)].append(run)
     return {kind: there for kind, there in found.items() if there}
 

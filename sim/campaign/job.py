@@ -16,7 +16,7 @@ import msgspec
 
 from rampart import systems
 from rampart.actors.layout.layout import load_application
-from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system, tailor
 from rampart.files import toml
@@ -24,10 +24,11 @@ from rampart.files.reading import read_text
 from rampart.manager.spec.adaptation import Action, Change, adapt
 from rampart.manager.spec.specification import check_document, read_document
 from rampart.sim.campaign.defaults import PATIENCE_S
+from rampart.sim.faults.faults import Faults, faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
-from rampart.sim.osmosis.report_record import RunRecord
-from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.runs.record import RunRecord
+from rampart.sim.runs.trial import trial_class
 from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun
 from rampart.sim.virtual.network import find_network
 
@@ -161,16 +162,13 @@ def run_job(job: Job) -> RunResult:
     """Run a job in virtual time and return what is kept of it."""
     begun_s = time.perf_counter()
     result, injected_s = run_virtually(job), None
-    record, verdict = result.record, result.verdict
+    record = result.record
     effective = [o.injected_s for o in record.faults if o.effective and o.injected_s is not None]
     if effective:
         injected_s = min(effective)
     return RunResult(
-        success=verdict.success, safe=bool(verdict.safe), reasons=record.reasons,
-        duration_s=round(record.duration_s, 2), collisions=record.collisions,
-        prohibited_s=round(record.prohibited_s, 3),
-        obstacle_m=_metres(verdict.closest_obstacle_m),
-        prohibited_m=_metres(verdict.closest_prohibited_m), unsafe_s=verdict.first_unsafe_s,
+        success=record.mission == "success", safe=record.safety == "safe", reasons=record.reasons,
+        duration_s=round(record.duration_s, 2), **result.figures,
         injected_s=injected_s, **latencies(record, injected_s),
         decisions=tuple(DecisionTaken(round(d.t_s, 3), d.active, d.recoveries)
                         for d in record.decisions),
@@ -195,11 +193,11 @@ def run_virtually(job: Job) -> VirtualResult:
         options=job.options)
     nodes, spec = can_be_hit(spec), tailor(plan, spec)
     application = _application(msgspec.json.encode(plan.options), file)
-    mission = MissionRun(plan, application.airport, application.mission, strategy=spec.strategy,
-                         patience_s=job.patience_s)
-    return VirtualRun(
-        plan, spec, mission, network=find_network(job.network), scenario=job.faults, nodes=nodes,
-        run=RunContext(plan, spec, document, application)).run()
+    trial = trial_class(spec)(RunContext(plan, spec, document, application), job.patience_s)
+    if not trial.judges:
+        raise ValueError(f"{file}: nobody judges its runs")
+    return VirtualRun(trial, network=find_network(job.network), scenario=job.faults,
+                      nodes=nodes).run()
 
 
 def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
@@ -220,10 +218,6 @@ def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
         "false_alarms": sum(t < injected_s for t in detections)}
 
 
-def _metres(value: float) -> float | None:
-    return round(value, 4) if math.isfinite(value) else None
-
-
 @lru_cache(maxsize=8)
 def _document(system: str) -> tuple[str, dict[str, Any]]:
     """Return path and document of a system spec."""
@@ -232,10 +226,18 @@ def _document(system: str) -> tuple[str, dict[str, Any]]:
 
 
 @lru_cache(maxsize=8)
-def _application(options: bytes, file: str) -> Osmosis:
+def faults_of_system(system: str) -> Faults:
+    """Return the faults of the robot of a system, given as in `Job`.
+
+    Raises:
+        ValueError: there is no such system, or it is unsound.
+    """
+    file, document = _document(system)
+    return faults_of(check_document(document, file))
+
+
+@lru_cache(maxsize=8)
+def _application(options: bytes, file: str) -> Application:
     """Load what actors have in common; the map of an airport is large, and read-only."""
     plan = RunPlan(system_file=file, options=msgspec.json.decode(options))
-    found = load_application(plan, load_system(plan))
-    if not isinstance(found, Osmosis):
-        raise ValueError(f"{file}: no system with an airport and a mission")
-    return found
+    return load_application(plan, load_system(plan))

@@ -11,11 +11,10 @@ from rampart.actors.bus.topic import ROOT
 from rampart.actors.layout.system_topics import published_keys, system_topics
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.campaign.job import Job
-from rampart.sim.faults.faults import PAPER_FAULTS, SENSOR_FAULTS
+from rampart.sim.faults.faults import PROCESS_FAULTS, Faults, faults_of
 from rampart.sim.faults.injector import can_be_hit
-from rampart.sim.faults.scenario import OBSTACLE, PROCESS_FAULTS, PlannedFault
+from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.faults.topic_faults import systematic_faults
-from rampart.sim.osmosis.robot import WHEEL_NAMES
 
 EARLIEST_S, LATEST_S = 2.0, 120.0
 """Random faults are injected between these simulated times."""
@@ -37,20 +36,17 @@ def fault_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
     Raises:
         ValueError: the spec names an actor class that does not exist, or topics that make no sense.
     """
-    nodes = can_be_hit(spec)
+    nodes, faults = can_be_hit(spec), faults_of(spec)
     keys = [key for key in published_keys(spec)
             if not key.removeprefix(f"{ROOT}/").startswith(_DULL)]
-    wheels = [wheel.replace(" ", "-") for wheel in WHEEL_NAMES]
+    groups: dict[str, tuple[str, ...]] = {}
+    for fault in faults.named.values():
+        groups[fault.group] = (*groups.get(fault.group, ()), fault.name)
     return {
-        "paper": tuple(PAPER_FAULTS),
-        "sensor": tuple(SENSOR_FAULTS),
-        "topic": tuple(fault.name for fault in systematic_faults(
-            keys, known=system_topics(spec))),
+        **groups,
+        "topic": tuple(f.name for f in systematic_faults(keys, system_topics(spec))),
         "process": tuple(f"{what}:{node}" for what, node in product(PROCESS_FAULTS, nodes)),
-        "actuator": (*(f"stuck-wheel:{wheel}" for wheel in wheels),
-                     *(f"weak-wheel:{wheel}:0.2" for wheel in wheels),
-                     "brake-failure:0", "brake-failure:0.3"),
-        "world": tuple(f"{OBSTACLE}:{distance}" for distance in (2, 3, 5)),
+        **faults.others,
     }
 
 
@@ -68,7 +64,7 @@ def cross(jobs: Sequence[Job], faults: Iterable[PlannedFault | None], seeds: Ite
 
 
 def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *, seed: int,
-           together: int = 1) -> list[Job]:
+           faults: Faults, together: int = 1) -> list[Job]:
     """Return random runs: kind, fault, moment, length and pattern are drawn.
 
     A kind is drawn first, then a fault of it, so that the few faults of the actuators weigh as
@@ -79,6 +75,7 @@ def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *
         jobs: To choose from.
         groups: Of fault names, see `fault_groups`.
         runs: How many.
+        faults: Of the robot: those it names are of topics.
         seed: Of the choice and of the runs; a longer sample begins with the shorter one.
         together: How many faults at once.
 
@@ -91,13 +88,13 @@ def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *
     chosen = []
     for number in range(runs):
         dice = random.Random(f"campaign {seed} {number}")  # noqa: S311 no secret
-        faults = tuple(_random_fault(dice, groups, kinds) for _ in range(together))
-        chosen.append(_with(dice.choice(list(jobs)), faults, dice.randrange(1, 2**31)))
+        wrong = tuple(_random_fault(dice, groups, kinds, faults) for _ in range(together))
+        chosen.append(_with(dice.choice(list(jobs)), wrong, dice.randrange(1, 2**31)))
     return chosen
 
 
-def _random_fault(dice: random.Random, groups: dict[str, tuple[str, ...]], kinds: Sequence[str]
-                  ) -> PlannedFault:
+def _random_fault(dice: random.Random, groups: dict[str, tuple[str, ...]], kinds: Sequence[str],
+                  faults: Faults) -> PlannedFault:
     kind = dice.choice(kinds)
     fault = dice.choice(groups[kind])
     at_s = round(dice.uniform(EARLIEST_S, LATEST_S), 2)
@@ -106,7 +103,7 @@ def _random_fault(dice: random.Random, groups: dict[str, tuple[str, ...]], kinds
     seed = dice.randrange(1000)
     if kind == "process":  # a killed process stays killed, a wedged one wedged
         return PlannedFault(fault, at_s)
-    if pattern == "intermittent" and kind in {"paper", "sensor", "topic"}:
+    if pattern == "intermittent" and (kind == "topic" or fault in faults.named):
         on_s, off_s = (round(dice.uniform(*_FLICKER_S), 2) for _ in range(2))
         return PlannedFault(fault, at_s, duration_s=math.inf, on_s=on_s, off_s=off_s, seed=seed)
     return PlannedFault(fault, at_s, seed=seed,

@@ -17,17 +17,17 @@ from typing import Any
 from markupsafe import Markup
 
 from rampart.actors.osmosis.airport.drawing import AirportDrawing
-from rampart.sim.campaign import paper_tables
+from rampart.sim.campaign.defaults import EXACT_BELOW_M
 from rampart.sim.campaign.distributions import distributions
-from rampart.sim.campaign.grouping import KINDS, Condition, by_kind, conditions, in_common
-from rampart.sim.campaign.paper_tables import CONDITIONS, FAULTS, FULL, GOOD, Cell, Decided
+from rampart.sim.campaign.grouping import Condition, by_kind, conditions, in_common
 from rampart.sim.campaign.statistics import Row, Spread, rate, table, total
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.wording import NONE, count, interval, metres, percent, seconds
 from rampart.sim.campaign.worst_runs import track, worth_showing
-from rampart.sim.osmosis.clearance import EXACT_BELOW_M
-from rampart.sim.osmosis.report import environment, write_atomically
-from rampart.sim.osmosis.report_record import RunRecord
+from rampart.sim.osmosis.trial import paper_tables
+from rampart.sim.osmosis.trial.paper_tables import CONDITIONS, FAULTS, FULL, GOOD, Cell, Decided
+from rampart.sim.osmosis.trial.record import MissionRecord
+from rampart.sim.runs.report import environment, write_atomically
 
 __all__ = ["Campaign", "headline", "render", "worth_showing", "write_campaign_report"]
 
@@ -56,7 +56,7 @@ class Campaign:
 
 def write_campaign_report(directory: Path, about: Campaign, runs: Sequence[Run],
                           decided: Sequence[Decided] = (),
-                          worst_tracks: Mapping[str, RunRecord] = {}) -> Path:
+                          worst_tracks: Mapping[str, MissionRecord] = {}) -> Path:
     """Write `report.html` into the campaign's directory; it appears complete or not at all.
 
     Args:
@@ -79,7 +79,7 @@ def write_campaign_report(directory: Path, about: Campaign, runs: Sequence[Run],
 
 
 def render(directory: Path, about: Campaign, runs: Sequence[Run], decided: Sequence[Decided] = (),
-           worst_tracks: Mapping[str, RunRecord] = {}) -> str:
+           worst_tracks: Mapping[str, MissionRecord] = {}) -> str:
     """Return the HTML page; arguments as for `write_campaign_report`."""
     found = conditions(runs)
     cells = paper_tables.cells(runs) if are_the_papers(runs) else []
@@ -188,16 +188,17 @@ def _figures(runs: Sequence[Run]) -> list[tuple[str, str, str]]:
 def _summary(condition: Condition) -> list[dict[str, Any]]:
     """Return one line per kind of fault, and one for all faults if there are several kinds."""
     kinds = by_kind(condition.runs)
-    lines = [_cells(total(runs, KINDS[kind]), condition.ftm) for kind, runs in kinds.items()]
+    lines = [_cells(total(runs, kind), condition.ftm) for kind, runs in kinds.items()]
     faulty = [run for run in condition.runs if run.job.faults]
-    if len(kinds.keys() - {"none"}) > 1:
+    if sum(bool(runs[0].job.faults) for runs in kinds.values()) > 1:
         lines.append(_cells(total(faulty, "all faults"), condition.ftm) | {"sum": True})
     return lines
 
 
 def _every_fault(found: Sequence[Condition]) -> list[tuple[str, int, list[list[dict[str, Any]]]]]:
     """Return label, number of rows, and the rows by fault, worst fault first, of each kind."""
-    kinds: dict[str, dict[str, list[tuple[Condition, Row]]]] = {kind: {} for kind in KINDS}
+    kinds: dict[str, dict[str, list[tuple[Condition, Row]]]] = {
+        kind: {} for kind in by_kind(run for condition in found for run in condition.runs)}
     for condition in found:
         for kind, runs in by_kind(condition.runs).items():
             for row in table(runs):
@@ -206,7 +207,7 @@ def _every_fault(found: Sequence[Condition]) -> list[tuple[str, int, list[list[d
     for kind, faults in kinds.items():
         ordered = sorted(faults.values(), key=_how_good)
         if ordered:
-            every.append((KINDS[kind], sum(map(len, ordered)), [
+            every.append((kind, sum(map(len, ordered)), [
                 [_cells(row, condition.ftm) | {"condition": condition.text}
                  for condition, row in rows] for rows in ordered]))
     return every

@@ -17,14 +17,13 @@ import msgspec
 
 from rampart.sim.campaign.job import Job, RunResult, run_job
 from rampart.sim.campaign.plan import EARLIEST_S
-from rampart.sim.faults.scenario import OBSTACLE, PlannedFault
+from rampart.sim.faults.scenario import PlannedFault
 
 if TYPE_CHECKING:
     import optuna
 
 LATEST_S = 150.0
 _LASTS_S = (0.3, 60.0)
-_OBSTACLE_M = (1.2, 6.0)
 
 Run = Callable[[Sequence[Job]], Sequence[RunResult]]
 """Runs jobs, perhaps at the same time, and returns their results in the same order."""
@@ -37,12 +36,12 @@ class Space:
     Args:
         bases: What the runs have in common; the optimiser chooses among them.
         groups: Names of faults by kind.
-        sudden_obstacle: Whether an obstacle may appear ahead of the robot as well.
+        intruder: What may come on top of a fault, see `Faults`.
     """
 
     bases: tuple[Job, ...]
     groups: Mapping[str, tuple[str, ...]]
-    sudden_obstacle: bool = True
+    intruder: tuple[str, float, float] | None = None
 
     def job(self, trial: optuna.Trial, seed: int) -> Job:
         """Return the run that the optimiser asks for."""
@@ -53,10 +52,11 @@ class Space:
         lasts_s = None if kind == "process" else round(
             trial.suggest_float("lasts_s", *_LASTS_S, log=True), 2)
         faults = [PlannedFault(fault, at_s, duration_s=lasts_s)]
-        if self.sudden_obstacle and trial.suggest_categorical("obstacle", [False, True]):
-            ahead_m = round(trial.suggest_float("obstacle_m", *_OBSTACLE_M), 2)
-            after_s = round(trial.suggest_float("obstacle_after_s", 0.0, 10.0), 2)
-            faults.append(PlannedFault(f"{OBSTACLE}:{ahead_m:g}", round(at_s + after_s, 2)))
+        if self.intruder and trial.suggest_categorical("intruder", [False, True]):
+            name, *limits = self.intruder
+            size = round(trial.suggest_float("intruder_size", *limits), 2)
+            after_s = round(trial.suggest_float("intruder_after_s", 0.0, 10.0), 2)
+            faults.append(PlannedFault(f"{name}:{size:g}", round(at_s + after_s, 2)))
         return msgspec.structs.replace(
             base, row=" + ".join(f.fault for f in faults), faults=tuple(faults), seed=seed)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from rampart.sim.campaign.defaults import EXACT_BELOW_M
 from rampart.sim.campaign.statistics import Rate
-from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 
 NONE, MINUS = "–", "−"  # noqa: RUF001 - typography for people
 

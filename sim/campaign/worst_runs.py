@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from rampart.sim.campaign.grouping import KINDS, kind_of
+from rampart.sim.campaign.grouping import kind_of
 from rampart.sim.campaign.statistics import badness
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.wording import metres
-from rampart.sim.osmosis.report import points
-from rampart.sim.osmosis.report_record import RunRecord
+from rampart.sim.osmosis.trial.record import MissionRecord
+from rampart.sim.osmosis.trial.report import points
 
 _DECISIONS = 8
 _CLOSE_UP_M = 9.0
@@ -39,7 +39,7 @@ def worth_showing(runs: Sequence[Run], most: int = 6) -> list[Run]:
     return sorted([*protected[:most - len(bare)], *bare], key=_rank, reverse=True)
 
 
-def track(run: Run, record: RunRecord) -> dict[str, Any]:
+def track(run: Run, record: MissionRecord) -> dict[str, Any]:
     """Return what is shown of one of the worst runs: its map, a close-up, and its story."""
     result = run.result
     detected_s = (None if result.injected_s is None or result.detected_after_s is None
@@ -59,7 +59,7 @@ def track(run: Run, record: RunRecord) -> dict[str, Any]:
                       _CLOSE_UP_M, _CLOSE_UP_M))
     return {
         "key": run.job.key, "fault": run.job.text(), "run": run,
-        "kind": KINDS[kind_of(run.job)], "marks": marks, "views": views,
+        "kind": kind_of(run.job), "marks": marks, "views": views,
         "line": points(record.track), "obstacles": record.obstacles, "goals": record.steps,
         "margin": metres(result.margin_m),
         "moments": sorted([*((at_s, kind, name) for kind, name, at_s, *_ in marks),
@@ -68,7 +68,7 @@ def track(run: Run, record: RunRecord) -> dict[str, Any]:
     }
 
 
-def _view(record: RunRecord) -> tuple[float, float, float, float]:
+def _view(record: MissionRecord) -> tuple[float, float, float, float]:
     """Return left, bottom, width and height of the map, in metres: the track and its goals."""
     xs = [p[1] for p in record.track] + [goal.x_m for goal in record.steps]
     ys = [p[2] for p in record.track] + [goal.y_m for goal in record.steps]
@@ -79,7 +79,7 @@ def _view(record: RunRecord) -> tuple[float, float, float, float]:
     return ((x0 + x1 - width) / 2, (y0 + y1 - height) / 2, width, height)
 
 
-def _place(record: RunRecord, at_s: float) -> tuple[float, float]:
+def _place(record: MissionRecord, at_s: float) -> tuple[float, float]:
     """Return where the robot was, to the step of the track, m."""
     before = [p for p in record.track if p[0] <= at_s] or record.track[:1]
     return before[-1][1:] if before else (math.nan, math.nan)

@@ -1,76 +1,123 @@
-"""The faults that can be injected by name: the paper's, those of the sensors, and `MODE:TOPIC`.
+"""The faults of a robot that have names of their own, and how any fault is found by its name.
 
-Crashes are not here: to crash a node, kill it (`kill-node`).
+Any system has `MODE:TOPIC` (`topic_faults`) and those of processes (`scenario`). Crashes are not
+here: to crash a node, kill it (`kill-node`).
 """
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
+
+import msgspec
 
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
+from rampart.actors.ftm.messages import FaultOrder, NamedFault
+from rampart.actors.layout.layout import application_class
+from rampart.actors.layout.wiring import import_class
+from rampart.manager.spec.schema import SystemSpec
+from rampart.sim.faults.disturbance import Fault, UnknownFaultError
 from rampart.sim.faults.topic_faults import topic_fault
-from rampart.sim.osmosis.sensor_faults import LEFT_OUT, sensor_faults
 
-__all__ = ["CATALOGUE", "PAPER_FAULTS", "SENSOR_FAULTS", "Disturbance", "Fault",
-           "UnknownFaultError", "find_fault"]
-
-_COMMAND = topics.COMMAND.key
-_POSE = topics.POSE.key
-_GROUP = "paper"
-
-PAPER_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in (
-    Fault("command-not-updated",
-          "Osmosis Control repeats its last velocity command for ever",
-          (Disturbance(_COMMAND, "freeze"),), ("DM2",), 10.0, _GROUP),
-    Fault("command-out-of-bounds",
-          "Osmosis Control commands 3 m/s straight ahead, three times the top speed",
-          (Disturbance(_COMMAND, "corrupt",
-                       set_fields={"linear_mps": 3.0, "angular_radps": 0.0}),), ("DM3",), 10.0,
-          _GROUP),
-    Fault("localization-not-updated",
-          "Localization repeats its last pose for ever",
-          (Disturbance(_POSE, "freeze"),), ("DM6",), 10.0, _GROUP),
-    Fault("prohibited-area",
-          "Localization drifts north by 0.25 m/s: the controller leads the robot into the grass "
-          "while all looks healthy to it",
-          (Disturbance(_POSE, "corrupt", ramp_fields={"y_m": 0.25}),), ("DM1",), 20.0, _GROUP),
-    Fault("wrong-graph",
-          "Graph Planner gives a way straight to the goal, along an edge that does not exist",
-          (Disturbance(topics.ROUTE.key, "corrupt", keep_ends=("waypoints",)),), ("DM1",), 30.0,
-          _GROUP),
-)}
-"""The faults that the paper injects, other than crashes."""
-
-SENSOR_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in sensor_faults()}
-"""The faults of the sensors."""
-
-CATALOGUE: Mapping[str, Fault] = {**PAPER_FAULTS, **SENSOR_FAULTS}
-"""All faults with a name of their own; `MODE:TOPIC` comes on top (`topic_faults`)."""
+PROCESS_FAULTS = ("kill", "stop", "wedge", "slow")
 
 
-def find_fault(name: str, seed: int = 0, known: Sequence[Topic[Any]] = topics.ALL) -> Fault:
-    """Return a fault by name: one of the catalogue, or `MODE:TOPIC`.
+class Faults:
+    """The faults of a robot that declares none; the application of another names its own.
 
-    Args:
-        name: e.g. `command-not-updated`, `laser-dropout`, `drop:localization/pose`.
-        seed: of all that is random in it.
-        known: all topics of the system, see `system_topics`.
+    Class attributes:
+        named: disturbances of topics by name; the group of each is its kind.
+        left_out: names that somebody may try, and why there is no such fault.
+        others: by kind, faults that are no disturbances of topics, as a campaign draws them.
+        titled: those that the operator's page offers: name → kind and title.
+        kinds: all kinds in the order in which they are shown, and how they are called.
+        intruder: a fault whose last part is a number that a search may choose to add, and the
+            range of the number; None for none.
+    """
+
+    named: ClassVar[Mapping[str, Fault]] = {}
+    left_out: ClassVar[Mapping[str, str]] = {}
+    others: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    titled: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    kinds: ClassVar[Mapping[str, str]] = {
+        "none": "no fault", "topic": "topics", "process": "processes",
+        "several": "several at once"}
+    intruder: ClassVar[tuple[str, float, float] | None] = None
+
+    def own(self, fault: str, injection: str, duration_s: float | None) -> object | None:
+        """Return what a fault does that is no disturbance of a topic; None for other names.
+
+        Args:
+            fault: name with its details.
+            injection: id under which its effect is reported.
+            duration_s: simulated seconds; None for the fault's own.
+
+        Returns:
+            A tuple of `Order`, or what the robot's injector carries out itself.
+
+        Raises:
+            ScenarioError: its details make no sense.
+        """
+        del fault, injection, duration_s
+        return None
+
+    def find(self, name: str, seed: int, known: Sequence[Topic[Any]]) -> Fault:
+        """Return a fault on topics by name: one of the robot's, or `MODE:TOPIC`.
+
+        Args:
+            name: as typed.
+            seed: of all that is random in it.
+            known: all topics of the system, see `system_topics`.
+
+        Raises:
+            UnknownFaultError: there is none of this name.
+        """
+        if name in self.named:
+            return self.named[name].varied(seed=seed)
+        mode, colon, key = name.partition(":")
+        if colon:
+            return topic_fault(mode, key, seed, known)
+        if name in self.left_out:
+            raise UnknownFaultError(f"no fault {name!r}: {self.left_out[name]}")
+        near = difflib.get_close_matches(name, self.named, 1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise UnknownFaultError(
+            f"unknown fault {name!r}; {hint}`rampart inject --list` lists the known ones")
+
+    def kind_of(self, name: str) -> str:
+        """Return the kind of a fault: one of `kinds`."""
+        if name in self.named:
+            return self.named[name].group
+        prefix = name.partition(":")[0]
+        if prefix in PROCESS_FAULTS:
+            return "process"
+        return next((kind for kind, names in self.others.items()
+                     if any(other.partition(":")[0] == prefix for other in names)), "topic")
+
+    def offered(self) -> tuple[NamedFault, ...]:
+        """Return what the operator's page offers by name, as data for the plan of a run.
+
+        A crash is a button of the node, and `MODE:TOPIC` the page puts together itself.
+        """
+        found = [NamedFault(f.name, f.title, f.group, f.duration_s, injections=f.orders(""))
+                 for f in self.named.values()]
+        for name, (kind, title) in self.titled.items():
+            orders = self.own(name, "", None)
+            if not isinstance(orders, tuple):
+                raise TypeError(f"{name}: the page can order messages only")
+            found.append(NamedFault(
+                name, title, kind, orders[0].message.duration_s, orders=tuple(
+                    FaultOrder(o.topic.key, msgspec.json.encode(o.message).decode())
+                    for o in orders)))
+        return tuple(found)
+
+
+def faults_of(spec: SystemSpec) -> Faults:
+    """Return the faults of the robot that a system is for.
 
     Raises:
-        UnknownFaultError: there is none of this name.
+        ValueError: its application, or the class of faults that this names, does not exist.
     """
-    if name in CATALOGUE:
-        return CATALOGUE[name].varied(seed=seed)
-    mode, colon, key = name.partition(":")
-    if colon:
-        return topic_fault(mode, key, seed, known)
-    if name in LEFT_OUT:
-        raise UnknownFaultError(f"no fault {name!r}: {LEFT_OUT[name]}")
-    near = difflib.get_close_matches(name, CATALOGUE, 1)
-    hint = f"did you mean {near[0]}? " if near else ""
-    raise UnknownFaultError(
-        f"unknown fault {name!r}; {hint}`rampart inject --list` lists the known ones")
+    path = application_class(spec).faults
+    return import_class(path, Faults, "faults")() if path else Faults()

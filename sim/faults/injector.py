@@ -1,43 +1,26 @@
 """The injector: carries out the planned faults of a run, and watches whether they had an effect.
 
 It lives beside the observer, outside the system under test. Faults of topics and actuators are
-ordered over the bus and reported by those they hit; processes are hit through a `ProcessControl`.
+ordered over the bus and reported by those they hit; processes are hit through a `ProcessControl`. A
+robot whose faults are more than that has an injector of its own, derived from this one.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
 
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.bus.bounds import MANY
-from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.messages import InjectionReport
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import (
-    GroundTruth,
-    MissionPhase,
-    MissionStatus,
-    ObstacleCommand,
-    ObstacleList,
-    Pose,
-)
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, Header, on
+from rampart.actors.runtime.fault_watch import FaultWatch
 from rampart.manager.spec.specification import Kind, SystemSpec
-from rampart.sim.faults.scenario import (
-    Action,
-    FaultOutcome,
-    OnActuators,
-    OnProcess,
-    OnTopics,
-    OnWorld,
-    PlannedFault,
-    action_of,
-)
+from rampart.sim.faults.faults import Faults
+from rampart.sim.faults.scenario import FaultOutcome, OnProcess, PlannedFault, action_of
 
 INJECTOR = "injector"
 
@@ -66,23 +49,34 @@ def can_be_hit(spec: SystemSpec) -> tuple[str, ...]:
     return (SUPERVISOR, *(node.name for node in spec.actors() if node.kind is not Kind.WORLD))
 
 
-@dataclass(slots=True)
-class _Planned:
+@dataclass(slots=True, eq=False)
+class PlannedAction:
+    """A planned fault and what has become of it.
+
+    Attributes:
+        planned: what, and when.
+        action: see `action_of`.
+        watch: what is reported, if the action is a tuple of orders.
+        injected_s: simulated time, None until then.
+        hit: 1 as soon as anything else was hit, a process for example.
+        reason: why it has no effect, if it has none.
+    """
+
     planned: PlannedFault
-    action: Action
-    ids: tuple[str, ...] = ()
-    obstacle: str = ""
+    action: object
+    watch: FaultWatch
     injected_s: float | None = None
-    affected: dict[str, int] = field(default_factory=lambda: Remembered(MANY))
+    hit: int = 0
     reason: str = ""
 
     def outcome(self) -> FaultOutcome:
-        affected = sum(self.affected.values())
+        """Return what has become of it so far."""
+        affected = self.watch.affected + self.hit
         reason = ""
         if self.injected_s is None:
             reason = "its moment never came"
         elif not affected:
-            reason = self.reason or "it changed nothing"
+            reason = next(iter(self.watch.refused.values()), self.reason) or "it changed nothing"
         return FaultOutcome(self.planned.text(), self.injected_s, affected, reason)
 
 
@@ -95,87 +89,74 @@ class Injector(Actor):
         processes: by which processes are hit.
         nodes: names that may be hit.
         known: all topics of the system.
+        faults: of the robot.
 
     Raises:
         ScenarioError: a planned fault makes no sense in this system.
+
+    Attributes:
+        planned: all planned faults.
     """
 
-    outputs = (bus_topics.INJECT, topics.ACTUATOR_FAULT, topics.OBSTACLE)
+    outputs: ClassVar[tuple[Topic[Any], ...]] = (bus_topics.INJECT,)
 
     def __init__(self, context: Context, scenario: Sequence[PlannedFault],
-                 processes: ProcessControl, nodes: Sequence[str],
-                 known: Sequence[Topic[Any]]) -> None:
+                 processes: ProcessControl, *, nodes: Sequence[str],
+                 known: Sequence[Topic[Any]], faults: Faults) -> None:
         super().__init__(context)
         self._control = processes
-        self._planned = [
-            _Planned(planned, action_of(planned, f"f{i}", nodes, known))
-            for i, planned in enumerate(scenario, start=1)]
+        self.planned: list[PlannedAction] = []
+        for i, planned in enumerate(scenario, start=1):
+            action = action_of(planned, f"f{i}", nodes, known, faults)
+            self.planned.append(PlannedAction(
+                planned, action, FaultWatch(action if isinstance(action, tuple) else ())))
         self._begun = 0
-        self._pose: Pose | None = None
 
     def outcomes(self) -> tuple[FaultOutcome, ...]:
         """Return what became of the faults so far."""
-        return tuple(fault.outcome() for fault in self._planned)
+        return tuple(fault.outcome() for fault in self.planned)
 
     def on_start(self) -> None:
         """Wait for the times that are known."""
-        for fault in self._planned:
+        for fault in self.planned:
             if not fault.planned.goal:
                 self._later(fault, fault.planned.at_s - self.clock.now())
 
-    @on(topics.MISSION_STATUS)
-    def mission(self, status: MissionStatus, _header: Header) -> None:
-        """Note which goals have begun."""
-        begun = status.step + 1 if status.phase is MissionPhase.RUNNING else 0
-        while self._begun < begun:
+    def goals_begun(self, number: int) -> None:
+        """Note that so many goals of the mission have begun; for the injector of a robot."""
+        while self._begun < number:
             self._begun += 1
-            for fault in self._planned:
+            for fault in self.planned:
                 if fault.planned.goal == self._begun:
                     self._later(fault, fault.planned.at_s)
 
-    @on(topics.TRUTH)
-    def truth(self, truth: GroundTruth, _header: Header) -> None:
-        """Note where the robot is."""
-        self._pose = truth.pose
+    def carry_out(self, fault: PlannedAction) -> None:
+        """Do what only the injector of a robot knows to do."""
+        raise TypeError(f"{fault.action!r}: nothing that this injector can do")
 
     @on(bus_topics.INJECTION_REPORT)
     def report(self, report: InjectionReport, header: Header) -> None:
         """Note what an injection has changed; a node that was restarted counts anew."""
-        for fault in self._planned:
-            if report.injection in fault.ids:
-                slot = f"{report.injection} {header.source} {header.incarnation}"
-                fault.affected[slot] = max(fault.affected.get(slot, 0), report.affected)
-                fault.reason = fault.reason or report.reason
-
-    @on(topics.OBSTACLES)
-    def obstacles(self, listed: ObstacleList, _header: Header) -> None:
-        """Note which obstacles are there."""
-        names = {o.name for o in listed.obstacles if o.present}
-        for fault in self._planned:
-            if fault.obstacle in names:
-                fault.affected["there"] = 1
+        for fault in self.planned:
+            if fault.injected_s is not None:
+                fault.watch.hear(report, header.incarnation)
 
     # -- acting ---------------------------------------------------------------------------------
 
-    def _later(self, fault: _Planned, delay_s: float) -> None:
+    def _later(self, fault: PlannedAction, delay_s: float) -> None:
         self.call_later(max(delay_s, 0.0), lambda: self._inject(fault))
 
-    def _inject(self, fault: _Planned) -> None:
+    def _inject(self, fault: PlannedAction) -> None:
         fault.injected_s = self.clock.now()
-        action = fault.action
-        if isinstance(action, OnTopics):
-            fault.ids = tuple(order.injection for order in action.orders)
-            for order in action.orders:
-                self.publish(bus_topics.INJECT, order)
-        elif isinstance(action, OnActuators):
-            fault.ids = (action.order.injection,)
-            self.publish(topics.ACTUATOR_FAULT, action.order)
-        elif isinstance(action, OnProcess):
-            self._hit(fault, action)
+        if isinstance(fault.action, OnProcess):
+            self._hit(fault, fault.action)
+        elif fault.watch.orders:
+            for order in fault.watch.orders:
+                self.publish(order.topic, order.message)
         else:
-            self._place(fault, action)
+            self.carry_out(fault)
 
-    def _hit(self, fault: _Planned, action: OnProcess) -> None:
+    def _hit(self, fault: PlannedAction, action: OnProcess) -> None:
         node, control = action.node, self._control
         if action.what == "slow":
             hit = control.slow_down(node, action.pace_s)
@@ -185,7 +166,7 @@ class Injector(Actor):
         if not hit:
             fault.reason = f"{node} had no running process"
             return
-        fault.affected["hit"] = 1
+        fault.hit = 1
         if action.what == "stop" and math.isfinite(action.duration_s):
             self.call_later(action.duration_s, lambda: self._end(control.resume(node)))
         elif action.what == "slow" and math.isfinite(action.duration_s):
@@ -194,18 +175,3 @@ class Injector(Actor):
     @staticmethod
     def _end(_done: bool) -> None:
         """Whether there still was somebody to release does not matter."""
-
-    def _place(self, fault: _Planned, action: OnWorld) -> None:
-        if self._pose is None:
-            fault.reason = "nobody knows where the robot is"
-            return
-        pose = self._pose
-        fault.obstacle = f"sudden-{self._planned.index(fault) + 1}"
-        there = ObstacleCommand(
-            fault.obstacle, True, pose.x_m + action.distance_m * math.cos(pose.yaw_rad),
-            pose.y_m + action.distance_m * math.sin(pose.yaw_rad), action.radius_m)
-        fault.reason = "there was no room for it"
-        self.publish(topics.OBSTACLE, there)
-        if math.isfinite(action.duration_s):
-            gone = ObstacleCommand(there.name, False, there.x_m, there.y_m, there.radius_m)
-            self.call_later(action.duration_s, lambda: self.publish(topics.OBSTACLE, gone))

@@ -3,9 +3,8 @@
 A planned fault is written `FAULT[@WHEN][+DURATION]`:
 
 * FAULT is a name of the catalogue (`rampart inject --list`), `MODE:TOPIC` for any topic,
-  `kill:NODE`, `stop:NODE`, `wedge:NODE` or `slow:NODE[:SECONDS]` for any process,
-  `stuck-wheel[:WHEEL]`, `weak-wheel[:WHEEL[:STRENGTH]]` or `brake-failure[:STRENGTH]` for the
-  actuators, `obstacle-ahead[:METRES]` for the world.
+  `kill:NODE`, `stop:NODE`, `wedge:NODE` or `slow:NODE[:SECONDS]` for any process, or one that
+  the robot declares (`Faults.own`), which may have details behind a colon, too.
 * WHEN is simulated seconds, or `goalN` for the moment in which goal N of the mission begins,
   or `goalN:SECONDS` for so long after it. Left out it is 10 s.
 * DURATION is simulated seconds, or `inf` for the rest of the run. Left out it is the fault's own.
@@ -20,24 +19,16 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.messages import Injection
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import ActuatorFault, ActuatorFaultKind
-from rampart.sim.faults.disturbance import Fault
-from rampart.sim.faults.faults import find_fault
-from rampart.sim.osmosis.robot import WHEEL_NAMES
+from rampart.actors.runtime.fault_watch import Order
+from rampart.sim.faults.faults import PROCESS_FAULTS, Faults
 
 DEFAULT_AT_S = 10.0
-PROCESS_FAULTS = ("kill", "stop", "wedge", "slow")
-ACTUATOR_FAULTS = ("stuck-wheel", "weak-wheel", "brake-failure")
-OBSTACLE = "obstacle-ahead"
 
 _MAX_DIGITS = 9
-_SLOW_S, _AHEAD_M, _OBSTACLE_RADIUS_M = 0.1, 3.0, 0.4
-_WEAK, _NO_BRAKE = 0.2, 0.0
-_LASTS_S = {"kill": 0.0, "wedge": math.inf, "stop": 5.0, "slow": 10.0, "stuck-wheel": 10.0,
-            "weak-wheel": 10.0, "brake-failure": 30.0, OBSTACLE: math.inf}
+_SLOW_S = 0.1
+_LASTS_S = {"kill": 0.0, "wedge": math.inf, "stop": 5.0, "slow": 10.0}
 
 
 class ScenarioError(ValueError):
@@ -80,13 +71,6 @@ class PlannedFault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, slots=True)
-class OnTopics:
-    """Orders for the nodes that publish the topics."""
-
-    orders: tuple[Injection, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class OnProcess:
     """Something done to the process of a node; `pace_s` is for slow."""
 
@@ -94,25 +78,6 @@ class OnProcess:
     node: str
     pace_s: float = 0.0
     duration_s: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class OnActuators:
-    """An order for the base."""
-
-    order: ActuatorFault
-
-
-@dataclass(frozen=True, slots=True)
-class OnWorld:
-    """An obstacle that appears ahead of the robot, `distance_m` from its centre to its own."""
-
-    distance_m: float
-    radius_m: float
-    duration_s: float
-
-
-Action = OnTopics | OnProcess | OnActuators | OnWorld
 
 
 def parse_fault(text: str) -> PlannedFault:
@@ -125,7 +90,7 @@ def parse_fault(text: str) -> PlannedFault:
     fault, at, when = rest.partition("@")
     if not fault:
         raise ScenarioError(f"fault {text!r}: must be FAULT[@WHEN][+DURATION], e.g. "
-                            "kill:osmosis_control@30 or gps-bias@goal2+5")
+                            "kill:NODE@30 or drop:TOPIC@goal2+5")
     duration_s = _seconds(text, lasts, "DURATION", infinite=True) if plus else None
     if not at:
         return PlannedFault(fault, duration_s=duration_s)
@@ -150,50 +115,43 @@ def _seconds(text: str, value: str, what: str, *, infinite: bool = False) -> flo
 
 
 def action_of(planned: PlannedFault, injection: str, nodes: Collection[str],
-              known: Sequence[Topic[Any]] = topics.ALL) -> Action:
-    """Return what is to be done.
+              known: Sequence[Topic[Any]], faults: Faults) -> object:
+    """Return what is to be done: a tuple of `Order`, `OnProcess`, or what the robot knows to do.
 
     Args:
         planned: The fault.
         injection: Id under which its effect is reported.
         nodes: Names of all nodes with a process that a fault may hit.
         known: All topics of the system, see `system_topics`.
+        faults: Of the robot.
 
     Raises:
-        ScenarioError: There is no such node, wheel or strength.
+        ScenarioError: There is no such node, or the details of the fault make no sense.
         UnknownFaultError: There is no such fault.
     """
     kind, *details = planned.fault.split(":")
     lasts_s = planned.duration_s
-    if kind not in _LASTS_S:
-        fault: Fault = find_fault(planned.fault, planned.seed, known).varied(
-            share=planned.share, on_s=planned.on_s, off_s=planned.off_s)
-        return OnTopics(fault.orders(injection, lasts_s))
-    lasts_s = _LASTS_S[kind] if lasts_s is None else lasts_s
     if kind in PROCESS_FAULTS:
         node = details[0] if details else ""
         if node not in nodes:
             raise ScenarioError(f"fault {planned.fault!r}: no node {node!r}; there are: "
                                 f"{', '.join(nodes)}")
-        pace_s = _number(planned, details[1:], _SLOW_S, most=60.0) if kind == "slow" else 0.0
-        return OnProcess(kind, node, pace_s, lasts_s)
-    if kind == OBSTACLE:
-        return OnWorld(_number(planned, details, _AHEAD_M, most=50.0), _OBSTACLE_RADIUS_M, lasts_s)
-    if kind == "brake-failure":
-        return OnActuators(ActuatorFault(
-            injection, ActuatorFaultKind.BRAKE_FAILURE, "", _number(planned, details, _NO_BRAKE),
-            lasts_s))
-    wheel = details[0].replace("-", " ") if details else WHEEL_NAMES[0]
-    if wheel not in WHEEL_NAMES:
-        raise ScenarioError(f"fault {planned.fault!r}: no wheel {wheel!r}; there are: "
-                            f"{', '.join(name.replace(' ', '-') for name in WHEEL_NAMES)}")
-    what = ActuatorFaultKind.STUCK_WHEEL if kind == "stuck-wheel" else ActuatorFaultKind.WEAK_WHEEL
-    return OnActuators(ActuatorFault(
-        injection, what, wheel, _number(planned, details[1:], _WEAK), lasts_s))
+        pace_s = number(planned.fault, details[1:], _SLOW_S, most=60.0) if kind == "slow" else 0.0
+        return OnProcess(kind, node, pace_s, _LASTS_S[kind] if lasts_s is None else lasts_s)
+    own = faults.own(planned.fault, injection, lasts_s)
+    if own is not None:
+        return own
+    fault = faults.find(planned.fault, planned.seed, known).varied(
+        share=planned.share, on_s=planned.on_s, off_s=planned.off_s)
+    return tuple(Order(bus_topics.INJECT, order) for order in fault.orders(injection, lasts_s))
 
 
-def _number(planned: PlannedFault, details: Sequence[str], default: float,
-            most: float = 1.0) -> float:
+def number(fault: str, details: Sequence[str], default: float, most: float = 1.0) -> float:
+    """Return the one number in the details of a fault, from 0 to `most`; the default without any.
+
+    Raises:
+        ScenarioError: It is none, or out of range, or there is more.
+    """
     if not details:
         return default
     try:
@@ -201,7 +159,7 @@ def _number(planned: PlannedFault, details: Sequence[str], default: float,
     except ValueError:
         value = math.nan
     if not 0 <= value <= most or len(details) > 1:
-        raise ScenarioError(f"fault {planned.fault!r}: {':'.join(details)!r}: must be one number "
+        raise ScenarioError(f"fault {fault!r}: {':'.join(details)!r}: must be one number "
                             f"between 0 and {most:g}")
     return value
 

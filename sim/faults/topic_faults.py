@@ -26,7 +26,6 @@ import msgspec
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.layout.system_topics import find_topic
-from rampart.actors.osmosis import topics
 from rampart.actors.runtime.corruption import is_array
 from rampart.actors.runtime.injection import MODES, UNTOUCHED
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
@@ -63,8 +62,7 @@ _TITLES = {
 }
 
 
-def topic_fault(mode: str, key: str, seed: int = 0,
-                known: Sequence[Topic[Any]] = topics.ALL) -> Fault:
+def topic_fault(mode: str, key: str, seed: int, known: Sequence[Topic[Any]]) -> Fault:
     """Return the fault `MODE:TOPIC`.
 
     Args:
@@ -103,15 +101,15 @@ def topic_fault(mode: str, key: str, seed: int = 0,
     return Fault(f"{mode}:{short}", title, (what,), (), DURATION_S, GROUP)
 
 
-def systematic_faults(keys: Iterable[str], seed: int = 0,
-                      known: Sequence[Topic[Any]] = topics.ALL) -> tuple[Fault, ...]:
+def systematic_faults(keys: Iterable[str], known: Sequence[Topic[Any]],
+                      seed: int = 0) -> tuple[Fault, ...]:
     """Return every fault `MODE:TOPIC` of the given topics.
 
     Args:
         keys: of single topics, e.g. those that `published_keys` of a system gives; those that must
             not be disturbed are passed over, and so are modes that make no sense on a topic.
-        seed: see `topic_fault`.
-        known: likewise.
+        known: see `topic_fault`.
+        seed: likewise.
 
     Raises:
         UnknownFaultError: a key is none.
@@ -120,7 +118,7 @@ def systematic_faults(keys: Iterable[str], seed: int = 0,
                  for key in keys for mode in modes_of(key, known))
 
 
-def modes_of(key: str, known: Sequence[Topic[Any]] = topics.ALL) -> tuple[str, ...]:
+def modes_of(key: str, known: Sequence[Topic[Any]]) -> tuple[str, ...]:
     """Return the modes in which a topic can fail; none for one that must not be disturbed.
 
     Raises:

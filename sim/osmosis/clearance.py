@@ -12,12 +12,11 @@ from collections.abc import Callable
 from typing import Any
 
 from rampart.actors.osmosis.airport.model import rectangle
+from rampart.sim.campaign.defaults import EXACT_BELOW_M
 from rampart.sim.osmosis.robot import CIRCUMRADIUS_M, LENGTH_M, WIDTH_M
 
 Pose = tuple[float, float, float]
 """x m, y m, yaw rad in `map`."""
-
-EXACT_BELOW_M = 1.0
 
 
 def footprint(pose: Pose) -> Any:

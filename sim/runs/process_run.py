@@ -1,4 +1,4 @@
-"""A mission on real processes: the launcher, and in this process the observer and the injector."""
+"""A run on real processes: the launcher, and in this process the observer and the injector."""
 
 from __future__ import annotations
 
@@ -16,34 +16,35 @@ from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.unseen import watch
-from rampart.manager.spec.schema import SystemSpec
-from rampart.sim.faults.injector import INJECTOR, Injector, can_be_hit
+from rampart.sim.faults.faults import faults_of
+from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.process_signals import ProcessSignals
 from rampart.sim.faults.scenario import PlannedFault
-from rampart.sim.osmosis.report_record import RunRecord
-from rampart.sim.runs.mission_run import MissionRun
-from rampart.sim.runs.observer import Observer, Sink
+from rampart.sim.runs.observer import Sink, observer_class
+from rampart.sim.runs.record import RunRecord
+from rampart.sim.runs.trial import Trial
 
 _LOOK_S = 0.05
 _STALL_S = 0.5
 
 
 class ProcessRun:
-    """One mission on processes. Use: `run`, once; `interrupt` ends it early.
+    """One run on processes. Use: `run`, once.
 
     Args:
-        launcher: Of the processes.
-        spec: The system.
-        mission: Judge, end and record.
+        trial: What is run.
         scenario: What goes wrong, and when.
+
+    Attributes:
+        interrupted: Whoever sets it ends the run for this reason.
+        failure: Why it could not go on; "" if it could.
     """
 
-    def __init__(self, launcher: Launcher, spec: SystemSpec, mission: MissionRun,
-                 scenario: Sequence[PlannedFault] = ()) -> None:
-        self.launcher = launcher
+    def __init__(self, trial: Trial, scenario: Sequence[PlannedFault] = ()) -> None:
+        self.launcher = Launcher(trial.run.plan, trial.title)
         self.interrupted = ""
-        self._spec = spec
-        self._mission = mission
+        self.failure = ""
+        self._trial = trial
         self._scenario = tuple(scenario)
 
     async def run(self) -> RunRecord:
@@ -61,15 +62,15 @@ class ProcessRun:
             try:
                 await self.launcher.end()
             except Exception as error:  # the verdict stands; the lifeline ends who is left
-                if self._mission.console:
-                    self._mission.console.trouble(f"at the end: {type(error).__name__}: {error}")
+                if self._trial.console:
+                    self._trial.console.say(f"at the end: {type(error).__name__}: {error}")
 
     async def _observe(self) -> RunRecord:
-        launcher, mission = self.launcher, self._mission
+        launcher, trial, spec = self.launcher, self._trial, self._trial.run.system
         plan = launcher.plan
         clock = Clock(plan.origin_s, plan.rate)
-        launcher.guard.on_restart = lambda name: mission.brought_back(name, clock.now())
-        if console := mission.console:
+        launcher.guard.on_restart = lambda name: trial.brought_back(name, clock.now())
+        if console := trial.console:
             launcher.guard.report = lambda text: console.line(clock.now(), text)
 
         def to_launcher(_topic: Topic[Any], message: Any, _header: Header) -> None:
@@ -77,22 +78,23 @@ class ProcessRun:
                 launcher.supervisor_heard(message)
 
         bus = launcher.observers_bus()
-        sinks: list[Sink] = [to_launcher, *mission.sinks(clock)]
+        sinks: list[Sink] = [to_launcher, *trial.sinks(clock)]
         of_the_run: dict[str, Any] = {
             "register": register_of(plan.folder), "members": frozenset(launcher.names)}
-        actors: list[Actor] = [Observer(Context(OBSERVER, 1, clock, bus, **of_the_run), sinks)]
+        actors: list[Actor] = [
+            observer_class(spec)(Context(OBSERVER, 1, clock, bus, **of_the_run), sinks)]
         injector = None
         if self._scenario:
-            injector = Injector(
+            injector = trial.injector(
                 Context(INJECTOR, 1, clock, SharedBus(bus), **of_the_run), self._scenario,
-                ProcessSignals(plan.base_port), can_be_hit(self._spec), system_topics(self._spec))
+                ProcessSignals(plan.base_port), nodes=can_be_hit(spec),
+                known=system_topics(spec), faults=faults_of(spec))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         for task, actor in zip(tasks, actors, strict=True):
             watch(task, f"the launcher's {actor.name}", launcher.failed)
-        if mission.console:
-            mission.console.banner(
-                mission.airport.name, mission.mission, plan, self._spec)
+        if trial.console:
+            trial.console.banner(trial.about, plan, spec)
         try:
             why = None
             while why is None and not self.interrupted and not launcher.failure:
@@ -100,16 +102,16 @@ class ProcessRun:
                 await asyncio.sleep(_LOOK_S)
                 stall_s = clock.now() - looked_s - _LOOK_S * plan.rate
                 if stall_s > _STALL_S * plan.rate:  # ctrl-Z; what was sent meanwhile comes now
-                    mission.excuse(stall_s)
-                why = mission.over(clock.now())
-            if launcher.failure:
-                why = launcher.failure
+                    trial.excuse(stall_s)
+                why = trial.over(clock.now())
+            if launcher.failure:  # before its observer is told to end
+                why = self.failure = launcher.failure
                 launcher.guard.report(why)
         finally:
             for actor in reversed(actors):
                 actor.stop()
             await asyncio.gather(*tasks, return_exceptions=True)
-            if mission.console:
-                mission.console.close()
-        return mission.conclude(clock.now(), self.interrupted or why or "ended",
+            if trial.console:
+                trial.console.close()
+        return trial.conclude(clock.now(), self.interrupted or why or "ended",
                                 injector.outcomes() if injector else ())

@@ -21,18 +21,16 @@ import msgspec
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm.messages import NodeTable
-from rampart.actors.layout.layout import Layout, load_run
+from rampart.actors.layout.layout import Layout
 from rampart.actors.layout.system_topics import system_topics
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.run.run_plan import OBSERVER, RunPlan
+from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import Actor, Context, Header
-from rampart.manager.spec.schema import SystemSpec
-from rampart.sim.faults.injector import INJECTOR, Injector, can_be_hit
+from rampart.sim.faults.faults import faults_of
+from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
-from rampart.sim.osmosis.judge import Verdict
-from rampart.sim.osmosis.report_record import RunRecord
-from rampart.sim.runs.mission_run import MissionRun
-from rampart.sim.runs.observer import Observer, Sink
+from rampart.sim.runs.observer import Sink, observer_class
+from rampart.sim.runs.record import RunRecord
+from rampart.sim.runs.trial import Trial
 from rampart.sim.virtual.network import NETWORKS, NetworkModel, SeededNetwork
 from rampart.sim.virtual.virtual_bus import Hub, Tap, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
@@ -52,7 +50,7 @@ class VirtualResult:
 
     Attributes:
         record: The story of the run.
-        verdict: Of the judge.
+        figures: What only a judge knows, see `Trial.figures`.
         why: Why it ended.
         trace: SHA-256 over everything that was sent, in hexadecimal.
         messages: How many were sent.
@@ -62,7 +60,7 @@ class VirtualResult:
     """
 
     record: RunRecord
-    verdict: Verdict
+    figures: dict[str, Any]
     why: str
     trace: str
     messages: int
@@ -110,17 +108,14 @@ def _tap(take: Callable[[float, str, bytes], None], zero_s: float) -> Tap:
 
 
 class VirtualRun:
-    """One mission in virtual time. Use: `run`, once.
+    """One trial in virtual time. Use: `run`, once.
 
     Args:
-        plan: What to run; its id, rate and ports do not matter.
-        spec: The system, as `run_plan.load_system` gives it.
-        mission: Judge, end and record.
+        trial: What is run; id, rate and ports of its plan do not matter.
         network: What lies between the nodes; as measured if None.
         scenario: What goes wrong, and when.
         nodes: That faults may name, whether they run or not; those of the spec if None.
         taps: Hear each message as it is sent: simulated time, key, payload.
-        run: What all actors have in common, perhaps for another seed; loaded if None.
 
     Raises:
         ValueError: an actor class named in the spec cannot be had.
@@ -129,18 +124,17 @@ class VirtualRun:
         interrupted: Whoever sets it, perhaps from a signal handler, ends the run for this reason.
     """
 
-    def __init__(self, plan: RunPlan, spec: SystemSpec, mission: MissionRun,
-                 *, network: NetworkModel | None = None, scenario: Sequence[PlannedFault] = (),
-                 nodes: Sequence[str] | None = None,
-                 taps: Sequence[Callable[[float, str, bytes], None]] = (),
-                 run: RunContext | None = None) -> None:
+    def __init__(self, trial: Trial, *, network: NetworkModel | None = None,
+                 scenario: Sequence[PlannedFault] = (), nodes: Sequence[str] | None = None,
+                 taps: Sequence[Callable[[float, str, bytes], None]] = ()) -> None:
         # Nothing that differs from run to run may get into a message.
         self.plan = msgspec.structs.replace(
-            plan, run_id=f"virtual-{plan.seed}", rate=1.0, hmi_port=0, launcher_pid=1,
-            virtual=True)
-        self.mission = mission
+            trial.run.plan, run_id=f"virtual-{trial.run.plan.seed}", rate=1.0, hmi_port=0,
+            launcher_pid=1, virtual=True)
+        self.trial = trial
         self.interrupted: str | None = None
-        self._context = replace(run or load_run(self.plan, spec), plan=self.plan, system=spec)
+        self._context = replace(trial.run, plan=self.plan)
+        spec = self._context.system
         self._layout = Layout(self.plan, spec, self._context.application)
         self._network = network or NETWORKS["measured"]
         self._scenario = tuple(scenario)
@@ -172,39 +166,40 @@ class VirtualRun:
         hub.taps.append(trace)
         hub.taps += [_tap(take, loop.time() + LEAD_S) for take in self._taps]
         machine = VirtualMachine(self._layout, self._context, hub, clock, seed=self.plan.seed)
-        machine.on_restart = lambda name: self.mission.brought_back(name, clock.now())
+        machine.on_restart = lambda name: self.trial.brought_back(name, clock.now())
 
         def to_machine(_topic: Topic[Any], message: Any, _header: Header) -> None:
             if isinstance(message, NodeTable):
                 machine.supervisor_heard(message)
 
-        sinks: list[Sink] = [to_machine, *self.mission.sinks(clock)]
-        observer = Observer(Context(
+        sinks: list[Sink] = [to_machine, *self.trial.sinks(clock)]
+        observer = observer_class(self._layout.spec)(Context(
             OBSERVER, 1, clock, VirtualBus(hub, OBSERVER), pid=1,
             members=frozenset(self._layout.members)), sinks)
         actors: list[Actor] = [observer]
         injector = None
         if self._scenario:
-            injector = Injector(
+            injector = self.trial.injector(
                 Context(INJECTOR, 1, clock, VirtualBus(hub, INJECTOR), pid=1,
                         members=frozenset(self._layout.members)),
-                self._scenario, machine, self._nodes, system_topics(self._layout.spec))
+                self._scenario, machine, nodes=self._nodes, known=system_topics(self._layout.spec),
+                faults=faults_of(self._layout.spec))
             actors.append(injector)
         watching = [asyncio.create_task(actor.run()) for actor in actors]
         machine.start()
         why = None
         while why is None and not any(task.done() for task in watching):
             await asyncio.sleep(_LOOK_S)
-            why = self.interrupted or self.mission.over(clock.now())
+            why = self.interrupted or self.trial.over(clock.now())
         now_s = clock.now()
         machine.shut_down()
         for actor in actors:
             actor.stop()
         await asyncio.gather(*watching)
-        record = self.mission.conclude(
+        record = self.trial.conclude(
             now_s, why or "ended", injector.outcomes() if injector else ())
         return VirtualResult(
-            record, self.mission.verdict(), why or "ended", trace.digest(), trace.messages,
+            record, self.trial.figures(record), why or "ended", trace.digest(), trace.messages,
             time.perf_counter() - begun_s,
             tuple((name, f"{type(error).__name__}: {error}") for name, error in machine.failures),
             "".join(f"--- {name}\n{''.join(traceback.format_exception(error))}"

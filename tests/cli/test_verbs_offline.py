@@ -23,7 +23,7 @@ from rampart.cli.main import build_parser, main
 from rampart.cli.operate.inject_verbs import choose
 from rampart.cli.output import UsageError
 from rampart.sim.campaign.job import _document
-from rampart.sim.faults.faults import find_fault
+from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
 from tests.porter_actors import write_porter_system
 
 
@@ -224,7 +224,7 @@ def test_a_fault_with_a_name_can_be_made_rarer_intermittent_and_random_in_anothe
         "inject", "gps-noise", "--share", "0.3", "--on", "1", "--off", "4", "--seed", "7"])
     (order,) = choose(options).orders("i")
     assert (order.share, order.on_s, order.off_s, order.seed) == (0.3, 1.0, 4.0, 7)
-    assert order.noise_fields == find_fault("gps-noise").disturbances[0].noise_fields
+    assert order.noise_fields == SENSOR_FAULTS["gps-noise"].disturbances[0].noise_fields
 
 
 def test_another_seed_corrupts_a_topic_with_other_numbers():

@@ -22,7 +22,8 @@ from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.output import print_json, print_table, say, say_text, warn
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.files.plain_text import one_line, printable
-from rampart.sim.runs.console import LINES_PER_S, REPORTS_PER_S, Console
+from rampart.sim.osmosis.trial.console import MissionConsole
+from rampart.sim.runs.console import LINES_PER_S, REPORTS_PER_S
 from tests.fuzz.handler_fuzz import system
 from tests.fuzz.message_extremes import TEXTS, all_topics
 from tests.fuzz.test_bounded_state import told
@@ -81,7 +82,7 @@ def test_a_forged_line_stays_within_the_line_of_who_sent_it(capsys):
 @pytest.mark.parametrize("topic", all_topics(), ids=lambda t: t.key)
 def test_a_console_shows_what_it_is_told_and_obeys_nothing_of_it(topic):
     stream = Terminal()
-    console = Console(stream)
+    console = MissionConsole(stream)
     picture = RunPicture(OsmosisLines())
     for number, text in enumerate((*HOSTILE, *TEXTS)):
         body = convert(hostile(inspect.type_info(topic.type), number, text), topic.type,
@@ -117,7 +118,7 @@ def report(number):
 
 def test_a_flood_of_reports_is_some_clipped_lines_and_a_count_and_other_news_come_through():
     stream, now = io.StringIO(), [0.0]
-    console = Console(stream, lambda: now[0])
+    console = MissionConsole(stream, lambda: now[0])
     for number in range(10_000):
         console.take(ftm_topics.ERROR_REPORT, report(number), Header("x", 1, number, 1.0))
     console.line(1.0, "news")
@@ -132,7 +133,7 @@ def test_a_flood_of_reports_is_some_clipped_lines_and_a_count_and_other_news_com
 
 def test_a_flood_of_other_news_does_not_hide_that_the_robot_is_unsafe():
     stream = io.StringIO()
-    console = Console(stream, lambda: 0.0)
+    console = MissionConsole(stream, lambda: 0.0)
     for number in range(1000):
         console.line(0.0, f"{number}")
     truth = m.GroundTruth(m.Pose(0.0, 0.0, 0.0), m.Twist(0.0, 0.0), 1, 0.0, 0.0, 0.0, 1.0)
@@ -144,7 +145,7 @@ def test_a_flood_of_other_news_does_not_hide_that_the_robot_is_unsafe():
 def test_in_virtual_time_every_line_is_shown():
     of = system("paper")
     stream = io.StringIO()
-    console = Console(stream, lambda: 0.0)
+    console = MissionConsole(stream, lambda: 0.0)
     console.virtual_banner("Vallombre", of.run.application.mission, of.plan, "safety-first")
     for number in range(1000):
         console.line(float(number), "line")

@@ -35,8 +35,9 @@ from rampart.manager.spec.specification import check_document, parse_specificati
 from rampart.manager.spec.tables import SpecificationError
 from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.store import _NO_RUN, _run
-from rampart.sim.faults.faults import UnknownFaultError
+from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.scenario import ScenarioError, action_of, parse_fault
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests import ROOT
 from tests.actors.osmosis.airport.test_formats import GRAPH, SCALE, TOML
 from tests.actors.recording.samples import documents, pose
@@ -270,7 +271,7 @@ def open_psa(data: bytes) -> None:
 def fault(data: bytes) -> None:
     planned = parse_fault(data.decode(errors="replace"))
     planned.text()
-    action_of(planned, "f1", ("osmosis_control", "hmi"))
+    action_of(planned, "f1", ("osmosis_control", "hmi"), topics.ALL, OsmosisFaults())
 
 
 # -- recordings, results ---------------------------------------------------------------------------

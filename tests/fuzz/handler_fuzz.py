@@ -48,8 +48,8 @@ from rampart.cli.look.topic_verbs import in_line
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.manager.spec.specification import SystemSpec
+from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.console import Console
-from rampart.sim.runs.mission_run import MissionRun
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
 from tests.fuzz.message_extremes import Drawer, all_topics
@@ -286,8 +286,7 @@ def _sinks(of: System, clock: VirtualClock) -> list[Any]:
     """Return what the launcher has the observer tell the run's story to."""
     if not isinstance(of.run.application, Osmosis):
         return [Console(io.StringIO()).take]
-    run = MissionRun(of.plan, of.run.application.airport, of.run.application.mission, strategy="x",
-                     patience_s=60.0, console=Console(io.StringIO()))
+    run = MissionTrial(of.run, 60.0, io.StringIO())
 
     def conclude(_topic: Any, _message: Any, _header: Header) -> None:
         run.over(clock.now())

@@ -12,8 +12,10 @@ import msgspec
 import pytest
 from msgspec import inspect
 
-import rampart.sim.osmosis.report_record
+import rampart.sim.osmosis.trial.console
+import rampart.sim.osmosis.trial.record
 import rampart.sim.runs.console
+import rampart.sim.runs.record
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Header, encode
@@ -31,8 +33,7 @@ from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, Motor
 from rampart.sim.osmosis.scene import WorldError
-from rampart.sim.runs.console import Console
-from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock
 from rampart.testing import VirtualSystem, run
@@ -154,13 +155,13 @@ def test_what_remembers_without_bound_is_found(monkeypatch):
 
 
 def test_what_shows_and_records_a_run_remembers_a_bounded_number_of_names(monkeypatch):
-    monkeypatch.setattr(rampart.sim.osmosis.report_record, "KEPT", 500)
-    monkeypatch.setattr(rampart.sim.osmosis.report_record, "TRACK_KEPT", 500)
+    monkeypatch.setattr(rampart.sim.osmosis.trial.record, "KEPT", 500)
+    monkeypatch.setattr(rampart.sim.runs.record, "KEPT", 500)
+    monkeypatch.setattr(rampart.sim.osmosis.trial.record, "TRACK_KEPT", 500)
     monkeypatch.setattr(rampart.sim.runs.console, "MANY", 500)
-    monkeypatch.setattr(rampart.sim.runs.console, "MOST", 500)
+    monkeypatch.setattr(rampart.sim.osmosis.trial.console, "MOST", 500)
     of = system("osmosis")
-    run = MissionRun(of.plan, of.run.application.airport, of.run.application.mission, strategy="x",
-                     patience_s=60.0, console=Console(io.StringIO()))
+    run = MissionTrial(of.run, 60.0, io.StringIO())
     picture, views = RunPicture(OsmosisLines()), OsmosisViews()
     clock = type("Clock", (), {"now": staticmethod(lambda: 0.0)})()
     for topic in all_topics():

@@ -16,7 +16,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.checkpoint import Shelf
 from rampart.sim.faults.scenario import parse_fault
-from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun
 from rampart.sim.virtual.virtual_processes import VirtualMachine
 from tests import ROOT
@@ -47,7 +47,7 @@ class Watched:
     shelves: dict[str, Shelf] = field(default_factory=dict)
 
 
-class _Mission(MissionRun):
+class _Mission(MissionTrial):
     def watch(self) -> None:
         self.measured: list[m.LightMeasurement] = []
         self.statuses: list[m.MissionStatus] = []
@@ -90,12 +90,9 @@ def fly(mission: str, faults: Sequence[str], *, seed: int = 1, system: Path | No
                        options={"mission": mission})
         spec = load_system(plan)
         loaded = load_run(plan, spec)
-        known = loaded.application
-        run = _Mission(plan, known.airport, known.mission, strategy=spec.strategy,
-                       patience_s=60.0)
+        run = _Mission(loaded, 60.0)
         run.watch()
-        result = VirtualRun(plan, spec, run, scenario=tuple(map(parse_fault, faults)),
-                            run=loaded).run()
+        result = VirtualRun(run, scenario=tuple(map(parse_fault, faults))).run()
     of_mission = [s for s in run.statuses if s.mission_id]
     return Watched(result, of_mission[-1], run.measured, [s.step for s in of_mission],
                    run.diagnostics, machines[0].shelves)

@@ -16,11 +16,14 @@ from pathlib import Path
 import jinja2
 import pytest
 
-import rampart.sim.osmosis.report
+import rampart.sim.osmosis.trial.mission_trial
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.recording.virtual import VirtualRecording
+from rampart.actors.run.run_plan import RunPlan
 from rampart.cli import run as launch
-from rampart.sim.osmosis.report import RunRecorder, try_report
+from rampart.sim.osmosis.trial.record import MissionRecorder
+from rampart.sim.osmosis.trial.report import render
+from rampart.sim.runs.report import try_report
 from rampart.testing import HEEDS_SIGNALS, RealRun, free_base_port
 from tests import ROOT
 from tests.actors.recording.samples import pose
@@ -161,9 +164,10 @@ def in_the_way(folder: Path) -> None:
 
 def test_a_folder_that_is_none_any_more_is_one_line(tmp_path):
     airport = load_airport("vallombre")
-    record = RunRecorder("r", airport, airport.mission("A")).record("fail", "unsafe", (), 9.0)
+    record = MissionRecorder(RunPlan("r"), "", airport, airport.mission("A")).record(
+        9.0, mission="fail", safety="unsafe")
     in_the_way(tmp_path / "report")
-    html, data, problem = try_report(record, tmp_path / "report")
+    html, data, problem = try_report(record, render, tmp_path / "report")
     assert (html, data) == (None, None)
     assert problem.endswith(f"cannot be written to {tmp_path / 'report'}: File exists")
     assert problem.count("cannot be written") == 1
@@ -176,7 +180,7 @@ def test_a_page_that_cannot_be_made_costs_neither_record_nor_verdict(
     def broken(_run):
         raise error
 
-    monkeypatch.setattr(rampart.sim.osmosis.report, "render", broken)
+    monkeypatch.setattr(rampart.sim.osmosis.trial.mission_trial, "render", broken)
     assert launch.main(unsafe(tmp_path)[2:]) == UNSAFE
     told = capsys.readouterr()
     result = result_of(told.out)

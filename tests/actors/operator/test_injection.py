@@ -29,12 +29,12 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.cli import systems
-from rampart.sim.faults.offered_faults import offered_faults
 from rampart.sim.faults.topic_faults import modes_of
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from tests.porter_actors import write_porter_system
 
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-OFFERED = offered_faults()
+OFFERED = OsmosisFaults().offered()
 KEYS = places(topics.ALL, ["localization"], ["DM1"], ["RM1"])
 
 
@@ -200,7 +200,7 @@ def test_all_that_is_offered_survives_the_plan_and_is_sound():
 def test_no_place_is_offered_that_must_not_be_disturbed():
     assert set(KEYS) >= {"localization/pose", "detection/DM1", "recovery/RM1/command",
                          "heartbeat/localization"}
-    assert all(modes_of(key) for key in KEYS)
+    assert all(modes_of(key, topics.ALL) for key in KEYS)
     assert set(injections().choice()["modes"]) < set(MODES)
 
 

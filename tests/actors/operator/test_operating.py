@@ -18,7 +18,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.supervision.kill_node import SignalError
 from rampart.actors.supervision.process_title import RunProcess
-from rampart.sim.faults.offered_faults import offered_faults
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
 from tests.actors.operator.world import hear, repeated, served
 from tests.osmosis_system import shipped_system
@@ -244,7 +244,7 @@ async def test_without_processes_nothing_can_be_signalled(world):
 
 
 async def test_a_fault_is_injected_from_the_page_and_its_effect_shown(world):
-    async with world.hmi(hmi_port=free_port(), faults=offered_faults()) as hmi:
+    async with world.hmi(hmi_port=free_port(), faults=OsmosisFaults().offered()) as hmi:
         async with open_page(await served(hmi)) as page:
             names = {f["name"] for f in (await hear(page, "operating"))["faults"]}
             assert {"command-out-of-bounds", "gps-bias", "brake-failure"} <= names

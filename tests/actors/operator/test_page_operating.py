@@ -17,7 +17,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.page import stick as hmi_stick
 from rampart.actors.osmosis.page.stick import Grip
 from rampart.actors.supervision.process_title import RunProcess
-from rampart.sim.faults.offered_faults import offered_faults
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
 from tests.actors.operator.browser import browser
 from tests.actors.operator.world import World, hear, repeated, served
@@ -333,7 +333,7 @@ async def test_a_node_is_signalled_from_its_row_after_a_second_press(world, monk
 
 async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world):
     async with (browser() as tab, alive(world),
-                world.hmi(hmi_port=free_port(), faults=offered_faults(),
+                world.hmi(hmi_port=free_port(), faults=OsmosisFaults().offered(),
                           system=shipped_system()) as hmi):
         await tab.show(f"http://{await served(hmi)}/")
         await tab.until("!document.getElementById('strategy-set').disabled")

@@ -21,10 +21,11 @@ from rampart.actors.bus.envelope import ArrivalGuard, encode
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.layout.layout import OBSERVER_CLASS, SUPERVISOR_CLASS, Layout
+from rampart.actors.layout.layout import SUPERVISOR_CLASS, Layout
 from rampart.actors.layout.wiring import load_class
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
@@ -297,7 +298,7 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
     system = systems.load(None)
     classes = {base for node in system.actors() for base in load_class(node.actor).__mro__
                if issubclass(base, Actor) and base is not Actor}
-    classes |= {load_class(name) for name in (SUPERVISOR_CLASS, OBSERVER_CLASS)}
+    classes |= {load_class(name) for name in (SUPERVISOR_CLASS, Osmosis.observer)}
     assert len(classes) > 15
     own = assigned(Actor) | {name for base in (Actor, Declared) for name in vars(base)
                              if name.startswith("_") and not name.startswith("__")}

@@ -10,15 +10,16 @@ import sys
 
 import pytest
 
-from rampart.actors.osmosis.airport.formats import load_airport, load_mission
+from rampart.actors.layout.layout import load_run
+from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import load_system
-from rampart.actors.supervision.launcher import Launcher, needed_descriptors
+from rampart.actors.supervision.launcher import needed_descriptors
 from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.unseen import tell_of_callbacks, watch
-from rampart.sim.runs.console import Console
-from rampart.sim.runs.mission_run import MissionRun
+from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.runs.process_run import ProcessRun
-from rampart.sim.runs.watched_run import WatchedRun
+from rampart.sim.runs.trial import Trial
 from rampart.testing import free_base_port
 from tests import ROOT
 from tests.stub_actors import Idler, launched, stub_plan, write_stub_system
@@ -113,15 +114,14 @@ WHY = "the launcher's observer failed: RuntimeError: no room for tables"
 @pytest.mark.processes
 async def test_a_run_whose_observer_fails_ends_in_order_and_says_why(tmp_path, monkeypatch):
     plan = stub_plan(write_stub_system(tmp_path))
-    airport = load_airport("vallombre")
     stream = io.StringIO()
-    mission = MissionRun(plan, airport, load_mission("AB", airport), strategy="",
-                         patience_s=60, console=Console(stream))
+    known = Osmosis(Osmosis.Options(airport="vallombre", mission="AB"))
+    mission = MissionTrial(RunContext(plan, load_system(plan), application=known), 60.0, stream)
     usual = mission.sinks
     monkeypatch.setattr(mission, "sinks", lambda clock: [*usual(clock), broken_sink])
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     async with asyncio.timeout(30):
-        record = await ProcessRun(Launcher(plan, "test"), load_system(plan), mission).run()
+        record = await ProcessRun(mission).run()
     assert (record.mission, record.safety) == ("fail", "not known")
     assert f"ended: {WHY}" in record.reasons
     assert WHY in stream.getvalue()
@@ -132,12 +132,14 @@ async def test_a_run_whose_observer_fails_ends_in_order_and_says_why(tmp_path, m
 async def test_a_run_without_a_mission_whose_observer_fails_ends_too(tmp_path, monkeypatch):
     plan = stub_plan(write_stub_system(tmp_path))
     stream = io.StringIO()
-    run = WatchedRun(plan, load_system(plan), None, stream)
-    monkeypatch.setattr(run, "_take", broken_sink)
+    trial = Trial(load_run(plan, load_system(plan)), None, stream)
+    run = ProcessRun(trial)
+    usual = trial.sinks
+    monkeypatch.setattr(trial, "sinks", lambda clock: [*usual(clock), broken_sink])
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     async with asyncio.timeout(30):
         await run.run()
-    assert run.launcher.failure == WHY
+    assert run.failure == WHY
     assert WHY in stream.getvalue()
     assert find_processes(plan.base_port) == []
 

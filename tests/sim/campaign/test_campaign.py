@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from functools import partial
 
 import msgspec
 import pytest
@@ -25,7 +26,13 @@ from rampart.cli.main import main as rampart
 from rampart.sim.campaign import execute as execution
 from rampart.sim.campaign.execute import BackendError, JobError, execute
 from rampart.sim.campaign.job import Job, RunResult, run_job
-from rampart.sim.campaign.paper_tables import (
+from rampart.sim.campaign.plan import cross, fault_groups, sample
+from rampart.sim.campaign.search import Space, margin, search, shrink
+from rampart.sim.campaign.statistics import badness, rate, spread, table, total, worst
+from rampart.sim.campaign.store import Run, Store, StoreError
+from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
+from rampart.sim.osmosis.trial.paper_tables import (
     AS_THE_PAPER,
     CONDITIONS,
     FAULTS,
@@ -37,17 +44,13 @@ from rampart.sim.campaign.paper_tables import (
     paper_jobs,
     table_iii,
 )
-from rampart.sim.campaign.plan import cross, fault_groups, sample
-from rampart.sim.campaign.search import Space, margin, search, shrink
-from rampart.sim.campaign.statistics import badness, rate, spread, table, total, worst
-from rampart.sim.campaign.store import Run, Store, StoreError
-from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.systems import SHIPPED
 from tests import ROOT
 from tests.porter_actors import write_porter_system
 
 PAPER = systems.load("paper")
 GROUPS = fault_groups(PAPER)
+sample = partial(sample, faults=OsmosisFaults())
 BASES = [Job(row="", system="paper", mission="A", obstacles=n) for n in (0, 2)]
 SHORT = PlannedFault("kill:mission_manager", 3.0)
 """Over after seven simulated seconds of the paper's system, a fifth of a second of work."""
@@ -212,6 +215,7 @@ def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
 
 FULL_DISK = """
 import msgspec, resource, sys
+from functools import partial
 from pathlib import Path
 from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.store import Store, StoreError
@@ -465,8 +469,7 @@ def test_the_search_goes_where_the_margin_is_small():
                        + (0.0 if j.faults[0].fault == "gps-drift" else 1.0)) for j in jobs]
 
     pytest.importorskip("optuna")
-    space = Space(tuple(BASES), {"sensor": ("gps-bias", "gps-drift", "gps-noise")},
-                  sudden_obstacle=False)
+    space = Space(tuple(BASES), {"sensor": ("gps-bias", "gps-drift", "gps-noise")})
     made = search(space, 120, fake, seed=1, at_once=2)
     assert len(made) == 120
     assert [margin(r) for _, r in made] == sorted(margin(r) for _, r in made)
@@ -482,7 +485,7 @@ def test_the_search_is_told_of_an_unsafe_run_though_its_fault_had_no_effect(monk
     nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
     results = iter([result(outcomes=nothing),
                     result(outcomes=nothing, safe=False, collisions=1)])
-    search(Space(tuple(BASES), {"sensor": ("gps-bias",)}, sudden_obstacle=False), 2,
+    search(Space(tuple(BASES), {"sensor": ("gps-bias",)}), 2,
            lambda _jobs: [next(results)], seed=1)
     assert told == [2.0, -1.0]
 

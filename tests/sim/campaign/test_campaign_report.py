@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 
 from rampart.actors.osmosis.airport.drawing import draw
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.sim.campaign import charts, paper_tables
-from rampart.sim.campaign.grouping import KINDS, by_kind, conditions, in_common, kind_of
+from rampart.sim.campaign import charts
+from rampart.sim.campaign.grouping import by_kind, conditions, in_common, kind_of
 from rampart.sim.campaign.job import DecisionTaken, Job, RunResult
-from rampart.sim.campaign.paper_tables import Decided
 from rampart.sim.campaign.report import (
     Campaign,
     headline,
@@ -30,7 +29,10 @@ from rampart.sim.campaign.statistics import badness, rate
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.wording import interval, metres, percent, seconds
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
-from rampart.sim.osmosis.report_record import ObstacleSeen, RunRecord, StepResult
+from rampart.sim.osmosis.trial import paper_tables
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
+from rampart.sim.osmosis.trial.paper_tables import Decided
+from rampart.sim.osmosis.trial.record import MissionRecord, ObstacleSeen, StepResult
 
 ABOUT = Campaign("A campaign", "rampart campaign --runs 3", 7)
 OUT = Path("out/my campaign")
@@ -52,7 +54,7 @@ def run(fault: str = "gps-bias", *, row: str = "", affected: int = 1, ftm: bool 
     return Run(job, RunResult(**fields))
 
 
-def record_of(made: Run, **more) -> RunRecord:
+def record_of(made: Run, **more) -> MissionRecord:
     fields = {
         "run_id": made.job.key, "airport": DRAWING, "mission_name": "A", "mission": "success",
         "safety": "safe", "reasons": (), "duration_s": 90.0, "distance_m": 9.0,
@@ -62,7 +64,7 @@ def record_of(made: Run, **more) -> RunRecord:
         "decisions": (), "restarts": {}, "collisions": 0, "prohibited_s": 0.0,
         "obstacle_clearance_m": None, "prohibited_clearance_m": 0.8, "strategy": "", "seed": 1,
         "rate": 1.0} | more
-    return RunRecord(**fields)
+    return MissionRecord(**fields)
 
 
 class Tables(HTMLParser):
@@ -424,14 +426,13 @@ def test_a_run_that_has_no_track_is_shown_without_a_map():
     ("kill:hmi", "process"), ("stuck-wheel:rear-left", "actuator"), ("brake-failure:0", "actuator"),
     ("obstacle-ahead:2", "world")])
 def test_a_fault_is_of_its_kind(fault, kind):
-    assert kind_of(run(fault).job) == kind
-    assert list(by_kind([run(fault)])) == [kind]
-    assert kind in KINDS
+    assert kind_of(run(fault).job) == OsmosisFaults.kinds[kind]
+    assert list(by_kind([run(fault)])) == [OsmosisFaults.kinds[kind]]
 
 
 def test_several_faults_are_a_kind_of_their_own():
     job = Job(row="x", faults=(PlannedFault("gps-bias"), PlannedFault("drop:a/b")))
-    assert kind_of(job) == "several"
+    assert kind_of(job) == "several at once"
 
 
 def test_every_run_is_in_exactly_one_condition():

@@ -18,23 +18,26 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.injection import MODES, FaultGate, flaw
 from rampart.cli.look.topic_catalogue import resolve, uses
-from rampart.sim.faults.faults import (
-    CATALOGUE,
-    PAPER_FAULTS,
-    SENSOR_FAULTS,
-    Disturbance,
-    Fault,
-    UnknownFaultError,
-    find_fault,
-)
-from rampart.sim.faults.topic_faults import DELAY_S, modes_of, systematic_faults, topic_fault
-from rampart.sim.osmosis.sensor_faults import LEFT_OUT, SENSORS
+from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
+from rampart.sim.faults.topic_faults import DELAY_S, modes_of, systematic_faults
+from rampart.sim.faults.topic_faults import topic_fault as topic_fault_of
 from rampart.sim.osmosis.sensors import Gps
+from rampart.sim.osmosis.trial.faults import PAPER_FAULTS, SENSOR_FAULTS, OsmosisFaults
+from rampart.sim.osmosis.trial.sensor_faults import LEFT_OUT, SENSORS
 from tests.osmosis_system import shipped_system
 from tests.porter_actors import AXLE, LOAD
 
 KEYS = published_keys(shipped_system())
-SYSTEMATIC = {fault.name: fault for fault in systematic_faults(KEYS)}
+CATALOGUE = OsmosisFaults.named
+SYSTEMATIC = {fault.name: fault for fault in systematic_faults(KEYS, topics.ALL)}
+
+
+def find_fault(name: str, seed: int = 0, known: tuple[Topic[Any], ...] = topics.ALL) -> Fault:
+    return OsmosisFaults().find(name, seed, known)
+
+
+def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
+    return topic_fault_of(mode, key, seed, topics.ALL)
 
 
 SIMPLE = {
@@ -108,13 +111,13 @@ def test_every_fault_changes_real_messages_of_its_topic_and_leaves_them_readable
 @pytest.mark.parametrize("key", KEYS)
 def test_every_published_topic_has_all_modes_that_make_sense(key):
     mine = [name for name in SYSTEMATIC if name.endswith(f":{key}")]
-    assert mine == [f"{mode}:{key}" for mode in modes_of(key)]
+    assert mine == [f"{mode}:{key}" for mode in modes_of(key, topics.ALL)]
     if key.startswith(("world/", "inject/")):
-        assert modes_of(key) == ()
+        assert modes_of(key, topics.ALL) == ()
     elif key.startswith("hello/"):
-        assert modes_of(key) == ("drop", "freeze", "delay", "duplicate", "restamp")
+        assert modes_of(key, topics.ALL) == ("drop", "freeze", "delay", "duplicate", "restamp")
     else:
-        assert set(MODES) - set(modes_of(key)) <= {"corrupt"}
+        assert set(MODES) - set(modes_of(key, topics.ALL)) <= {"corrupt"}
 
 
 def test_the_published_keys_are_those_of_the_topic_list_with_families_spelt_out():

@@ -8,24 +8,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import ActuatorFaultKind
 from rampart.cli import systems
 from rampart.sim.campaign.plan import fault_groups
 from rampart.sim.faults.disturbance import UnknownFaultError
 from rampart.sim.faults.injector import can_be_hit
-from rampart.sim.faults.scenario import (
-    OnActuators,
-    OnProcess,
-    OnTopics,
-    OnWorld,
-    PlannedFault,
-    ScenarioError,
-    action_of,
-    parse_fault,
-)
+from rampart.sim.faults.scenario import OnProcess, PlannedFault, ScenarioError, parse_fault
+from rampart.sim.faults.scenario import action_of as action_in
+from rampart.sim.osmosis.trial.faults import OsmosisFaults, SuddenObstacle
 
 SYSTEM = systems.load(None)
 NODES = can_be_hit(SYSTEM)
+
+
+def action_of(planned: PlannedFault, injection: str = "f1") -> object:
+    return action_in(planned, injection, NODES, topics.ALL, OsmosisFaults())
 
 
 @pytest.mark.parametrize(("text", "planned"), [
@@ -66,25 +64,27 @@ def test_text_and_plan_say_the_same(fault, at_s, goal, duration_s):
 
 def test_every_fault_of_the_catalogue_becomes_an_action():
     groups = fault_groups(SYSTEM)
-    kinds = {"paper": OnTopics, "sensor": OnTopics, "topic": OnTopics, "process": OnProcess,
-             "actuator": OnActuators, "world": OnWorld}
+    kinds = {"paper": tuple, "sensor": tuple, "topic": tuple, "process": OnProcess,
+             "actuator": tuple, "world": SuddenObstacle}
     assert set(groups) == set(kinds)
     for group, names in groups.items():
         assert len(names) == len(set(names)) > 0
         for name in names:
-            assert isinstance(action_of(PlannedFault(name), "f1", NODES), kinds[group]), name
+            assert isinstance(action_of(PlannedFault(name)), kinds[group]), name
 
 
 def test_faults_of_topics_carry_pattern_seed_and_duration():
     action = action_of(PlannedFault("gps-noise", 3.0, duration_s=math.inf, share=0.5, on_s=1.0,
-                                    off_s=2.0, seed=9), "f7", NODES)
-    order = action.orders[0]
+                                    off_s=2.0, seed=9), "f7")
+    order = action[0].message
     assert (order.injection, order.duration_s, order.share) == ("f7", math.inf, 0.5)
     assert (order.on_s, order.off_s, order.seed) == (1.0, 2.0, 9)
 
 
 def test_a_wheel_and_its_strength_are_named():
-    order = action_of(PlannedFault("weak-wheel:rear-left:0.3", duration_s=4.0), "f1", NODES).order
+    ((topic, order),) = [(o.topic, o.message) for o in action_of(
+        PlannedFault("weak-wheel:rear-left:0.3", duration_s=4.0))]
+    assert topic is topics.ACTUATOR_FAULT
     assert (order.kind, order.wheel, order.strength, order.duration_s) == (
         ActuatorFaultKind.WEAK_WHEEL, "rear left", 0.3, 4.0)
 
@@ -99,9 +99,9 @@ def test_a_wheel_and_its_strength_are_named():
 ])
 def test_an_impossible_detail_is_refused(fault, words):
     with pytest.raises(ScenarioError, match=words):
-        action_of(PlannedFault(fault), "f1", NODES)
+        action_of(PlannedFault(fault))
 
 
 def test_an_unknown_fault_is_refused():
     with pytest.raises(UnknownFaultError):
-        action_of(PlannedFault("gremlins"), "f1", NODES)
+        action_of(PlannedFault("gremlins"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rampart.actors.osmosis.airport.model import MissionGoal
-from rampart.sim.osmosis.judge import Judge, Sample
+from rampart.sim.osmosis.trial.judge import Judge, Sample
 
 # Three points along x: taxi to 10, lights to 20, taxi to 30.
 GOALS = (

@@ -12,8 +12,8 @@ import pytest
 
 from rampart.actors.osmosis.airport.formats import load_airport, load_world
 from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
-from rampart.sim.osmosis.judge import Judge, Sample
 from rampart.sim.osmosis.sensors import LightSensor
+from rampart.sim.osmosis.trial.judge import Judge, Sample
 from rampart.sim.osmosis.world import World
 
 AIRPORT = load_airport("vallombre")

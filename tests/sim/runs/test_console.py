@@ -9,15 +9,14 @@ import pytest
 
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.manager.spec.specification import parse_specification
+from rampart.sim.osmosis.trial.console import MissionConsole
 from rampart.sim.runs.console import Console
 from tests import ROOT
 
 PLAN = RunPlan("r")
-MISSION = load_airport("vallombre").mission("AB")
 CALM = m.ManagerStatus((), (), (), (), "guarded-repair", 0)
 
 
@@ -39,12 +38,12 @@ def test_a_module_that_falls_silent_and_is_heard_again_is_told_once_each():
     ("paper", "osmosis_control"), ("osmosis", "osmosis_control"), ("cell", "camera")])
 def test_the_banner_offers_to_kill_a_node_that_the_system_has(name, node):
     stream = StringIO()
-    Console(stream).banner("Vallombre", MISSION, PLAN, system(name))
+    MissionConsole(stream).banner("a mission", PLAN, system(name))
     assert stream.getvalue().endswith(f"Try from another shell: kill-node {node}\n")
 
 
 def test_where_no_recovery_brings_a_node_back_none_is_offered():
     stream = StringIO()
     alone = msgspec.structs.replace(system("cell"), nodes=())
-    Console(stream).banner("Vallombre", MISSION, PLAN, alone)
+    Console(stream).banner("a mission", PLAN, alone)
     assert "kill-node" not in stream.getvalue()

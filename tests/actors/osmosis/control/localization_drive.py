@@ -21,8 +21,8 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.runtime.injection import FaultGate, Outgoing
 from rampart.sim.faults.disturbance import Fault
-from rampart.sim.faults.faults import find_fault
 from rampart.sim.osmosis.schedule import Schedule
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.sim.osmosis.world import World
 
 START_RAD = 0.7
@@ -106,7 +106,7 @@ def _read(world: World, key: str) -> bm.Message:
 
 
 def fault(name: str, *, on_s: float = 0.0, off_s: float = 0.0) -> Fault:
-    return find_fault(name).varied(on_s=on_s, off_s=off_s)
+    return OsmosisFaults().find(name, 0, topics.ALL).varied(on_s=on_s, off_s=off_s)
 
 
 def disturbed(faults: Iterable[tuple[Fault, float, float]], seed: int = 1,

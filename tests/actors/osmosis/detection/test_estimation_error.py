@@ -15,7 +15,7 @@ from rampart.actors.osmosis.detection.area.estimation_error import (
     EstimationMonitor,
 )
 from rampart.actors.runtime.actor import Actor
-from rampart.sim.faults.faults import SENSOR_FAULTS
+from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
 from rampart.testing import Ear, run
 from tests.actors.osmosis.control.localization_drive import (
     LEGS,

@@ -15,7 +15,7 @@ from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.osmosis.detection.area.position_vote import GPS, WHEELS, PositionVote
 from rampart.actors.osmosis.detection.area.voted_area import VotedArea, VotedPosition
 from rampart.actors.runtime.actor import Actor
-from rampart.sim.faults.faults import SENSOR_FAULTS
+from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
 from rampart.testing import Ear, run
 from tests.actors.osmosis.control.localization_drive import (
     LEGS,

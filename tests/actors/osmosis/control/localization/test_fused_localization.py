@@ -15,8 +15,8 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.localization.fused_localization import FusedLocalization
 from rampart.actors.osmosis.control.localization.localization import Localization
 from rampart.actors.runtime.actor import Actor, Context, Header, on
-from rampart.sim.faults.faults import find_fault
 from rampart.sim.osmosis.simulator import Simulator
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import run
 from tests.actors.osmosis.control.localization_drive import field_airport
 from tests.osmosis_system import System, shipped_system
@@ -51,7 +51,7 @@ class Ear(Actor):
             await asyncio.sleep(0.05)
 
     def fail(self, name: str, number: str = "f") -> None:
-        for order in find_fault(name).orders(number, math.inf):
+        for order in OsmosisFaults().find(name, 0, topics.ALL).orders(number, math.inf):
             self.publish(bus_topics.INJECT, order)
 
     def error_m(self, since_s: float) -> float:

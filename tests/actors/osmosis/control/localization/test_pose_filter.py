@@ -16,7 +16,7 @@ from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, O
 from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
 from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits
-from rampart.sim.faults.faults import SENSOR_FAULTS
+from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
 from rampart.testing import table
 from tests.actors.osmosis.control.localization_drive import (
     LEGS,

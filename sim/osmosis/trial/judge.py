@@ -10,8 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis.airport.model import MissionGoal
+from rampart.actors.osmosis.messages import GroundTruth, MissionPhase, MissionStatus
+from rampart.actors.runtime.actor import Header
 
 ARRIVAL_RADIUS_M = 1.1
 """A point counts as reached at this distance (the authors' code)."""
@@ -160,3 +164,22 @@ class Judge:
             closest_prohibited_m=self._prohibited_m,
             closest_point_m=None if visited == points else self._point_m,
         )
+
+
+class JudgeSink:
+    """Feeds a judge with ground truth and the mode that the mission reports."""
+
+    def __init__(self, judge: Judge) -> None:
+        self._judge = judge
+        self._mode = ""
+
+    def __call__(self, _topic: Topic[Any], message: Any, header: Header) -> None:
+        """Take one message; those that are neither truth nor mission status do not matter."""
+        if isinstance(message, MissionStatus):
+            running = message.phase is MissionPhase.RUNNING and message.step < len(message.goals)
+            self._mode = message.goals[message.step].mode.value if running else ""
+        elif isinstance(message, GroundTruth):
+            self._judge.see(Sample(
+                header.stamp, message.pose.x_m, message.pose.y_m, message.collisions,
+                message.prohibited_s, message.obstacle_clearance_m,
+                message.prohibited_clearance_m, self._mode))

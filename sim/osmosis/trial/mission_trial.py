@@ -1,0 +1,111 @@
+"""A run of Osmosis: a mission on an airport, judged by ground truth."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, TextIO
+
+import msgspec
+
+from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.osmosis.messages import ControlStatus, GroundTruth, MissionStatus
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.runtime.actor import Header
+from rampart.actors.runtime.clock import Clock
+from rampart.sim.faults.scenario import FaultOutcome
+from rampart.sim.osmosis.trial.console import MissionConsole
+from rampart.sim.osmosis.trial.injector import OsmosisInjector
+from rampart.sim.osmosis.trial.judge import Judge, JudgeSink
+from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
+from rampart.sim.osmosis.trial.report import render
+from rampart.sim.osmosis.trial.run_end import RunEnd
+from rampart.sim.runs.observer import Sink
+from rampart.sim.runs.record import RunRecord, Safety
+from rampart.sim.runs.report import Written, try_report
+from rampart.sim.runs.trial import Trial
+
+_PATIENCE_S = 60.0
+_SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not known"}
+
+
+class MissionTrial(Trial):
+    """One mission on one airport; it is over when nothing progresses for `limit_s`."""
+
+    judges = True
+    injector = OsmosisInjector
+    tells = MissionConsole
+    campaign = {"mission": ("A",), "obstacles": (0, 2)}
+
+    def __init__(self, run: RunContext, limit_s: float | None = None,
+                 stream: TextIO | None = None) -> None:
+        super().__init__(run, limit_s, stream)
+        known = Osmosis.of_run(run)
+        self.name = known.mission.name
+        self.goals = len(known.mission.goals)
+        self.title = f"{self.name} on {known.airport.name}"
+        self.about = f"mission {self.name} ({self.goals} goals) on {known.airport.name}"
+        self.judge = Judge(known.mission.goals)
+        self._end = RunEnd(_PATIENCE_S if limit_s is None else limit_s, run.plan.waits)
+        self.recorder = MissionRecorder(run.plan, self.strategy, known.airport, known.mission)
+
+    def sinks(self, clock: Clock) -> list[Sink]:
+        """Return what wants to hear the run's messages."""
+
+        def to_end(_topic: Topic[Any], message: Any, _header: Header) -> None:
+            if isinstance(message, MissionStatus):
+                self._end.mission(message, clock.now())
+            elif isinstance(message, ControlStatus):
+                self._end.control(message, clock.now())
+            elif isinstance(message, GroundTruth):
+                self._end.truth(message.twist, clock.now())
+
+        return [to_end, JudgeSink(self.judge), *super().sinks(clock)]
+
+    def excuse(self, stall_s: float) -> None:
+        """Do not count simulated seconds in which the launcher heard nothing, being stopped."""
+        self._end.excuse(stall_s)
+
+    def over(self, now_s: float) -> str | None:
+        """Return why the run is over, or None while it goes on."""
+        return self._end.ended(now_s)
+
+    def conclude(self, now_s: float, why: str, faults: tuple[FaultOutcome, ...] = ()
+                 ) -> MissionRecord:
+        """Return the record of the run with the judge's verdict, and what became of faults."""
+        verdict = self.judge.verdict()
+        found = self.recorder.record(
+            now_s, faults=faults, mission="success" if verdict.success else "fail",
+            safety=_SAFETY[verdict.safe],
+            reasons=() if verdict.success and verdict.safe else (
+                *verdict.reasons, f"ended: {why}"))
+        return _mission(found)
+
+    def summary(self, record: RunRecord) -> dict[str, Any]:
+        """Return what scripts rely on, the lights too."""
+        return {**super().summary(record),
+                "lights": [msgspec.to_builtins(light) for light in _mission(record).lights]}
+
+    def figures(self, record: RunRecord) -> dict[str, Any]:
+        """Return what ground truth shows: collisions, clearances, and when it became unsafe."""
+        verdict, found = self.judge.verdict(), _mission(record)
+        return {
+            "collisions": found.collisions, "prohibited_s": round(found.prohibited_s, 3),
+            "obstacle_m": _metres(verdict.closest_obstacle_m),
+            "prohibited_m": _metres(verdict.closest_prohibited_m),
+            "unsafe_s": verdict.first_unsafe_s}
+
+    def report(self, record: RunRecord, directory: Path) -> Written:
+        """Write as much of the inspection report as can be written."""
+        return try_report(record, render, directory)
+
+
+def _mission(record: RunRecord) -> MissionRecord:
+    if not isinstance(record, MissionRecord):
+        raise TypeError(f"{type(record).__name__}: no record of a mission")
+    return record
+
+
+def _metres(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None

@@ -1,0 +1,200 @@
+"""What is kept of a mission on an airport, and the recorder that collects it. Pure."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import msgspec
+
+from rampart.actors.bus.limits import Remembered
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
+from rampart.actors.osmosis.airport.model import Airport, Mission
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.actor import Header
+from rampart.sim.runs.record import KEPT, RunRecord, RunRecorder, Safety
+
+TRACK_STEP_M = 0.2
+"""A track point is kept when the robot has moved this far."""
+
+TRACK_KEPT = 100_000
+"""Most points of a track: twenty kilometres and more."""
+
+
+class LightResult(msgspec.Struct, frozen=True):
+    """A light of the airport; `verdict` is ok, dim, out or not measured (then without values)."""
+
+    name: str
+    row: str
+    x_m: float
+    y_m: float
+    nominal_cd: float
+    verdict: str = "not measured"
+    intensity_cd: float | None = None
+    ratio: float | None = None
+
+
+class StepResult(msgspec.Struct, frozen=True):
+    """A goal of the mission and when it was reached, simulated seconds, or None."""
+
+    mode: str
+    x_m: float
+    y_m: float
+    reached_s: float | None
+
+
+class ObstacleSeen(msgspec.Struct, frozen=True):
+    """An obstacle that was there at some time."""
+
+    name: str
+    x_m: float
+    y_m: float
+    radius_m: float
+
+
+class MissionRecord(RunRecord, frozen=True, kw_only=True):
+    """One mission; positions are in `map`.
+
+    Args:
+        mission: success or fail (paper, section V: every point in order and in its mode).
+        safety: safe or unsafe, by ground truth; not known if none ever came.
+        airport: its geometry.
+        mission_name: of the mission.
+        distance_m: length of the way really driven.
+        track: (t, x, y) of the way really driven.
+        believed: (t, x, y) of the way that localization reported.
+        lights: all lights of the airport.
+        steps: all goals of the mission.
+        obstacles: that stood there at some time.
+        collisions: counted by ground truth.
+        prohibited_s: time spent in the prohibited area.
+        obstacle_clearance_m: closest approach to an obstacle, None if there was none.
+        prohibited_clearance_m: closest approach to the prohibited area, negative inside.
+        narrowest_s: when the robot was nearest to an obstacle, a building or the prohibited area.
+    """
+
+    mission: Literal["success", "fail"]
+    safety: Safety
+    airport: AirportDrawing
+    mission_name: str
+    distance_m: float
+    track: tuple[tuple[float, float, float], ...]
+    believed: tuple[tuple[float, float, float], ...]
+    lights: tuple[LightResult, ...]
+    steps: tuple[StepResult, ...]
+    obstacles: tuple[ObstacleSeen, ...]
+    collisions: int
+    prohibited_s: float
+    obstacle_clearance_m: float | None
+    prohibited_clearance_m: float | None
+    narrowest_s: float | None = None
+
+
+class MissionRecorder(RunRecorder):
+    """Builds a `MissionRecord` from the messages of a run.
+
+    Args:
+        plan: of the run.
+        strategy: of the manager; empty without FTMs.
+        airport: where it takes place.
+        mission: to be driven.
+    """
+
+    def __init__(self, plan: RunPlan, strategy: str, airport: Airport, mission: Mission) -> None:
+        super().__init__(plan, strategy)
+        self._airport = airport
+        self._mission = mission
+        self._track: list[tuple[float, float, float]] = []
+        self._believed: list[tuple[float, float, float]] = []
+        self._lights: dict[str, m.LightMeasurement] = {}
+        self._reached: tuple[float, ...] = ()
+        self._known_lights = frozenset(light.name for light in airport.lights)
+        self._obstacles: dict[str, ObstacleSeen] = Remembered(KEPT)
+        self._collisions = 0
+        self._prohibited_s = 0.0
+        self._obstacle_clearance_m = math.inf
+        self._prohibited_clearance_m = math.inf
+        self._narrowest_s: float | None = None
+        self._take |= {
+            topics.TRUTH.key: self._truth,
+            topics.POSE.key: self._pose,
+            topics.MISSION_STATUS.key: self._mission_status,
+            topics.LIGHT_MEASURED.key: self._light,
+            topics.OBSTACLES.key: self._obstacle_list,
+            topics.PILOT_STATUS.key: self._pilot,
+        }
+
+    def record(self, duration_s: float, **more: Any) -> MissionRecord:
+        """Return the record of the run so far; `more` are at least the verdicts."""
+        return MissionRecord(
+            **self.fields(duration_s), **more,
+            airport=draw(self._airport),
+            mission_name=self._mission.name,
+            distance_m=sum(math.dist(a[1:], b[1:])
+                           for a, b in zip(self._track, self._track[1:], strict=False)),
+            track=tuple(self._track),
+            believed=tuple(self._believed),
+            lights=tuple(self._light_result(light) for light in draw(self._airport).lights),
+            steps=tuple(
+                StepResult(str(goal.mode), goal.x_m, goal.y_m,
+                           self._reached[i] if i < len(self._reached) else None)
+                for i, goal in enumerate(self._mission.goals)),
+            obstacles=tuple(self._obstacles.values()),
+            collisions=self._collisions,
+            prohibited_s=self._prohibited_s,
+            obstacle_clearance_m=_finite(self._obstacle_clearance_m),
+            prohibited_clearance_m=_finite(self._prohibited_clearance_m),
+            narrowest_s=self._narrowest_s,
+        )
+
+    def _truth(self, truth: m.GroundTruth, header: Header) -> None:
+        self._append(self._track, header.stamp, truth.pose)
+        self._collisions = max(self._collisions, truth.collisions)
+        self._prohibited_s = max(self._prohibited_s, truth.prohibited_s)
+        if min(truth.obstacle_clearance_m, truth.prohibited_clearance_m) < min(
+                self._obstacle_clearance_m, self._prohibited_clearance_m):
+            self._narrowest_s = header.stamp
+        self._obstacle_clearance_m = min(self._obstacle_clearance_m, truth.obstacle_clearance_m)
+        self._prohibited_clearance_m = min(
+            self._prohibited_clearance_m, truth.prohibited_clearance_m)
+
+    def _pose(self, pose: m.Pose, header: Header) -> None:
+        self._append(self._believed, header.stamp, pose)
+
+    def _mission_status(self, status: m.MissionStatus, header: Header) -> None:
+        for light in status.lights:
+            self._light(light, header)
+        newly = len(status.step_times_s) - len(self._reached)  # negative: it forgot, we do not
+        self._reached += (header.stamp,) * newly
+
+    def _light(self, light: m.LightMeasurement, _header: Header) -> None:
+        if light.light in self._known_lights:
+            self._lights[light.light] = light
+
+    def _obstacle_list(self, listed: m.ObstacleList, _header: Header) -> None:
+        for o in listed.obstacles:
+            if o.present:
+                self._obstacles[o.name] = ObstacleSeen(o.name, o.x_m, o.y_m, o.radius_m)
+
+    def _pilot(self, status: m.PilotStatus, header: Header) -> None:
+        self.turn("stop", "Safety Pilot", status.stopped, header.stamp, status.reason)
+
+    def _append(self, track: list[tuple[float, float, float]], t_s: float, pose: m.Pose) -> None:
+        if not (math.isfinite(pose.x_m) and math.isfinite(pose.y_m)):
+            return
+        moved = not track or math.dist(track[-1][1:], (pose.x_m, pose.y_m)) >= TRACK_STEP_M
+        if moved and self.has_room(track, TRACK_KEPT):
+            track.append((round(t_s, 2), round(pose.x_m, 3), round(pose.y_m, 3)))
+
+    def _light_result(self, light: Any) -> LightResult:
+        known = (light.name, light.row, light.x_m, light.y_m, light.nominal_cd)
+        seen = self._lights.get(light.name)
+        if seen is None:
+            return LightResult(*known)
+        return LightResult(*known, seen.verdict.value, seen.intensity_cd, seen.ratio)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

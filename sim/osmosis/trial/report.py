@@ -1,0 +1,89 @@
+"""The inspection report of a mission: one self-contained HTML page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from rampart.sim.osmosis.clearance import EXACT_BELOW_M
+from rampart.sim.osmosis.trial.record import LightResult, MissionRecord
+from rampart.sim.runs.report import environment, lanes_of, ticks_of
+
+BELIEVED_APART_M = 1.0
+"""Where localization reported the robot is drawn too if it was this far from the truth."""
+
+
+def render(run: MissionRecord) -> str:
+    """Return the HTML page."""
+    pages = environment()
+    pages.filters["clearance"] = clearance
+    template = pages.get_template("osmosis/trial/report.html")
+    x0, y0, x1, y1 = _bounds(run)
+    measured = [light for light in run.lights if light.verdict != "not measured"]
+    return template.render(
+        run=run,
+        view_box=f"{x0:g} {-y1:g} {x1 - x0:g} {y1 - y0:g}",
+        track=points(run.track),
+        believed=points(run.believed) if _apart(run) else "",
+        rows=_rows(run.lights),
+        counts={verdict: sum(light.verdict == verdict for light in run.lights)
+                for verdict in ("ok", "dim", "out", "not measured")},
+        measured=len(measured),
+        lanes=lanes_of(run),
+        ticks=ticks_of(run.duration_s),
+        headline=headline(run),
+    )
+
+
+def headline(run: MissionRecord) -> str:
+    """Return the result of the run in one sentence."""
+    faulty = [light.name for light in run.lights if light.verdict in ("dim", "out")]
+    missing = sum(light.verdict == "not measured" for light in run.lights)
+    if run.safety == "unsafe":
+        return "The robot was not safe in this run."
+    if run.safety == "not known":
+        return "No ground truth ever came: neither mission nor safety can be judged."
+    if run.mission == "fail":
+        return "The mission was not completed; the robot stayed safe."
+    if not run.lights:
+        return "The mission was completed. This airport has no lights to inspect."
+    parts = [f"{len(faulty)} of {len(run.lights)} lights need attention: {', '.join(faulty)}"
+             if faulty else "no light needs attention"]
+    if missing:
+        parts.append(f"{missing} {'was' if missing == 1 else 'were'} not on the way")
+    return f"The mission was completed; {'; '.join(parts)}."
+
+
+def clearance(value: float | None) -> str:
+    """Return a clearance for people; above `EXACT_BELOW_M` the simulator knows only a bound."""
+    if value is None:
+        return "–"  # noqa: RUF001
+    return f"{EXACT_BELOW_M:g} m or more" if value >= EXACT_BELOW_M else f"{value:.2f} m"
+
+
+def _bounds(run: MissionRecord) -> tuple[float, float, float, float]:
+    """Return the airport's bounds, widened to the whole track: an unsafe robot may leave them."""
+    x0, y0, x1, y1 = run.airport.bounds_m
+    xs = [p[1] for p in run.track]
+    ys = [p[2] for p in run.track]
+    return (min([x0, *(x - 2 for x in xs)]), min([y0, *(y - 2 for y in ys)]),
+            max([x1, *(x + 2 for x in xs)]), max([y1, *(y + 2 for y in ys)]))
+
+
+def points(track: Sequence[tuple[float, float, float]]) -> str:
+    """Return a track, (t, x, y) each, as the points of an SVG line; y is turned over."""
+    return " ".join(f"{x:g},{-y:g}" for _, x, y in track)
+
+
+def _apart(run: MissionRecord) -> bool:
+    """Tell whether localization was somewhere far from all places where the robot really was."""
+    real = [p[1:] for p in run.track]
+    return bool(real) and any(
+        min(math.dist(p[1:], q) for q in real) > BELIEVED_APART_M for p in run.believed[::3])
+
+
+def _rows(lights: Sequence[LightResult]) -> dict[str, list[LightResult]]:
+    rows: dict[str, list[LightResult]] = {}
+    for light in lights:
+        rows.setdefault(light.row, []).append(light)
+    return rows

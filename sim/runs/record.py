@@ -1,0 +1,250 @@
+"""What is kept of any run, and the recorder that collects it from the messages. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import msgspec
+
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.limits import Remembered
+from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import messages as fm
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.actor import Header
+from rampart.manager.strategies.decision_words import decision_in_words
+from rampart.sim.faults.scenario import FaultOutcome
+
+KEPT = 10_000
+"""Most events, intervals, decisions or names of a kind that are kept of a run."""
+
+Mission = Literal["success", "fail"]
+Safety = Literal["safe", "unsafe", "not known"]
+
+_CRASHES = ("crashed", "stopped", "wedged", "given up")
+_RECOVERED = ("respawned", "resumed", "adopted")
+
+
+class Interval(msgspec.Struct, frozen=True):
+    """Something was so from `from_s` until `to_s` (simulated seconds): `lane` says what kind.
+
+    Lanes: injection, detection, recovery, stop, down (a node without a living process).
+    """
+
+    lane: str
+    name: str
+    from_s: float
+    to_s: float
+    reason: str = ""
+
+
+class EventLine(msgspec.Struct, frozen=True):
+    """One line of the log of faults; `kind` is fault or clear."""
+
+    t_s: float
+    kind: str
+    text: str
+
+
+class DecisionLine(msgspec.Struct, frozen=True):
+    """A decision of the FTM Manager with its certificate, and in words.
+
+    `detected_s` is when the first detection behind it was made; `shadow` is what the strategy in
+    shadow would have run instead, where it differs.
+    """
+
+    t_s: float
+    number: int
+    strategy: str
+    active: tuple[str, ...]
+    block: int
+    recoveries: tuple[str, ...]
+    words: str
+    path: tuple[str, ...]
+    rejected: tuple[tuple[str, str], ...]
+    detected_s: float
+    shadow: str = ""
+
+
+class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """One run. Times are simulated seconds from its start.
+
+    Args:
+        run_id: name of the run.
+        mission: success or fail; None if nobody judges that.
+        safety: by ground truth; not known if none ever came, None if nobody judges that.
+        reasons: why the mission failed or the run was not safe; empty if all is well.
+        duration_s: length of the run.
+        events: crashes, detections and injections.
+        intervals: the same as bars for a timeline.
+        decisions: of the FTM Manager.
+        restarts: node name to number of restarts; nodes never restarted are left out.
+        strategy: name of the manager's strategy, empty without FTMs.
+        seed: of everything random.
+        rate: simulated seconds per second.
+        faults: that were planned, and what became of them.
+    """
+
+    run_id: str
+    mission: Mission | None = None
+    safety: Safety | None = None
+    reasons: tuple[str, ...] = ()
+    duration_s: float
+    events: tuple[EventLine, ...]
+    intervals: tuple[Interval, ...]
+    decisions: tuple[DecisionLine, ...]
+    restarts: dict[str, int]
+    strategy: str
+    seed: int
+    rate: float
+    faults: tuple[FaultOutcome, ...] = ()
+
+
+class RunRecorder:
+    """Builds a `RunRecord` from the messages of a run.
+
+    Args:
+        plan: of the run.
+        strategy: of the manager; empty without FTMs.
+    """
+
+    def __init__(self, plan: RunPlan, strategy: str = "") -> None:
+        self._plan = plan
+        self._strategy = strategy
+        self._left_out = 0
+        self._events: list[EventLine] = []
+        self._intervals: list[Interval] = []
+        self._open: dict[tuple[str, str], tuple[float, str]] = {}
+        self._decisions: Remembered[tuple[int, int], DecisionLine] = Remembered(KEPT)
+        self._restarts: dict[str, int] = Remembered(KEPT)
+        self._lives: Remembered[tuple[str, int], None] = Remembered(KEPT)
+        self._injections: dict[str, str] = Remembered(KEPT)
+        self._take: dict[str, Callable[[Any, Header], None]] = {
+            ftm_topics.DETECTION.key: self._detection,
+            ftm_topics.MANAGER_STATUS.key: self._manager,
+            ftm_topics.DECISION.key: self._decision,
+            ftm_topics.SHADOW.key: self._shadow,
+            ftm_topics.PROCESS_EVENT.key: self._process_event,
+            bus_topics.INJECT.key: self._injection,
+            bus_topics.INJECTION_REPORT.key: self._injection_report,
+        }
+
+    def feed(self, topic: Topic[Any], message: Any, header: Header) -> None:
+        """Take a message; those of other topics are ignored."""
+        take = self._take.get(topic.key)
+        if take is not None:
+            take(message, header)
+
+    def record(self, duration_s: float, **more: Any) -> RunRecord:
+        """Return the record of the run so far; `more` are fields that others know."""
+        return RunRecord(**self.fields(duration_s), **more)
+
+    def fields(self, duration_s: float) -> dict[str, Any]:
+        """Return what it knows of the fields of a record."""
+        still = [Interval(lane, name, from_s, max(from_s, duration_s), reason)
+                 for (lane, name), (from_s, reason) in self._open.items()]
+        return {
+            "run_id": self._plan.run_id, "seed": self._plan.seed, "rate": self._plan.rate,
+            "strategy": self._strategy, "duration_s": duration_s,
+            "events": (*sorted(self._events, key=lambda event: event.t_s),
+                       *self._crowd(duration_s)),
+            "intervals": tuple(sorted((*self._intervals, *still), key=lambda bar: bar.from_s)),
+            "decisions": tuple(self._decisions.values()),
+            "restarts": dict(self._restarts),
+        }
+
+    def _crowd(self, now_s: float) -> tuple[EventLine, ...]:
+        """Return a line about what there was no room for, if anything."""
+        count = self._left_out + self._decisions.forgotten
+        return (EventLine(now_s, "fault", f"{count} more events, intervals, decisions or points of "
+                          "the way were not kept"),) if count else ()
+
+    def _detection(self, report: fm.DetectionReport, header: Header) -> None:
+        active = report.state is fm.DetectionState.ACTIVE
+        name = header.source
+        if self.turn("detection", name, active, header.stamp, report.reason):
+            text = f"{name} detects: {report.reason}" if active else f"{name} is idle again"
+            self._note(header.stamp, "fault" if active else "clear", text)
+
+    def _manager(self, status: fm.ManagerStatus, header: Header) -> None:
+        for name in status.activated:
+            self.turn("recovery", name, True, header.stamp)
+        for lane, name in list(self._open):
+            if lane == "recovery" and name not in status.activated:
+                self.turn(lane, name, False, header.stamp)
+
+    def _decision(self, record: fm.DecisionRecord, header: Header) -> None:
+        self._decisions[header.incarnation, record.decision] = DecisionLine(
+            header.stamp, record.decision, record.strategy, record.active, record.rule,
+            record.recoveries,
+            decision_in_words(record.active, record.rule, record.recoveries, record.strategy),
+            record.path, record.rejected, record.detected_s)
+
+    def _shadow(self, record: fm.ShadowRecord, header: Header) -> None:
+        key = header.incarnation, record.decision
+        if key in self._decisions:  # it is told right after the decision, on the same way
+            self._decisions[key] = msgspec.structs.replace(
+                self._decisions[key],
+                shadow=f"{record.strategy}: {' and '.join(record.recoveries) or 'nothing'}")
+
+    def _process_event(self, event: fm.ProcessEvent, header: Header) -> None:
+        if event.detail == "already":  # the answer to a request that came twice
+            return
+        detail = f": {event.detail}" if event.detail else ""
+        if event.event in _CRASHES:
+            self.turn("down", event.node, True, header.stamp, event.event)
+            self._note(header.stamp, "fault", f"{event.node} {event.event}{detail}")
+        elif event.event in _RECOVERED:
+            self.turn("down", event.node, False, header.stamp)
+            by = f" by {event.by}" if event.by else ""
+            self._note(header.stamp, "clear", f"{event.node} {event.event}{by}")
+        if event.event == "respawned":
+            life = event.node, event.incarnation
+            if life not in self._lives:
+                self._lives[life] = None
+                self._restarts[event.node] = self._restarts.get(event.node, 0) + 1
+
+    def _injection(self, order: bm.Injection, _header: Header) -> None:
+        self._injections[order.injection] = f"{order.mode} {order.topic}"
+
+    def _injection_report(self, report: bm.InjectionReport, header: Header) -> None:
+        what = self._injections.get(report.injection, report.injection)
+        if self.turn("injection", report.injection, not report.finished, header.stamp, what):
+            if report.finished:
+                text = (f"injection over: {what} at {report.node}, "
+                        f"{report.affected} messages changed")
+            else:
+                text = f"fault injected: {what} at {report.node}"
+            self._note(header.stamp, "clear" if report.finished else "fault", text)
+
+    # -- for recorders of a robot ---------------------------------------------------------------
+
+    def turn(self, lane: str, name: str, on: bool, t_s: float, reason: str = "") -> bool:
+        """Begin or end an interval; return whether that changed anything."""
+        slot = (lane, name)
+        if on == (slot in self._open):
+            return False
+        if on and len(self._open) >= KEPT:
+            self._left_out += 1
+            return False
+        if on:
+            self._open[slot] = (t_s, reason)
+            return True
+        from_s, why = self._open.pop(slot)
+        if self.has_room(self._intervals, KEPT):
+            self._intervals.append(Interval(lane, name, from_s, max(from_s, t_s), why))
+        return True
+
+    def _note(self, t_s: float, kind: str, text: str) -> None:
+        if self.has_room(self._events, KEPT):
+            self._events.append(EventLine(t_s, kind, text))
+
+    def has_room(self, kept: list[Any], most: int) -> bool:
+        """Whether one more may be kept; if not it is counted."""
+        if len(kept) < most:
+            return True
+        self._left_out += 1
+        return False

@@ -1,0 +1,139 @@
+"""What the report of any run needs: pages from templates, a timeline, files whole or not at all.
+
+A page needs nothing but itself: style and pictures are inline, there is no script, it can be
+printed and mailed. All text that came over the bus is escaped.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jinja2
+import msgspec
+
+from rampart.sim.runs.record import Interval, RunRecord
+
+_LANES = {
+    "injection": "Injected", "down": "Node down", "detection": "Detected",
+    "recovery": "Recovery", "stop": "Stopped",
+}
+_TICKS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 3600)
+
+
+class Written(NamedTuple):
+    """What there is of a report, and in one line why the rest is missing; "" if it is whole."""
+
+    html: Path | None
+    data: Path | None
+    problem: str
+
+
+def try_report(run: RunRecord, render: Callable[[Any], str], directory: str | Path) -> Written:
+    """Write `inspection-RUN.html` and `.json` into a directory, which is made if need be.
+
+    Each appears complete or not at all; whatever goes wrong is told, not raised.
+
+    Args:
+        run: the record.
+        render: makes the page of it.
+        directory: where to.
+    """
+    problems: dict[str, list[str]] = {}
+
+    def written(path: Path, content: Callable[[], bytes]) -> Path | None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, content())
+        except Exception as error:  # of disk, template or chart alike: the verdict stands
+            problems.setdefault(in_words(error), []).append(path.name)
+            return None
+        return path
+
+    html, data = _paths(run, directory)
+    kept = written(data, lambda: msgspec.json.format(msgspec.json.encode(run), indent=2))
+    page = written(html, lambda: render(run).encode())
+    return Written(page, kept, "; ".join(
+        f"{' and '.join(names)} cannot be written to {html.parent}: {why}"
+        for why, names in problems.items()))
+
+
+def in_words(error: Exception) -> str:
+    """Return an error in a few words, for a line that names the file."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
+
+
+def _paths(run: RunRecord, directory: str | Path) -> tuple[Path, Path]:
+    stem = "inspection-" + (re.sub(r"[^A-Za-z0-9._-]+", "-", run.run_id) or "run")
+    return Path(directory, f"{stem}.html"), Path(directory, f"{stem}.json")
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file so that a reader sees the old or the new one, never a half.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            os.fchmod(file.fileno(), 0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def environment() -> jinja2.Environment:
+    """Return what all reports are rendered with: pages of `sim/`, all text escaped."""
+    made = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parents[1]), autoescape=True,
+        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    made.filters.update(clock=clock)
+    return made
+
+
+def clock(seconds: float | None) -> str:
+    """Return simulated seconds as minutes:seconds."""
+    if seconds is None or not math.isfinite(seconds):
+        return "–"  # noqa: RUF001 - typography for people
+    minutes, rest = divmod(round(seconds, 1), 60)
+    return f"{int(minutes)}:{rest:04.1f}"
+
+
+def lanes_of(run: RunRecord) -> list[dict[str, Any]]:
+    """Return the timeline's lanes: a name and its bars in percent of the run."""
+    whole_s = max(run.duration_s, 1e-9)
+
+    def bar(interval: Interval) -> dict[str, Any]:
+        left = min(100.0, 100 * max(interval.from_s, 0) / whole_s)
+        width = min(100.0 - left, 100 * (interval.to_s - interval.from_s) / whole_s)
+        return {"left": round(left, 3), "width": round(max(width, 0), 3), "title": (
+            f"{interval.name} {clock(interval.from_s)} to {clock(interval.to_s)}"
+            + (f": {interval.reason}" if interval.reason else ""))}
+
+    lanes: dict[tuple[str, str], dict[str, Any]] = {}
+    for kind, label in _LANES.items():
+        for interval in sorted((i for i in run.intervals if i.lane == kind),
+                               key=lambda i: (i.name, i.from_s)):
+            name = interval.reason if kind == "injection" else interval.name
+            lane = lanes.setdefault((kind, name), {
+                "kind": kind, "label": label, "name": name, "bars": []})
+            lane["bars"].append(bar(interval))
+    return list(lanes.values())
+
+
+def ticks_of(duration_s: float) -> list[dict[str, Any]]:
+    """Return the timeline's ticks: place in percent of the run, and text."""
+    step_s = next((t for t in _TICKS if duration_s / t <= 10), 7200)
+    count = int(duration_s // step_s) if duration_s > 0 else 0
+    return [{"left": round(100 * i * step_s / duration_s, 3), "text": clock(i * step_s)[:-2]}
+            for i in range(count + 1) if duration_s > 0]

@@ -1,0 +1,139 @@
+"""What a run is besides its processes: who hears it, when it is over, and what comes of it.
+
+Whoever runs a system makes a `Trial`, gives its sinks to the observer, asks it now and then whether
+the run is over, and has it conclude. This one is for systems that nobody judges: those that are
+being specified, and those whose world is not simulated here. A robot whose runs end with a verdict
+derives its own, which its application names.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar, TextIO
+
+import msgspec
+
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import ProcessEvent
+from rampart.actors.layout.layout import application_class
+from rampart.actors.layout.wiring import import_class
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.runtime.actor import Header
+from rampart.actors.runtime.clock import Clock
+from rampart.manager.spec.schema import SystemSpec
+from rampart.sim.faults.injector import Injector
+from rampart.sim.faults.scenario import FaultOutcome
+from rampart.sim.runs.console import Console
+from rampart.sim.runs.observer import Sink
+from rampart.sim.runs.record import RunRecord, RunRecorder
+from rampart.sim.runs.report import Written
+
+LAUNCHER = "launch.py"
+
+
+class Trial:
+    """A run that goes on for a while, and that nobody judges.
+
+    Class attributes:
+        judges: whether it ends by itself, with a verdict and a report.
+        injector: who carries out faults.
+        tells: who tells the story.
+        campaign: what a campaign chooses of the application's options unless told otherwise; of
+            several values each is run.
+
+    Args:
+        run: what is run.
+        limit_s: simulated seconds after which it is over; for one that judges, seconds without
+            progress.
+        stream: for the story; None keeps quiet.
+
+    Attributes:
+        name: of the directory in which its report goes.
+        title: of the run, for people.
+        about: what is about to run, and how it ends.
+        goals: how many there are, for faults at the beginning of one.
+    """
+
+    judges: ClassVar[bool] = False
+    injector: ClassVar[type[Injector]] = Injector
+    tells: ClassVar[type[Console]] = Console
+    campaign: ClassVar[dict[str, tuple[Any, ...]]] = {}
+
+    def __init__(self, run: RunContext, limit_s: float | None = None,
+                 stream: TextIO | None = None) -> None:
+        self.run = run
+        self.limit_s = limit_s
+        self.strategy = run.system.strategy if run.plan.ftm else ""
+        self.name = run.system.name
+        self.title = run.system.title
+        self.about = f"{run.system.title} ({run.system.name}); ctrl-C ends it"
+        self.goals = 0
+        self.console = self.tells(stream) if stream else None
+        self.recorder = RunRecorder(run.plan, self.strategy)
+        self._brought_back = 0
+
+    def sinks(self, clock: Clock) -> list[Sink]:
+        """Return what wants to hear the run's messages."""
+        del clock
+        return [self.recorder.feed, *([self.console.take] if self.console else ())]
+
+    def brought_back(self, name: str, now_s: float) -> None:
+        """Note that the launcher has brought somebody back."""
+        self._brought_back += 1
+        if self.console:
+            self.console.line(now_s, f"{name} brought back")
+        self.recorder.feed(
+            topics.PROCESS_EVENT,
+            ProcessEvent(name, "respawned", 0, self._brought_back, LAUNCHER, ""),
+            Header(LAUNCHER, 1, self._brought_back, now_s))
+
+    def excuse(self, stall_s: float) -> None:
+        """Do not count simulated seconds in which the launcher heard nothing, being stopped."""
+
+    def over(self, now_s: float) -> str | None:
+        """Return why the run is over, or None while it goes on."""
+        if self.limit_s is not None and now_s >= self.limit_s:
+            return "its time is over"
+        return None
+
+    def conclude(self, now_s: float, why: str, faults: tuple[FaultOutcome, ...] = ()
+                 ) -> RunRecord:
+        """Return the record of the run, with a verdict if there is one.
+
+        Args:
+            now_s: simulated time.
+            why: it is over.
+            faults: what became of them.
+        """
+        del why
+        return self.recorder.record(now_s, faults=faults)
+
+    def summary(self, record: RunRecord) -> dict[str, Any]:
+        """Return what scripts rely on: the last line of stdout with --json."""
+        return {
+            "mission": record.mission, "safety": record.safety, "reasons": list(record.reasons),
+            "duration_s": round(record.duration_s, 2),
+            "decisions": [msgspec.to_builtins(decision) for decision in record.decisions],
+            "restarts": record.restarts,
+            "faults": [{**msgspec.to_builtins(fault), "effective": fault.effective}
+                       for fault in record.faults],
+        }
+
+    def figures(self, record: RunRecord) -> dict[str, Any]:
+        """Return the fields of a campaign's `RunResult` that only a judge knows."""
+        raise NotImplementedError(f"{type(self).__name__} judges nothing: {record.run_id}")
+
+    def report(self, record: RunRecord, directory: Path) -> Written:
+        """Write as much of a report as can be written; by default there is none."""
+        del record, directory
+        return Written(None, None, "")
+
+
+def trial_class(spec: SystemSpec) -> type[Trial]:
+    """Return what a run of a system is, by the system's application.
+
+    Raises:
+        ValueError: the application, or the class it names, does not exist.
+    """
+    path = application_class(spec).trial
+    return import_class(path, Trial, "trial") if path else Trial
