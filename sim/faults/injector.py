@@ -101,8 +101,8 @@ class Injector(Actor):
     outputs: ClassVar[tuple[Topic[Any], ...]] = (bus_topics.INJECT,)
 
     def __init__(self, context: Context, scenario: Sequence[PlannedFault],
-                 processes: ProcessControl, *, nodes: Sequence[str], known: Sequence[Topic[Any]],
-                 faults: Faults) -> None:
+                 processes: ProcessControl, *, nodes: Sequence[str],
+                 known: Sequence[Topic[Any]], faults: Faults) -> None:
         super().__init__(context)
         self._control = processes
         self.planned: list[PlannedAction] = []

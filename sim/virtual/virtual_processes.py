@@ -222,11 +222,6 @@ class VirtualMachine:
 
     # -- what can happen to a process -----------------------------------------------------------
 
-    def pid_of(self, node: str) -> int | None:
-        """Return the pid of a node's newest process, or None if it has none."""
-        process = self._process_of(node)
-        return process.pid if process else None
-
     def condition(self, node: str) -> Condition:
         """Return what a node's process is doing."""
         process = self._process_of(node)
