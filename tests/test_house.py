@@ -44,8 +44,7 @@ LARGEST_ROOM = 15
 STILL_UPWARD: set[tuple[str, str]] = set()
 
 STILL_ROBOTIC = {
-    "cli.analyse.campaigning", "sim.campaign.grouping", "sim.campaign.report",
-    "sim.campaign.worst_runs"}
+    "cli.analyse.campaigning", "sim.campaign.report", "sim.campaign.worst_runs"}
 
 STILL_NAMED = {
     "cli.operate.inject_verbs", "manager.spec.mobile_robot",

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import msgspec
 
-from rampart.sim.campaign.job import Job, faults_of_system
+from rampart.sim.campaign.job import Job, faults_of_system, trial_of_system
 from rampart.sim.campaign.store import Run
-from rampart.sim.osmosis.trial.paper_tables import AS_THE_PAPER
 
 
 @dataclass(frozen=True)
@@ -73,8 +72,9 @@ def _strategy(job: Job) -> str:
 def _mechanisms(job: Job) -> str:
     if not job.ftm or not job.retuned:
         return "mechanisms as shipped" if job.ftm else ""
-    if job.retuned == AS_THE_PAPER:
-        return "mechanisms as in the paper"
+    for name, retuned in trial_of_system(job.system).retunings.items():
+        if job.retuned == retuned:
+            return name
     return "retuned " + msgspec.json.encode(job.retuned, order="deterministic").decode()
 
 

@@ -28,7 +28,7 @@ from rampart.sim.faults.faults import Faults, faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.runs.record import RunRecord
-from rampart.sim.runs.trial import trial_class
+from rampart.sim.runs.trial import Trial, trial_class
 from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun
 from rampart.sim.virtual.network import find_network
 
@@ -234,6 +234,13 @@ def faults_of_system(system: str) -> Faults:
     """
     file, document = _document(system)
     return faults_of(check_document(document, file))
+
+
+@lru_cache(maxsize=8)
+def trial_of_system(system: str) -> type[Trial]:
+    """Return what a run of a system is; arguments and errors as of `faults_of_system`."""
+    file, document = _document(system)
+    return trial_class(check_document(document, file))
 
 
 @lru_cache(maxsize=8)

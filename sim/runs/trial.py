@@ -8,6 +8,7 @@ derives its own, which its application names.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
@@ -38,8 +39,7 @@ class Trial:
         judges: whether it ends by itself, with a verdict and a report.
         injector: who carries out faults.
         tells: who tells the story.
-        campaign: what a campaign chooses of the application's options unless told otherwise; of
-            several values each is run.
+        retunings: changes to a system that have a name, see `Job.retuned`.
 
     Args:
         run: what is run.
@@ -57,7 +57,7 @@ class Trial:
     judges: ClassVar[bool] = False
     injector: ClassVar[type[Injector]] = Injector
     tells: ClassVar[type[Console]] = Console
-    campaign: ClassVar[dict[str, tuple[Any, ...]]] = {}
+    retunings: ClassVar[Mapping[str, dict[str, dict[str, Any]]]] = {}
 
     def __init__(self, run: RunContext, limit_s: float | None = None,
                  stream: TextIO | None = None) -> None:

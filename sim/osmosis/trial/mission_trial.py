@@ -36,7 +36,8 @@ class MissionTrial(Trial):
     judges = True
     injector = OsmosisInjector
     tells = MissionConsole
-    campaign = {"mission": ("A",), "obstacles": (0, 2)}
+    retunings = {"mechanisms as in the paper": {
+        "RM2": {"latched": True}, "RM5": {"latched": True}}}
 
     def __init__(self, run: RunContext, limit_s: float | None = None,
                  stream: TextIO | None = None) -> None:
