@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""Start the robot: build the system from its spec, run a mission, judge it, report on it."""
+"""Start a system from this checkout, as `rampart run` does; reports go to its folder `reports`."""
 
 import sys
+from pathlib import Path
 
 from rampart.cli.run import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(reports=Path(__file__).resolve().parent / "reports"))

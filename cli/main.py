@@ -24,6 +24,7 @@ from rampart.cli.record import bag_verbs, record_verbs
 from rampart.files import streams, working_folder
 
 _EPILOG = """examples:
+  rampart run --virtual --seed 7                 start a system; `rampart run --help`
   rampart status                                 the run at a glance
   rampart top                                    the run in the terminal, live
   rampart node list                              processes, states, restarts
@@ -54,6 +55,7 @@ def build_parser() -> argparse.ArgumentParser:
     common.add_argument("--port", type=int, metavar="N",
                         help="base port of the run, if there are several on this machine")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs.add_parser("run", add_help=False, help="start a system: the same as launch.py")
     node_verbs.add(verbs, formatter, common)
     top_verb.add(verbs, formatter, common)
     topic_verbs.add(verbs, formatter, common)
@@ -79,6 +81,12 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code."""
+    if arguments is None:
+        arguments = sys.argv[1:]
+    if arguments[:1] == ["run"]:
+        from rampart.cli.run import main as run  # noqa: PLC0415 physics and all: other verbs need not
+
+        return run(arguments[1:], "rampart run")
     streams.secure()
     code = _run(arguments)
     if code == 0 and (why := streams.lost_result()):

@@ -27,7 +27,7 @@ ROOMS = (
     "actors.detection", "actors.recovery", "actors.layout", "manager.actor",
     "actors.supervision", "actors.recording", "actors.operator",
     "sim.virtual", "sim.faults", "sim.runs", "sim.campaign",
-    "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.main", "cli.run",
+    "cli", "cli.look", "cli.operate", "cli.record", "cli.analyse", "cli.run", "cli.main",
     "testing",
 )
 """The rooms of the engine, from the bottom to the top: each may import those before it."""
@@ -44,16 +44,16 @@ LARGEST_ROOM = 15
 STILL_UPWARD: set[tuple[str, str]] = set()
 
 STILL_ROBOTIC = {
-    "cli.analyse.campaigning", "cli.operate.inject_verbs", "sim.campaign.grouping",
-    "sim.campaign.report", "sim.campaign.worst_runs"}
+    "cli.analyse.campaigning", "sim.campaign.grouping", "sim.campaign.report",
+    "sim.campaign.worst_runs"}
 
 STILL_NAMED = {
-    "cli.operate.inject_verbs", "manager.spec.mobile_robot", "manager.spec.parameters",
+    "cli.operate.inject_verbs", "manager.spec.mobile_robot",
     "sim.campaign.grouping", "sim.campaign.job", "sim.campaign.report",
     "sim.campaign.worst_runs"}
 
 STILL_TOO_LONG = {
-    "actors.osmosis.messages", "cli.analyse.campaigning", "cli.run", "sim.osmosis.world"}
+    "actors.osmosis.messages", "cli.analyse.campaigning", "sim.osmosis.world"}
 
 STILL_CIRCULAR: set[tuple[str, str]] = set()
 

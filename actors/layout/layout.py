@@ -62,7 +62,8 @@ class Layout:
             name: Unit(name, nodes) for name, nodes in spec.processes().items()}
         self.unit_of: dict[str, str] = {
             node.name: unit.name for unit in self.units.values() for node in unit.nodes}
-        supervisor, observer = load_class(SUPERVISOR_CLASS), load_class(application_class(spec).observer)
+        supervisor = load_class(SUPERVISOR_CLASS)
+        observer = load_class(application_class(spec).observer)
         heard = msgspec.convert({"nodes": tuple(self.unit_of)}, supervisor.Parameters)
         own = [Member(SUPERVISOR, supervisor, heard),
                Member(OBSERVER, observer, observer.Parameters())]

@@ -1,7 +1,7 @@
 """Who talks with whom, computed from what the actor classes declare.
 
-Two nodes are partners if one publishes a key that the other hears, or one watches the other's
-life. A node dials its partners only, so a respawn costs a handful of connections, not one per
+Two nodes are partners if one publishes a key that the other hears, or one watches the
+other. A node dials its partners only, so a respawn costs a handful of connections, not one per
 process of the system.
 """
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -19,6 +19,7 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NamedFault
+from rampart.actors.runtime.fault_watch import FIRST_EFFECT_S, FaultWatch, Order
 from rampart.actors.runtime.injection import UNTOUCHED, flaw
 
 TAKE_HOLD_S = 3.0
@@ -26,9 +27,6 @@ TAKE_HOLD_S = 3.0
 
 LATE_END_S = 2.0
 """Simulated seconds that the report of the end may be late before its publisher counts as gone."""
-
-FIRST_EFFECT_S = 10.0
-"""Simulated seconds within which a permanent fault must change a message."""
 
 DELAY_S = 1.5
 """Delay of `delay:TOPIC`: longer than any freshness timeout of the shipped system."""
@@ -41,8 +39,6 @@ MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp")
 """Modes that fit any topic; what to corrupt in a message is for the catalogue."""
 
 MAX_WAITING = 16
-MAX_PUBLISHERS = 100
-"""Of so many nodes reports on one injection are kept."""
 
 _KEPT = 20
 
@@ -51,49 +47,19 @@ class FaultError(ValueError):
     """A fault that cannot be injected; one line."""
 
 
-@dataclass(frozen=True, slots=True)
-class Order:
-    """A message to send, and where: a request to disturb a topic, or a fault of another kind."""
-
-    topic: Topic[Any]
-    message: Any
-
-    def with_(self, **changed: Any) -> Order:
-        """Return the order with other fields."""
-        return Order(self.topic, msgspec.structs.replace(self.message, **changed))
-
-    @property
-    def injection(self) -> str:
-        """Its id."""
-        return str(self.message.injection)
-
-    @property
-    def place(self) -> str:
-        """What is disturbed: a topic's key, or that on which another fault is ordered."""
-        return str(getattr(self.message, "topic", self.topic.key))
-
-
-@dataclass(slots=True)
-class Ordered:
+@dataclass(slots=True, kw_only=True)
+class Ordered(FaultWatch):
     """One fault as ordered, and what is known of it."""
 
     injection: str
     fault: str
-    orders: tuple[Order, ...]
     begins_s: float
     duration_s: float
-    affected: dict[str, dict[str, int]] = field(default_factory=dict)
-    finished: set[str] = field(default_factory=set)
     reason: str = ""
     sent: bool = False
     ending: bool = False
     outcome: str = ""
     effective: bool | None = None
-
-    @property
-    def changed(self) -> int:
-        """How many messages (or ticks of the base) it has changed, as far as reported."""
-        return sum(n for nodes in self.affected.values() for n in nodes.values())
 
     def state(self, now_s: float) -> str:
         """Return in a few words how far it is."""
@@ -101,9 +67,11 @@ class Ordered:
             return self.outcome
         if now_s < self.begins_s:
             return f"begins at {self.begins_s:.0f} s"
-        if not self.affected:
+        if not self.reports:
             return "asked for"
-        return f"in force, {self.changed} changed" if self.changed else "in force, no effect so far"
+        if self.affected:
+            return f"in force, {self.affected} changed"
+        return "in force, no effect so far"
 
 
 class Injections:
@@ -163,9 +131,9 @@ class Injections:
         name = f"{self._prefix}.{self._count}"
         orders, own_s = self._find(fault, name)
         lasts_s = own_s if duration_s is None else duration_s
-        ordered = Ordered(name, fault, tuple(
-            o.with_(duration_s=lasts_s) for o in orders),
-            now_s + delay_s, lasts_s)
+        ordered = Ordered(
+            tuple(o.with_(duration_s=lasts_s) for o in orders), injection=name, fault=fault,
+            begins_s=now_s + delay_s, duration_s=lasts_s)
         self._ordered.append(ordered)
         ended = [o for o in self._ordered if o.outcome]
         for old in ended[:max(0, len(self._ordered) - _KEPT)]:
@@ -184,8 +152,9 @@ class Injections:
                     ordered.outcome = "withdrawn before it took hold"
                 ordered.ending = True
                 ordered.duration_s = max(now_s - ordered.begins_s, 0.0)
-                ordered.orders = tuple(o.with_(duration_s=0.0) for o in ordered.orders)
-                return ordered.orders
+                over = tuple(o.with_(duration_s=0.0) for o in ordered.orders)
+                ordered.orders = over
+                return over
         raise FaultError(f"no fault {injection[:60]!r} is under way")
 
     def _find(self, fault: str, injection: str
@@ -223,22 +192,14 @@ class Injections:
         begun = [o for o in self._ordered if not o.outcome and now_s >= o.begins_s]
         for ordered in begun:
             ordered.sent = True
-        return [order for o in begun for order in o.orders
-                if order.injection not in (o.finished if o.ending else o.affected)]
+        return [order for o in begun for order in (o.unfinished if o.ending else o.unanswered)]
 
     def hear(self, report: bm.InjectionReport) -> str:
         """Take a report; return what to tell, "" if there is nothing to say yet."""
         for o in self._ordered:
-            if o.outcome or report.injection not in {x.injection for x in o.orders}:
+            if o.outcome or not o.hear(report):
                 continue
-            nodes = o.affected.setdefault(report.injection, {})
-            if len(nodes) >= MAX_PUBLISHERS and report.node not in nodes:
-                continue
-            nodes[report.node] = max(nodes.get(report.node, 0), report.affected)
-            o.reason = o.reason or report.reason
-            if report.finished:
-                o.finished.add(report.injection)
-            if len(o.finished) == len(o.orders):
+            if not o.unfinished:
                 return self._conclude(o)
             if report.affected and o.effective is None:
                 o.effective = True
@@ -252,14 +213,13 @@ class Injections:
         for o in self._ordered:
             if o.outcome:
                 continue
-            missing = [x for x in o.orders if x.injection not in o.affected]
-            if missing and now_s > o.begins_s + TAKE_HOLD_S:
-                where = ", ".join(x.place for x in missing)
-                o.reason = o.reason or f"nobody that publishes {where} answers"
+            if o.unanswered and now_s > o.begins_s + TAKE_HOLD_S:
+                where = ", ".join(x.place for x in o.unanswered)
+                o.reason = f"nobody that publishes {where} answers"
                 told.append(self._conclude(o))
             elif (math.isfinite(o.duration_s)
                   and now_s > o.begins_s + o.duration_s + LATE_END_S):
-                o.reason = o.reason or "its publisher did not report the end, it was restarted"
+                o.reason = "its publisher did not report the end, it was restarted"
                 told.append(self._conclude(o))
             elif (math.isinf(o.duration_s) and o.effective is None
                   and now_s > o.begins_s + FIRST_EFFECT_S):
@@ -268,14 +228,15 @@ class Injections:
         return told
 
     def _conclude(self, o: Ordered) -> str:
-        o.effective = o.changed > 0
+        o.effective = o.affected > 0
+        reason = next(iter(o.refused.values()), o.reason)
         unit = "messages changed"
         if any(x.topic is not bus_topics.INJECTION_REQUEST for x in o.orders):
             unit = "ticks changed"
         if o.effective:
-            o.outcome = f"over, {o.changed} {unit}" + (f"; {o.reason}" if o.reason else "")
+            o.outcome = f"over, {o.affected} {unit}" + (f"; {reason}" if reason else "")
         else:
-            o.outcome = f"no effect: {o.reason or 'nothing was sent that it would have changed'}"
+            o.outcome = f"no effect: {reason or 'nothing was sent that it would have changed'}"
         return f"fault {o.fault}: {o.outcome}"
 
 

@@ -15,7 +15,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.layout.system_topics import declared_topics, find_topic, published_keys
 from rampart.actors.operator.adaptation import StrategyChoice
-from rampart.actors.operator.injection import FaultError, Injections, Order, places
+from rampart.actors.operator.injection import FaultError, Injections, places
 from rampart.actors.operator.requests import (
     EndFaultRequest,
     InjectRequest,
@@ -30,7 +30,8 @@ from rampart.manager.strategies.registry import STRATEGIES
 
 if TYPE_CHECKING:
     from rampart.actors.operator.state import HmiState
-    from rampart.actors.runtime.actor import Actor
+    from rampart.actors.runtime.fault_watch import Order
+from rampart.actors.runtime.actor import Actor
 
 OVERHEAD_S = 1.0
 """Real seconds granted for what does not run in simulated time: sockets, scheduling, a respawn."""

@@ -55,6 +55,12 @@ class Osmosis(Application):
     faults = "rampart.sim.osmosis.trial.faults:OsmosisFaults"
     observer = "rampart.sim.osmosis.trial.observer:OsmosisObserver"
     trial = "rampart.sim.osmosis.trial.mission_trial:MissionTrial"
+    examples = (
+        ("--mission A --obstacles 2", "two obstacles on the way"),
+        ("--joystick", "drive by hand: hold the left shoulder button"),
+        ("--virtual --fault kill:osmosis_control@30 --fault gps-bias@goal2+5", "two faults"),
+        ("--airport my/airport.graph --mission my/MISSION_A.miss", "an airport of your own"),
+    )
     options: Options
 
     def __init__(self, options: Options) -> None:

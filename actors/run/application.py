@@ -39,6 +39,7 @@ class Application:
         lines: class that tells of them in `rampart status`, `top` and `metrics`, likewise.
         faults: class path of its `Faults`; "" if it has none of its own.
         observer: class path of who hears a run for judge and report.
+        examples: of the command line, for its help: options, and what they do.
         trial: class path of the `Trial` that its runs are; "" if nobody judges them.
 
     Attributes:
@@ -57,6 +58,7 @@ class Application:
     faults: ClassVar[str] = ""
     observer: ClassVar[str] = "rampart.sim.runs.observer:Observer"
     trial: ClassVar[str] = ""
+    examples: ClassVar[tuple[tuple[str, str], ...]] = ()
 
     def __init__(self, options: Any = None) -> None:
         self.options = options or self.Options()

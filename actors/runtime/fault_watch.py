@@ -102,6 +102,17 @@ class FaultWatch:
 
     @property
     def unfinished(self) -> tuple[Order, ...]:
-        """The orders on which nobody has reported the end."""
-        over = {report.injection for report in self.reports.values() if report.finished}
-        return tuple(order for order in self.orders if order.injection not in over)
+        """The orders of which not everybody who answered has reported the end."""
+        going_on = {r.injection for r in self.reports.values() if not r.finished}
+        return tuple(order for order in self.orders
+                     if order.injection in going_on or order in self.unanswered)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether there is nothing left to wait for: it is over, or permanent and has an effect."""
+        return not self.unfinished or (self.is_permanent and self.affected > 0)
+
+    @property
+    def waits_s(self) -> float:
+        """How long that may take, simulated seconds."""
+        return FIRST_EFFECT_S if self.is_permanent else self.orders[0].message.duration_s

@@ -1,7 +1,7 @@
 """The supervisor: starts the processes, watches them three ways, kills and respawns them.
 
 * *Crashed*: the process's pidfd becomes readable, at once; this works for processes that are
-  not children, so a restarted supervisor adopts the living ones it finds in /proc.
+  not children, so a restarted supervisor adopts those that it finds in /proc.
 * *Stopped*: no heartbeat, and the kernel says the process is stopped (SIGSTOP).
 * *Wedged*: no heartbeat although the process runs: its event loop turns no more. Of the manager,
   whose silence stops the robot, the status counts as much as the heartbeat.

@@ -11,6 +11,7 @@ import msgspec
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.layout.system_topics import published_keys
+from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.runtime.corruption import InjectionError, field_type, is_array
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.cli import systems
@@ -19,8 +20,8 @@ from rampart.cli.operate.injecting import run_fault
 from rampart.cli.output import UsageError, print_json, print_table, say
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
+from rampart.sim.faults.faults import Faults, faults_of
 from rampart.sim.faults.topic_faults import modes_of, systematic_faults
-from rampart.sim.osmosis.trial.faults import PAPER_FAULTS, SENSOR_FAULTS, OsmosisFaults
 
 _DEFAULT_DURATION_S = 5.0
 
@@ -136,9 +137,18 @@ def _known_fault(options: argparse.Namespace) -> Fault:
     try:
         _, colon, key = options.fault.partition(":")
         known = topics_for(key, options.port) if colon else ()
-        return OsmosisFaults().find(options.fault, options.seed or 0, known)
+        return _faults(options.port).find(options.fault, options.seed or 0, known)
     except UnknownFaultError as error:
         raise UsageError(str(error)) from None
+
+
+def _faults(port: int | None) -> Faults:
+    """Return the faults of the run's robot; of the shipped system's, if there is none to read."""
+    try:
+        spec = systems.load(find_run(port).system_file)
+    except (NoRunError, UsageError):
+        spec = systems.load(None)
+    return faults_of(spec)
 
 
 def _own_fault(options: argparse.Namespace) -> Fault:
@@ -210,20 +220,20 @@ def _amount(option: str, text: str, topic: Topic[Any]) -> tuple[str, float]:
 
 def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
     known = systems.topics_of(spec)
-    keys = published_keys(spec)
+    keys, faults = published_keys(spec), faults_of(spec)
     if as_json:
-        everything = (*PAPER_FAULTS.values(), *SENSOR_FAULTS.values(),
-                      *systematic_faults(keys, known))
+        everything = (*faults.named.values(), *systematic_faults(keys, known))
         print_json([{"name": f.name, "title": f.title, "group": f.group,
                      "detected_by": f.detected_by, "duration_s": f.duration_s,
                      "topics": [d.topic for d in f.disturbances]} for f in everything])
         return
-    for title, faults in (("the paper's faults", PAPER_FAULTS), ("sensors", SENSOR_FAULTS)):
-        say(f"{title}:")
-        print_table(("fault", "seen by", "s", "what happens"),
-                    [(f.name, " ".join(f.detected_by), f"{f.duration_s:g}", f.title)
-                     for f in faults.values()])
-        say()
+    for kind, title in faults.kinds.items():
+        rows = [(f.name, " ".join(f.detected_by), f"{f.duration_s:g}", f.title)
+                for f in faults.named.values() if f.group == kind]
+        if rows:
+            say(f"{title}:")
+            print_table(("fault", "seen by", "s", "what happens"), rows)
+            say()
     say(f"any topic, as MODE:TOPIC; MODE is one of {', '.join(MODES)}:")
     print_table(("topic", "modes"), list(_modes_by_topic(keys, known).items()))
     say()

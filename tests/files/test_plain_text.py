@@ -146,7 +146,7 @@ def test_in_virtual_time_every_line_is_shown():
     of = system("paper")
     stream = io.StringIO()
     console = MissionConsole(stream, lambda: 0.0)
-    console.virtual_banner("Vallombre", of.run.application.mission, of.plan, "safety-first")
+    console.banner("a mission", of.plan, of.run.system, virtual=True)
     for number in range(1000):
         console.line(float(number), "line")
     assert len(stream.getvalue().splitlines()) == 1001

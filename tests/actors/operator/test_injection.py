@@ -15,7 +15,6 @@ from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator.adaptation import GIVE_UP_S, StrategyChoice
 from rampart.actors.operator.injection import (
-    FIRST_EFFECT_S,
     LATE_END_S,
     MAX_WAITING,
     TAKE_HOLD_S,
@@ -27,6 +26,7 @@ from rampart.actors.operator.operating import places_of
 from rampart.actors.operator.requests import RefusedError
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.runtime.fault_watch import FIRST_EFFECT_S
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.cli import systems
 from rampart.sim.faults.topic_faults import modes_of

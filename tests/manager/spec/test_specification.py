@@ -429,6 +429,16 @@ REFUSED = {
                             ["$.robot.sensing_range_m = 0.7: obstacles must be seen"]),
     "a hold above its bound": ([("release_hold_s = 0.5 ", "release_hold_s = 20.0 ")],
                                ["$.timing.release_hold_max_s = 10.0: must be no less"]),
+    "a backoff above its bound": ([("[layers]", "[supervision]\nbackoff_s = 3.0\n[layers]")],
+                                  ["$.supervision.backoff_max_s = 2.0: must be no less than "
+                                   "backoff_s = 3"]),
+    "attempts that come sooner and sooner": (
+        [("[layers]", "[supervision]\nattempt_max_s = 5.0\n[layers]")],
+        ["$.supervision.attempt_max_s = 5.0: must be no less than attempt_s = 10"]),
+    "no restart at all": ([("[layers]", "[supervision]\nintensity = 0\n[layers]")],
+                          ["$.supervision.intensity = 0: "]),
+    "a window that is none": ([("[layers]", "[supervision]\nperiod_s = 0.0\n[layers]")],
+                              ["$.supervision.period_s = 0.0: "]),
 }
 
 

@@ -1,0 +1,279 @@
+"""What can be said on the command line when a system is started, and the plan that follows."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import socket
+import uuid
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rampart import systems
+from rampart.actors.layout.layout import Layout, application_class
+from rampart.actors.layout.wiring import load_class
+from rampart.actors.recording.bag_writer import check_target
+from rampart.actors.run.application import Application
+from rampart.actors.run.run_plan import DEFAULT_PORT, RunPlan, load_system
+from rampart.actors.web.access import Access, AccessError, is_loopback, new_token
+from rampart.actors.web.token_file import SecretError, read_secret
+from rampart.cli import application_options
+from rampart.cli.output import UsageError
+from rampart.manager.spec.specification import SystemSpec
+from rampart.manager.strategies.registry import STRATEGIES
+from rampart.sim.faults.faults import faults_of
+from rampart.sim.virtual.network import NETWORKS
+
+ERROR_LOG = "errors.log"
+LAST_PORT = 32_000
+TOKEN_VARIABLE = "RAMPART_HMI_TOKEN"  # noqa: S105 the name of one
+HMI = "rampart.actors.operator.hmi:Hmi"
+
+_EXAMPLES = (
+    ("", "the shipped system, as its spec says"),
+    ("--rate 4 --no-hmi --json", "four times real time, result as JSON"),
+    ("--hmi-host 0.0.0.0", "the page for other machines too, with a token"),
+    ("--hmi-token-file FILE", "the page for others, with a token of yours"),
+    ("--record run.mcap", "keep everything that is said; `rampart replay`"),
+    ("--no-ftm", "the baseline, without fault tolerance"),
+    ("--virtual --seed 7", "in seconds, and every time the same"),
+    ("--virtual --fault kill:NODE@30 --fault drop:TOPIC@goal2+5", "with faults"),
+    *((f"--system {name}", "another one that is shipped") for name in systems.names().split(", ")),
+)
+
+_EPILOG = """\
+while it runs, from another shell:
+  kill-node NODE                                    kill a node and watch it come back
+  rampart inject --list                             the faults that can be injected
+  rampart status                                    what the robot and its nodes are doing
+exit code: 0 success and safe, 1 mission failed but safe, 2 bad usage or spec, 3 unsafe,
+4 safety not known: no ground truth ever came. A report that cannot be written and output that
+nobody reads change none of them; with --json, "report_error" says why there is no "report"
+"""
+
+
+def parser(program: str = "", kind: type[Application] = Application,
+           said: Mapping[str, Any] | None = None) -> argparse.ArgumentParser:
+    """Return the parser of the command line.
+
+    Args:
+        program: as it is typed.
+        kind: the application of the system that is started, which adds options.
+        said: what the system's spec says of them.
+    """
+    examples = "".join(f"  {program} {how:<40} {what}\n" for how, what in (
+        *_EXAMPLES, *kind.examples))
+    p = argparse.ArgumentParser(
+        prog=program, epilog=f"examples:\n{examples}{_EPILOG}",
+        description="Start a system from its spec, run it, judge it, report on it.",
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--wait", action="store_true",
+                   help="let the operator start the mission from the page")
+    p.add_argument("--system", metavar="FILE", default=str(systems.DEFAULT),
+                   help=f"system spec, or name of a shipped one: {systems.names()} "
+                   "(default: osmosis)")
+    p.add_argument("--strategy", metavar="NAME", default="",
+                   help=f"one of {', '.join(STRATEGIES)} (default: the system's)")
+    p.add_argument("--shadow", metavar="NAME", default="",
+                   help="a second strategy that decides without effect; where it differs, it says "
+                   "so (default: the system's)")
+    p.add_argument("--no-ftm", action="store_true",
+                   help="run the paper's unprotected baseline: last command kept, no dead man, "
+                   "no respawn")
+    p.add_argument("--rate", metavar="R", type=float, default=1.0,
+                   help="simulated seconds per second (default: 1)")
+    p.add_argument("--seed", metavar="N", type=int, default=1, help="for sensor noise (default: 1)")
+    p.add_argument("--no-hmi", action="store_true", help="no operator's page (its node still runs)")
+    p.add_argument("--hmi-port", metavar="PORT", type=int, default=8080,
+                   help="port of the operator's page (default: 8080)")
+    p.add_argument("--hmi-host", metavar="HOST", default="127.0.0.1",
+                   help="address of the operator's page (default: 127.0.0.1, this machine only). "
+                   "Any other makes it need a token, which is printed with the page's address "
+                   "when the run starts")
+    p.add_argument("--hmi-token-file", metavar="FILE", default="",
+                   help="a file of yours, of mode 0600, with that token, 16 characters or more, to "
+                   f"keep it over several runs; or set {TOKEN_VARIABLE} to it (default: a random "
+                   "one; for yourself on this machine none is needed)")
+    p.add_argument("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS)  # refused
+    p.add_argument("--port", metavar="PORT", type=int, default=DEFAULT_PORT,
+                   help="number that tells runs on this machine apart; no port is opened "
+                   f"(default: {DEFAULT_PORT})")
+    p.add_argument("--patience", metavar="S", type=float, default=60.0,
+                   help="simulated seconds without progress after which the mission counts as "
+                   "failed (default: 60)")
+    p.add_argument("--duration", metavar="S", type=float,
+                   help="simulated seconds after which a system without a mission ends (default: "
+                   "when it is interrupted)")
+    p.add_argument("--record", metavar="FILE", help="keep everything that is sent in an MCAP file, "
+                   "for `rampart bag info`, `rampart replay` and Foxglove-compatible viewers")
+    p.add_argument("--overwrite", action="store_true", help="--record may replace an existing file")
+    p.add_argument("--report", metavar="DIR", help="where the report goes, checkpoints, and in "
+                   f"{ERROR_LOG} the tracebacks of nodes that failed (default: "
+                   "reports/TIME-MISSION, without a mission reports/TIME-SYSTEM)")
+    p.add_argument("--virtual", action="store_true",
+                   help="run a mission in virtual time: all actors in this process, many times "
+                   "faster than real; the same --seed gives the same run, to the byte")
+    p.add_argument("--network", metavar="NAME", default="measured",
+                   help=f"with --virtual, what lies between the nodes: {', '.join(NETWORKS)} "
+                   "(default: measured)")
+    p.add_argument("--fault", metavar="FAULT[@WHEN][+S]", action="append", default=[],
+                   help="a fault to inject into a mission (repeatable): one of `rampart inject "
+                   "--list`, MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE, slow:NODE, or of the "
+                   "robot's; WHEN is simulated seconds or goalN (default: 10), S how long it lasts")
+    p.add_argument("--json", action="store_true",
+                   help="last line of stdout is one JSON object with the result")
+    application_options.add(p, kind, said or {})
+    return p
+
+
+def parse(arguments: Sequence[str] | None, program: str
+          ) -> tuple[argparse.Namespace, type[Application]]:
+    """Return the options, those of the system's application included, and its class.
+
+    Args:
+        arguments: of the command line; None for those of this process.
+        program: as it is typed.
+
+    Raises:
+        UsageError: there is no such system, or an option that it does not have.
+        ValueError: the system's spec is unsound.
+    """
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--system", default=str(systems.DEFAULT))
+    system = str(first.parse_known_args(arguments)[0].system)
+    spec = load_system(RunPlan(system_file=str(_system_file(system))))
+    kind = application_class(spec)
+    options, unknown = parser(program, kind, spec.application).parse_known_args(arguments)
+    if unknown:
+        raise UsageError(f"{unknown[0]}: no option of the launcher or of {spec.name}; --system "
+                         f"{system} --help shows those there are")
+    return options, kind
+
+
+def _system_file(system: str) -> Path:
+    found = systems.find(system)
+    if not found.is_file():
+        what = "is a directory" if found.is_dir() else "no such file"
+        raise UsageError(f"--system {system}: {what}; a spec is right, or the name of a "
+                         f"shipped one: {systems.names()}")
+    return found
+
+
+def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPlan, SystemSpec]:
+    """Return the plan that the options ask for, and the system they name.
+
+    Raises:
+        UsageError: an option makes no sense, or not in this system.
+        ValueError: the system's spec is unsound.
+    """
+    _check(options)
+    system_file = _system_file(options.system)
+    token, token_is_new = _token(options)
+    plan = RunPlan(
+        run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
+        seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
+        ftm=not options.no_ftm, options=application_options.chosen(options, kind),
+        hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
+        hmi_host=options.hmi_host, hmi_token=token,
+        hmi_token_is_new=token_is_new,
+        waits=options.wait)
+    spec = load_system(plan)
+    if not options.no_hmi:
+        plan = msgspec.structs.replace(plan, faults=faults_of(spec).offered())
+    return _fitting(options, plan, spec), spec
+
+
+def _fitting(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> RunPlan:
+    """Return the plan without a page that nobody serves.
+
+    Raises:
+        UsageError: an option needs a node that the system has not.
+    """
+    if not _has_actor(plan, spec, HMI):
+        refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token_file"),
+                f"no node of {spec.name} serves an operator's page")
+        plan = msgspec.structs.replace(plan, hmi_port=0)
+    return plan
+
+
+def _has_actor(plan: RunPlan, spec: SystemSpec, actor: str) -> bool:
+    """Tell whether a node of the system is of this class, or of one that is derived from it."""
+    return any(node.actor == actor for node in spec.nodes) or any(
+        issubclass(member.actor, load_class(actor))
+        for member in Layout(plan, spec).members.values())
+
+
+def refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
+    """Refuse options that would have no effect, each by its name and value as it is typed."""
+    for name in names:
+        value = getattr(options, name)
+        if value == parser().get_default(name):
+            continue
+        shown = value[0] if isinstance(value, list) else value
+        text = "" if value is True else f" {shown:g}" if isinstance(shown, float) else f" {shown}"
+        raise UsageError(f"--{name.replace('_', '-')}{text}: {why}")
+
+
+def _check(options: argparse.Namespace) -> None:
+    if not 0.1 <= options.rate <= 20:
+        raise UsageError(f"--rate {options.rate:g}: must be between 0.1 and 20")
+    if options.duration is not None and not 0 < options.duration < 1e9:
+        raise UsageError(f"--duration {options.duration:g}: must be above 0")
+    if not options.patience > 0:
+        raise UsageError(f"--patience {options.patience:g}: must be above 0")
+    if options.record:
+        check_target(Path(options.record), overwrite=options.overwrite)
+    elif options.overwrite:
+        raise UsageError("--overwrite: only with --record FILE")
+    for name, port in (("--port", options.port), ("--hmi-port", options.hmi_port)):
+        if not 1024 <= port <= LAST_PORT:
+            raise UsageError(f"{name} {port}: must be between 1024 and {LAST_PORT}, below the "
+                             "ports that the kernel gives to outgoing connections")
+    if options.network != "measured" and not options.virtual:
+        raise UsageError(f"--network {options.network}: only with --virtual; Zenoh carries the "
+                         "messages of real processes")
+    if options.virtual and options.network not in NETWORKS:
+        raise UsageError(f"--network {options.network}: unknown; known: {', '.join(NETWORKS)}")
+    for option, name in (("--strategy", options.strategy), ("--shadow", options.shadow)):
+        if name and name not in STRATEGIES:
+            raise UsageError(f"{option} {name}: unknown strategy; known: {', '.join(STRATEGIES)}")
+
+
+def _token(options: argparse.Namespace) -> tuple[str, bool]:
+    """Return what the operator's page asks for, and whether it is new and has to be printed.
+
+    It comes from a file or the environment, which other users cannot read as they can read a
+    command line; where none is given and one is needed it is made.
+    """
+    host: str = options.hmi_host
+    own = os.environ.pop(TOKEN_VARIABLE, "")  # not for whatever is started
+    if options.hmi_token is not None:
+        raise UsageError("--hmi-token: a command line is read by every user of this machine; put "
+                         "another token into a file of mode 0600 for --hmi-token-file FILE, or "
+                         f"into the variable {TOKEN_VARIABLE}")
+    if options.no_hmi or options.virtual:
+        if options.wait:
+            raise UsageError("--wait: the mission is started from the operator's page, which there "
+                             f"is not with --{'no-hmi' if options.no_hmi else 'virtual'}")
+        return "", False
+    source = TOKEN_VARIABLE
+    try:
+        if options.hmi_token_file:
+            source = f"--hmi-token-file {options.hmi_token_file}"
+            own = read_secret(Path(options.hmi_token_file))
+        token = own or ("" if is_loopback(host) else new_token())
+        Access(host, options.hmi_port, token)
+    except (AccessError, SecretError) as error:
+        raise UsageError(f"{source}: {error}") from None
+    try:
+        family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, number) as probe:
+            probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or str(error)
+        raise UsageError(f"--hmi-host {host}: no address of this machine ({why}); 0.0.0.0 stands "
+                         "for all it has") from None
+    return token, bool(token) and not own
