@@ -56,8 +56,8 @@ async def live(options: argparse.Namespace, viewer: FoxgloveViewer) -> int:
             async with contextlib.aclosing(sessions(
                     options.of, stop, follow=True, option="--run")) as found:
                 async for session in found:
-                    say(f"showing {session.run.title} (port {session.run.base_port})")
                     _watch(session, viewer)
+                    say(f"showing {session.run.title} (port {session.run.base_port})")
                     while not stop.is_set() and not is_over(session.run):
                         with contextlib.suppress(TimeoutError):
                             await asyncio.wait_for(stop.wait(), LOOK_S)
