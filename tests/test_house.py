@@ -47,9 +47,8 @@ STILL_ROBOTIC = {
     "cli.analyse.campaigning", "sim.campaign.report", "sim.campaign.worst_runs"}
 
 STILL_NAMED = {
-    "cli.operate.inject_verbs", "manager.spec.mobile_robot",
-    "sim.campaign.grouping", "sim.campaign.job", "sim.campaign.report",
-    "sim.campaign.worst_runs"}
+    "cli.operate.inject_verbs", "manager.spec.mobile_robot", "sim.campaign.grouping",
+    "sim.campaign.job", "sim.campaign.report", "sim.campaign.worst_runs"}
 
 STILL_TOO_LONG = {
     "actors.osmosis.messages", "cli.analyse.campaigning", "sim.osmosis.world"}
