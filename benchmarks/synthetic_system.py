@@ -10,8 +10,6 @@ import random
 
 _HEAD = '''name = "synthetic"
 title = "{mechanisms} mechanisms, {recoveries} recoveries"
-airport = "vallombre"
-mission = "AB"
 
 [robot]
 length_m = 0.72

@@ -1,4 +1,5 @@
 """What a robot adds to `rampart status`, `rampart top` and `rampart metrics`."""
+# ruff: noqa: ARG002 a robot that says nothing needs nothing
 
 from __future__ import annotations
 
@@ -43,25 +44,20 @@ class RobotLines:
             plan: of the run, as plain data.
             kinds: of the nodes that there are.
         """
-        del latest, plan, kinds
         return []
 
     def status_data(self, latest: Latest) -> dict[str, Any]:
         """Return the same as data."""
-        del latest
         return {}
 
     def rows(self, latest: Latest, width: int) -> list[Row]:
         """Return the lines of `rampart top` for a screen so many cells wide."""
-        del latest, width
         return []
 
     def data(self, latest: Latest) -> dict[str, Any]:
         """Return the same as data."""
-        del latest
         return {}
 
     def families(self, latest: Latest) -> Iterator[Any]:
         """Yield the families (`prometheus_client.Metric`) of `rampart metrics`."""
-        del latest
         yield from ()

@@ -17,7 +17,7 @@ import msgspec
 
 from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.envelope import UNREADABLE, Header, decode, encode
-from rampart.actors.bus.tap import Tap
+from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
@@ -186,7 +186,7 @@ async def connect(port: int | None = None) -> AsyncIterator[Session]:
         run = find_run(port)
     except NoRunError as error:
         raise UsageError(str(error)) from None
-    bus = ZenohBus("", 0, None, run.endpoints, Tap(run.base_port))
+    bus = ZenohBus("", 0, None, run.endpoints, RecorderConnection(run.base_port))
     try:
         await bus.open()
     except BusError as error:

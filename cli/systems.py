@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from rampart import systems
-from rampart.actors.bus.topic import Topic
 from rampart.actors.layout.layout import application_class
 from rampart.actors.layout.system_topics import declared_topics, own_topics, system_topics
-from rampart.actors.layout.wiring import import_class
+from rampart.actors.layout.wiring import REPORTS_ON, import_class, load_member
 from rampart.cli.output import UsageError
 from rampart.cli.robot_lines import RobotLines
 from rampart.files import toml
 from rampart.files.reading import FileError, read_text
-from rampart.manager.spec.specification import SpecificationError, SystemSpec, parse_specification
+from rampart.manager.spec.specification import SystemSpec, parse_specification
 
 T = TypeVar("T")
 
@@ -39,6 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser, *, what: str = "", dest: str 
 def load(file: str | None) -> SystemSpec:
     """Read a system spec.
 
+    Parameters are checked of the detection and recovery modules that ship. Others are imported when
+    they are started, and for no look at a file that somebody else may have written.
+
     Args:
         file: path, or name of a shipped system; None for the shipped default.
 
@@ -47,55 +49,42 @@ def load(file: str | None) -> SystemSpec:
     """
     path = DEFAULT if file is None else systems.find(file)
     try:
-        return parse_specification(read_text(path, toml.MAX_SIZE), str(path))
+        spec = parse_specification(read_text(path, toml.MAX_SIZE), str(path))
+        for node in spec.actors():
+            if node.kind in REPORTS_ON and node.actor.startswith("rampart."):
+                load_member(node, spec, str(path))
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}; a spec is right, or the name of a shipped "
                          f"one: {systems.names()}") from None
     except FileError as error:
         raise UsageError(f"{path}: {error}") from None
-    except SpecificationError as error:
-        raise UsageError(str(error)) from None
-
-
-def declared(spec: SystemSpec) -> tuple[Topic[Any], ...]:
-    """Return the topics of the engine and of a system's application.
-
-    Raises:
-        UsageError: the application's class cannot be had.
-    """
-    return _usable(declared_topics, spec)
-
-
-def lines_of(spec: SystemSpec) -> RobotLines:
-    """Return what is told of a system's robot.
-
-    Raises:
-        UsageError: the application's class cannot be had, or what it names for this.
-    """
-    return _usable(lambda of: import_class(
-        application_class(of).lines, RobotLines, "lines")(), spec)
-
-
-def topics_of(spec: SystemSpec) -> tuple[Topic[Any], ...]:
-    """Return all topics of a system.
-
-    Raises:
-        UsageError: an actor class that the spec names cannot be had, or declares what is no topic.
-    """
-    return _usable(system_topics, spec)
-
-
-def own_topics_of(spec: SystemSpec) -> tuple[Topic[Any], ...]:
-    """Return the topics that a system has beyond the common ones.
-
-    Raises:
-        UsageError: as `topics_of`.
-    """
-    return _usable(own_topics, spec)
-
-
-def _usable(of: Callable[[SystemSpec], T], spec: SystemSpec) -> T:
-    try:
-        return of(spec)
     except ValueError as error:
         raise UsageError(str(error)) from None
+    return spec
+
+
+def _usable(of: Callable[[SystemSpec], T]) -> Callable[[SystemSpec], T]:
+    """Return a function of a system that has users told what its actors or application lack."""
+    def told(spec: SystemSpec) -> T:
+        try:
+            return of(spec)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+    return told
+
+
+def _lines_of(spec: SystemSpec) -> RobotLines:
+    return import_class(application_class(spec).lines, RobotLines, "lines")()
+
+
+declared = _usable(declared_topics)
+"""Returns the topics of the engine and of a system's application."""
+
+topics_of = _usable(system_topics)
+"""Returns all topics of a system."""
+
+own_topics_of = _usable(own_topics)
+"""Returns the topics that a system has beyond the declared ones."""
+
+lines_of = _usable(_lines_of)
+"""Returns what is told of a system's robot."""

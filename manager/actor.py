@@ -14,7 +14,6 @@ knows as well.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -23,7 +22,7 @@ from rampart.actors.bus.bounds import DOCUMENT_CHARS, clip
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.actors.layout.wiring import load_class
+from rampart.actors.layout.wiring import REPORTS_ON, load_member
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.manager.arbitration.arbiter import build_arbiter
@@ -82,7 +81,7 @@ class FtmManager(Actor):
 
     @classmethod
     def output_names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]
+        cls, topic: Topic[Any], name: str, parameters: Any
     ) -> tuple[str, ...] | None:
         """Command any recovery module."""
         if topic is topics.RECOVERY_COMMAND:
@@ -171,19 +170,19 @@ class FtmManager(Actor):
         """Make a change at once and whole; return why not, or ""."""
         if not self._document:
             return "this manager was started without a system file"
-        document, system = adapt(self._document, change, f"{self._system.name}.toml")
+        file = f"{self._system.name}.toml"
+        document, system = adapt(self._document, change, file)
+        check_modules(self._system, system)
+        for node in system.actors():
+            if node.kind in REPORTS_ON:
+                load_member(node, system, file)
         busy = self.arbiter_state.busy
         if busy:
             return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"
-        check_modules(self._system, system)
         text = msgspec.json.encode(document).decode()
         if len(text) > DOCUMENT_CHARS:
             return (f"the system would have {len(text)} characters, at most {DOCUMENT_CHARS} are "
                     "right")
-        for detection in system.detections:
-            load_class(detection.actor, topics.DETECTION)
-        for recovery in system.recoveries:
-            load_class(recovery.actor, topics.RECOVERY)
         arbiter = build_arbiter(system)
         self.arbiter_state = take_over(arbiter, self.arbiter_state, self.clock.now())
         self._arbiter, self._document, self._system = arbiter, document, system

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.runtime.actor import Actor, Header, every, on
+from rampart.manager.spec.tables import Name, NonNegative
 from tests import ROOT
 
 
@@ -31,16 +33,30 @@ AXLE = Topic("porter/axle/{name}", Axle, Qos.STATE, 2, "base_link", "Speed of ax
 class Platform(Actor):
     """Weighs, and turns."""
 
+    class Parameters(Actor.Parameters, frozen=True):
+        """What the platform is like.
+
+        Attributes:
+            axles: their names.
+            mass_kg: what it carries.
+        """
+
+        axles: tuple[Name, ...] = ("front",)
+        mass_kg: NonNegative = 20.0
+
+    parameters: Parameters
     outputs = (LOAD, AXLE)
 
     @classmethod
-    def output_names(cls, *_: object) -> tuple[str, ...]:
+    def output_names(
+        cls, topic: Topic[Any], name: str, parameters: Parameters
+    ) -> tuple[str, ...]:
         """Name the axles."""
-        return ("front", "rear")
+        return parameters.axles
 
     @every(0.1)
     def weigh(self) -> None:
-        self.publish(LOAD, Load(20.0))
+        self.publish(LOAD, Load(self.parameters.mass_kg))
 
 
 class Display(Actor):
@@ -54,9 +70,11 @@ class Display(Actor):
 def write_porter_system(directory: Path) -> Path:
     """Write the shipped system with two more nodes."""
     text = (ROOT / "systems" / "osmosis.toml").read_text(encoding="utf-8")
-    for name, actor in (("platform", "Platform"), ("display", "Display")):
+    for name, actor, parameters in (
+            ("platform", "Platform", '{ axles = ["front", "rear"] }'),
+            ("display", "Display", "{}")):
         text += (f'\n[[node]]\nname = "{name}"\nactor = "tests.porter_actors:{actor}"\n'
-                 'kind = "non-control"\n')
+                 f'kind = "non-control"\nparameters = {parameters}\n')
     file = directory / "porter.toml"
     file.write_text(text, encoding="utf-8")
     return file

@@ -14,6 +14,9 @@ from pathlib import Path
 
 import pytest
 
+from rampart.actors.osmosis import topics
+from rampart.manager.spec.specification import parse_specification
+from rampart.systems import SHIPPED
 from tests import ROOT
 
 ROOMS = (
@@ -32,6 +35,9 @@ ROOMS = (
 ROBOTS = ("osmosis",)
 """Parts of a path that make a room one of a robot; the engine may not import such a room."""
 
+CLASS_OF_A_ROBOT = re.compile(rf"[\w.]*\b({'|'.join(ROBOTS)})\b[\w.]*(:\w+)?")
+"""A text that is such a path names a module or class of a robot."""
+
 LARGEST_FILE = 400
 LARGEST_ROOM = 15
 
@@ -39,6 +45,11 @@ STILL_UPWARD: set[tuple[str, str]] = set()
 
 STILL_ROBOTIC = {
     "cli.analyse.campaigning", "sim.campaign.report", "sim.campaign.worst_runs"}
+
+STILL_NAMED = {
+    "cli.operate.inject_verbs", "manager.spec.mobile_robot",
+    "sim.campaign.grouping", "sim.campaign.job", "sim.campaign.report",
+    "sim.campaign.worst_runs"}
 
 STILL_TOO_LONG = {
     "actors.osmosis.messages", "cli.analyse.campaigning", "sim.osmosis.world"}
@@ -111,6 +122,38 @@ def test_no_import_goes_up():
 
 def test_the_engine_imports_no_robot():
     assert {module for module, _ in robotic()} == STILL_ROBOTIC
+
+
+def names_of_the_robot() -> set[str]:
+    """Return names that only a robot has: its nodes, modules, mechanisms, topics, map."""
+    found = {"airport", "obstacles", "runway", "osmosis"}
+    for name in ("osmosis", "paper"):
+        spec = parse_specification((SHIPPED / f"{name}.toml").read_text("utf-8"), name)
+        parts = (spec.nodes, spec.detections, spec.recoveries, spec.mechanisms, spec.events)
+        found |= {one.name for part in parts for one in part}
+    return (found | {topic.key for topic in topics.ROBOT}) - {"simulator", "hmi"}
+
+
+def naming() -> set[str]:
+    """Return the modules of the engine with a text that is a robot's name or class."""
+    robots = names_of_the_robot()
+    found = set()
+    for module, file in MODULES.items():
+        if is_robot(module) or module == "systems":  # which one is the default
+            continue
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        shown = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) \
+                    and id(node) not in shown \
+                    and (node.value in robots or CLASS_OF_A_ROBOT.fullmatch(node.value)):
+                found.add(module)
+    return found
+
+
+def test_the_engine_names_no_robot_in_texts_either():
+    """Docstrings and the examples of a help text may; what decides may not know a name."""
+    assert naming() == STILL_NAMED
 
 
 def test_no_circle_of_imports():

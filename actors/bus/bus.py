@@ -11,7 +11,7 @@ Deliver = Callable[[str, bytes], None]
 """Called on the event loop with the concrete key and the payload."""
 
 PeerChange = Callable[[str, int, bool], None]
-"""Called on the event loop with node, incarnation, and whether it lives."""
+"""Called on the event loop with node, incarnation, and whether it is there."""
 
 
 class BusError(Exception):
@@ -19,7 +19,7 @@ class BusError(Exception):
 
 
 class Bus(Protocol):
-    """Publish and subscribe on keys, and know who lives.
+    """Publish and subscribe on keys, and know who is there.
 
     Attributes:
         bursts: Whether several messages may be delivered one after the other before the event
@@ -29,7 +29,7 @@ class Bus(Protocol):
     bursts: bool
 
     async def open(self) -> None:
-        """Join the bus and announce this node as alive.
+        """Join the bus and announce this node.
 
         Raises:
             BusError: an endpoint is taken or invalid.
@@ -45,7 +45,7 @@ class Bus(Protocol):
         """Have `deliver` called for each message on keys that match."""
 
     def watch(self, node: str, changed: PeerChange) -> None:
-        """Have `changed` called now if the node lives, and whenever it appears or vanishes."""
+        """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
 
     async def close(self) -> None:
         """Leave the bus. Closing twice is harmless."""

@@ -40,7 +40,7 @@ _KEYS = 256
 class Header(msgspec.Struct, frozen=True, gc=False):
     """Who sent a message and when.
 
-    `incarnation` counts the lives of a node; `sequence` the messages of one life; `stamp` is the
+    `incarnation` counts the processes of a node; `sequence` the messages of one; `stamp` is the
     simulated time at which the content was true (for a sensor: when it was measured).
     """
 
@@ -92,8 +92,8 @@ def _decoder(kind: type[Any]) -> Callable[[bytes], Envelope[Any]]:
     return decoder.decode
 
 
-class _Life:
-    """What was heard from a node in its present life.
+class _Heard:
+    """What was heard from the present incarnation of a node.
 
     Attributes:
         incarnation: which.
@@ -130,7 +130,7 @@ class ArrivalGuard:
         self._members = frozenset(members)
         self._crowded = crowded
         self._register = register
-        self._lives: dict[str, _Life] = {}
+        self._heard: dict[str, _Heard] = {}
         self._strangers: deque[str] = deque()
 
     def receiver(
@@ -146,7 +146,7 @@ class ArrivalGuard:
                 now, or comes from a superseded incarnation.
         """
         unpack, kind = _decoders.get(topic.type) or _decoder(topic.type), topic.type.__name__
-        lives, meet, is_command = self._lives, self._meet, topic.qos is Qos.COMMAND
+        heard_of, meet, is_command = self._heard, self._meet, topic.qos is Qos.COMMAND
         now, object_to = self._now, self._object_to
 
         def receive(key: str, payload: bytes) -> None:  # made of every message
@@ -161,24 +161,24 @@ class ArrivalGuard:
             if not message.stamp - now() <= AHEAD_S:  # nor is one that is no number
                 refuse(key, f"stamped {message.stamp - now():.2f} s ahead of now")
                 return
-            life = lives.get(message.source)
-            if life is None or life.incarnation != message.incarnation:
-                objection = object_to(life, message)
+            heard = heard_of.get(message.source)
+            if heard is None or heard.incarnation != message.incarnation:
+                objection = object_to(heard, message)
                 if objection:
                     refuse(key, objection)
                     return
-                life = meet(message.source, message.incarnation)
+                heard = meet(message.source, message.incarnation)
             sequence = message.sequence
             if is_command:
-                recent = life.recent.get(key)
+                recent = heard.recent.get(key)
                 if recent is None:
-                    _make_room(life.recent)
-                    recent = life.recent[key] = deque(maxlen=_REMEMBERED_COMMANDS)
+                    _make_room(heard.recent)
+                    recent = heard.recent[key] = deque(maxlen=_REMEMBERED_COMMANDS)
                 if sequence in recent:
                     return
                 recent.append(sequence)
             else:
-                newest = life.newest
+                newest = heard.newest
                 before = newest.get(key)
                 if before is None:
                     _make_room(newest)
@@ -189,25 +189,25 @@ class ArrivalGuard:
 
         return receive
 
-    def _object_to(self, life: _Life | None, message: Header) -> str:
+    def _object_to(self, heard: _Heard | None, message: Header) -> str:
         """Return why an incarnation is not that of a node's present process; "" if it may be."""
         which = f"incarnation {message.incarnation} of {message.source}"
-        if life is not None and message.incarnation < life.incarnation:
-            return f"{which} was superseded by {life.incarnation}"
+        if heard is not None and message.incarnation < heard.incarnation:
+            return f"{which} was superseded by {heard.incarnation}"
         issued = self._register(message.source)
         if issued is not None and message.incarnation != issued:
             return f"{which}, of which {issued} was issued last"
         return ""
 
-    def _meet(self, source: str, incarnation: int) -> _Life:
-        life = _Life(incarnation)
-        if source not in self._members and source not in self._lives:
+    def _meet(self, source: str, incarnation: int) -> _Heard:
+        heard = _Heard(incarnation)
+        if source not in self._members and source not in self._heard:
             self._strangers.append(source)
             if len(self._strangers) > STRANGERS:
-                self._lives.pop(self._strangers.popleft(), None)
+                self._heard.pop(self._strangers.popleft(), None)
                 self._crowded()
-        self._lives[source] = life
-        return life
+        self._heard[source] = heard
+        return heard
 
 
 def _make_room(by_key: dict[str, Any]) -> None:

@@ -2,7 +2,7 @@
 
 Whatever a node remembers by a name that a message told it has room for so many names and no more,
 and whatever it repeats to others leaves so many times a second. What is over the bound is counted,
-and whoever owns the bound reports the count: nothing disappears unseen.
+and the owner of the bound reports the count: nothing disappears unseen.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ meets a new one looks it up (`Register`). It is kept as the target of a symbolic
 written and read whole or not at all, in a system call or two and with no byte of a disk.
 
 The folder lies in memory where it can: `$XDG_RUNTIME_DIR`, else `/dev/shm`, else the folder for
-temporary files. Whoever ends a run removes it; what is left when all of a run dies at once goes
+temporary files. What ends a run removes it; what is left when all of a run dies at once goes
 when the same user starts the next one.
 """
 

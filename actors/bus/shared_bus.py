@@ -11,7 +11,7 @@ from rampart.actors.bus.topic import Topic
 class SharedBus:
     """Passes everything on to a bus that somebody else opens and closes.
 
-    For an actor that nobody knows to dial: whoever is respawned dials the owner of the session.
+    For an actor that nobody knows to dial: a node that is respawned dials the owner of the session.
 
     Args:
         owner: The bus; opened before this one.

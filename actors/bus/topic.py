@@ -22,7 +22,7 @@ class Qos(Enum):
     """How a topic's messages travel and wait.
 
     `SENSOR`: best sample is the newest; the mailbox keeps one per key, latest wins.
-    `STATE`: like a sensor, and repeated at `rate_hz` even without change, so that whoever joins
+    `STATE`: like a sensor, and repeated at `rate_hz` even without change, so that who joins
     late (a respawned node) knows it within one period.
     `COMMAND`: each message counts; the mailbox queues it, bounded, and reports an overflow.
     """

@@ -29,8 +29,8 @@ from typing import Any
 import zenoh
 
 from rampart.actors.bus.bus import BusError, Deliver, PeerChange
+from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import socket_path
-from rampart.actors.bus.tap import Tap
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import HELLO
 from rampart.actors.bus.unix_peer import peer
@@ -100,7 +100,7 @@ def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
 
 
 def _mark(where: str) -> str:
-    """Return how the Zenoh id of whoever listens at an endpoint begins."""
+    """Return how the Zenoh id of the node that listens at an endpoint begins."""
     return "1" + hashlib.blake2b(where.encode(), digest_size=8).hexdigest()[1:]
 
 
@@ -121,23 +121,23 @@ class ZenohBus:
 
     Args:
         node: name under which this session announces itself; "" announces nothing (a tool).
-        incarnation: life of the node.
+        incarnation: of the node.
         listen: endpoint to listen on, or None.
         dial: endpoints of the partners.
-        tap: for a recorder of the run; None for none.
+        recorder: connection to a recorder of the run; None for none.
     """
 
     bursts = True
 
     def __init__(
         self, node: str, incarnation: int, listen: str | None, dial: Iterable[str],
-        tap: Tap | None = None,
+        recorder: RecorderConnection | None = None,
     ) -> None:
         self._node = node
         self._incarnation = incarnation
         self._listen = listen
         self._dial = tuple(dial)
-        self._tap = tap
+        self._recorder = recorder
         self._session: zenoh.Session | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._arrived: deque[Callable[[], None]] = deque()
@@ -146,7 +146,7 @@ class ZenohBus:
         self._held: list[Any] = []
 
     async def open(self) -> None:
-        """Open the session, link it with the partners that are there, and declare this node alive.
+        """Open the session, link it with the partners that are there, and announce this node.
 
         Raises:
             BusError: the endpoint is in use or invalid.
@@ -193,8 +193,8 @@ class ZenohBus:
                 else zenoh.CongestionControl.DROP,
             )
         publisher.put(payload)
-        if self._tap is not None:
-            self._tap.take(key, payload)
+        if self._recorder is not None:
+            self._recorder.take(key, payload)
 
     def has_readers(self, key: str) -> bool:  # noqa: ARG002
         """Not asked of the network: somebody may be listening."""
@@ -210,7 +210,7 @@ class ZenohBus:
         self._held.append(self._require().declare_subscriber(key_expression, arrived))
 
     def watch(self, node: str, changed: PeerChange) -> None:
-        """Have `changed` called now if the node lives, and whenever it appears or vanishes."""
+        """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
 
         def arrived(sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
             incarnation = str(sample.key_expr).rsplit("/", 1)[1]
@@ -227,8 +227,8 @@ class ZenohBus:
         self._held.clear()
         self._publishers.clear()
         self._arrived.clear()
-        if self._tap is not None:
-            self._tap.close()
+        if self._recorder is not None:
+            self._recorder.close()
         if session is not None:
             await asyncio.to_thread(session.close)
 

@@ -24,7 +24,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DetectionReport, DetectionState
 from rampart.actors.runtime.actor import Actor, Context, every
-from rampart.actors.runtime.parameters import amount
+from rampart.manager.spec.tables import NonNegative
 
 TRANSITIONS = {
     DetectionState.IDLE: frozenset({DetectionState.ACTIVE}),
@@ -78,6 +78,17 @@ class Monitor(Protocol):
 M = TypeVar("M", bound=Monitor)
 
 
+class Waiting(Actor.Parameters, frozen=True):
+    """Parameters of a module that waits for its first input.
+
+    Attributes:
+        startup_grace_s: how long that may take while the system starts; None: the spec's. A
+            respawned module joins a running system: for it the timeout itself is the grace.
+    """
+
+    startup_grace_s: NonNegative | None = None
+
+
 class DetectionModule(Actor):
     """Base of DM1 to DM7.
 
@@ -105,7 +116,8 @@ class DetectionModule(Actor):
         if not self.first_life:
             return timeout_s
         startup_s = self.context.run.system.timing.startup_grace_s
-        return max(timeout_s, amount(self.parameters, "startup_grace_s", startup_s))
+        said_s = getattr(self.parameters, "startup_grace_s", None)
+        return max(timeout_s, startup_s if said_s is None else said_s)
 
     # -- the state machine ----------------------------------------------------------------------
 

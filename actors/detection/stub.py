@@ -6,6 +6,8 @@ from rampart.actors.detection.module import DetectionModule
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import Header, on
+from rampart.actors.runtime.parameters import NodeNames
+from rampart.manager.spec.tables import Positive
 
 
 class StubDetection(DetectionModule):
@@ -13,6 +15,19 @@ class StubDetection(DetectionModule):
 
     What it was told dies with it: in a new life it is idle from the start.
     """
+
+    class Parameters(DetectionModule.Parameters, frozen=True):
+        """For the analyses alone: it stands for a module that is not written yet.
+
+        Attributes:
+            watch: names of the nodes that it is to watch.
+            timeout_s: within how long it is to detect, s.
+            margin_m: distance at which it is to warn.
+        """
+
+        watch: NodeNames = ()
+        timeout_s: Positive | None = None
+        margin_m: Positive | None = None
 
     def on_start(self) -> None:
         """In a new life, say at once that nobody has said anything yet."""

@@ -2,47 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from rampart.actors.bus import messages as m
 from rampart.actors.bus import topics
 from rampart.actors.bus.topic import Topic
-from rampart.actors.detection.module import DetectionModule
+from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.detection.watchdog_core import WatchdogCore
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import amount
+from rampart.actors.runtime.parameters import HeartbeatTimeout, NodeNames
 
 
 class Watchdog(DetectionModule):
-    """Active while one of the nodes it watches is dead, stopped or wedged.
+    """Active while one of the nodes it watches is dead, stopped or wedged."""
 
-    Parameters:
-        watch: names of the nodes.
-        timeout_s: a node without a heartbeat for so long has failed, s.
+    class Parameters(Waiting, frozen=True, kw_only=True):
+        """Whom it watches.
 
-    The first heartbeats of a starting system may take the spec's `startup_grace_s`. A respawned
-    module joins a running system: for it the timeout itself is the grace.
-    """
+        Attributes:
+            watch: names of the nodes.
+            timeout_s: a node without a heartbeat for so long has failed, s.
+        """
+
+        watch: NodeNames
+        timeout_s: HeartbeatTimeout = 0.5
+
+    parameters: Parameters
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        timeout_s = amount(self.parameters, "timeout_s", 0.5)
+        timeout_s = self.parameters.timeout_s
         self.monitor = self.judged_by(WatchdogCore(
-            watched_nodes(self.parameters), timeout_s, self.clock.now(),
+            self.parameters.watch, timeout_s, self.clock.now(),
             self.grace_s(timeout_s), known=self.first_life))
 
     @classmethod
     def names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+        cls, topic: Topic[Any], name: str, parameters: Parameters  # noqa: ARG003
     ) -> tuple[str, ...] | None:
         """Hear the heartbeats of the watched nodes."""
-        return watched_nodes(parameters)
+        return parameters.watch
 
     @classmethod
-    def watches(cls, name: str, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003
+    def watches(cls, name: str, parameters: Parameters) -> tuple[str, ...]:  # noqa: ARG003
         """Watch the life of the watched nodes."""
-        return watched_nodes(parameters)
+        return parameters.watch
 
     def on_peer(self, node: str, incarnation: int, alive: bool) -> None:
         """See a process come or go: the fast path to a crash."""
@@ -55,15 +59,3 @@ class Watchdog(DetectionModule):
         self.monitor.beat(header.source, header.incarnation, header.stamp,
                           self.clock.now())
         self.follow()
-
-
-def watched_nodes(parameters: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the parameter `watch`.
-
-    Raises:
-        ValueError: it is no list of names.
-    """
-    nodes = parameters.get("watch", ())
-    if isinstance(nodes, str) or not all(isinstance(n, str) and n for n in nodes) or not nodes:
-        raise ValueError(f"parameters.watch = {nodes!r}: must be a list of node names")
-    return tuple(nodes)

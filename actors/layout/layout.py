@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.zenoh_bus import endpoint
-from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.layout.wiring import Member, import_class, load_class, partners
+from rampart.actors.layout.wiring import Member, import_class, load_class, load_member, partners
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan, load_document, tailor
-from rampart.actors.runtime.actor import Actor
 from rampart.manager.spec.specification import (
     Kind,
     NodeSpec,
@@ -45,41 +41,6 @@ class Unit(msgspec.Struct, frozen=True):
         return self.nodes[0].respawn
 
 
-def actor_parameters(plan: RunPlan, spec: SystemSpec, node: NodeSpec,
-                     application: Application) -> dict[str, Any]:
-    """Return a node's parameters: what follows from plan and spec, then what the spec says.
-
-    A recovery module that respawns gets the nodes that name it; the world gets the run's seed, the
-    dead man of the robot's base, and what the application tells it.
-    """
-    derived: dict[str, Any] = {}
-    if node.kind is Kind.RECOVERY:
-        own = tuple(n.name for n in spec.nodes if n.respawn == node.name)
-        derived = {"nodes": own} if own else {}
-    elif node.kind is Kind.WORLD:
-        derived = {"seed": plan.seed, **application.world_parameters(),
-                   "dead_man": spec.layers.dead_man,
-                   "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
-    return {**derived, **node.parameters}
-
-
-REPORTS_ON: Mapping[Kind, Topic[Any]] = {
-    Kind.DETECTION: topics.DETECTION, Kind.RECOVERY: topics.RECOVERY}
-"""What modules of the tables `[[detection]]` and `[[recovery]]` publish."""
-
-
-def _class_of(plan: RunPlan, spec: SystemSpec, node: NodeSpec) -> type[Actor]:
-    try:
-        return load_class(node.actor, REPORTS_ON.get(node.kind))
-    except ValueError as error:
-        names = {"node": [n.name for n in spec.nodes],
-                 "detection": [d.name for d in spec.detections],
-                 "recovery": [r.name for r in spec.recoveries]}
-        path = next(f"$.{table}[{among.index(node.name)}]" for table, among in names.items()
-                    if node.name in among)
-        raise ValueError(f"{plan.system_file}: {path}.{error}") from None
-
-
 class Layout:
     """Everything derived from plan and spec: units, endpoints, partners.
 
@@ -89,8 +50,8 @@ class Layout:
         application: of the run; without one, what it tells the world is missing.
 
     Raises:
-        ValueError: an actor class named in the spec does not exist, cannot be imported, or belongs
-            into another table.
+        ValueError: an actor class named in the spec does not exist, cannot be imported, belongs
+            into another table, or does not take its parameters.
     """
 
     def __init__(self, plan: RunPlan, spec: SystemSpec,
@@ -101,15 +62,17 @@ class Layout:
             name: Unit(name, nodes) for name, nodes in spec.processes().items()}
         self.unit_of: dict[str, str] = {
             node.name: unit.name for unit in self.units.values() for node in unit.nodes}
-        known = application or Application()
-        own = [
-            Member(SUPERVISOR, load_class(SUPERVISOR_CLASS), {"nodes": tuple(self.unit_of)}),
-            Member(OBSERVER, load_class(application_class(spec).observer), {}),
-        ]
-        self.members: dict[str, Member] = {
-            m.name: m for m in (*own, *(
-                Member(n.name, _class_of(plan, spec, n), actor_parameters(plan, spec, n, known))
-                for n in spec.actors()))}
+        supervisor = load_class(SUPERVISOR_CLASS)
+        observer = load_class(application_class(spec).observer)
+        heard = msgspec.convert({"nodes": tuple(self.unit_of)}, supervisor.Parameters)
+        own = [Member(SUPERVISOR, supervisor, heard),
+               Member(OBSERVER, observer, observer.Parameters())]
+        world = {"seed": plan.seed, **(application or Application()).world_parameters(),
+                 "dead_man": spec.layers.dead_man,
+                 "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
+        self.members: dict[str, Member] = {m.name: m for m in (*own, *(
+            load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
+            for n in spec.actors()))}
         self._partners = partners(self.members.values())
 
     def listen(self, node: str) -> str:

@@ -1,7 +1,7 @@
 """Who talks with whom, computed from what the actor classes declare.
 
-Two nodes are partners if one publishes a key that the other hears, or one watches the other's
-life. A node dials its partners only, so a respawn costs a handful of connections, not one per
+Two nodes are partners if one publishes a key that the other hears, or one watches the
+other. A node dials its partners only, so a respawn costs a handful of connections, not one per
 process of the system.
 """
 
@@ -12,14 +12,25 @@ import traceback
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
+
+import msgspec
 
 import rampart
 from rampart.actors.bus.topic import Topic
+from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
+from rampart.actors.runtime.parameters import read_parameters
 from rampart.files import working_folder
+from rampart.manager.spec.checks import modules
+from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
 T = TypeVar("T")
+
+REPORTS_ON: Mapping[Kind, Topic[Any]] = {
+    Kind.DETECTION: topics.DETECTION, Kind.RECOVERY: topics.RECOVERY}
+"""What modules of the tables `[[detection]]` and `[[recovery]]` publish."""
 
 _ROOMS_OF_0_6 = ("actors", "manager", "sim")
 
@@ -30,7 +41,7 @@ class Member:
 
     name: str
     actor: type[Actor]
-    parameters: Mapping[str, Any]
+    parameters: Actor.Parameters
 
 
 def published(member: Member) -> dict[str, tuple[str, ...] | None]:
@@ -81,6 +92,35 @@ def topics_of(actor: type[Actor]) -> tuple[tuple[Topic[Any], ...], tuple[Topic[A
         tuple(t for t in actor.inputs() if t not in BASE_INPUTS),
         tuple(actor.outputs),
     )
+
+
+def load_member(node: NodeSpec, spec: SystemSpec, file: str,
+                derived: Mapping[str, Any] = MappingProxyType({})) -> Member:
+    """Load the class of an actor, and read its parameters as that declares them.
+
+    Args:
+        node: what the spec says of it.
+        spec: the system; to a module that respawns it says which nodes.
+        file: name of the spec, for messages.
+        derived: parameters that it is given besides, if it takes them.
+
+    Raises:
+        ValueError: there is no such class, or it does not take a parameter; the message is one
+            line and names file, path and value.
+    """
+    path = next(path for path, name, *_ in modules(spec) if name == node.name)
+    own = tuple(n.name for n in spec.nodes if n.respawn == node.name)
+    derived = {"nodes": own} if own else derived
+    try:
+        actor = load_class(node.actor, REPORTS_ON.get(node.kind))
+        takes = {field.name for field in msgspec.structs.fields(actor.Parameters)}
+    except ValueError as error:
+        raise ValueError(f"{file}: {path}.{error}") from None
+    except (TypeError, NameError) as error:
+        raise ValueError(f"{file}: {path}.actor = {node.actor!r}: Parameters: {error}") from None
+    given = {name: derived[name] for name in takes & derived.keys()} | node.parameters
+    return Member(node.name, actor, read_parameters(
+        actor.Parameters, given, file, f"{path}.parameters", spec))
 
 
 def load_class(path: str, reports_on: Topic[Any] | None = None) -> type[Actor]:

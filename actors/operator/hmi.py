@@ -59,7 +59,7 @@ class Hmi(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         run, plan = context.run, context.run.plan
-        self._port: int = self.parameters.get("port", plan.hmi_port)
+        self._port: int = plan.hmi_port
         self._state = self._make_state()
         self._operating = self._make_operating()
         self._camera = self._make_camera()

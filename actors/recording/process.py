@@ -1,7 +1,7 @@
 """The recorder as a process of its own: `python -m rampart.actors.recording.process ORDER`.
 
-ORDER is a JSON object (`Order`). It says "ready" on stdout when taps can find it, or "error: …" and
-ends; on stderr it says what came of it.
+ORDER is a JSON object (`Order`). It says "ready" on stdout when nodes can find it, or "error: …"
+and ends; on stderr it says what came of it.
 """
 
 from __future__ import annotations

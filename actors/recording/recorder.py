@@ -1,4 +1,4 @@
-"""The recorder: takes what the taps hand over, and writes it down.
+"""The recorder: takes what the nodes hand over, and writes it down.
 
 It is a process of its own, and neither a node nor on the bus: whatever becomes of it, nobody waits
 for it, and the robot drives on. It sleeps most of the time: some twenty times a second it empties
@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable
 from operator import itemgetter
 from pathlib import Path
 
-from rampart.actors.bus import tap
+from rampart.actors.bus import recorder_connection
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.recording.bag_writer import BagError, BagWriter, open_target
 from rampart.actors.recording.run_documents import Documents, collect
@@ -70,21 +70,21 @@ class Recorder:
         self._from_start = launcher is not None
         self._listener: socket.socket | None = None
         self._sockets = selectors.DefaultSelector()
-        self._buffer = bytearray(tap.MAX_FRAME_BYTES)
+        self._buffer = bytearray(recorder_connection.MAX_FRAME_BYTES)
         self._info: RunInfo | None = None
         self._waiting: list[Frame] = []
         self._next_ask_s = 0.0
         self._next_flush_s = 0.0
 
     def open(self) -> None:
-        """Take the place where taps look for a recorder.
+        """Take the place where nodes look for a recorder.
 
         Raises:
             BagError: the run is being recorded already.
         """
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
-            listener.bind(tap.address(self._port))
+            listener.bind(recorder_connection.address(self._port))
         except OSError:
             listener.close()
             raise BagError(f"the run on port {self._port} is being recorded already") from None
@@ -222,8 +222,9 @@ class Recorder:
             connection: socket.socket = key.fileobj  # type: ignore[assignment]
             try:
                 while (size := connection.recv_into(self._buffer)) > 0:
-                    with contextlib.suppress(ValueError):  # not from a tap
-                        frames.append(tap.parse_frame(memoryview(self._buffer)[:size]))
+                    with contextlib.suppress(ValueError):  # not a node's
+                        frames.append(recorder_connection.parse_frame(
+                            memoryview(self._buffer)[:size]))
             except BlockingIOError:
                 continue
             except OSError:

@@ -16,7 +16,6 @@ nothing between a decision and its effect waits for a timer.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from rampart.actors.bus.bounds import clip
@@ -88,7 +87,7 @@ class RecoveryModule(Actor):
 
     @classmethod
     def names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+        cls, topic: Topic[Any], name: str, parameters: Any  # noqa: ARG003
     ) -> tuple[str, ...] | None:
         """Hear the commands to itself."""
         return (name,) if topic is topics.RECOVERY_COMMAND else None

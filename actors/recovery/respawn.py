@@ -6,7 +6,6 @@ Both do the same; what differs is in the nodes: a control node comes back from i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
@@ -17,37 +16,46 @@ from rampart.actors.ftm.messages import ProcessEvent, RecoveryCommand, RespawnRe
 from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.recovery.respawn_core import RespawnCore
 from rampart.actors.runtime.actor import Context, Header, on
+from rampart.actors.runtime.parameters import NodeNames
 
 _REQUESTS_PER_LIFE = 1_000_000
 
 
 class Respawn(RecoveryModule):
-    """Has the supervisor respawn the nodes that a command names, and waits until they are heard.
+    """Has the supervisor respawn the nodes that a command names, and waits until they are heard."""
 
-    Parameters:
-        nodes: names of the nodes that it may respawn.
-    """
+    class Parameters(RecoveryModule.Parameters, frozen=True):
+        """What it is for.
+
+        Attributes:
+            nodes: names of the nodes that it may respawn; those whose `respawn` names it, if left
+                out.
+        """
+
+        nodes: NodeNames
+
+    parameters: Parameters
 
     outputs = (*RecoveryModule.outputs, topics.RESPAWN)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._core = RespawnCore(own_nodes(self.parameters),
+        self._core = RespawnCore(self.parameters.nodes,
                                  context.incarnation * _REQUESTS_PER_LIFE, self.clock.now())
 
     @classmethod
     def names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]
+        cls, topic: Topic[Any], name: str, parameters: Parameters
     ) -> tuple[str, ...] | None:
         """Hear the heartbeats of its nodes."""
         if topic is bus_topics.HEARTBEAT:
-            return own_nodes(parameters)
+            return parameters.nodes
         return super().names(topic, name, parameters)
 
     @classmethod
-    def watches(cls, name: str, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003
+    def watches(cls, name: str, parameters: Parameters) -> tuple[str, ...]:  # noqa: ARG003
         """Watch the life of its nodes, to know which incarnation has failed."""
-        return own_nodes(parameters)
+        return parameters.nodes
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Ask for the nodes that the command names."""
@@ -102,15 +110,3 @@ class Respawn(RecoveryModule):
         elif not self._core.pending:
             back = self._core.back
             self.succeed(f"{', '.join(back)} back" if back else "no node was named")
-
-
-def own_nodes(parameters: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the parameter `nodes`.
-
-    Raises:
-        ValueError: it is no list of names.
-    """
-    nodes = parameters.get("nodes", ())
-    if isinstance(nodes, str) or not nodes or not all(isinstance(n, str) and n for n in nodes):
-        raise ValueError(f"parameters.nodes = {nodes!r}: must be a list of node names")
-    return tuple(nodes)

@@ -30,6 +30,7 @@ from rampart.actors.runtime.context import Context
 from rampart.actors.runtime.declaration import BASE_INPUTS, BASE_OUTPUTS, Declared, every, on
 from rampart.actors.runtime.injected_faults import InjectedFaults
 from rampart.actors.runtime.mailbox import IDLE, Dispatcher
+from rampart.actors.runtime.parameters import read_parameters
 from rampart.actors.runtime.timer import Timer, Timers
 
 __all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every", "on"]
@@ -52,7 +53,8 @@ class Actor(Declared):
         self.name = context.name
         self._incarnation = context.incarnation
         self.clock = context.clock
-        self.parameters = context.parameters
+        self.parameters = read_parameters(
+            self.Parameters, context.parameters, context.name, "parameters")
         self._bus = context.bus
         self._guard = ArrivalGuard(
             context.clock.now, context.members, self._crowded, context.register)

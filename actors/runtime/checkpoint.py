@@ -24,9 +24,9 @@ S = TypeVar("S", bound=msgspec.Struct)
 GENERATIONS = 4
 """So many generations are kept of each node."""
 
-FAILED_LIVES = 3
-"""A state with which so many lives in a row failed, each soon after its start, is not tried again:
-the node starts idle rather than in a loop of crashes."""
+FAILED_IN_A_ROW = 3
+"""A state with which so many processes in a row failed, each soon after its start, is tried no
+more: the node starts idle rather than in a loop of crashes."""
 
 SOON_S = 10.0
 """A failure within so many simulated seconds of the start is put down to the state loaded."""
@@ -75,7 +75,7 @@ class Loaded:
     Attributes:
         records: sound ones, newest first.
         problems: what was found damaged, one line each.
-        failures: how many lives in a row failed soon after they had loaded.
+        failures: how many processes in a row failed soon after they had loaded.
     """
 
     records: tuple[Record, ...] = ()
@@ -105,7 +105,7 @@ class CheckpointStore(Protocol):
         """
 
     def note_failures(self, failures: int) -> None:
-        """Keep how many lives in a row have failed.
+        """Keep how many processes in a row have failed.
 
         Raises:
             CheckpointError: it could not be kept.
@@ -256,7 +256,7 @@ class Keeper:
         store: where.
         report: takes one line for the operator.
         now: simulated time.
-        expected: a life came before this one, so a state should be there.
+        expected: a process came before this one, so a state should be there.
     """
 
     def __init__(self, store: CheckpointStore, report: Callable[[str], None],
@@ -291,8 +291,8 @@ class Keeper:
     def _find(self, form: StateFormat[S]) -> S | None:
         loaded = self._load()
         self._failures = loaded.failures
-        if loaded.failures >= FAILED_LIVES:
-            self._report(f"{loaded.failures} lives in a row have failed with the state kept; "
+        if loaded.failures >= FAILED_IN_A_ROW:
+            self._report(f"{loaded.failures} processes in a row have failed with the state kept; "
                          "starting without it")
             self._note(0)
             return None
@@ -338,7 +338,7 @@ class Keeper:
             self._report("checkpoints are kept again")
 
     def failed(self) -> None:
-        """Note that this life ends by a failure of its own."""
+        """Note that this process ends by a failure of its own."""
         if not self._used or self._superseded:
             return
         soon = self._now() - self._began_s <= SOON_S

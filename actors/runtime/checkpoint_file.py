@@ -76,7 +76,7 @@ class Unsound(Exception):  # noqa: N818 a finding
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """Whose states these are: run, claiming incarnation, how many lives in a row failed."""
+    """Whose states these are: run, claiming incarnation, how many processes in a row failed."""
 
     run: str
     incarnation: int

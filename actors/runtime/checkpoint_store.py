@@ -8,7 +8,7 @@ instruction, leaves a log whose tail the next one ignores.
 has it, and no death of the process can take it back. That the disk has it as well is seen to by a
 thread, which syncs the log every `sync_period_s`: loss of power costs at most that and one sync.
 So the loop of a node never waits for the disk. For the same reason the log is copied into the
-database by that thread and not by whoever commits (`wal_autocheckpoint` 0): while commits go on,
+database by that thread, not by the one that commits (`wal_autocheckpoint` 0): while commits go on,
 until nothing is left. Then the log is cut to nothing, which needs the lock but no sync, and the
 thread itself writes the first entry of the new one, because SQLite would have a node's save sync
 it. (It is synced without the lock. A loss of power before that finds the old log or none: a file
@@ -19,10 +19,10 @@ once in `log_limit_bytes`, waits for it: 15 to 25 ms were measured.
 damaged, the file is set aside and begun anew with what is sound of it: a file is either whole or
 replaced, and there is no kind of damage that is dealt with in a way of its own.
 
-*Claimed.* Whoever loads claims the file for its incarnation, and every save asks, in the same
-transaction, whether the claim still stands: an older process that lives on is refused. What can be
-read is used even if the claim fails, for a lock or a full disk; then the first save claims, and
-its generation follows all that the older process has written by then.
+*Claimed.* Who loads claims the file for its incarnation, and every save asks, in the same
+transaction, whether the claim still stands: an older process is refused, should it still run. What
+can be read is used even if the claim fails, for a lock or a full disk; then the first save claims,
+and its generation follows all that the older process has written by then.
 
 Assumed: the directory is on a local file system (SQLite's locks and shared log index do not work
 over most network ones), and the disk keeps what it has acknowledged to have synced.
@@ -65,7 +65,7 @@ class SqliteCheckpoints:
     Args:
         file: the node's; it and its directory are made when they are needed.
         run: name of the run; states of another run are not this one's, and are forgotten.
-        incarnation: which life of the node this is.
+        incarnation: which process of the node this is.
         sync_period_s: seconds between syncs; what a loss of power can cost. 0 has no thread.
         log_limit_bytes: size of the log at which it is copied into the database and cut.
     """
@@ -114,7 +114,7 @@ class SqliteCheckpoints:
             self._thread.start()
 
     def note_failures(self, failures: int) -> None:
-        """Keep how many lives in a row have failed."""
+        """Keep how many processes in a row have failed."""
         try:
             owner = disk.Owner(self._run, self._incarnation, failures)
             self._ready().execute(

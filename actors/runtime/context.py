@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
+
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.run_folder import Register
 from rampart.actors.run.run_context import RunContext
@@ -23,7 +25,7 @@ class Context:
         incarnation: which process of the node this is, counted from 1.
         clock: simulated time.
         bus: this actor's access to the bus, not yet open.
-        parameters: the node's parameters from the system spec.
+        parameters: the node's parameters, as the system spec gives them or read already.
         run: what all actors of the run have in common, loaded once.
         pid: number of the process that it runs in.
         checkpoints: where this node's state is kept.
@@ -37,7 +39,7 @@ class Context:
     incarnation: int
     clock: Clock
     bus: Bus
-    parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameters: Mapping[str, Any] | msgspec.Struct = field(default_factory=dict)
     run: RunContext = field(default_factory=RunContext)
     pid: int = field(default_factory=os.getpid)
     checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)

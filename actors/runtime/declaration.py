@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
+
+import msgspec
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
@@ -45,8 +47,14 @@ class Declared:
 
     Class attributes:
         outputs: topics it publishes; publishing another one raises.
+        Parameters: what the system spec may say of it, by field: type, range and default. A class
+            that takes more derives its own from that of its base class.
     """
 
+    class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+        """None, unless a subclass declares some."""
+
+    parameters: Parameters
     outputs: ClassVar[tuple[Topic[Any], ...]] = ()
     _handlers: ClassVar[tuple[tuple[Topic[Any], str], ...]] = ()
     _periodic: ClassVar[tuple[tuple[float, str], ...]] = ()
@@ -66,20 +74,26 @@ class Declared:
 
     @classmethod
     def names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+        cls, topic: Topic[Any], name: str, parameters: Any  # noqa: ARG003
     ) -> tuple[str, ...] | None:
-        """Which members of an input family the node `name` hears; None for all."""
+        """Which members of an input family a node hears, None for all.
+
+        Args:
+            topic: one of its inputs.
+            name: of the node.
+            parameters: of the node, as its class's `Parameters`.
+        """
         return None
 
     @classmethod
     def output_names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+        cls, topic: Topic[Any], name: str, parameters: Any  # noqa: ARG003
     ) -> tuple[str, ...] | None:
-        """Which members of an output family the node `name` publishes; None for any."""
+        """Which members of an output family a node publishes, likewise; None for any."""
         return (name,)
 
     @classmethod
-    def watches(cls, name: str, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003
+    def watches(cls, name: str, parameters: Any) -> tuple[str, ...]:  # noqa: ARG003
         """Nodes of which `on_peer` reports that they appear and vanish."""
         return ()
 
@@ -89,7 +103,7 @@ class Declared:
         return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
 
     @classmethod
-    def published(cls, key: str, name: str, parameters: Mapping[str, Any]) -> Topic[Any] | None:
+    def published(cls, key: str, name: str, parameters: Any) -> Topic[Any] | None:
         """Return the topic of a key below `rampart/`, if the node `name` publishes it."""
         for topic in (*cls.outputs, *BASE_OUTPUTS):
             head, family, tail = topic.key.partition("{name}")

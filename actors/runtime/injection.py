@@ -80,7 +80,7 @@ class FaultGate:
 
     Attributes:
         in_force: injections by id; while empty, nothing needs to pass the gate.
-        last: body and stamp last sent per key, by whoever sends, so that a freeze has something
+        last: body and stamp last sent per key, by any sender, so that a freeze has something
             to repeat.
     """
 

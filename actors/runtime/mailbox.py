@@ -144,6 +144,7 @@ class Dispatcher:
         self.mailbox = Mailbox(on_overflow=on_overflow, on_item=self.wake)
         self.stance = AWAKE
         self.progress = 0
+        self._waiting = self.mailbox.waiting
         self.stopping = False
         self._bursts = bursts
         self._held = False
@@ -200,31 +201,39 @@ class Dispatcher:
     def work(self, item: Callable[[], None] | None = None) -> None:
         """Handle an item, which may be given while `IDLE` only, and then all that wait."""
         self.stance = AWAKE
-        mailbox, ended = self.mailbox, self._ended
-        waiting = mailbox.waiting
-        if ended is None or ended.done():
-            return
+        waiting = self._waiting
         if item is None:
-            if self._held:
-                self.stance = RESTING
+            if self._ended is None or self._ended.done():
                 return
-            if waiting:
-                item = mailbox.take()
+            if self._held or not waiting:
+                self.stance = RESTING if self._held else self._at_rest
+                return
+            item = self.mailbox.take()
         try:
-            while item is not None:
+            while True:
                 item()
                 self.progress += 1
                 if self._pace_s:
-                    ended.get_loop().call_later(self._pace_s, self.work)
+                    asyncio.get_running_loop().call_later(self._pace_s, self.work)
                     return  # still awake: whatever arrives meanwhile waits
-                item = mailbox.take() if waiting and not self.stopping else None
+                if not waiting or self.stopping:
+                    break
+                item = self.mailbox.take()
         except Exception as error:
-            ended.set_exception(error)
+            self._end(error)
             return
         if self.stopping:
-            ended.set_result(None)
+            self._end(None)
         else:
             self.stance = self._at_rest
+
+    def _end(self, error: Exception | None) -> None:
+        if self._ended is None or self._ended.done():
+            return
+        if error is None:
+            self._ended.set_result(None)
+        else:
+            self._ended.set_exception(error)
 
     def _stop(self) -> None:
         self.stopping = True

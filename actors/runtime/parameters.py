@@ -1,45 +1,126 @@
-"""A node's parameters from the system spec, one reader per kind of value."""
+"""A node's parameters from the system spec, read as its actor's class declares them.
+
+The class has a nested `class Parameters`, see `rampart.actors.runtime.actor.Actor`. What a type
+alone cannot say of a value is marked on it: that it names nodes of the system, or how often that
+comes for which a timeout waits.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from msgspec import inspect
+
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.tables import Name, SpecificationError
+from rampart.manager.spec.timeouts import find_false_alarm
+
+P = TypeVar("P", bound=msgspec.Struct)
+
+NodeName = Annotated[Name, msgspec.Meta(extra={"names": "node"})]
+NodeNames = Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, extra={"names": "node"})]
+RecoveryNames = Annotated[tuple[Name, ...], msgspec.Meta(extra={"names": "recovery module"})]
+
+ControlTimeout = Annotated[float, msgspec.Meta(gt=0, extra={"period": "control_period_s"})]
+"""How long, s, to wait for what comes as often as commands, poses and scans."""
+HeartbeatTimeout = Annotated[float, msgspec.Meta(gt=0, extra={"period": "heartbeat_period_s"})]
+"""How long, s, to wait for a heartbeat."""
+
+_WORDS: dict[type[inspect.Type], str] = {
+    inspect.FloatType: "a number", inspect.IntType: "a whole number", inspect.StrType: "a text",
+    inspect.BoolType: "true or false", inspect.VarTupleType: "a list"}
+_BOUNDS = {"ge": ", {:g} or more", "gt": " > {:g}", "le": ", at most {:g}", "lt": ", below {:g}"}
 
 
-def amount(parameters: Mapping[str, Any], name: str, default: float) -> float:
-    """Return a parameter that is a number, 0 or more.
+def read_parameters(kind: type[P], given: Mapping[str, Any] | msgspec.Struct, file: str, path: str,
+                    spec: SystemSpec | None = None) -> P:
+    """Return parameters as the type that declares them; those that are of it already, as they are.
+
+    Args:
+        kind: Nested class of the actor.
+        given: As the spec gives them, names of times replaced by the times.
+        file: Name of the spec, for messages.
+        path: Where in it they are.
+        spec: The system, if what they say of it is to be checked.
 
     Raises:
-        ValueError: it is none; the message names parameter and value.
+        SpecificationError: One is unknown, missing, or has a value that makes no sense.
     """
-    value = parameters.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) \
-            or not (math.isfinite(value) and value >= 0):
-        raise ValueError(f"parameters.{name} = {value!r}: must be a number, 0 or more")
-    return float(value)
+    if not isinstance(given, Mapping):
+        return msgspec.convert(given, kind)
+    try:
+        read = msgspec.convert(given, kind)
+    except msgspec.ValidationError as error:
+        name, problem = _explain(kind, given, str(error))
+    else:
+        misfit = next(_misfits(kind, given, spec), None) if spec else None
+        if misfit is None:
+            return read
+        name, problem = misfit
+    value = [given[name]] if name in given else []
+    raise SpecificationError(file, f"{path}.{name}", problem, *value)
 
 
-def switch(parameters: Mapping[str, Any], name: str) -> bool:
-    """Return a parameter that is true or false; false if it is left out.
+def _explain(kind: type[msgspec.Struct], given: Mapping[str, Any], error: str) -> tuple[str, str]:
+    """Return which parameter msgspec refuses, and what would be right."""
+    known = kind.__struct_fields__
+    for name in given:
+        if name not in known:
+            listed = ", ".join(known) or "none, its class declares no Parameters"
+            return name, f"unknown parameter; known: {listed}"
+    for field in msgspec.structs.fields(kind):
+        if field.name in given:
+            try:
+                msgspec.convert(given[field.name], field.type)
+            except msgspec.ValidationError as wrong:
+                words = _expected(inspect.type_info(field.type))
+                return field.name, f"expected {words}" if words else str(wrong).replace("`", "")
+        elif field.required:
+            return field.name, "missing; without it the node does not start"
+    name, _, problem = error.partition(": ")  # of its `__post_init__`
+    return name, problem
 
-    Raises:
-        ValueError: it is neither; the message names parameter and value.
-    """
-    value = parameters.get(name, False)
-    if not isinstance(value, bool):
-        raise ValueError(f"parameters.{name} = {value!r}: must be true or false")
-    return value
+
+@cache
+def _marks(kind: type[msgspec.Struct]) -> dict[str, dict[str, str]]:
+    """Return what is marked on the fields, by their names."""
+    infos = {f.name: inspect.type_info(f.type) for f in msgspec.structs.fields(kind)}
+    return {name: info.extra for name, info in infos.items()
+            if isinstance(info, inspect.Metadata) and info.extra}
 
 
-def names(parameters: Mapping[str, Any], name: str) -> tuple[str, ...]:
-    """Return a parameter that is a list of names; empty if it is left out.
+def _misfits(kind: type[msgspec.Struct], given: Mapping[str, Any],
+             spec: SystemSpec) -> Iterator[tuple[str, str]]:
+    """Find names that the system has not, and timeouts that it trips when all is well."""
+    for field, marks in _marks(kind).items():
+        if field not in given:
+            continue
+        if what := marks.get("names"):
+            known = [row.name for row in (spec.nodes if what == "node" else spec.recoveries)]
+            for name in [given[field]] if isinstance(given[field], str) else given[field]:
+                if name not in known:
+                    yield field, f"unknown {what} {name!r}; known: {', '.join(known) or 'none'}"
+        if "period" in marks and (
+                problem := find_false_alarm(spec.timing, given[field], marks["period"])):
+            yield field, problem
 
-    Raises:
-        ValueError: it is no list of names; the message names parameter and value.
-    """
-    found = parameters.get(name, ())
-    if isinstance(found, str) or not isinstance(found, list | tuple) \
-            or not all(isinstance(n, str) and n for n in found):
-        raise ValueError(f"parameters.{name} = {found!r}: must be a list of names")
-    return tuple(found)
+
+def _expected(kind: inspect.Type) -> str:
+    """Say which values a type has, "" if there are no simple words for it."""
+    if isinstance(kind, inspect.Metadata):
+        if what := (kind.extra or {}).get("names"):
+            return (f"the name of a {what}" if isinstance(kind.type, inspect.StrType)
+                    else f"a list of {what} names")
+        return _expected(kind.type)
+    if isinstance(kind, inspect.UnionType):
+        return " or ".join(filter(None, map(_expected, kind.types)))
+    if isinstance(kind, inspect.LiteralType):
+        return " or ".join(map(repr, kind.values))
+    words = _WORDS.get(type(kind), "")
+    for name, text in _BOUNDS.items():
+        if (bound := getattr(kind, name, None)) is not None:
+            words += text.format(bound)
+    return words

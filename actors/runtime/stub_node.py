@@ -1,4 +1,4 @@
-"""A node that only lives: its loop turns, its heart beats, and it can be killed."""
+"""A node that does nothing: its loop turns, its heart beats, and it can be killed."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The launcher's guard: brings back supervisor and spawners, those that hang too.
 
-The supervisor brings everybody back, and needs a spawner for it; whoever is missing of the three
+The supervisor brings everybody back, and needs a spawner for it; which of the three is missing
 the guard replaces. Who is dead is seen in /proc. Who hangs is judged with `patience`: a process
 that waits for a processor is left alone. Of two spawners that hang one is replaced first, and the
 other one when that is back, so that no error of judgement leaves none.
@@ -49,7 +49,7 @@ class Guard:
         supervisor_pid: of the present supervisor, 0 before the first.
         supervisor_incarnation: likewise.
         policy: how often the supervisor is brought back.
-        on_restart: called with the name of whoever was brought back.
+        on_restart: called with the name of what was brought back.
         report: called with one line when something cannot be done.
     """
 
@@ -94,7 +94,7 @@ class Guard:
             await asyncio.sleep(_ASK_AGAIN_S)
 
     def supervisor_heard(self) -> None:
-        """Note that the supervisor lives."""
+        """Note that the supervisor is heard."""
         self._patience[SUPERVISOR].answered()
 
     async def keep(self) -> None:

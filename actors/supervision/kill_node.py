@@ -26,7 +26,7 @@ signals:
   STOP   the process stands still, as under a debugger; CONT lets it go on
   TERM   the process ends in order; its supervisor takes that for a crash all the same
   SEGV   as if it had touched memory that is not there
-  WEDGE  the process lives, its event loop turns no more (SIGUSR2)
+  WEDGE  the process stays, its event loop turns no more (SIGUSR2)
 
 examples:
   kill-node osmosis_control                  kill it and watch it come back

@@ -22,7 +22,7 @@ import time
 import msgspec
 
 from rampart.actors.bus import run_folder
-from rampart.actors.bus.tap import Tap
+from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
 from rampart.actors.ftm.messages import NodeTable
@@ -123,7 +123,7 @@ class Launcher:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[self._lifeline[0]],
             env=working_folder.environment(), process_group=0)  # see `lifeline`
         assert spawner.stdin is not None  # noqa: S101 for the type checker
-        with contextlib.suppress(BrokenPipeError):  # it has died: whoever waits for it will notice
+        with contextlib.suppress(BrokenPipeError):  # it has died: what waits for it will notice
             spawner.stdin.write(msgspec.json.encode(self.plan))
             spawner.stdin.close()
         return spawner
@@ -186,7 +186,7 @@ class Launcher:
         self.guard.report(line)
 
     def supervisor_heard(self, _table: NodeTable) -> None:
-        """Note that the supervisor lives."""
+        """Note that the supervisor is heard."""
         self.guard.supervisor_heard()
 
     def _reap(self) -> None:
@@ -199,7 +199,7 @@ class Launcher:
         folder = self.plan.folder
         others = [endpoint(folder, name) for name in self.names if name != OBSERVER]
         return ZenohBus(OBSERVER, 1, endpoint(folder, OBSERVER), others,
-                        Tap(self.plan.base_port))
+                        RecorderConnection(self.plan.base_port))
 
     # -- tools ----------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ stopped process cannot read. Two things end it all the same:
 * the launcher has the run in a process group of its own, and when the last process outside that
   holds it together, the launcher, is gone, the kernel sends SIGHUP and SIGCONT to the group if one
   of its members is stopped (setpgid(2), "orphaned process group"): with all of them stopped there
-  is still the kernel. Not where whoever adopts the launcher's children is of the same session, as
+  is still the kernel. Not where what adopts the launcher's children is of the same session, as
   a shell that is the first process of a container.
 """
 

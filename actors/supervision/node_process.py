@@ -1,7 +1,7 @@
 """What runs in a node's process after the fork: title, lifeline, signals, actors, exit code.
 
 SIGTERM asks the actors to end in order. SIGUSR2 wedges the event loop for good, process and
-liveliness token alive: the fault that only a heartbeat from the loop can show.
+liveliness token still there: the fault that only a heartbeat from the loop can show.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from rampart.actors.bus.bus import BusError
+from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import register_of
-from rampart.actors.bus.tap import Tap
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.layout.layout import Layout
 from rampart.actors.run.run_context import RunContext
@@ -49,7 +49,7 @@ def make_actor(
     member = layout.members[name]
     clock = Clock(layout.plan.origin_s, layout.plan.rate, loop.time)
     bus = ZenohBus(name, incarnation, layout.listen(name), layout.dial(name),
-                   Tap(layout.plan.base_port))
+                   RecorderConnection(layout.plan.base_port))
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, run,
         register=register_of(layout.plan.folder),
@@ -83,7 +83,7 @@ def node_main(
     """
     told: list[Exception] = []
 
-    def tell(error: Exception) -> None:  # at once: whoever replaces this process may kill it
+    def tell(error: Exception) -> None:  # at once: what replaces this process may kill it
         told.append(error)
         _complain(f"{'+'.join(names)} #{incarnation} failed: {type(error).__name__}: {error}")
         _log_traceback(layout, names, incarnation, error)
@@ -143,7 +143,7 @@ def go_first() -> None:
 
 
 def wedge(_signal: int, _frame: Any) -> None:
-    """Handle SIGUSR2: turn no more, and live on."""
+    """Handle SIGUSR2: turn no more, and stay."""
     while True:
         time.sleep(3600)
 

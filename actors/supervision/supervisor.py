@@ -1,7 +1,7 @@
 """The supervisor: starts the processes, watches them three ways, kills and respawns them.
 
 * *Crashed*: the process's pidfd becomes readable, at once; this works for processes that are
-  not children, so a restarted supervisor adopts the living ones it finds in /proc.
+  not children, so a restarted supervisor adopts those that it finds in /proc.
 * *Stopped*: no heartbeat, and the kernel says the process is stopped (SIGSTOP).
 * *Wedged*: no heartbeat although the process runs: its event loop turns no more. Of the manager,
   whose silence stops the robot, the status counts as much as the heartbeat.
@@ -24,7 +24,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -97,8 +97,14 @@ class _Process(SupervisedProcess):
 
 
 class Supervisor(Relay):
-    """Keeps the processes of the run running. Parameters: `nodes`, the names it watches."""
+    """Keeps the processes of the run running."""
 
+    class Parameters(Relay.Parameters, frozen=True):
+        """Whom it hears: the names of all nodes."""
+
+        nodes: tuple[str, ...] = ()
+
+    parameters: Parameters
     outputs = (topics.NODES, topics.PROCESS_EVENT, *Relay.outputs)
 
     def __init__(self, context: Context, processes: Processes | None = None) -> None:
@@ -125,10 +131,10 @@ class Supervisor(Relay):
 
     @classmethod
     def names(
-        cls, topic: Topic[Any], name: str, parameters: Mapping[str, Any]  # noqa: ARG003
+        cls, topic: Topic[Any], name: str, parameters: Parameters  # noqa: ARG003
     ) -> tuple[str, ...] | None:
         """Hear the heartbeats of the nodes that it starts."""
-        return tuple(parameters.get("nodes", ())) if topic is bus_topics.HEARTBEAT else None
+        return parameters.nodes if topic is bus_topics.HEARTBEAT else None
 
     def _process_of(self, node: str) -> _Process | None:
         return self._processes.get(self._layout.unit_of.get(node, ""))

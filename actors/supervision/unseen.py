@@ -2,7 +2,7 @@
 
 asyncio tells of a task's failure when somebody asks for its result or when it is collected, which
 may be never, and of a callback's on a log that nobody reads. Here a failed callback is told in one
-line, and the end of a task that is to run as long as the loop is given to whoever can act on it.
+line, and the end of a task that is to run as long as the loop is given to those who can act on it.
 """
 
 from __future__ import annotations

@@ -125,8 +125,7 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
         print_json({
             "top": formula.top, "minimal_cut_sets": found.count, "by_size": found.sizes,
             "coherent": formula.is_monotone,
-            "sets": [{"events": g.events, "barriers": g.barriers} for g in guarded]
-            if guarded else [{"events": events} for events in sets]})
+            "sets": guarded or [{"events": events} for events in sets]})
         return 0
     say(f"{formula.top}: {found.count} minimal cut sets"
         + ("" if formula.is_monotone else " (not coherent: sets of which exactly these occur)"))

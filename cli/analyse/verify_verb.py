@@ -52,12 +52,7 @@ def run(options: argparse.Namespace) -> int:
     finally:
         show_progress("")
     if options.json:
-        print_json({
-            "system": report.system, "strategy": report.strategy,
-            "active_sets": report.active_sets, "states": report.states,
-            "permissiveness": report.permissiveness,
-            "stuck_behind_last_resort": report.stuck_behind_last_resort,
-            "properties": report.properties})
+        print_json(report)
     else:
         _show(spec, report, time.monotonic() - start)
     wanted = set(options.strategy or [spec.strategy]) | {""}

@@ -9,6 +9,7 @@ import itertools
 import math
 import statistics
 from collections import deque
+from collections.abc import AsyncIterator
 from typing import Any
 
 import msgspec
@@ -169,16 +170,13 @@ async def topic_echo(options: argparse.Namespace) -> int:
             say(f"garbage {short} {len(payload)} bytes, not a {topic.type.__name__}: {reason}; "
                 f"{payload[:_SHOWN_BYTES]!r}")
 
-    async with connect(options.port) as session:
-        _check_member(session, topic, key)
+    async with _checked(options.port, topic, key) as session:
         session.listen(topic, key, heard, garbage)
-        loop = asyncio.get_running_loop()
-        end = math.inf if options.duration is None else loop.time() + options.duration
-        while not (done.is_set() or is_over(session.run) or streams.lost()) and (
-                left := end - loop.time()) > 0:
+        async for left in _while_it_runs(session, options.duration):
+            if done.is_set():
+                break
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(done.wait(), min(LOOK_S, left))
-        _tell_end(session)
     if not seen:
         raise _nothing_came(options.key, options.duration)
     return 0
@@ -192,8 +190,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
     duration_s = options.duration
     if options.json and duration_s is None:
         duration_s = 3.0
-    async with connect(options.port) as session:
-        _check_member(session, topic, key)
+    async with _checked(options.port, topic, key) as session:
 
         def heard(short: str, _header: Header, _body: Any) -> None:
             times = arrivals.get(short)
@@ -202,16 +199,13 @@ async def topic_hz(options: argparse.Namespace) -> int:
             times.append(session.clock.now())
 
         session.listen(topic, key, heard)
-        loop = asyncio.get_running_loop()
-        end = math.inf if duration_s is None else loop.time() + duration_s
-        while (left := end - loop.time()) > 0 and not (is_over(session.run) or streams.lost()):
+        async for left in _while_it_runs(session, duration_s):
             await asyncio.sleep(min(_HZ_REPORT_S, left))
             if not options.json:
                 for short in sorted(arrivals):
                     _print_rate(short, rate_of(list(arrivals[short])))
                 if not arrivals:
                     say(f"nothing on {options.key} yet")
-        _tell_end(session)
     if options.json:
         print_json([{"key": short, "nominal_hz": topic.rate_hz, **rate_of(list(times))}
                     for short, times in sorted(arrivals.items())])
@@ -257,7 +251,12 @@ def _print_rate(key: str, rate: dict[str, Any]) -> None:
         f"max: {rate['max_s']:.3f}s std dev: {rate['std_dev_s']:.5f}s window: {rate['window']}")
 
 
-def _tell_end(session: Session) -> None:
+async def _while_it_runs(session: Session, duration_s: float | None) -> AsyncIterator[float]:
+    """Yield the real seconds that are left, until they are over or the run or the reader is."""
+    loop = asyncio.get_running_loop()
+    end = math.inf if duration_s is None else loop.time() + duration_s
+    while (left := end - loop.time()) > 0 and not (is_over(session.run) or streams.lost()):
+        yield left
     if is_over(session.run):
         warn(f"the run has ended: {session.run.title} (port {session.run.base_port})")
 
@@ -267,13 +266,17 @@ def _nothing_came(key: str, duration_s: float | None) -> NoEffectError:
     return NoEffectError(f"nothing came on {key} {when}")
 
 
-def _check_member(session: Session, topic: Topic[Any], key: str) -> None:
-    if not topic.is_family or key == topic.pattern or topic not in topics.ALL:
-        return  # the members of a robot's own families need not be nodes
-    head, tail = topic.at("\0").split("\0")
-    member = key[len(head):len(key) - len(tail)]
-    if member not in session.run.nodes:
-        raise unknown("node", member, session.run.nodes)
+@contextlib.asynccontextmanager
+async def _checked(port: int | None, topic: Topic[Any], key: str) -> AsyncIterator[Session]:
+    """Join the run, and make sure that it has the node of which a family's member is asked for."""
+    async with connect(port) as session:
+        # The members of a robot's own families need not be nodes.
+        if topic.is_family and key != topic.pattern and topic in topics.ALL:
+            head, tail = topic.at("\0").split("\0")
+            member = key[len(head):len(key) - len(tail)]
+            if member not in session.run.nodes:
+                raise unknown("node", member, session.run.nodes)
+        yield session
 
 
 def _positive(option: str, value: float | None) -> None:

@@ -14,11 +14,9 @@ from rampart.actors.bus.envelope import Header
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import TELEOPERATION
-from rampart.actors.osmosis.control.teleoperation.joystick_device import (
-    AUTO,
-    JoystickDevice,
-    mapping_of,
-)
+from rampart.actors.osmosis.control.teleoperation.joystick_device import AUTO, JoystickDevice
+from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
+from rampart.actors.runtime.parameters import read_parameters
 from rampart.cli import systems
 from rampart.cli.following import is_over, stopped_by_signals
 from rampart.cli.osmosis.keyboard_stick import KeyboardStick
@@ -93,9 +91,10 @@ def _open(name: str, session: Session, drive: _Drive) -> JoystickDevice:
     spec = systems.load(session.run.system_file)
     parameters = next((n.parameters for n in spec.nodes if n.actor == TELEOPERATION), {})
     try:
-        mapping = mapping_of(parameters)
+        mapping = read_parameters(Teleoperation.Parameters, parameters, session.run.system_file,
+                                  "teleoperation")
     except ValueError as error:
-        raise UsageError(f"{session.run.system_file}: teleoperation: {error}") from None
+        raise UsageError(str(error)) from None
     device = JoystickDevice(name, mapping, lambda: drive.moved(device.stick), drive.lost)
     missing = device.open()
     if missing:

@@ -25,8 +25,8 @@ from rampart.actors.bus import run_folder, topics
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.messages import Message
+from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.shared_bus import SharedBus
-from rampart.actors.bus.tap import Tap
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
@@ -133,7 +133,8 @@ class Replay:
                 prefix="rampart-replay-") as directory:
             folder = Path(directory)
             clock = Clock(time.monotonic() + delay_s - self._start_s / self._rate, self._rate)
-            bus = ZenohBus("", 0, endpoint(self._sockets, run_info.REPLAY), [], Tap(self._port))
+            bus = ZenohBus("", 0, endpoint(self._sockets, run_info.REPLAY), [],
+                           RecorderConnection(self._port))
             with self._answering(clock, folder):
                 try:
                     await bus.open()

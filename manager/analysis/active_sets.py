@@ -6,7 +6,7 @@ which some of them can be. Counterexamples are found smallest first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from itertools import chain, combinations
 from typing import TypeVar
 
@@ -81,7 +81,7 @@ class ActiveSets:
             Case(active, frozenset(late), strategy.choose(active, arrangement, frozenset(late)))
             for size in range(1, len(names) + 1)
             for active in combinations(names, size)
-            for late in (_subsets(active) if strategy.patient else ((),))]
+            for late in (subsets(active) if strategy.patient else ((),))]
         self._by_set = {(case.active, case.late): case for case in self.cases}
         tree, recover = arrangement.tree, arrangement.mechanisms.recover
         self.last_resort = frozenset(recover[tree.root])
@@ -271,5 +271,6 @@ def judge(name: str, strategy: str, cases: list[T], find: Callable[[T], Trace | 
     return Property(name, strategy, not found, len(cases), len(found), tuple(found[:KEPT]))
 
 
-def _subsets(names: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+def subsets(names: Collection[str]) -> Iterator[tuple[str, ...]]:
+    """Yield all sets of some names, the empty one first and smaller ones before larger."""
     return chain.from_iterable(combinations(names, size) for size in range(len(names) + 1))

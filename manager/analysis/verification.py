@@ -17,6 +17,7 @@ from rampart.manager.analysis.active_sets import (
     ActiveSets,
     Property,
     order_agrees_with_tree,
+    subsets,
 )
 from rampart.manager.analysis.transitions import Transitions, Violation, explore
 from rampart.manager.model.mechanisms import Contract
@@ -177,8 +178,7 @@ class _Explorer:
         mechanisms, order = self.arrangement.mechanisms, self.arrangement.order
         # Whoever is not among them may make one of them wait: as if it were not asked for yet.
         here = frozenset(
-            frozenset(part) for one in asked
-            for part in _parts(one.intersection(names)))
+            frozenset(part) for one in asked for part in subsets(one.intersection(names)))
         shape = _shape(names, here, self._urgent, self.arrangement)
         key = (shape, exclusive, with_modules, deaths)
         if key not in self._known:
@@ -226,10 +226,6 @@ def _reachable(recoveries: tuple[str, ...], mechanisms: tuple[str, ...], arrange
             found.add(following)
             following = arrangement.mechanisms.contracts[following].escalate_to
     return found
-
-
-def _parts(names: frozenset[str]) -> Iterator[tuple[str, ...]]:
-    return chain.from_iterable(combinations(sorted(names), n) for n in range(len(names) + 1))
 
 
 def _shape(names: tuple[str, ...], asked: frozenset[frozenset[str]], urgent: frozenset[str],

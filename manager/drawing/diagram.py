@@ -171,9 +171,7 @@ def _fault_tree(spec: SystemSpec, situation: Situation) -> _Parts:
 def _gate(event: EventSpec) -> str:
     if not event.of:
         return ""
-    if event.gate in {"or", "and"}:
-        return str(event.gate)
-    return "at-least"
+    return event.gate if isinstance(event.gate, str) else "at-least"
 
 
 def _ftm_tree(spec: SystemSpec, situation: Situation) -> _Parts:

@@ -12,6 +12,7 @@ not the shared event but a mechanism whose ways up end at two different ones.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from graphlib import TopologicalSorter
 
@@ -57,12 +58,9 @@ class FaultTree:
 
     def __init__(self, events: Sequence[Event]) -> None:
         self.events = {event.name: event for event in events}
-        if len(self.events) != len(events):
-            seen: set[str] = set()
-            for event in events:
-                if event.name in seen:
-                    raise FaultTreeError(event.name, "duplicate event name")
-                seen.add(event.name)
+        for name, count in Counter(event.name for event in events).items():
+            if count > 1:
+                raise FaultTreeError(name, "duplicate event name")
         self.parents: dict[str, list[str]] = {name: [] for name in self.events}
         for event in events:
             self._join(event)

@@ -12,16 +12,8 @@ from itertools import chain
 from rampart.manager.model.gates import WORDS, GateError, detection_gate, recovery_gate
 from rampart.manager.model.order import find_cycle
 from rampart.manager.spec import arbitration_checks, time_checks
-from rampart.manager.spec.parameters import TAKES, TIMES_OUT_ON, find_wrong
-from rampart.manager.spec.schema import (
-    NODE_KINDS,
-    DetectionSpec,
-    Kind,
-    RecoverySpec,
-    SystemSpec,
-)
+from rampart.manager.spec.schema import NODE_KINDS, Kind, SystemSpec
 from rampart.manager.spec.tables import Finding, unknown
-from rampart.manager.spec.timeouts import find_false_alarm
 
 Validator = Callable[[SystemSpec], Iterator[Finding]]
 
@@ -55,7 +47,7 @@ def _first(spec: SystemSpec, validators: Iterable[Validator]) -> Finding | None:
     return next(chain.from_iterable(validator(spec) for validator in validators), None)
 
 
-def _modules(spec: SystemSpec) -> Iterator[tuple[str, str, str, str]]:
+def modules(spec: SystemSpec) -> Iterator[tuple[str, str, str, str]]:
     """Yield path, name, process and respawner of all nodes, detection and recovery modules."""
     for i, node in enumerate(spec.nodes):
         yield f"$.node[{i}]", node.name, node.process, node.respawn
@@ -67,7 +59,7 @@ def _modules(spec: SystemSpec) -> Iterator[tuple[str, str, str, str]]:
 
 def _names(spec: SystemSpec) -> Iterator[Finding]:
     taken = dict.fromkeys(RESERVED, "reserved")
-    named = [(path, name, process) for path, name, process, _ in _modules(spec)]
+    named = [(path, name, process) for path, name, process, _ in modules(spec)]
     named += [(f"$.mechanism[{i}]", m.name, "") for i, m in enumerate(spec.mechanisms)]
     for path, name, process in named:
         if name in WORDS:
@@ -118,9 +110,9 @@ def _sole_nodes(spec: SystemSpec) -> Iterator[Finding]:
 
 def _processes(spec: SystemSpec) -> Iterator[Finding]:
     """Actors of one process come back together: all by the same hand, and none by its own."""
-    lives_in = {name: process or name for _, name, process, _ in _modules(spec)}
+    lives_in = {name: process or name for _, name, process, _ in modules(spec)}
     first: dict[str, tuple[str, str]] = {}
-    for path, name, _, respawn in _modules(spec):
+    for path, name, _, respawn in modules(spec):
         other, by = first.setdefault(lives_in[name], (name, respawn))
         if respawn != by:
             yield Finding(f"{path}.process", f"{other} lives there too and is brought back by {by},"
@@ -128,8 +120,6 @@ def _processes(spec: SystemSpec) -> Iterator[Finding]:
                           (lives_in[name],))
     managers = {lives_in[node.name] for node in spec.nodes if node.kind is Kind.MANAGER}
     for index, recovery in enumerate(spec.recoveries):
-        if "nodes" not in TAKES.get(recovery.actor, {}):
-            continue
         for place, name in enumerate(recovery.parameters.get("nodes", ())):
             if lives_in[name] in managers:
                 yield Finding(f"$.recovery[{index}].parameters.nodes[{place}]", "the manager lives "
@@ -145,39 +135,28 @@ def _detections(spec: SystemSpec) -> Iterator[Finding]:
         path = f"$.detection[{index}]"
         parameters = detection.parameters
         if "watch" in parameters:
-            watch = parameters["watch"]
-            if not isinstance(watch, list) or not watch or \
-                    not all(isinstance(name, str) for name in watch):
-                yield Finding(f"{path}.parameters.watch", "expected a list of node names", (watch,))
-                return
-            watched: set[str] = set()
-            for place, name in enumerate(watch):
-                if name not in nodes:
-                    yield unknown(f"{path}.parameters.watch[{place}]", name, "node", nodes)
-                if name in watched:
-                    yield Finding(f"{path}.parameters.watch[{place}]", "listed twice", (name,))
-                watched.add(name)
+            yield from _node_names(f"{path}.parameters.watch", parameters["watch"], nodes)
         for key in ("timeout_s", "margin_m"):
             value = parameters.get(key, 1.0)
             if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
                 yield Finding(f"{path}.parameters.{key}", "expected a number > 0", (value,))
                 return
-        yield from _parameters(path, detection, nodes)
-        if detection.actor in TIMES_OUT_ON and "timeout_s" in parameters:
-            problem = find_false_alarm(
-                spec.timing, parameters["timeout_s"], TIMES_OUT_ON[detection.actor])
-            if problem:
-                yield Finding(f"{path}.parameters.timeout_s", problem, (parameters["timeout_s"],))
         if not detection.latency_s > 0:
             yield Finding(f"{path}.within_s", "missing; say within how many seconds the module "
                                               "detects, here or as parameters.timeout_s")
 
 
-def _parameters(path: str, module: DetectionSpec | RecoverySpec, nodes: Collection[str],
-                derived: Collection[str] = ()) -> Iterator[Finding]:
-    for name, problem in find_wrong(module.actor, module.parameters, nodes, derived):
-        value = (module.parameters[name],) if name in module.parameters else ()
-        yield Finding(f"{path}.parameters.{name}", problem, value)
+def _node_names(path: str, value: object, nodes: Collection[str]) -> Iterator[Finding]:
+    if not isinstance(value, list) or not value or not all(isinstance(n, str) for n in value):
+        yield Finding(path, "expected a list of node names", (value,))
+        return
+    listed: set[str] = set()
+    for place, name in enumerate(value):
+        if name not in nodes:
+            yield unknown(f"{path}[{place}]", name, "node", nodes)
+        if name in listed:
+            yield Finding(f"{path}[{place}]", "listed twice", (name,))
+        listed.add(name)
 
 
 def _mechanisms(spec: SystemSpec) -> Iterator[Finding]:
@@ -206,7 +185,6 @@ def _mechanisms(spec: SystemSpec) -> Iterator[Finding]:
 def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
     names = [recovery.name for recovery in spec.recoveries]
     nodes = dict.fromkeys(node.name for node in spec.nodes)
-    respawns = {node.respawn for node in spec.nodes}
     there = {node.name for node in spec.nodes}.union(
         *(recovery.claims | recovery.disables for recovery in spec.recoveries))
     for index, recovery in enumerate(spec.recoveries):
@@ -222,8 +200,9 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
         if recovery.escalate_to and recovery.escalate_to not in names:
             yield unknown(f"$.recovery[{index}].escalate_to", recovery.escalate_to,
                            "recovery module", names)
-        own = ["nodes"] if recovery.name in respawns else []
-        yield from _parameters(f"$.recovery[{index}]", recovery, nodes, own)
+        if "nodes" in recovery.parameters:
+            yield from _node_names(f"$.recovery[{index}].parameters.nodes",
+                                   recovery.parameters["nodes"], nodes)
     cycle = find_cycle({r.name: [r.escalate_to] if r.escalate_to else [] for r in spec.recoveries})
     if cycle:
         yield Finding(f"$.recovery[{names.index(cycle[0])}].escalate_to",

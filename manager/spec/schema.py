@@ -121,7 +121,11 @@ class DetectionSpec(Table, frozen=True):
 
 
 class RecoverySpec(Table, frozen=True):
-    """A recovery module; the contract fields are those of `mechanisms.Contract`."""
+    """A recovery module; the contract fields are those of `mechanisms.Contract`.
+
+    A key of `parameters` that means something here too: `nodes`, a list of names of those that it
+    may respawn.
+    """
 
     name: Name
     title: str

@@ -39,10 +39,9 @@ class Arrangement:
         self.depth = {name: tree.up_set[bit].bit_count() - 1 for name, bit in tree.number.items()}
         self._width = len(tree.names)
         self._ftms = (1 << self._width) - 1
-        self._bits = {
-            name: tree.bit[name] | order.mask(way) << self._width
-            for name, way in mechanisms.recover.items()}
         self.asks = {name: order.mask(way) for name, way in mechanisms.recover.items()}
+        self._bits = {name: tree.bit[name] | mask << self._width
+                      for name, mask in self.asks.items()}
         self._conflicts = {
             name: order.mask(
                 other for other in order.names if other != name and (

@@ -9,7 +9,7 @@ Deciding and giving reasons are two steps, because a robot should brake first an
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from typing import Protocol
 
 import msgspec
@@ -80,12 +80,11 @@ def chains(order: PartialOrder, upper: str, lowers: Iterable[str]) -> tuple[str,
     return tuple(" > ".join(order.chain(upper, lower)) for lower in lowers if lower != upper)
 
 
-def dominance(order: PartialOrder, taken: Iterable[str], candidates: Iterable[str]
+def dominance(order: PartialOrder, taken: Iterable[str], candidates: Sequence[str]
               ) -> tuple[str, ...]:
     """Return the chains from what was taken down to the candidates below it."""
-    candidates = tuple(candidates)
-    return tuple(chain for one in taken for chain in chains(
-        order, one, (c for c in candidates if order.is_above(one, c))))
+    return tuple(" > ".join(order.chain(one, lower)) for one in taken for lower in candidates
+                 if order.is_above(one, lower))
 
 
 def turned_down(order: PartialOrder, taken: Collection[str], candidates: Iterable[str]

@@ -153,7 +153,8 @@ class VirtualSystem:
         if self.layout is None or name not in self.layout.members:
             raise LookupError(f"no node {name!r} in the file of this system")
         member = self.layout.members[name]
-        return self.start(name, member.actor, *others, **{**member.parameters, **parameters})
+        return self.start(name, member.actor, *others, **{
+            **msgspec.structs.asdict(member.parameters), **parameters})
 
     async def kill(self, name: str) -> None:
         """End an actor as SIGKILL would: its token vanishes, it says nothing more."""

@@ -1,8 +1,8 @@
 """The injector: carries out the planned faults of a run, and watches whether they had an effect.
 
 It lives beside the observer, outside the system under test. Faults of topics and actuators are
-ordered over the bus and reported by those they hit; processes are hit through a `Hand`. A robot
-whose faults are more than that has an injector of its own, derived from this one.
+ordered over the bus and reported by those they hit; processes are hit through a `ProcessControl`. A
+robot whose faults are more than that has an injector of its own, derived from this one.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rampart.sim.faults.scenario import FaultOutcome, OnProcess, PlannedFault, a
 INJECTOR = "injector"
 
 
-class Hand(Protocol):
+class ProcessControl(Protocol):
     """Does things to processes; each method returns whether there was somebody to do it to."""
 
     def kill(self, node: str) -> bool:
@@ -86,7 +86,7 @@ class Injector(Actor):
     Args:
         context: of the actor.
         scenario: what goes wrong, and when.
-        hand: by which processes are hit.
+        processes: by which processes are hit.
         nodes: names that may be hit.
         known: all topics of the system.
         faults: of the robot.
@@ -100,10 +100,11 @@ class Injector(Actor):
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (bus_topics.INJECT,)
 
-    def __init__(self, context: Context, scenario: Sequence[PlannedFault], hand: Hand, *,
-                 nodes: Sequence[str], known: Sequence[Topic[Any]], faults: Faults) -> None:
+    def __init__(self, context: Context, scenario: Sequence[PlannedFault],
+                 processes: ProcessControl, *, nodes: Sequence[str],
+                 known: Sequence[Topic[Any]], faults: Faults) -> None:
         super().__init__(context)
-        self._hand = hand
+        self._control = processes
         self.planned: list[PlannedAction] = []
         for i, planned in enumerate(scenario, start=1):
             action = action_of(planned, f"f{i}", nodes, known, faults)
@@ -156,19 +157,20 @@ class Injector(Actor):
             self.carry_out(fault)
 
     def _hit(self, fault: PlannedAction, action: OnProcess) -> None:
-        node, hand = action.node, self._hand
+        node, control = action.node, self._control
         if action.what == "slow":
-            hit = hand.slow_down(node, action.pace_s)
+            hit = control.slow_down(node, action.pace_s)
         else:
-            hit = {"kill": hand.kill, "stop": hand.stop, "wedge": hand.wedge}[action.what](node)
+            hit = {"kill": control.kill, "stop": control.stop,
+                   "wedge": control.wedge}[action.what](node)
         if not hit:
             fault.reason = f"{node} had no running process"
             return
         fault.hit = 1
         if action.what == "stop" and math.isfinite(action.duration_s):
-            self.call_later(action.duration_s, lambda: self._end(hand.resume(node)))
+            self.call_later(action.duration_s, lambda: self._end(control.resume(node)))
         elif action.what == "slow" and math.isfinite(action.duration_s):
-            self.call_later(action.duration_s, lambda: self._end(hand.slow_down(node, 0.0)))
+            self.call_later(action.duration_s, lambda: self._end(control.slow_down(node, 0.0)))
 
     @staticmethod
     def _end(_done: bool) -> None:

@@ -8,8 +8,9 @@ on the way, each message with the stamp of its reading.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 
 from rampart.actors.bus import messages as bm
@@ -25,13 +26,13 @@ from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
+from rampart.manager.spec.tables import Positive
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.schedule import Schedule
 from rampart.sim.osmosis.sensors import LaserSpec
 from rampart.sim.osmosis.world import World
 
 WAKE_UP_S = 0.02
-DEAD_MAN_TIMEOUT_S = 0.4
 MAX_CATCH_UP_S = 1.0
 
 _JOBS = (
@@ -41,25 +42,37 @@ _JOBS = (
 
 
 class Simulator(Actor):
-    """Runs the `World` on the actor's clock.
+    """Runs the `World` on the actor's clock."""
 
-    Parameters (all optional): `seed`; `obstacles`, number of presets that take part;
-    `dead_man`, False switches it off; `dead_man_timeout_s`; `laser_range_m`; `laser_rays`;
-    `upper_laser`, True for a robot with a second one.
-    """
+    class Parameters(Actor.Parameters, frozen=True):
+        """Robot and world; the run says the first four.
 
+        Attributes:
+            seed: of everything random.
+            obstacles: number of presets that take part.
+            dead_man: whether the base brakes when commands cease.
+            dead_man_timeout_s: after how long.
+            laser_range_m: of each laser.
+            laser_rays: of each laser.
+            upper_laser: whether the robot has a second one.
+        """
+
+        seed: int = 0
+        obstacles: int = 0
+        dead_man: bool = True
+        dead_man_timeout_s: Positive = 0.4
+        laser_range_m: Positive = 8.0
+        laser_rays: Annotated[int, msgspec.Meta(ge=2)] = 181
+        upper_laser: bool = False
+
+    parameters: Parameters
     outputs = (*_JOBS, ftm_topics.HOLDS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        parameters = self.parameters
         self._airport = Osmosis.of(context).airport
         self._laser = LaserSpec(
-            rays=int(parameters.get("laser_rays", 181)),
-            range_max_m=float(parameters.get("laser_range_m", 8.0)),
-        )
-        timeout_s = float(parameters.get("dead_man_timeout_s", DEAD_MAN_TIMEOUT_S))
-        self._dead_man_s = timeout_s if parameters.get("dead_man", True) else None
+            rays=self.parameters.laser_rays, range_max_m=self.parameters.laser_range_m)
         self._asked_s = self._skipped_s = 0.0
         self._real_time_factor = 1.0
         self._brakes: Holders[bool] = Holders(
@@ -69,13 +82,13 @@ class Simulator(Actor):
 
     def on_start(self) -> None:
         """Build the world at the present time."""
-        now_s = self.clock.now()
+        now_s, parameters = self.clock.now(), self.parameters
         self._world = World(
             self._airport,
             Osmosis.of(self.context).world,
-            seed=int(self.parameters.get("seed", 0)),
-            obstacles=int(self.parameters.get("obstacles", 0)),
-            dead_man_timeout_s=self._dead_man_s,
+            seed=parameters.seed,
+            obstacles=parameters.obstacles,
+            dead_man_timeout_s=parameters.dead_man_timeout_s if parameters.dead_man else None,
             laser=self._laser,
             start_s=now_s,
             max_catch_up_s=MAX_CATCH_UP_S,
@@ -92,7 +105,7 @@ class Simulator(Actor):
             topics.TRUTH: self._truth,
             topics.OBSTACLES: self._obstacles,
         }
-        if self.parameters.get("upper_laser", False):
+        if parameters.upper_laser:
             readings[topics.UPPER_SCAN] = lambda: self._scan(1)
         self._readings = {topic.key: (topic, read) for topic, read in readings.items()}
         self._schedule = Schedule(

@@ -18,7 +18,7 @@ from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.unseen import watch
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import INJECTOR, can_be_hit
-from rampart.sim.faults.process_hand import ProcessHand
+from rampart.sim.faults.process_signals import ProcessSignals
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord
@@ -87,7 +87,7 @@ class ProcessRun:
         if self._scenario:
             injector = trial.injector(
                 Context(INJECTOR, 1, clock, SharedBus(bus), **of_the_run), self._scenario,
-                ProcessHand(plan.base_port), nodes=can_be_hit(spec),
+                ProcessSignals(plan.base_port), nodes=can_be_hit(spec),
                 known=system_topics(spec), faults=faults_of(spec))
             actors.append(injector)
         tasks = [asyncio.create_task(actor.run()) for actor in actors]

@@ -78,11 +78,11 @@ class Hub:
 
     def announce(self, node: str, incarnation: int, *, alive: bool) -> None:
         """Tell the watchers that a node appeared or vanished."""
-        lives = self.alive.setdefault(node, set())
+        living = self.alive.setdefault(node, set())
         if alive:
-            lives.add(incarnation)
+            living.add(incarnation)
         else:
-            lives.discard(incarnation)
+            living.discard(incarnation)
         for watched, changed, bus in list(self._watchers):
             if watched == node:
                 bus.soon(lambda c=changed: c(node, incarnation, alive))  # type: ignore[misc]
@@ -157,7 +157,7 @@ class VirtualBus:
         self._hub.subscribe(key_expression, deliver, self)
 
     def watch(self, node: str, changed: PeerChange) -> None:
-        """Have `changed` called now if the node lives, and whenever it appears or vanishes."""
+        """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
         self._hub.watch(node, changed, self)
         for incarnation in sorted(self._hub.alive.get(node, ())):
             self.soon(lambda i=incarnation: changed(node, i, True))  # type: ignore[misc]

@@ -140,7 +140,7 @@ class VirtualMachine:
         self._loop.call_later(PERIOD_S, self._guard)
 
     def supervisor_heard(self, table: NodeTable) -> None:
-        """Note that the supervisor lives, and which incarnations it has reached."""
+        """Note that the supervisor is heard, and which incarnations it has reached."""
         self._supervisor_heard_s = self._loop.time()
         for row in table.nodes:
             self._known[row.name] = max(self._known.get(row.name, 0), row.incarnation)
@@ -244,7 +244,7 @@ class VirtualMachine:
         return self._hold(node, Condition.STOPPED)
 
     def wedge(self, node: str) -> bool:
-        """Have its event loop turn no more, process and token alive."""
+        """Have its event loop turn no more, process and token still there."""
         return self._hold(node, Condition.WEDGED)
 
     def resume(self, node: str) -> bool:

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE, ArrivalGuard, Header, encode
-from rampart.actors.bus.tap import frame, parse_frame
+from rampart.actors.bus.recorder_connection import frame, parse_frame
 from rampart.actors.operator.requests import RequestError, RequestReader
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE

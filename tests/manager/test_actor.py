@@ -513,7 +513,7 @@ def test_it_repeats_what_is_wanted_and_shows_that_it_lives():
 
 
 def test_it_hears_only_modules_and_people_and_commands_all_recovery_modules():
-    member = Member("ftm_manager", FtmManager, {})
+    member = Member("ftm_manager", FtmManager, FtmManager.Parameters())
     assert heard(member) == {
         "detection/{name}": None, "recovery/{name}/state": None, "manager/reset": None,
         "manager/adapt": None}

@@ -98,6 +98,44 @@ def test_a_module_of_one_s_own_that_cannot_be_imported_is_one_line_with_file_pat
     assert not (tmp_path / "report").exists()
 
 
+PLAIN = """
+from rampart.actors.detection.module import DetectionModule
+
+class Level(DetectionModule):
+"""
+DECLARED = f"""{PLAIN}
+    class Parameters(DetectionModule.Parameters, frozen=True):
+        highest_m: float = 2.0
+"""
+SAID = {
+    "none declared": (f"{PLAIN}    pass\n", "highest_m = 1", "parameters.highest_m = 1: unknown "
+                      "parameter; known: none, its class declares no Parameters"),
+    "wrong type": (DECLARED, 'highest_m = "x"', "parameters.highest_m = 'x': expected a number"),
+    "no struct": (f"{PLAIN}    class Parameters:\n        highest_m = 2.0\n", "highest_m = 1",
+                  "actor = 'own:Level': Parameters: "),
+    "no such type": (f"{PLAIN}    class Parameters(DetectionModule.Parameters, frozen=True):\n"
+                     "        highest_m: 'Metres' = 2.0\n", "highest_m = 1",
+                     "actor = 'own:Level': Parameters: name 'Metres' is not defined"),
+}
+
+
+@pytest.mark.parametrize("how", ["--rate=4", "--virtual", "--fault=drop:localization/pose"])
+@pytest.mark.parametrize("what", SAID)
+def test_a_parameter_that_an_actor_of_one_s_own_does_not_take_is_one_line_before_anything_starts(
+        tmp_path, what, how):
+    source, said, words = SAID[what]
+    (tmp_path / "own.py").write_text(source)
+    bounds = 'actor = "rampart.actors.osmosis.detection.bounds:Bounds"\n'
+    (tmp_path / "own.toml").write_text(changed(
+        PAPER, (bounds, f'actor = "own:Level"\nparameters = {{ {said} }}\n')))
+    done = launched(tmp_path, "--system", "own.toml", how, "--no-hmi", "--port",
+                    str(free_base_port()), "--report", str(tmp_path / "report"))
+    assert done.returncode == 2, done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert f"{tmp_path}/own.toml: $.detection[2].{words}" in done.stderr
+    assert not (tmp_path / "report").exists()
+
+
 OWN_ACTOR = '''
 from rampart.actors.runtime.actor import every
 from rampart.actors.runtime.stub_node import StubNode

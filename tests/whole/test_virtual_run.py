@@ -192,6 +192,20 @@ def test_killed_guards_come_back_and_the_mission_goes_on():
                                "graph_planner": 1}
 
 
+def test_a_supervisor_that_ends_too_often_waits_until_the_window_of_the_spec_has_room(tmp_path):
+    file = tmp_path / "impatient.toml"
+    file.write_text((ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
+                    + "\n[supervision]\nintensity = 2\nperiod_s = 10.0\nbackoff_s = 0.5\n",
+                    encoding="utf-8")
+    kills = [f"kill:supervisor@{at_s}" for at_s in (4, 6, 8)]
+    record = run_virtually(job(*kills, "kill:mission_manager@20", system=str(file))).record
+    back_s = [e.t_s for e in record.events if "supervisor respawned" in e.text]
+    assert len(back_s) == 3
+    assert back_s[0] < 4.5  # at once
+    assert 6.5 < back_s[1] < 7.0  # after the backoff
+    assert 14.5 < back_s[2] < 15.0  # ten seconds after the first restart, and the backoff
+
+
 def test_a_wedged_supervisor_is_replaced():
     record = run_virtually(job("wedge:supervisor@8", SHORT.text().replace("@6", "@12"))).record
     assert record.restarts == {"supervisor": 1, "mission_manager": 1}

@@ -333,7 +333,9 @@ function manager(heard) {
   say($("alarm-text"), m && m.active.length ? `Active: ${m.active.join(", ")}.` : "");
   document.title = `${latched.length ? "⚠ stopped · " : acting ? "▲ recovery · " : ""}Rampart`;
   memory.once("latched", latched, () => $("resets").replaceChildren(...latched.map((name) => {
-    const button = element("button", "", name === "RM1" ? "Reset emergency stop (RM1)" : `Reset ${name}`);
+    const box = picture.system?.order?.boxes.find((shown) => shown.name === name);
+    const title = box && box.title !== name ? `${box.title.toLowerCase()} (${name})` : name;
+    const button = element("button", "", `Reset ${title}`);
     button.onclick = () => send({ type: "reset", recovery: name });
     return button;
   })));

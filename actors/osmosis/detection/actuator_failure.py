@@ -7,28 +7,35 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.actuator_failure_monitor import ActuatorMonitor, MotionLimits
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import amount
+from rampart.manager.spec.tables import NonNegative
 
 _FIRST_STATUS_S = 0.3
 """A respawned module waits this long for a first status of the base before it says idle."""
 
 
 class ActuatorFailure(DetectionModule):
-    """Active while wheels do not turn, or brakes do not brake, as the base was told.
+    """Active while wheels do not turn, or brakes do not brake, as the base was told."""
 
-    Parameters:
-        wheel_radius_m: of the base.
-        hold_s: how long a finding stays without new evidence, s.
-    """
+    class Parameters(DetectionModule.Parameters, frozen=True):
+        """The base, and patience.
+
+        Attributes:
+            wheel_radius_m: of the base.
+            hold_s: how long a finding stays without new evidence, s.
+        """
+
+        wheel_radius_m: NonNegative = MotionLimits().wheel_radius_m
+        hold_s: NonNegative = MotionLimits().hold_s
+
+    parameters: Parameters
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         system = context.run.system
-        usual = MotionLimits()
         self.monitor = self.judged_by(ActuatorMonitor(
             MotionLimits(
-                wheel_radius_m=amount(self.parameters, "wheel_radius_m", usual.wheel_radius_m),
-                hold_s=amount(self.parameters, "hold_s", usual.hold_s),
+                wheel_radius_m=self.parameters.wheel_radius_m,
+                hold_s=self.parameters.hold_s,
                 braking_mps2=system.robot.braking_mps2),
             self.known_after_s(_FIRST_STATUS_S)))
 

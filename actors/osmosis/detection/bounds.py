@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.bounds_check import BoundsCheck
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import amount
+from rampart.actors.runtime.parameters import NodeNames
+from rampart.manager.spec.tables import NonNegative
 
 _FIRST_COMMAND_S = 0.2
 """A respawned module waits this long for a first command, four periods, before it says idle."""
@@ -20,20 +18,28 @@ class Bounds(DetectionModule):
     """Active while Osmosis Control commands what the robot was never meant to drive.
 
     The limits are the robot's top speed and top turn rate in the system spec.
-
-    Parameters:
-        hold_s: how long commands must have been good again before the module is idle, s.
-        suspects: whom to name when it is active, for a recovery that respawns: Osmosis Control,
-            by the incarnation that sent the bad command. By default nobody is named.
     """
+
+    class Parameters(DetectionModule.Parameters, frozen=True):
+        """What it reports, and for how long.
+
+        Attributes:
+            hold_s: how long commands must have been good again before the module is idle, s.
+            suspects: whom to name when it is active, for a recovery that respawns: Osmosis
+                Control, by the incarnation that sent the bad command. By default nobody is named.
+        """
+
+        hold_s: NonNegative = 0.5
+        suspects: NodeNames = ()
+
+    parameters: Parameters
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         system = context.run.system
-        self._suspects = suspects_of(self.parameters)
         self.monitor = self.judged_by(BoundsCheck(
             system.robot.top_speed_mps, system.robot.top_turn_rate_radps,
-            amount(self.parameters, "hold_s", 0.5),
+            self.parameters.hold_s,
             self.known_after_s(_FIRST_COMMAND_S)))
 
     @on(topics.COMMAND)
@@ -44,17 +50,6 @@ class Bounds(DetectionModule):
         if not self.monitor.active:
             self.monitor.nodes = ()
         elif not was_active or not self.monitor.good:
-            self.monitor.nodes = tuple(f"{n}#{header.incarnation}" for n in self._suspects)
+            self.monitor.nodes = tuple(
+                f"{n}#{header.incarnation}" for n in self.parameters.suspects)
         self.follow()
-
-
-def suspects_of(parameters: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the parameter `suspects`, nobody by default.
-
-    Raises:
-        ValueError: it is no list of names.
-    """
-    names = parameters.get("suspects", ())
-    if isinstance(names, str) or not all(isinstance(n, str) and n for n in names):
-        raise ValueError(f"parameters.suspects = {names!r}: must be a list of node names")
-    return tuple(names)

@@ -14,12 +14,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import msgspec
+
 from rampart.actors.bus.plausible import is_possible
 from rampart.actors.detection.lasting import Lasting
+from rampart.manager.spec.tables import NonNegative
 
 
-@dataclass(frozen=True, slots=True)
-class ComparisonLimits:
+class ComparisonLimits(msgspec.Struct, frozen=True):
     """What is a disagreement.
 
     Args:
@@ -33,13 +35,13 @@ class ComparisonLimits:
             is missing is said by others.
     """
 
-    linear_mps: float = 0.25
-    angular_radps: float = 0.35
-    linear_s: float = 2.0
-    angular_s: float = 0.4
-    hold_s: float = 0.5
-    fresh_s: float = 0.2
-    forget_s: float = 3.0
+    linear_mps: NonNegative = 0.25
+    angular_radps: NonNegative = 0.35
+    linear_s: NonNegative = 2.0
+    angular_s: NonNegative = 0.4
+    hold_s: NonNegative = 0.5
+    fresh_s: NonNegative = 0.2
+    forget_s: NonNegative = 3.0
 
 
 @dataclass(slots=True)

@@ -7,38 +7,38 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.command_comparison import CommandComparison, ComparisonLimits
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import amount
+from rampart.actors.runtime.parameters import NodeNames
 
 _FIRST_PAIR_S = 0.3
 """A respawned module waits this long for two commands before it says idle."""
 
-
 class CommandDisagreement(DetectionModule):
-    """Active while the two computers of the command disagree; names the life to be respawned.
+    """Active while the two computers of the command disagree; names the life to be respawned."""
 
-    Parameters:
-        suspects: names of the two nodes in the order in which they are accused; by default the
-            standby first, whose restart costs nothing.
-        linear_mps, angular_radps: differences that are none.
-        linear_s, angular_s: how long each may last.
-        hold_s: how long they must have agreed again before the module is idle, s.
-    """
+    class Parameters(DetectionModule.Parameters, ComparisonLimits, frozen=True):
+        """Whom it compares; what it lets pass as of `ComparisonLimits`.
+
+        Attributes:
+            suspects: names of the two nodes in the order in which they are accused; by default
+                the standby first, whose restart costs nothing.
+        """
+
+        suspects: NodeNames = ("standby_control", "osmosis_control")
+
+        def __post_init__(self) -> None:
+            """Check what a type cannot say."""
+            if not len(set(self.suspects)) == len(self.suspects) == 2 \
+                    or "osmosis_control" not in self.suspects:
+                raise ValueError("suspects: expected osmosis_control and its standby")
+
+    parameters: Parameters
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        names = self.parameters.get("suspects", ("standby_control", "osmosis_control"))
-        if isinstance(names, str) or len(names) != 2 or "osmosis_control" not in names:
-            raise ValueError(f"parameters.suspects = {names!r}: must name osmosis_control and "
-                             "its standby")
-        first, second = map(str, names)
+        first, second = self.parameters.suspects
         self._standby = second if first == "osmosis_control" else first
-        usual = ComparisonLimits()
         self.monitor = self.judged_by(CommandComparison(
-            (first, second),
-            ComparisonLimits(**{
-                name: amount(self.parameters, name, getattr(usual, name))
-                for name in ("linear_mps", "angular_radps", "linear_s", "angular_s", "hold_s")}),
-            self.known_after_s(_FIRST_PAIR_S)))
+            (first, second), self.parameters, self.known_after_s(_FIRST_PAIR_S)))
 
     @on(topics.COMMAND)
     def command(self, message: m.Twist, header: Header) -> None:

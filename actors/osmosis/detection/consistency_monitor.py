@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from rampart.actors.bus.plausible import is_possible, is_sane
 from rampart.actors.osmosis.messages import (
     ControlPhase,
@@ -25,12 +27,12 @@ from rampart.actors.osmosis.messages import (
     MissionStatus,
     Route,
 )
+from rampart.manager.spec.tables import NonNegative
 
 _DRIVING = frozenset({MissionPhase.RUNNING, MissionPhase.RETURNING})
 
 
-@dataclass(frozen=True, slots=True)
-class ConsistencyLimits:
+class ConsistencyLimits(msgspec.Struct, frozen=True):
     """How long is too long, and how far too far.
 
     Args:
@@ -41,11 +43,11 @@ class ConsistencyLimits:
         moved_m: how far the robot may drive while its progress is said to be the same.
     """
 
-    patience_s: float = 2.5
-    silence_s: float = 2.5
-    arrival_s: float = 6.0
-    arrival_m: float = 0.5
-    moved_m: float = 3.0
+    patience_s: NonNegative = 2.5
+    silence_s: NonNegative = 2.5
+    arrival_s: NonNegative = 6.0
+    arrival_m: NonNegative = 0.5
+    moved_m: NonNegative = 3.0
 
 
 @dataclass(slots=True)

@@ -15,18 +15,25 @@ from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.route_monitor import RouteMonitor
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import amount
+from rampart.manager.spec.tables import NonNegative
 
 _FIRST_ROUTE_S = 0.5
 """A respawned module waits this long for a first route, two periods, before it says idle."""
 
 
 class ErroneousRoute(DetectionModule):
-    """Active while the Graph Planner gives routes that must not be driven; names it as failed.
+    """Active while the Graph Planner gives routes that must not be driven; names it as failed."""
 
-    Parameters:
-        hold_s: how long routes must have been good again before the module is idle, s.
-    """
+    class Parameters(DetectionModule.Parameters, frozen=True):
+        """Patience.
+
+        Attributes:
+            hold_s: how long routes must have been good again before the module is idle, s.
+        """
+
+        hold_s: NonNegative = 0.5
+
+    parameters: Parameters
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -34,7 +41,7 @@ class ErroneousRoute(DetectionModule):
         check = RouteCheck(airport)
         self.monitor = self.judged_by(RouteMonitor(
             lambda waypoints, goal: check.fault(waypoints, None, goal),
-            amount(self.parameters, "hold_s", 0.5),
+            self.parameters.hold_s,
             self.known_after_s(_FIRST_ROUTE_S)))
 
     @on(topics.MISSION_STATUS)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from rampart.actors.detection.module import DetectionModule
+from typing import Literal
+
+from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import amount, names
+from rampart.actors.runtime.parameters import ControlTimeout, NodeNames
+from rampart.manager.spec.tables import NonNegative
 
 
 class Freshness(DetectionModule):
@@ -15,32 +18,36 @@ class Freshness(DetectionModule):
 
     Class attributes:
         subject: what is stale, for the reason.
-        default_timeout_s: timeout if no parameter says.
-
-    Parameters:
-        timeout_s: greatest admissible age of the content, s.
-        hold_s: how long it must be fresh again before the module is idle, s.
-        suspects: names of nodes to be respawned when it is active, as a rule the one that
-            publishes the topic; none by default, as in the paper.
-
-    The first sample of a starting system may take the spec's `startup_grace_s`. A respawned
-    module joins a running system: for it the timeout itself is the grace.
     """
 
+    class Parameters(Waiting, frozen=True):
+        """What is stale, and who is named then.
+
+        Attributes:
+            timeout_s: greatest admissible age of the content, s.
+            hold_s: how long it must be fresh again before the module is idle, s.
+            suspects: names of nodes to be respawned when it is active, as a rule the one that
+                publishes the topic; none by default, as in the paper.
+            topic: says again what the class says, for readers of the spec.
+        """
+
+        timeout_s: ControlTimeout = 1.0
+        hold_s: NonNegative = 0.2
+        suspects: NodeNames = ()
+
+    parameters: Parameters
     subject = ""
-    default_timeout_s = 1.0
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         if not self.subject:
             raise ValueError(f"{self.name}: actor Freshness hears no topic; name a subclass, "
                              "CommandFreshness or LocalizationFreshness")
-        timeout_s = amount(self.parameters, "timeout_s", self.default_timeout_s)
+        timeout_s = self.parameters.timeout_s
         self.monitor = self.judged_by(FreshnessMonitor(
-            self.subject, timeout_s, amount(self.parameters, "hold_s", 0.2), self.clock.now(),
+            self.subject, timeout_s, self.parameters.hold_s, self.clock.now(),
             self.grace_s(timeout_s), known=self.first_life))
-        self._suspects = names(self.parameters, "suspects")
-        self.monitor.nodes = self._suspects
+        self.monitor.nodes = self._suspects = self.parameters.suspects
 
     def sample(self, header: Header) -> None:
         """Take note of a sample."""
@@ -57,8 +64,13 @@ class Freshness(DetectionModule):
 class CommandFreshness(Freshness):
     """DM2: Osmosis Control's command is not updated (0.64 s in the authors' code)."""
 
+    class Parameters(Freshness.Parameters, frozen=True):
+        """As of `Freshness`."""
+
+        timeout_s: ControlTimeout = 0.64
+        topic: Literal["control/command"] = "control/command"
+
     subject = "command"
-    default_timeout_s = 0.64
 
     @on(topics.COMMAND)
     def command(self, _message: m.Twist, header: Header) -> None:
@@ -69,8 +81,12 @@ class CommandFreshness(Freshness):
 class LocalizationFreshness(Freshness):
     """DM6: the pose is not updated (1 s in the authors' code)."""
 
+    class Parameters(Freshness.Parameters, frozen=True):
+        """As of `Freshness`."""
+
+        topic: Literal["localization/pose"] = "localization/pose"
+
     subject = "localization"
-    default_timeout_s = 1.0
 
     @on(topics.POSE)
     def pose(self, _message: m.Pose, header: Header) -> None:

@@ -16,24 +16,20 @@ from rampart.actors.osmosis.detection.consistency_monitor import (
     ConsistencyMonitor,
 )
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import amount
 
 
 class MissionConsistency(DetectionModule):
-    """Active while a control node contradicts the others, or its words are not updated.
+    """Active while a control node contradicts the others, or its words are not updated."""
 
-    Parameters:
-        patience_s: how long a contradiction may last, s.
-        silence_s: greatest age of what a node says about the mission, s.
-    """
+    class Parameters(DetectionModule.Parameters, ConsistencyLimits, frozen=True):
+        """As of `ConsistencyLimits`."""
+
+    parameters: Parameters
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        limits = ConsistencyLimits()
         self.monitor = self.judged_by(ConsistencyMonitor(
-            ConsistencyLimits(amount(self.parameters, "patience_s", limits.patience_s),
-                              amount(self.parameters, "silence_s", limits.silence_s)),
-            self.clock.now(), known=self.first_life))
+            self.parameters, self.clock.now(), known=self.first_life))
 
     @on(topics.MISSION_STATUS)
     @on(topics.GOAL)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
-from rampart.actors.detection.module import DetectionModule
+from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.pilot_output_monitor import PilotLimits, PilotOutputMonitor
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import amount
+from rampart.actors.runtime.parameters import ControlTimeout, NodeName
+from rampart.manager.spec.tables import NonNegative
 
 
 class PilotOutput(DetectionModule):
@@ -17,28 +18,38 @@ class PilotOutput(DetectionModule):
 
     Names the pilot's life, so that it can be respawned: an error of software that sits in its
     process goes with it.
-
-    Parameters:
-        pilot: name of the Safety Pilot's node.
-        timeout_s: how old the newest command for the base may be; below the base's dead man.
-        wrong_s: how long commands for the base may be without explanation, s.
-        hold_s: how long all must have been well again before the module is idle, s.
     """
+
+    class Parameters(Waiting, frozen=True):
+        """Whom it checks, and how strictly.
+
+        Attributes:
+            pilot: name of the Safety Pilot's node.
+            timeout_s: how old the newest command for the base may be; below the base's dead man.
+            wrong_s: how long commands for the base may be without explanation, s.
+            hold_s: how long all must have been well again before the module is idle, s.
+        """
+
+        pilot: NodeName = "safety_pilot"
+        timeout_s: ControlTimeout = PilotLimits().timeout_s
+        wrong_s: NonNegative = PilotLimits().wrong_s
+        hold_s: NonNegative = PilotLimits().hold_s
+
+    parameters: Parameters
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system = context.run.system
-        usual = PilotLimits()
+        system, parameters = context.run.system, self.parameters
         limits = PilotLimits(
             # As the Safety Pilot has it: without its checks it goes on for ever.
             held_s=(system.timing.command_timeout_s if system.layers.safety_pilot_checks
                     else math.inf),
-            timeout_s=amount(self.parameters, "timeout_s", usual.timeout_s),
-            wrong_s=amount(self.parameters, "wrong_s", usual.wrong_s),
-            hold_s=amount(self.parameters, "hold_s", usual.hold_s))
+            timeout_s=parameters.timeout_s,
+            wrong_s=parameters.wrong_s,
+            hold_s=parameters.hold_s)
         self.monitor = self.judged_by(PilotOutputMonitor(
-            str(self.parameters.get("pilot", "safety_pilot")), self.clock.now(),
-            self.grace_s(limits.timeout_s), limits, known=self.first_life))
+            parameters.pilot, self.clock.now(), self.grace_s(limits.timeout_s), limits,
+            known=self.first_life))
 
     @on(topics.COMMAND)
     def command(self, message: m.Twist, _header: Header) -> None:

@@ -31,12 +31,19 @@ from rampart.actors.runtime.actor import Context, Header, on
 
 
 class OsmosisHmi(Hmi):
-    """The operator's node of Osmosis.
+    """The operator's node of Osmosis."""
 
-    Parameters: `camera`, the module that renders the picture of the robot
-        (`rampart.sim.osmosis.camera`), if any.
-    """
+    class Parameters(Hmi.Parameters, frozen=True):
+        """What its page shows.
 
+        Attributes:
+            camera: module that renders the picture of the robot (`rampart.sim.osmosis.camera`);
+                "" for none.
+        """
+
+        camera: str = ""
+
+    parameters: Parameters
     outputs = (*Hmi.outputs, topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.JOYSTICK,
                topics.ACTUATOR_FAULT)
     requests = OSMOSIS_REQUESTS
@@ -69,7 +76,7 @@ class OsmosisHmi(Hmi):
         return Driving(self, self._state)
 
     def _make_camera(self) -> CameraEye | None:
-        module = str(self.parameters.get("camera", ""))
+        module = self.parameters.camera
         if not (module and self._port and self._airport and self._airport.source):
             return None
         return CameraEye(renderer(module), {"airport": self._airport.source}, self._camera_view)

@@ -7,34 +7,30 @@ less room. The mission goes on in a degraded mode, and takes longer.
 
 from __future__ import annotations
 
-import math
-
 from rampart.actors.osmosis.messages import PilotMode, PilotStatus
 from rampart.actors.osmosis.recovery.controlled_stop import PilotRecovery
 from rampart.actors.runtime.actor import Context, Header
-
-DEFAULT_TOP_SPEED_MPS = 0.5
+from rampart.manager.spec.tables import Positive
 
 
 class ReducedSpeed(PilotRecovery):
-    """The Safety Pilot lets nobody drive faster than a bound.
+    """The Safety Pilot lets nobody drive faster than a bound."""
 
-    Parameters:
-        top_speed_mps: the bound.
+    class Parameters(PilotRecovery.Parameters, frozen=True):
+        """How slowly.
 
-    Raises:
-        ValueError: the bound is no positive number.
-    """
+        Attributes:
+            top_speed_mps: the bound.
+        """
 
+        top_speed_mps: Positive = 0.5
+
+    parameters: Parameters
     mode = PilotMode.AUTO
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        bound = self.parameters.get("top_speed_mps", DEFAULT_TOP_SPEED_MPS)
-        if isinstance(bound, bool) or not isinstance(bound, int | float) or not (
-                0 < bound < math.inf):
-            raise ValueError(f"parameters.top_speed_mps = {bound!r}: must be a speed above 0")
-        self.top_speed_mps = float(bound)
+        self.top_speed_mps = self.parameters.top_speed_mps
 
     def pilot_status(self, message: PilotStatus, header: Header) -> None:
         """See which bound the Safety Pilot keeps."""

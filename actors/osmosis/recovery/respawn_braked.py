@@ -21,9 +21,6 @@ class RespawnBraked(Respawn):
     """`Respawn` that holds the low-level brake from its order until its nodes are back.
 
     If the nodes do not come back the brake stays engaged until the manager releases this recovery.
-
-    Parameters:
-        nodes: names of the nodes that it may respawn.
     """
 
     outputs = (*Respawn.outputs, topics.BRAKE)

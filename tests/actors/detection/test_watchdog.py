@@ -12,6 +12,7 @@ from rampart.actors.detection.watchdog_core import WatchdogCore
 from rampart.actors.ftm import messages as m
 from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.runtime.actor import Actor
+from rampart.actors.runtime.parameters import read_parameters
 from rampart.testing import Ear, play, run, table
 from tests.osmosis_system import System
 
@@ -105,15 +106,15 @@ def test_strangers_are_ignored():
 
 
 def test_it_hears_the_heartbeats_of_its_nodes_only():
-    member = Member("DM4", Watchdog, {"watch": ["a", "b"]})
+    member = Member("DM4", Watchdog, Watchdog.Parameters(watch=("a", "b")))
     assert heard(member) == {"heartbeat/{name}": ("a", "b")}
-    assert Watchdog.watches("DM4", member.parameters) == ("a", "b")
+    assert Watchdog.watches("DM4", Watchdog.Parameters(watch=("a", "b"))) == ("a", "b")
 
 
 @pytest.mark.parametrize("watch_list", ["a", [], [1], [""]])
 def test_a_watch_list_that_is_none_is_refused_by_name(watch_list):
-    with pytest.raises(ValueError, match=r"parameters\.watch = .*: must be a list of node names"):
-        Watchdog.watches("DM4", {"watch": watch_list})
+    with pytest.raises(ValueError, match=r"DM4: x\.watch = .*: expected a list of node names"):
+        read_parameters(Watchdog.Parameters, {"watch": watch_list}, "DM4", "x")
 
 
 class Node(Actor):

@@ -21,8 +21,8 @@ from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
-from rampart.actors.bus import tap as taps
-from rampart.actors.bus.tap import Tap, frame, parse_frame
+from rampart.actors.bus import recorder_connection as wire
+from rampart.actors.bus.recorder_connection import RecorderConnection, frame, parse_frame
 from rampart.actors.osmosis import topics
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.bag_writer import BagError
@@ -72,7 +72,7 @@ class Robot:
     """One node that sends poses, numbered."""
 
     def __init__(self, port):
-        self.tap = Tap(port)
+        self.connection = RecorderConnection(port)
         self.sent = 0
         self.begun_s = time.monotonic()
 
@@ -80,7 +80,7 @@ class Robot:
         for _ in range(count):
             self.sent += 1
             _, key, payload = pose(self.sent, time.monotonic() - self.begun_s)
-            self.tap.take(key, payload)
+            self.connection.take(key, payload)
 
 
 def recorder_pid(port):
@@ -102,7 +102,7 @@ def recording(port, launcher, tmp_path):
         robot = Robot(port)
         yield process, robot, path
         process.end()
-        robot.tap.close()
+        robot.connection.close()
 
 
 def test_everything_is_written_from_the_first_message_to_the_last(recording):
@@ -151,7 +151,7 @@ def test_the_robot_does_not_notice_that_its_recorder_died(recording, port):
 
     def let_go() -> bool:
         robot.send(100)  # raises nothing, waits for nothing
-        return robot.tap._socket is None
+        return robot.connection._socket is None
 
     wait_until(let_go, 15, "the connection is still there")
 
@@ -181,7 +181,7 @@ def test_a_launcher_that_is_killed_leaves_a_whole_recording_and_no_recorder(
     robot.send(100)
     wait_until(path.exists, 15, "it has not begun")
     robot.send(100)
-    robot.tap.close()
+    robot.connection.close()
     launcher.kill()
     wait_until(lambda: recorder_pid(port) is None, 15, "the recorder was left")
     assert numbers(path) == list(range(1, 201))
@@ -230,7 +230,7 @@ def test_what_nodes_send_after_their_launcher_has_ended_is_recorded(port, tmp_pa
         for _ in range(20):
             time.sleep(0.02)
             robot.send()
-        robot.tap.close()
+        robot.connection.close()
         thread.join()
     os.close(read_end)
     os.close(write_end)
@@ -304,7 +304,7 @@ def test_strangers_at_the_socket_are_not_recorded_and_do_no_harm(recording, port
     import socket
 
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
-        stranger.connect(taps.address(port))
+        stranger.connect(wire.address(port))
         for junk in (b"x", b"\xff" * 100, frame(float("nan"), "k", b"")[:-1]):
             stranger.send(junk)
         robot.send(5)
@@ -323,9 +323,9 @@ def test_a_frame_comes_back_and_a_broken_one_is_refused():
 
 def test_a_tap_looks_for_a_recorder_once_a_second_and_not_with_every_message(port, monkeypatch):
     looks = []
-    monkeypatch.setattr(Tap, "_look", lambda self: looks.append(now_s))
+    monkeypatch.setattr(RecorderConnection, "_look", lambda self: looks.append(now_s))
     now_s = 0.0
-    node = Tap(port, lambda: now_s)
+    node = RecorderConnection(port, lambda: now_s)
     for step in range(400):
         now_s = step * 0.01
         node.take("rampart/k", b"")
@@ -336,7 +336,7 @@ def test_a_node_without_a_descriptor_left_goes_on_unrecorded(port, monkeypatch):
     def none_left(*_arguments: object) -> None:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
-    node = Tap(port)
+    node = RecorderConnection(port)
     monkeypatch.setattr(socket, "socket", none_left)
     node.take("rampart/k", b"")
 
@@ -357,7 +357,7 @@ def test_topics_that_nobody_wants_are_left_out_and_gaps_are_told_all_the_same(
         wait_until(path.exists, 15, "it has not begun")
         os.write(write_end, b"x")
         thread.join()
-        robot.tap.close()
+        robot.connection.close()
     os.close(read_end)
     os.close(write_end)
     assert numbers(path) == []
@@ -390,7 +390,7 @@ def test_topics_of_the_robot_s_own_can_be_wished_for(port, tmp_path, monkeypatch
 def test_a_message_too_long_for_a_recording_is_left_out_and_those_after_it_are_not(recording):
     process, robot, path = recording
     robot.send(1)
-    robot.tap.take("rampart/manager/system", b"x" * (taps.MAX_FRAME_BYTES + 1))
+    robot.connection.take("rampart/manager/system", b"x" * (wire.MAX_FRAME_BYTES + 1))
     robot.send(1)
     process.end()
     assert numbers(path) == [1, 2]
@@ -410,7 +410,7 @@ def test_a_run_that_is_there_is_recorded_until_ctrl_c_or_the_terminal_is_closed(
         wait_until(lambda: robot.send() or numbers(path), 30, "nothing is written")
         verb.send_signal(number)
         told = verb.communicate(timeout=20)[0]
-    robot.tap.close()
+    robot.connection.close()
     assert verb.returncode == 0, told
     kept = numbers(path)
     assert f"recorded {len(kept)} messages in {path}, none lost; it ends because" in told

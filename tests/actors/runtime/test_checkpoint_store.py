@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from rampart.actors.runtime.checkpoint import (
     BUSY_TIMES,
-    FAILED_LIVES,
+    FAILED_IN_A_ROW,
     GENERATIONS,
     RETRY_S,
     SOON_S,
@@ -714,14 +714,14 @@ def test_a_keeper_names_what_it_passed_over():
 def test_a_state_that_lives_fail_with_soon_is_given_up_and_one_that_works_is_not():
     shelf = Shelf()
     Desk(MemoryCheckpoints(shelf, 1)).keeper.keep(COUNTER, Counter(13, 0))
-    for incarnation in range(2, 2 + FAILED_LIVES):
+    for incarnation in range(2, 2 + FAILED_IN_A_ROW):
         desk = Desk(MemoryCheckpoints(shelf, incarnation))
         assert desk.keeper.kept(COUNTER) == Counter(13, 0)
         desk.now_s = SOON_S / 2
         desk.keeper.failed()
     last = Desk(MemoryCheckpoints(shelf, 9), expected=True)
     assert last.keeper.kept(COUNTER) is None
-    assert last.told == [f"{FAILED_LIVES} lives in a row have failed with the state kept; "
+    assert last.told == [f"{FAILED_IN_A_ROW} processes in a row have failed with the state kept; "
                          "starting without it"]
     assert shelf.failures == 0
 

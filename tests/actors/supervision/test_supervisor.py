@@ -489,7 +489,7 @@ def test_a_process_that_is_adapted_while_it_is_replaced_is_replaced_once(outage_
         async with running() as world:
             document = load_document(PLAN)
             row = next(r for r in document["detection"] if r["name"] == "DM2")
-            row["parameters"] = {**row.get("parameters", {}), "new": 1}
+            row["parameters"] = {**row.get("parameters", {}), "hold_s": 0.9}
             world.machine.fork_error = SpawnerUnavailableError("none")
             world.kill("DM2")
             await asyncio.sleep(0.02)

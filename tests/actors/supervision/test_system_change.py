@@ -11,6 +11,7 @@ import pytest
 
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.layout import Layout, adapted_system
+from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
 from tests import ROOT
 
@@ -30,7 +31,7 @@ def document():
 
 def change(layout, document) -> Layout:
     text = document if isinstance(document, str) else json.dumps(document)
-    return adapted_system(layout, {}, AdaptedSystem(1, "a change", "me", text))[0]
+    return adapted_system(layout, RunContext(), AdaptedSystem(1, "a change", "me", text))[0]
 
 
 def test_a_sound_one_is_taken(layout, document):

@@ -47,10 +47,11 @@ async def run(monkeypatch, sockets):
                    "r1", 0, "test run")
     monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: info)
     nodes, tasks = [], []
-    for name, cls in (("mission_manager", MissionManager), ("planner", Planner)):
+    for name, cls, parameters in (
+            ("mission_manager", MissionManager, {"held_by": ["RM2"]}), ("planner", Planner, {})):
         bus = ZenohBus(name, 1, endpoint(sockets, name),
                        [endpoint(sockets, n) for n in names if n != name])
-        node = cls(Context(name, 1, clock, bus, {"held_by": ["RM2"]},
+        node = cls(Context(name, 1, clock, bus, parameters,
                            run=RunContext(application=Osmosis.on_map(load_airport("vallombre")))))
         tasks.append(asyncio.create_task(node.run()))
         nodes.append((node, bus))

@@ -102,14 +102,6 @@ def test_a_gate_and_an_order_and_a_strategy_are_changed():
     ("retune", "DM2", {"timeout_s": 5.0},
      "paper.toml: $.timing: the time budget does not fit: FTM2 needs 5.150 s (detection 5.000 + "
      "arbitration 0.050 + actuation 0.100) of 1.250 s before the robot drifts out of the corridor"),
-    ("retune", "DM4", {"timeout_s": 0.01},
-     "paper.toml: $.detection[3].parameters.timeout_s = 0.01: would raise false alarms; at least "
-     "0.420 s, 3 periods of heartbeat_period_s = 0.140 s, is right"),
-    ("retune", "DM1", {"hold_s": -1},
-     "paper.toml: $.detection[0].parameters.hold_s = -1: expected a number, 0 or more"),
-    ("retune", "DM3", {"hold": 1},
-     "paper.toml: $.detection[2].parameters.hold = 1: unknown parameter; Bounds takes hold_s, "
-     "suspects"),
     ("retune", "FTM3", {"against": {"within_s": 5.0, "hazard": "x", "typo": 1}},
      "paper.toml: $.mechanism[2].against.typo = 1: unknown field; known: within_s, hazard"),
     ("retune", "FTM3", {"detect": "DM3 and not DM3"},
@@ -299,6 +291,13 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
     ("retune", "RM5",
      '{"actor": "rampart.actors.osmosis.control.localization.localization:Localization"}',
      "it does not publish recovery/{name}/state, as the modules of this table do"),
+    ("retune", "DM4", '{"timeout_s": 0.01}',
+     "paper.toml: $.detection[3].parameters.timeout_s = 0.01: would raise false alarms; at least "
+     "0.420 s, 3 periods of heartbeat_period_s = 0.140 s, is right"),
+    ("retune", "DM1", '{"hold_s": -1}',
+     "paper.toml: $.detection[0].parameters.hold_s = -1: expected a number, 0 or more"),
+    ("retune", "DM3", '{"hold": 1}',
+     "paper.toml: $.detection[2].parameters.hold = 1: unknown parameter; known: hold_s, suspects"),
 ])
 def test_what_is_refused_changes_nothing(action, name, values, words):
     async def scenario(system: Whole, engineer: Engineer) -> None:

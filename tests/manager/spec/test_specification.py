@@ -111,7 +111,7 @@ def test_a_latency_that_does_not_fit_is_refused_though_the_timeout_would():
         edit((timeout, f"{timeout}\nwithin_s = 50.0")))
 
 
-def test_modules_of_other_people_take_what_they_like():
+def test_what_parameters_there_are_is_for_the_classes_to_say():
     spec = parse_specification(edit(
         ('"rampart.actors.osmosis.detection.freshness:CommandFreshness"', '"my.own:Freshness"'),
         ('topic = "control/command", ', 'topic = 3, hold_s = -1, anything = [true], ')), FILE)
@@ -205,26 +205,6 @@ REFUSED = {
         ["$.robot.corridor_clearance_m = 1e+306: out of all proportion"]),
     "tables without end": ([("[layers]", f"[{'.'.join('a' * 5000)}]")],
                            ["$: a key of more than 6 dotted parts"]),
-    # parameters
-    "a negative hold": ([('topic = "control/command",', 'hold_s = -1,')],
-                        ["$.detection[1].parameters.hold_s = -1: expected a number, 0 or more"]),
-    "a misspelt parameter": ([("margin_m = 0.6", "margim_m = 0.6")],
-                             ["$.detection[0].parameters.margim_m = 0.6: unknown parameter; "
-                              "ProhibitedArea takes margin_m, gps_timeout_s, hold_s"]),
-    "a parameter of a module that has none": (
-        [('actor = "rampart.actors.osmosis.recovery.emergency_stop:EmergencyStop"',
-          'actor = "rampart.actors.osmosis.recovery.emergency_stop:EmergencyStop"\n'
-           'parameters = { x = 1 }')],
-        ["$.recovery[0].parameters.x = 1: unknown parameter; EmergencyStop takes none"]),
-    "a topic that the class does not hear": (
-        [('topic = "control/command"', 'topic = "localization/pose"')],
-        ["$.detection[1].parameters.topic = 'localization/pose': expected 'control/command'"]),
-    "a suspect that is no node": (
-        [('topic = "control/command",', 'suspects = ["osmosis"],')],
-        ["$.detection[1].parameters.suspects = ['osmosis']: expected a list of node names"]),
-    "a watchdog that watches nobody": (
-        [('watch = ["localization"], ', "")],
-        ["$.detection[6].parameters.watch: missing; without it the module does not start"]),
     # names
     "duplicate node": ([('name = "hmi"', 'name = "teleoperation"')],
                        ["$.node[5].name = 'teleoperation': duplicate name, already at $.node[4]"]),
@@ -431,14 +411,6 @@ REFUSED = {
     "a heartbeat timeout that trips": (
         [("arbitration_s = 0.05 ", "heartbeat_timeout_s = 0.2\narbitration_s = 0.05 ")],
         ["$.timing.heartbeat_timeout_s = 0.2: would raise false alarms; at least 0.420 s"]),
-    "a watchdog's own timeout that trips": (
-        [('["localization"], timeout_s = "heartbeat_timeout_s"',
-          '["localization"], timeout_s = 0.2')],
-        ["$.detection[6].parameters.timeout_s = 0.2: would raise false alarms; at least 0.420 s, 3 "
-         "periods of heartbeat_period_s = 0.140 s, is right"]),
-    "a freshness timeout of its own that trips": (
-        [('timeout_s = "command_timeout_s"', "timeout_s = 0.1")],
-        ["$.detection[1].parameters.timeout_s = 0.1: would raise false alarms; at least 0.150 s"]),
     "a drive slower than its commands": (
         [("hardware_speed_mps = 3.0", "hardware_speed_mps = 0.3")],
         ["$.robot.hardware_speed_mps = 0.3: the drive cannot be slower than top_speed_mps = 1.0"]),
@@ -457,6 +429,16 @@ REFUSED = {
                             ["$.robot.sensing_range_m = 0.7: obstacles must be seen"]),
     "a hold above its bound": ([("release_hold_s = 0.5 ", "release_hold_s = 20.0 ")],
                                ["$.timing.release_hold_max_s = 10.0: must be no less"]),
+    "a backoff above its bound": ([("[layers]", "[supervision]\nbackoff_s = 3.0\n[layers]")],
+                                  ["$.supervision.backoff_max_s = 2.0: must be no less than "
+                                   "backoff_s = 3"]),
+    "attempts that come sooner and sooner": (
+        [("[layers]", "[supervision]\nattempt_max_s = 5.0\n[layers]")],
+        ["$.supervision.attempt_max_s = 5.0: must be no less than attempt_s = 10"]),
+    "no restart at all": ([("[layers]", "[supervision]\nintensity = 0\n[layers]")],
+                          ["$.supervision.intensity = 0: "]),
+    "a window that is none": ([("[layers]", "[supervision]\nperiod_s = 0.0\n[layers]")],
+                              ["$.supervision.period_s = 0.0: "]),
 }
 
 

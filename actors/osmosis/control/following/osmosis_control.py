@@ -30,7 +30,7 @@ from rampart.actors.osmosis.messages import (
     Twist,
 )
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.actors.runtime.parameters import amount, switch
+from rampart.manager.spec.tables import NonNegative
 
 
 class OsmosisControl(Actor):
@@ -38,18 +38,30 @@ class OsmosisControl(Actor):
 
     Class attributes:
         command_topic: where the command goes; a standby's has a topic of its own.
-
-    Parameters:
-        check_route: whether a route is checked before it is followed. Off by default, as in the
-            paper.
-        pass_after_s: how long the robot waits in a row before it drives round an obstacle, s;
-            for ever if 0, as in the paper.
-        has_standby: whether a standby listens, which is told at once where the robot means to be.
-        yaw_loop: whether the turn rate is controlled in a closed loop (`motion_loop`). Off by
-            default: the base is trusted to turn as it is told.
-        bridge_m: how far it drives by odometry without a fresh pose, m; if 0, as in the paper, it
-            goes on computing from the last pose it has, and does not ask for odometry.
     """
+
+    class Parameters(Actor.Parameters, frozen=True):
+        """What it does beyond the paper's.
+
+        Attributes:
+            check_route: whether a route is checked before it is followed.
+            pass_after_s: how long the robot waits in a row before it drives round an obstacle, s;
+                for ever if 0.
+            has_standby: whether a standby listens, which is told at once where the robot means to
+                be.
+            yaw_loop: whether the turn rate is controlled in a closed loop (`motion_loop`); if not,
+                the base is trusted to turn as it is told.
+            bridge_m: how far it drives by odometry without a fresh pose, m; if 0, it goes on
+                computing from the last pose it has, and does not ask for odometry.
+        """
+
+        check_route: bool = False
+        pass_after_s: NonNegative = 0.0
+        has_standby: bool = False
+        yaw_loop: bool = False
+        bridge_m: NonNegative = 0.0
+
+    parameters: Parameters
 
     command_topic: ClassVar[Topic[Twist]] = topics.COMMAND
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
@@ -58,19 +70,19 @@ class OsmosisControl(Actor):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         system, airport = context.run.system, Osmosis.of(context).airport
-        bridge_m = amount(self.parameters, "bridge_m", 0.0)
-        self._bridges = bridge_m > 0
+        parameters = self.parameters
+        self._bridges = parameters.bridge_m > 0
         self._lights = RowInspection(airport.lights, goes_back=system.layers.checkpoints) \
             if topics.LIGHT_MEASURED in self.outputs else None
         self.core = RouteControl(
             system, airport, self.report_diagnostic, context.clock.now(),
-            RowLimits(pass_after_s=amount(self.parameters, "pass_after_s", 0.0) or math.inf),
+            RowLimits(pass_after_s=parameters.pass_after_s or math.inf),
             lights=self._lights,
-            check=RouteCheck(airport) if switch(self.parameters, "check_route") else None,
-            bridge=DeadReckoning(bridge_m) if self._bridges else None,
+            check=RouteCheck(airport) if parameters.check_route else None,
+            bridge=DeadReckoning(parameters.bridge_m) if self._bridges else None,
             loop=MotionLoop(system.robot.top_turn_rate_radps)
-            if switch(self.parameters, "yaw_loop") else None,
-            has_standby=switch(self.parameters, "has_standby"))
+            if parameters.yaw_loop else None,
+            has_standby=parameters.has_standby)
 
     def listens(self, topic: Topic[Any]) -> bool:
         """Whether it hears a topic: the base publishes odometry only if somebody does."""

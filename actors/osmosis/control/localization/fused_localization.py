@@ -8,14 +8,13 @@ absolute pose and fix.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.localization.pose_filter import PoseFilter
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits
 from rampart.actors.osmosis.messages import GpsFix, Imu, Odometry, Pose
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.actors.runtime.parameters import amount
+from rampart.manager.spec.tables import NonNegative
 
 _PERIOD_S = 0.05
 
@@ -24,18 +23,23 @@ class FusedLocalization(Actor):
     """Publishes the fused pose with the stamp of its newest accepted reading.
 
     It publishes none while it does not know one, so that a reader, and DM6, sees it grow old.
-
-    Parameters:
-        bridge_m: how far the robot may go on dead reckoning alone, m.
     """
 
+    class Parameters(Actor.Parameters, frozen=True):
+        """How far it is trusted.
+
+        Attributes:
+            bridge_m: how far the robot may go on dead reckoning alone, m.
+        """
+
+        bridge_m: NonNegative = FilterLimits().bridge_m
+
+    parameters: Parameters
     outputs = (topics.POSE, topics.LOCALIZATION_STATUS)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        limits = FilterLimits()
-        self._filter = PoseFilter(replace(
-            limits, bridge_m=amount(self.parameters, "bridge_m", limits.bridge_m)))
+        self._filter = PoseFilter(FilterLimits(self.parameters.bridge_m))
         self._told_s = -math.inf
 
     @on(topics.IMU)

@@ -23,7 +23,7 @@ from rampart.actors.osmosis.messages import (
     Route,
 )
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.actors.runtime.parameters import names
+from rampart.actors.runtime.parameters import RecoveryNames
 
 UNCERTAIN_S = 1.0
 """A Mission Manager that comes back waits so long for word of the step that others are at. They
@@ -36,20 +36,26 @@ _SAME_POINT_M = 0.1
 class MissionManager(Actor):
     """Wires `mission_state` to its topics; see there for the machine.
 
-    Parameters:
-        held_by: names of the recovery modules that hold the robot while they are activated; the
-            mission is paused then, for that reason. None by default, as in the paper.
-
     Who holds the robot is heard from the FTM Manager's status, ten times a second, so a respawned
     Mission Manager finds out as well.
     """
 
+    class Parameters(Actor.Parameters, frozen=True):
+        """When the mission waits.
+
+        Attributes:
+            held_by: names of the recovery modules that hold the robot while they are activated;
+                the mission is paused then, for that reason. None by default, as in the paper.
+        """
+
+        held_by: RecoveryNames = ()
+
+    parameters: Parameters
     outputs = (topics.GOAL, topics.MISSION_STATUS, topics.MISSION_ORDER_ANSWER)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.state = MissionState()
-        self._held_by = names(self.parameters, "held_by")
         self._uncertain_until_s = -math.inf
         airport = Osmosis.of(context).airport
         self._lights = frozenset(light.name for light in airport.lights) if airport else None
@@ -69,8 +75,8 @@ class MissionManager(Actor):
     @on(ftm_topics.MANAGER_STATUS)
     def manager(self, message: ManagerStatus, _header: Header) -> None:
         """Pause while a recovery holds the robot, and go on when it is released."""
-        if self._held_by:
-            self._become(mission_state.hold(self.state, hold_reason(message, self._held_by)))
+        if held_by := self.parameters.held_by:
+            self._become(mission_state.hold(self.state, hold_reason(message, held_by)))
 
     @on(topics.CONTROL_STATUS)
     def progress(self, message: ControlStatus, _header: Header) -> None:

@@ -15,7 +15,7 @@ from rampart.actors.osmosis.control.planning.route_search import PlannedRoute, p
 from rampart.actors.osmosis.messages import Blockage, ControlStatus, GoalOrder, Mode, Pose, Route
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
-from rampart.actors.runtime.parameters import amount
+from rampart.manager.spec.tables import NonNegative
 
 
 class RouteKept(msgspec.Struct, frozen=True):
@@ -47,13 +47,23 @@ class GraphPlanner(Actor):
     If Osmosis Control reports that it does not get past something, the planner may plan round it:
     the stretch of the graph near that place is closed for a while. Where there is no other way
     the route stays, and the robot waits.
-
-    Parameters:
-        replan_after_s: how long the robot must have been blocked, s; never if 0, as in the paper.
-        avoid_for_s: how long the stretch stays closed, s (60).
-        avoid_gap_m: how far round the place the graph is closed, m (1).
     """
 
+    class Parameters(Actor.Parameters, frozen=True):
+        """When it plans round something.
+
+        Attributes:
+            replan_after_s: how long the robot must have been blocked, s; never if 0, as in the
+                paper.
+            avoid_for_s: how long the stretch stays closed, s.
+            avoid_gap_m: how far round the place the graph is closed, m.
+        """
+
+        replan_after_s: NonNegative = 0.0
+        avoid_for_s: NonNegative = 60.0
+        avoid_gap_m: NonNegative = 1.0
+
+    parameters: Parameters
     outputs = (topics.ROUTE,)
 
     def __init__(self, context: Context) -> None:
@@ -62,9 +72,7 @@ class GraphPlanner(Actor):
         self._pose: Pose | None = None
         self._order: GoalOrder | None = None
         self._route: Route | None = None
-        self._replan_after_s = amount(self.parameters, "replan_after_s", 0.0)
-        self._closures = Closures(amount(self.parameters, "avoid_gap_m", 1.0),
-                                  amount(self.parameters, "avoid_for_s", 60.0))
+        self._closures = Closures(self.parameters.avoid_gap_m, self.parameters.avoid_for_s)
         self._try_again_s = -math.inf
         self._blocked: Blockage | None = None
         self._kept: RouteKept | None = None
@@ -113,8 +121,9 @@ class GraphPlanner(Actor):
             if not math.isfinite(blockage.x_m + blockage.y_m):
                 continue
             self._blocked = blockage
-            if 0 < self._replan_after_s <= now_s - blockage.since_s and now_s >= self._try_again_s:
-                self._try_again_s = now_s + self._replan_after_s
+            after_s = self.parameters.replan_after_s
+            if 0 < after_s <= now_s - blockage.since_s and now_s >= self._try_again_s:
+                self._try_again_s = now_s + after_s
                 self._plan_round(blockage, now_s)
 
     @every(0.2)

@@ -20,10 +20,11 @@ import os
 import re
 import stat
 import struct
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
+
+import msgspec
 
 from rampart.actors.osmosis.messages import Joystick
 
@@ -48,8 +49,11 @@ class ForeignDeviceError(Exception):
     """What comes from the device are no records of a joystick; one line."""
 
 
-@dataclass(frozen=True, slots=True)
-class StickMapping:
+Number = Annotated[int, msgspec.Meta(ge=0, le=255)]
+Sign = Literal[-1, 1]
+
+
+class StickMapping(msgspec.Struct, frozen=True):
     """Which axes and which button of a device mean what; the defaults suit common gamepads.
 
     Attributes:
@@ -62,35 +66,17 @@ class StickMapping:
             stretched, so that the speed begins at zero.
     """
 
-    forward_axis: int = 1
-    left_axis: int = 0
-    forward_sign: int = -1
-    left_sign: int = -1
-    dead_man_button: int = 4
-    dead_zone: float = 0.1
+    forward_axis: Number = 1
+    left_axis: Number = 0
+    forward_sign: Sign = -1
+    left_sign: Sign = -1
+    dead_man_button: Number = 4
+    dead_zone: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.1
 
-
-def mapping_of(parameters: Mapping[str, Any]) -> StickMapping:
-    """Return the mapping that a node's parameters ask for; those for something else are left.
-
-    Raises:
-        ValueError: a value makes no sense; it says which, and what would be right.
-    """
-    given = {f.name: parameters[f.name] for f in fields(StickMapping) if f.name in parameters}
-    for name, value in given.items():
-        if name == "dead_zone":
-            right = "a number from 0 to below 1"
-            sound = isinstance(value, (int, float)) and 0 <= value < 1
-        elif name.endswith("_sign"):
-            right, sound = "1 or -1", value in (1, -1)
-        else:
-            right, sound = "a whole number from 0 to 255", value in range(256)
-        if not sound or isinstance(value, bool):
-            raise ValueError(f"{name} = {value!r}: must be {right}")
-    mapping = StickMapping(**given)
-    if mapping.forward_axis == mapping.left_axis:
-        raise ValueError(f"left_axis = {mapping.left_axis}: is the forward axis already")
-    return mapping
+    def __post_init__(self) -> None:
+        """Check what a type cannot say."""
+        if self.forward_axis == self.left_axis:
+            raise ValueError("left_axis: is the forward axis already")
 
 
 class StickDecoder:

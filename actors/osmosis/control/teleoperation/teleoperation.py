@@ -11,7 +11,10 @@ import math
 
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.control.teleoperation.joystick_device import JoystickDevice, mapping_of
+from rampart.actors.osmosis.control.teleoperation.joystick_device import (
+    JoystickDevice,
+    StickMapping,
+)
 from rampart.actors.osmosis.control.teleoperation.stick_arbitration import (
     TIMEOUT_S,
     Ruling,
@@ -20,6 +23,7 @@ from rampart.actors.osmosis.control.teleoperation.stick_arbitration import (
 from rampart.actors.osmosis.messages import Joystick, Twist
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.timer import Timer
+from rampart.manager.spec.tables import NonNegative
 
 _LOOK_S = 0.05
 """Period in which a held stick is repeated and a silent one noticed (simulated seconds)."""
@@ -48,21 +52,30 @@ class Teleoperation(Actor):
 
     A device tells changes only, so while its dead man is held its position is repeated; messages
     are repeated by whoever sends them. A device that vanishes has let go, and is looked for again.
-
-    Parameters: `linear_mps`, `angular_radps`: velocities at full stick; the robot's if left out.
-    `device`: path of a joystick or "auto" for the first one; "" for none. `forward_axis`,
-    `left_axis`, `forward_sign`, `left_sign`, `dead_man_button`, `dead_zone`: see
-    `joystick_device.StickMapping`.
     """
 
+    class Parameters(Actor.Parameters, StickMapping, frozen=True):
+        """How it is driven; axes and button as of `StickMapping`.
+
+        Attributes:
+            linear_mps: speed at full stick; the robot's if left out.
+            angular_radps: turn rate at full stick; the robot's if left out.
+            device: path of a joystick, or "auto" for the first one; "" for none.
+        """
+
+        linear_mps: NonNegative | None = None
+        angular_radps: NonNegative | None = None
+        device: str = ""
+
+    parameters: Parameters
     outputs = (topics.TELEOP_COMMAND,)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        robot = context.run.system.robot
-        self._linear_mps = float(context.parameters.get("linear_mps", robot.top_speed_mps))
-        self._angular_radps = float(
-            context.parameters.get("angular_radps", robot.top_turn_rate_radps))
+        robot, own = context.run.system.robot, self.parameters
+        self._linear_mps = robot.top_speed_mps if own.linear_mps is None else own.linear_mps
+        self._angular_radps = (
+            robot.top_turn_rate_radps if own.angular_radps is None else own.angular_radps)
         self._arbiter = StickArbiter(TIMEOUT_S)
         self._look: Timer | None = None
         self._device: JoystickDevice | None = None
@@ -70,15 +83,10 @@ class Teleoperation(Actor):
 
     def on_start(self) -> None:
         """Open the joystick, if there is to be one."""
-        name = Osmosis.of(self.context).joystick or self.parameters.get("device", "")
+        name = Osmosis.of(self.context).joystick or self.parameters.device
         if not name or self.context.run.plan.virtual:
             return
-        try:
-            mapping = mapping_of(self.parameters)
-        except ValueError as error:
-            self.report_diagnostic("joystick", f"not used: {error}", str(name))
-            return
-        self._device = JoystickDevice(str(name), mapping, self._moved, self._gone)
+        self._device = JoystickDevice(name, self.parameters, self._moved, self._gone)
         self._plug()
 
     def on_stop(self) -> None:

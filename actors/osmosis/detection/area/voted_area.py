@@ -11,19 +11,21 @@ from __future__ import annotations
 
 import math
 
-from rampart.actors.detection.module import DetectionModule
+from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
 from rampart.actors.osmosis.detection.area.geofence import FenceLimits
 from rampart.actors.osmosis.detection.area.position_vote import GPS, PositionVote
-from rampart.actors.osmosis.detection.area.prohibited_area import GPS_PERIOD_S, half_diagonal_m
+from rampart.actors.osmosis.detection.area.prohibited_area import (
+    GPS_PERIOD_S,
+    half_diagonal_m,
+    reaction_s,
+)
 from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
 from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import amount
-from rampart.manager.spec.mobile_robot import Robot, time_to_intrusion_s
-from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.tables import NonNegative, Positive
 
 _ABSOLUTE = "absolute pose"
 _ERROR_PER_M = 0.06
@@ -80,39 +82,43 @@ class VotedPosition:
 
 
 class VotedArea(DetectionModule):
-    """Active while the robot would not stop before the prohibited area, or its place is unknown.
+    """Active while the robot would not stop before the prohibited area, or its place is unknown."""
 
-    Parameters:
-        margin_m: as for `ProhibitedArea`.
-        unknown_s: how long the place may be unknown, s.
-        hold_s: how long it must have been safe again before the module is idle, s.
-        blind_s: how long it goes on by dead reckoning while fewer than two witnesses agree, s.
-        blind_m: how far it does so, m.
-    """
+    class Parameters(Waiting, frozen=True):
+        """When it warns.
+
+        Attributes:
+            margin_m: as for `ProhibitedArea`.
+            unknown_s: how long the place may be unknown, s.
+            hold_s: how long it must have been safe again before the module is idle, s.
+            blind_s: how long it goes on by dead reckoning while fewer than two witnesses agree, s.
+            blind_m: how far it does so, m.
+        """
+
+        margin_m: Positive | None = None
+        unknown_s: NonNegative = 5 * GPS_PERIOD_S
+        hold_s: NonNegative = 0.5
+        blind_s: NonNegative = 10.0
+        blind_m: NonNegative = 5.0
+
+    parameters: Parameters
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         system = context.run.system
         airport = Osmosis.of(context).airport
         robot = system.robot
-        timeout_s = amount(self.parameters, "unknown_s", 5 * GPS_PERIOD_S)
+        parameters = self.parameters
+        timeout_s = parameters.unknown_s
         self._looked_s = -math.inf
-        self._where = VotedPosition(robot.gps_accuracy_m,
-                                    amount(self.parameters, "blind_s", 10.0),
-                                    amount(self.parameters, "blind_m", 5.0))
+        self._where = VotedPosition(robot.gps_accuracy_m, parameters.blind_s, parameters.blind_m)
         self.monitor = self.judged_by(FenceMonitor(
             airport.prohibited_distance_m,
-            FenceLimits(half_diagonal_m(robot), self._reaction_s(system, robot),
+            FenceLimits(half_diagonal_m(robot), reaction_s(system, parameters.margin_m),
                         robot.braking_mps2),
             FreshnessMonitor("position that two sources agree on", timeout_s, 2 * GPS_PERIOD_S,
                              self.clock.now(), self.grace_s(timeout_s), known=self.first_life),
-            amount(self.parameters, "hold_s", 0.5)))
-
-    def _reaction_s(self, system: SystemSpec, robot: Robot) -> float:
-        needed_s = GPS_PERIOD_S + system.timing.arbitration_s + system.timing.actuation_s
-        if "margin_m" not in self.parameters:
-            return needed_s
-        return max(needed_s, time_to_intrusion_s(robot, amount(self.parameters, "margin_m", 0.0)))
+            parameters.hold_s))
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:

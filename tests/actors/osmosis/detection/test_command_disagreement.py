@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.detection.bounds import suspects_of
 from rampart.actors.osmosis.detection.command_comparison import CommandComparison, ComparisonLimits
 from rampart.testing import play, table
 
@@ -114,13 +113,3 @@ def test_active_and_an_accused_life_go_together(events):
     bench = Bench()
     bench.play(events)
     assert bool(bench.comparison.nodes) == bench.comparison.active
-
-
-@pytest.mark.parametrize("bad", ["osmosis_control", [""], [3]])
-def test_suspects_that_are_no_names_are_refused(bad):
-    with pytest.raises(ValueError, match="suspects"):
-        suspects_of({"suspects": bad})
-
-
-def test_nobody_is_suspected_by_default():
-    assert suspects_of({}) == ()

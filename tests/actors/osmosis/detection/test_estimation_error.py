@@ -206,5 +206,5 @@ def test_the_actor_names_the_life_that_lied():
 
 
 def test_the_actor_does_not_hear_the_absolute_pose_that_localization_lives_on():
-    assert set(heard(Member("DM8", EstimationError, {}))) == {
+    assert set(heard(Member("DM8", EstimationError, EstimationError.Parameters()))) == {
         "summit_xl/gps", "summit_xl/imu", "summit_xl/odom", "localization/pose"}

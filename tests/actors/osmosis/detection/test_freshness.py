@@ -199,14 +199,14 @@ def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_judges():
 @pytest.mark.parametrize(("cls", "key"), [
     (CommandFreshness, "control/command"), (LocalizationFreshness, "localization/pose")])
 def test_each_module_hears_its_own_topic_only(cls, key):
-    assert list(heard(Member("DM", cls, {}))) == [key]
+    assert list(heard(Member("DM", cls, cls.Parameters()))) == [key]
 
 
-@pytest.mark.parametrize("value", ["soon", -1.0, math.inf, True, None])
+@pytest.mark.parametrize("value", ["soon", -1.0, True, None])
 def test_a_timeout_that_is_no_duration_is_refused_by_name(value):
     async def scenario() -> None:
         async with System() as system:
-            with pytest.raises(ValueError, match=r"parameters\.timeout_s = .*: must be a number"):
+            with pytest.raises(ValueError, match=r"parameters\.timeout_s = .*: expected a number"):
                 system.start("DM2", CommandFreshness, timeout_s=value)
 
     run(scenario)
@@ -305,7 +305,7 @@ def test_it_names_the_suspected_node_and_the_life_that_was_heard_last():
 def test_suspects_that_are_no_names_are_refused():
     async def scenario() -> None:
         async with System() as system:
-            with pytest.raises(ValueError, match=r"parameters.suspects = 'x': must be a list"):
+            with pytest.raises(ValueError, match=r"parameters.suspects = 'x': expected a list"):
                 system.start("DM6", LocalizationFreshness, suspects="x")
 
     run(scenario)

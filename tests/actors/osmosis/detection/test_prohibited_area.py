@@ -222,7 +222,8 @@ def test_the_actor_is_active_when_gps_falls_silent():
 
 
 def test_the_actor_hears_gps_and_nothing_else_of_the_robot():
-    assert set(heard(Member("DM1", ProhibitedArea, {}))) == {"summit_xl/gps"}
+    member = Member("DM1", ProhibitedArea, ProhibitedArea.Parameters())
+    assert set(heard(member)) == {"summit_xl/gps"}
 
 
 def test_nonsense_on_the_command_is_reported_with_the_first_message():

@@ -319,7 +319,7 @@ def test_a_receiver_that_is_stuck_does_not_blind_it():
 
 
 def test_it_does_not_hear_the_localization_that_it_guards():
-    assert set(heard(Member("DM1", VotedArea, {}))) == {
+    assert set(heard(Member("DM1", VotedArea, VotedArea.Parameters()))) == {
         "summit_xl/gps", "summit_xl/imu", "summit_xl/odom", "summit_xl/absolute_pose"}
 
 

@@ -16,6 +16,7 @@ from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop
 from rampart.actors.osmosis.recovery.switch_teleoperation import SwitchTeleoperation
 from rampart.actors.recovery.module import TRANSITIONS, IllegalTransitionError, RecoveryModule
 from rampart.actors.recovery.respawn import Respawn
+from rampart.actors.runtime.parameters import read_parameters
 from rampart.testing import run
 from tests.actors.osmosis.recovery.world import Base, Boss, Node, Pilot, Supervisor, hang
 from tests.osmosis_system import System
@@ -503,7 +504,7 @@ def test_a_respawned_module_that_is_commanded_again_does_not_kill_who_is_well():
 
 
 def test_it_hears_the_heartbeats_of_its_nodes_and_its_own_commands_only():
-    member = Member("RM3", Respawn, {"nodes": ["a", "b"]})
+    member = Member("RM3", Respawn, Respawn.Parameters(nodes=("a", "b")))
     assert heard(member) == {
         "recovery/{name}/command": ("RM3",), "heartbeat/{name}": ("a", "b"),
         "supervisor/event": None}
@@ -511,5 +512,5 @@ def test_it_hears_the_heartbeats_of_its_nodes_and_its_own_commands_only():
 
 @pytest.mark.parametrize("nodes", ["a", [], [1], [""]])
 def test_a_list_of_nodes_that_is_none_is_refused_by_name(nodes):
-    with pytest.raises(ValueError, match=r"parameters\.nodes = .*: must be a list of node names"):
-        Respawn.watches("RM3", {"nodes": nodes})
+    with pytest.raises(ValueError, match=r"RM3: x\.nodes = .*: expected a list of node names"):
+        read_parameters(Respawn.Parameters, {"nodes": nodes}, "RM3", "x")

@@ -305,5 +305,5 @@ def test_another_plan_that_is_asked_for_avoids_what_is_in_the_way():
 
 
 def test_a_parameter_that_is_no_number_is_refused():
-    with pytest.raises(ValueError, match=r"replan_after_s = 'soon': must be a number, 0 or more"):
+    with pytest.raises(ValueError, match=r"replan_after_s = 'soon': expected a number, 0 or more"):
         planned(lambda _chain: asyncio.sleep(0), replan_after_s="soon")

@@ -23,8 +23,9 @@ from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     StickDecoder,
     StickMapping,
     device_path,
-    mapping_of,
 )
+from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
+from rampart.actors.runtime.parameters import read_parameters
 
 PLAIN = StickMapping(dead_zone=0.0)
 RELEASED = m.Joystick(0.0, 0.0, False)
@@ -109,20 +110,16 @@ def test_no_stream_of_records_leaves_the_range(records, zone, piece):
 
 
 @pytest.mark.parametrize(("parameters", "words"), [
-    ({"dead_zone": 1.0}, "dead_zone = 1.0: must be a number from 0 to below 1"),
+    ({"dead_zone": 1.0}, "dead_zone = 1.0: expected a number, 0 or more, below 1"),
     ({"dead_zone": "a"}, "dead_zone = 'a'"),
-    ({"forward_sign": 2}, "forward_sign = 2: must be 1 or -1"),
-    ({"left_sign": [1]}, "left_sign = [1]: must be 1 or -1"),
-    ({"dead_man_button": -1}, "dead_man_button = -1: must be a whole number"),
+    ({"forward_sign": 2}, "forward_sign = 2: expected -1 or 1"),
+    ({"left_sign": [1]}, "left_sign = [1]: expected -1 or 1"),
+    ({"dead_man_button": -1}, "dead_man_button = -1: expected a whole number, 0 or more, at most"),
     ({"dead_man_button": True}, "dead_man_button = True"),
     ({"left_axis": 1}, "left_axis = 1: is the forward axis already")])
 def test_a_mapping_without_sense_is_refused_by_name_and_value(parameters, words):
     with pytest.raises(ValueError, match=re.escape(words)):
-        mapping_of(parameters)
-
-
-def test_a_mapping_takes_what_is_given_and_leaves_the_rest():
-    assert mapping_of({"left_axis": 3, "linear_mps": 0.4}) == StickMapping(left_axis=3)
+        read_parameters(Teleoperation.Parameters, parameters, "spec.toml", "parameters")
 
 
 def test_the_first_joystick_is_the_one_with_the_lowest_number(tmp_path):

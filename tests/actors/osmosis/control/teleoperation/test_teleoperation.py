@@ -227,16 +227,6 @@ async def test_a_device_that_is_not_there_is_waited_for_and_the_page_drives_mean
         await it.plug()
 
 
-@pytest.mark.parametrize(("parameters", "words"), [
-    ({"dead_zone": 2}, "dead_zone = 2: must be"), ({"left_axis": "x"}, "left_axis = 'x'")])
-async def test_a_mapping_without_sense_is_told_and_the_page_still_drives(
-        tmp_path, parameters, words):
-    async with desk(tmp_path, **parameters) as it:
-        await it.until(lambda: it.told(words))
-        it.page.publish(topics.JOYSTICK, m.Joystick(0.5, 0.0, True))
-        await it.until(lambda: m.Twist(0.5, 0.0) in it.page.commands)
-
-
 async def test_in_virtual_time_no_device_is_opened(tmp_path):
     os.mkfifo(tmp_path / "stick")
     context = Context("teleoperation", 1, Clock(0.0), VirtualBus(Hub(), "teleoperation"),

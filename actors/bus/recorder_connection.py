@@ -2,9 +2,9 @@
 
 Why not a subscriber? One that hears everything over Zenoh takes an eleventh of a core for 900
 messages a second, all of it wake-ups, and every node pays for one more link. So the recorder is not
-on the bus at all: it listens on a unix socket, and whoever publishes puts a copy of each message
-there. The recorder comes by some twenty times a second and takes what has gathered. The price is
-one system call a message while somebody records, and one a second while nobody does.
+on the bus at all: it listens on a unix socket, and a node that publishes puts a copy of each
+message there. The recorder comes by some twenty times a second and takes what has gathered. The
+price is one system call a message while somebody records, and one a second while nobody does.
 
 A node never waits for the recorder: what does not fit into the socket is lost to the recording,
 where the gap in the sequence numbers shows. What a node has handed over survives its SIGKILL.
@@ -63,7 +63,7 @@ def parse_frame(data: bytes | memoryview) -> tuple[float, str, bytes]:
         raise ValueError(f"{len(data)} bytes that are no frame: {error}") from None
 
 
-class Tap:
+class RecorderConnection:
     """One bus's way to the recorder of its run.
 
     Args:

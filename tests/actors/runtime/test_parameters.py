@@ -1,0 +1,243 @@
+"""Parameters of actors: what a class declares is what a spec may say, and all that it may say."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import pytest
+
+from rampart import systems
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.layout.layout import Layout
+from rampart.actors.layout.wiring import REPORTS_ON, load_class, load_member
+from rampart.actors.osmosis.airport.formats import load_airport
+from rampart.actors.recovery.stub import StubRecovery
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.actor import Actor, Context
+from rampart.actors.runtime.parameters import NodeNames, read_parameters
+from rampart.cli import systems as cli_systems
+from rampart.cli.output import UsageError
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.specification import parse_specification
+from rampart.manager.spec.tables import NonNegative, SpecificationError
+from rampart.sim.virtual.virtual_bus import VirtualBus
+from rampart.testing import run
+from tests.manager.bench import FULL
+from tests.osmosis_system import System, run_context
+from tests.stub_actors import ROOT
+
+FILE = "osmosis.toml"
+SPECS = {path.name: parse_specification(path.read_text("utf-8"), path.name)
+         for path in sorted(systems.SHIPPED.glob("*.toml"))}
+FULL_SPEC = SPECS[FILE]
+ACTORS = {node.actor: node for spec in SPECS.values() for node in spec.actors()}
+STARTABLE = {"watch": ["osmosis_control"], "nodes": ["osmosis_control"]}
+VALUES = (-1, 0, 1, 2.5, True, "x", "done", "acting", "safety_pilot", "control/command", [], {},
+          [""], [3], ["nobody"], ["safety_pilot"], ["standby_control", "osmosis_control"],
+          ["osmosis_control", "osmosis_control"], ["safety_pilot", "standby_control"], ["RM1"])
+
+
+def plan(file: str) -> RunPlan:
+    return RunPlan(seed=5, system_file=file)
+
+
+def said(table: str, name: str, **parameters: Any) -> SystemSpec:
+    """The full system with other parameters of one module."""
+    rows = tuple(msgspec.structs.replace(row, parameters={**row.parameters, **parameters})
+                 if row.name == name else row for row in getattr(FULL_SPEC, table))
+    return msgspec.structs.replace(FULL_SPEC, **{table: rows})
+
+
+def refusal(spec: SystemSpec) -> str:
+    with pytest.raises(SpecificationError) as caught:
+        Layout(plan(FILE), spec)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("file", SPECS)
+def test_the_systems_that_ship_say_what_their_actors_take(file):
+    layout = Layout(plan(file), SPECS[file])
+    assert {type(m.parameters) for m in layout.members.values()} == {
+        m.actor.Parameters for m in layout.members.values()}
+
+
+def test_what_plan_and_spec_say_is_given_to_the_actors_that_take_it():
+    members = Layout(plan(FILE), said("nodes", "simulator", obstacles=1)).members
+    assert members["RM4"].parameters.nodes == ("localization", "hmi", "teleoperation")
+    world = members["simulator"].parameters
+    assert (world.seed, world.obstacles, world.dead_man, world.upper_laser) == (5, 1, True, True)
+    rows = tuple(msgspec.structs.replace(row, actor="rampart.actors.recovery.stub:StubRecovery")
+                 if row.name == "RM4" else row for row in FULL_SPEC.recoveries)
+    members = Layout(plan(FILE), msgspec.structs.replace(FULL_SPEC, recoveries=rows)).members
+    assert members["RM4"].parameters == StubRecovery.Parameters()
+
+
+@pytest.mark.parametrize(("table", "name", "parameters", "words"), [
+    ("detections", "DM2", {"timeout_s": True},
+     "detection[1].parameters.timeout_s = True: expected a number > 0"),
+    ("detections", "DM2", {"hold_s": "x"},
+     "detection[1].parameters.hold_s = 'x': expected a number, 0 or more"),
+    ("detections", "DM2", {"topic": "localization/pose"},
+     "detection[1].parameters.topic = 'localization/pose': expected 'control/command'"),
+    ("detections", "DM2", {"timeout_s": 0.1},
+     "detection[1].parameters.timeout_s = 0.1: would raise false alarms; at least 0.150 s"),
+    ("detections", "DM7", {"timeout_s": 0.2},
+     "detection[6].parameters.timeout_s = 0.2: would raise false alarms; at least 0.420 s, 3 "
+     "periods of heartbeat_period_s = 0.140 s, is right"),
+    ("detections", "DM1", {"margim_m": 0.6},
+     "detection[0].parameters.margim_m = 0.6: unknown parameter; known: startup_grace_s, margin"),
+    ("detections", "DM2", {"suspects": "osmosis_control"},
+     "detection[1].parameters.suspects = 'osmosis_control': expected a list of node names"),
+    ("detections", "DM2", {"suspects": ["osmosis"]},
+     "detection[1].parameters.suspects = ['osmosis']: unknown node 'osmosis'; known: mission_m"),
+    ("detections", "DM9", {"suspects": ["osmosis_control", "osmosis_control"]},
+     "detection[8].parameters.suspects = ['osmosis_control', 'osmosis_control']: expected "
+     "osmosis_control and its standby"),
+    ("detections", "DM12", {"pilot": "nobody"},
+     "detection[11].parameters.pilot = 'nobody': unknown node 'nobody'; known: mission_manager"),
+    ("detections", "DM12", {"pilot": 3},
+     "detection[11].parameters.pilot = 3: expected the name of a node"),
+    ("recoveries", "RM1", {"x": 1},
+     "recovery[0].parameters.x = 1: unknown parameter; known: none, its class declares no Param"),
+    ("recoveries", "RM7", {"nodes": []},
+     "recovery[6].parameters.nodes = []: expected a list of node names"),
+    ("nodes", "mission_manager", {"held_by": ["RM99"]},
+     "node[0].parameters.held_by = ['RM99']: unknown recovery module 'RM99'; known: RM1, RM2"),
+    ("nodes", "osmosis_control", {"yaw_loop": 1},
+     "node[2].parameters.yaw_loop = 1: expected true or false"),
+    ("nodes", "hmi", {"camera": 3}, "node[5].parameters.camera = 3: expected a text"),
+    ("nodes", "teleoperation", {"left_axis": 256},
+     "node[6].parameters.left_axis = 256: expected a whole number, 0 or more, at most 255"),
+    ("nodes", "teleoperation", {"left_axis": 1},
+     "node[6].parameters.left_axis = 1: is the forward axis already"),
+])
+def test_what_an_actor_does_not_take_is_refused_with_file_path_and_what_would_be_right(
+        table, name, parameters, words):
+    assert refusal(said(table, name, **parameters)).startswith(f"{FILE}: $.{words}")
+
+
+def test_what_an_actor_cannot_do_without_may_be_derived_but_not_left_out():
+    rows = tuple(msgspec.structs.replace(row, parameters={}) for row in FULL_SPEC.detections)
+    assert refusal(msgspec.structs.replace(FULL_SPEC, detections=rows)) == (
+        f"{FILE}: $.detection[3].parameters.watch: missing; without it the node does not start")
+
+
+@pytest.mark.parametrize(("old", "new", "words"), [
+    ("margin_m = 0.6,", "margin_m = 0.6, hold = 1,",
+     "$.detection[0].parameters.hold = 1: unknown parameter; known: startup_grace_s, margin_m"),
+    ("{ top_speed_mps = 0.6 }", '{ top_speed_mps = "x" }',
+     "$.recovery[7].parameters.top_speed_mps = 'x': expected a number > 0")])
+def test_a_look_at_a_spec_refuses_parameters_of_the_modules_that_ship(tmp_path, old, new, words):
+    file = tmp_path / "own.toml"
+    assert FULL.count(old) == 1
+    file.write_text(FULL.replace(old, new))
+    with pytest.raises(UsageError, match=re.escape(f"{file}: {words}")):
+        cli_systems.load(str(file))
+
+
+def test_a_look_at_a_spec_imports_nothing_of_its_author_s(tmp_path):
+    file = tmp_path / "own.toml"
+    file.write_text(FULL.replace("rampart.actors.osmosis.detection.bounds:Bou", "no.such:Bou"))
+    assert cli_systems.load(str(file)).detections[2].actor == "no.such:Bounds"
+
+
+# -- actors of one's own -------------------------------------------------------------------------
+
+
+class Plain(Actor):
+    """Of one who has not heard of `Parameters`."""
+
+
+class Lamp(Actor):
+    """Declares some."""
+
+    class Parameters(Actor.Parameters, frozen=True, kw_only=True):
+        brightness_cd: NonNegative
+        near: NodeNames = ("hmi",)
+        place_m: tuple[float, float] = (0.0, 0.0)
+
+    parameters: Parameters
+
+
+@pytest.mark.parametrize(("actor", "parameters", "words"), [
+    ("Plain", {"x": 1}, "x = 1: unknown parameter; known: none, its class declares no Parameters"),
+    ("Lamp", {}, "brightness_cd: missing; without it the node does not start"),
+    ("Lamp", {"brightness_cd": 1, "near": ["nobody"]},
+     "near = ['nobody']: unknown node 'nobody'; known: mission_manager"),
+    ("Lamp", {"brightness_cd": 1, "place_m": [1]},
+     "place_m = [1]: Expected array of length 2, got 1"),
+])
+def test_the_parameters_of_an_actor_of_one_s_own_are_checked_likewise(actor, parameters, words):
+    spec = said("nodes", "hmi", **parameters)
+    node = msgspec.structs.replace(
+        next(n for n in spec.nodes if n.name == "hmi"), actor=f"{__name__}:{actor}",
+        parameters=parameters)
+    where = "x.toml: $.node[5].parameters."
+    with pytest.raises(SpecificationError, match=re.escape(where + words)):
+        load_member(node, spec, "x.toml")
+
+
+def test_an_actor_of_one_s_own_reads_its_parameters_by_their_names():
+    async def scenario() -> None:
+        async with System() as system:
+            lamp = system.start("lamp", Lamp, brightness_cd=3)
+            assert (lamp.parameters.brightness_cd, lamp.parameters.near) == (3.0, ("hmi",))
+            assert Plain(Context("p", 1, system.clock, VirtualBus(system.hub, "p", 1))).parameters
+            with pytest.raises(SpecificationError, match=r"^lamp: parameters\.brightness_cd = -1"):
+                system.start("lamp", Lamp, brightness_cd=-1)
+
+    run(scenario)
+
+
+# -- the actors that ship ------------------------------------------------------------------------
+
+
+def declared() -> Iterator[tuple[str, str]]:
+    for path in ACTORS:
+        for field in msgspec.structs.fields(load_class(path).Parameters):
+            yield path, field.name
+
+
+@pytest.mark.parametrize(("path", "name"), list(declared()))
+def test_each_parameter_is_documented_where_it_is_declared(path, name):
+    kind = load_class(path).Parameters
+    assert any(re.search(rf"^\s*{name}: \S", base.__doc__ or "", re.MULTILINE)
+               or (name == "nodes" and "names of all nodes" in (base.__doc__ or ""))
+               for base in kind.__mro__), f"{path}: {name}"
+
+
+@pytest.mark.parametrize("path", [p for p, node in ACTORS.items() if node.kind in REPORTS_ON])
+def test_a_module_starts_with_every_value_that_is_accepted(path):
+    cls = load_class(path)
+    fields = msgspec.structs.fields(cls.Parameters)
+    needed = {f.name: STARTABLE[f.name] for f in fields if f.required}
+
+    async def scenario() -> None:
+        system, airport = System(), load_airport("vallombre")
+        for field in fields:
+            accepted = 0
+            for value in VALUES:
+                try:
+                    parameters = read_parameters(
+                        cls.Parameters, {**needed, field.name: value}, "f", "p", FULL_SPEC)
+                except SpecificationError:
+                    continue
+                accepted += 1
+                cls(Context("X", 1, system.clock, VirtualBus(system.hub, "X", 1), parameters,
+                            run_context(system=FULL_SPEC, airport=airport)))
+                cls.names(bus_topics.HEARTBEAT, "X", parameters)
+                cls.watches("X", parameters)
+            assert 0 < accepted < len(VALUES) or field.name == "topic", field.name
+
+    run(scenario)
+
+
+def test_the_manager_s_room_names_no_class_of_an_actor_but_its_own():
+    """What they take is said by the classes, and nowhere else."""
+    found = {name for file in (ROOT / "manager").rglob("*.py")
+             for name in re.findall(r"rampart\.[\w.]+:[A-Z]\w+", file.read_text("utf-8"))}
+    assert found <= {"rampart.manager.actor:FtmManager", "rampart.actors.operator.hmi:Hmi"}
