@@ -66,7 +66,7 @@ class Publisher:
     """Publishes sample after sample on the topic of a disturbance, four times a second."""
 
     def __init__(self, disturbance: Disturbance) -> None:
-        self.topic, self.key = resolve(disturbance.topic)
+        self.topic, self.key = resolve(disturbance.topic, topics.ALL)
         self.gate = FaultGate()
         self.now_s = 0.0
         self.n = 0
@@ -124,7 +124,7 @@ def test_the_published_keys_are_those_of_the_topic_list_with_families_spelt_out(
     nodes = {node.name for node in shipped_system().actors()} | {"supervisor"}
     by_topic: dict[str, set[str]] = {}
     for key in KEYS:
-        topic, _ = resolve(key)
+        topic, _ = resolve(key, topics.ALL)
         head, _, tail = topic.key.partition("{name}")
         by_topic.setdefault(topic.key, set()).add(
             key[len(head):len(key) - len(tail)] if topic.is_family else "")
@@ -297,7 +297,7 @@ def test_a_fault_is_found_by_its_name_and_makes_sense(name):
     assert fault.group in ("paper", "sensor", "topic")
     for order in fault.orders("i"):
         assert order.duration_s > 0
-        assert flaw(order, resolve(order.topic)[0].type) == ""
+        assert flaw(order, resolve(order.topic, topics.ALL)[0].type) == ""
 
 
 def test_catalogue_names_detection_modules_that_exist():
