@@ -147,7 +147,8 @@ def test_what_remembers_without_bound_is_found(monkeypatch):
 
     of = system("osmosis")
     monkeypatch.setattr(of.layout, "members", {
-        **of.layout.members, "DM1": type(of.layout.members["DM1"])("DM1", Hoarder, {})})
+        **of.layout.members, "DM1": type(of.layout.members["DM1"])(
+            "DM1", Hoarder, Hoarder.Parameters())})
     assert flooded(of, "DM1") == [(".heard", FLOOD)]
 
 

@@ -87,4 +87,5 @@ def test_a_changed_system_that_is_no_document_is_reported_and_the_supervisor_goe
 
 def test_a_document_nested_too_deep_is_a_value_error():
     with pytest.raises(ValueError, match="nested too deep"):
-        adapted_system(system("paper").layout, {}, m.AdaptedSystem(1, "", "", '{"a":' * 50_000))
+        adapted_system(system("paper").layout, system("paper").run,
+                       m.AdaptedSystem(1, "", "", '{"a":' * 50_000))
