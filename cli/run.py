@@ -277,3 +277,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
         return EXIT_USAGE
     except KeyboardInterrupt:
         return EXIT_FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

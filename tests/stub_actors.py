@@ -22,6 +22,9 @@ from tests import ROOT
 class Idler(Actor):
     """Beats its heart and does nothing else; it may stand in every table of a spec."""
 
+    class Parameters(Actor.Parameters, frozen=True, forbid_unknown_fields=False):
+        """It takes any, and heeds none."""
+
     outputs = (topics.POSE, ftm_topics.DETECTION, ftm_topics.RECOVERY)
 
 
