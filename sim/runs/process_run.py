@@ -27,6 +27,10 @@ from rampart.sim.runs.trial import Trial
 _LOOK_S = 0.05
 _STALL_S = 0.5
 
+_RELINK_S = 4.0
+"""Wall seconds in which a launcher that was stopped has its links again: those that it has lost are
+dialled after one second, and after two more."""
+
 
 class ProcessRun:
     """One run on processes. Use: `run`, once.
@@ -102,7 +106,7 @@ class ProcessRun:
                 await asyncio.sleep(_LOOK_S)
                 stall_s = clock.now() - looked_s - _LOOK_S * plan.rate
                 if stall_s > _STALL_S * plan.rate:  # ctrl-Z; what was sent meanwhile comes now
-                    trial.excuse(stall_s)
+                    trial.excuse(stall_s + _RELINK_S * plan.rate)
                 why = trial.over(clock.now())
             if launcher.failure:  # before its observer is told to end
                 why = self.failure = launcher.failure
