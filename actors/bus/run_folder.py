@@ -4,7 +4,7 @@ Only the run's user can enter it, and the kernel sees to that at both ends: no o
 connect to a socket in it, or put one of his own in the place of a node that is down. So there is no
 secret that could leak, no port that could be taken, and no handshake that takes longer for it.
 
-An incarnation is a number that is issued before the process is forked (`issue`); a reader that
+An incarnation is a number that a new process issues before it is heard (`issue`); a reader that
 meets a new one looks it up (`Register`). It is kept as the target of a symbolic link, which is
 written and read whole or not at all, in a system call or two and with no byte of a disk.
 
@@ -76,7 +76,7 @@ def socket_path(folder: str, name: str) -> str:
 
 
 def issue(folder: str, names: Iterable[str], incarnation: int) -> None:
-    """Make a number known as the incarnation of these nodes, before their process is forked.
+    """Make a number known as the incarnation of these nodes, before their process is heard.
 
     Raises:
         OSError: the folder is gone, or full.

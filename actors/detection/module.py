@@ -90,7 +90,7 @@ class Waiting(Actor.Parameters, frozen=True):
 
 
 class DetectionModule(Actor):
-    """Base of DM1 to DM7.
+    """Base of every detection module.
 
     A subclass either calls `activate` and `know_idle` itself, or has a `Monitor` (`judged_by`),
     hands it what it hears, and calls `follow` after each event. One that calls them itself calls

@@ -59,7 +59,7 @@ class IllegalTransitionError(RuntimeError):
 
 
 class RecoveryModule(Actor):
-    """Base of RM1 to RM5.
+    """Base of every recovery module.
 
     A subclass says what it does: `act` on each order, `let_go` when released. It calls
     `succeed`, `degrade` or `fail` when it knows how the action went. The deadline is the one in

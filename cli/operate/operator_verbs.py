@@ -37,7 +37,7 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
     parser = verbs.add_parser(
         "trigger", parents=[common], formatter_class=formatter,
         help="make the stand-in of a detection module detect",
-        description="Make a detection module that is a stand-in (actors.stub) active, for some\n"
+        description="Make a stand-in for a detection module (`detection.stub`) active, for some\n"
                     "simulated seconds. What real modules detect is injected: rampart inject.",
         epilog="examples:\n  rampart trigger D_CURTAIN\n  rampart trigger D_VISION --for 5")
     parser.add_argument("module", metavar="NAME", help="detection module, e.g. D_CURTAIN")
