@@ -23,7 +23,8 @@ from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from rampart.actors.bus.limits import RateLimit, ReportLimit
 from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection
-from rampart.actors.bus.topic import Qos, Topic
+from rampart.actors.bus.fields import Field
+from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT
 from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
 from rampart.actors.runtime.context import Context
@@ -76,6 +77,7 @@ class Actor(Declared):
         self._states: dict[str, tuple[Topic[Any], msgspec.Struct, float]] = {}
         self._outlets: dict[str | tuple[str, str], tuple[str, bool]] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
+        self._chosen: list[tuple[Topic[Any], str, Callable[[Any, Header], None]]] = []
 
     # -- what a subclass may override, besides what `Declared` has ---------------------------------
 
@@ -96,6 +98,44 @@ class Actor(Declared):
         """Runs as a mailbox item when a watched node appears or vanishes."""
 
     # -- what a subclass calls ------------------------------------------------------------------
+
+    def hear(self, key: str, handler: Callable[[Any, Header], None]) -> Topic[Any]:
+        """Hear a topic that the node's parameters name; to be called when it is made.
+
+        Args:
+            key: of a parameter of type `TopicHeard`.
+            handler: called with message and header.
+
+        Returns:
+            The topic.
+
+        Raises:
+            ValueError: the system has no such topic.
+        """
+        topic = self.chosen_topic(key)
+        self._chosen.append((topic, key, handler))
+        return topic
+
+    def hear_field(self, name: str, handler: Callable[[Any, Header], None]) -> None:
+        """Hear a field that the node's parameters name, likewise; of type `FieldName`.
+
+        Raises:
+            ValueError: there is no such topic, or its messages have no such field.
+        """
+        key, _, path = name.partition(":")
+        field = Field(self.chosen_topic(key).type, path)
+        self.hear(key, lambda message, header: handler(field(message), header))
+
+    def chosen_topic(self, key: str) -> Topic[Any]:
+        """Return a topic that the node's parameters name.
+
+        Raises:
+            ValueError: the system has none.
+        """
+        try:
+            return self.context.topics[key]
+        except KeyError:
+            raise ValueError(f"{self.name}: no topic {key!r}") from None
 
     def publish(
         self, topic: Topic[Any], body: msgspec.Struct, stamp: float | None = None,
@@ -205,6 +245,8 @@ class Actor(Declared):
             keys = [topic.at(n) for n in names] if names is not None else [topic.pattern]
             for key in keys:
                 self._bus.subscribe(topic, key, self._receiver(topic, handler))
+        for topic, key, handler in self._chosen:
+            self._bus.subscribe(topic, f"{ROOT}/{key}", self._receiver(topic, handler))
         for node in self.watches(self.name, self.parameters):
             self._bus.watch(node, self._peer_changed)
         self.on_start()
@@ -239,7 +281,8 @@ class Actor(Declared):
     def _receiver(
         self, topic: Topic[Any], handler: Callable[[Any, Header], None]
     ) -> Callable[[str, bytes], None]:
-        command, name, members = topic.qos is Qos.COMMAND, handler.__name__, self.context.members
+        command, members = topic.qos is Qos.COMMAND, self.context.members
+        name = getattr(handler, "__qualname__", "")
         dispatcher, mailbox = self._dispatcher, self._dispatcher.mailbox
 
         def take(key: str, message: Envelope[Any]) -> None:

@@ -11,6 +11,7 @@ import msgspec
 
 from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.run_folder import Register
+from rampart.actors.bus.topic import Topic
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.clock import Clock
@@ -33,6 +34,7 @@ class Context:
         failed: told of the error that ends the actor, while its peers still see it alive.
         register: returns the incarnation of a node that was issued last, None if it is not known.
         members: names of all nodes of the system; what others make it remember is bounded.
+        topics: those that parameters of the system's nodes name, by key.
     """
 
     name: str
@@ -47,3 +49,4 @@ class Context:
     failed: Callable[[Exception], None] = lambda _error: None
     register: Register = lambda _node: None
     members: frozenset[str] = frozenset()
+    topics: Mapping[str, Topic[Any]] = field(default_factory=dict)

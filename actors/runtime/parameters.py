@@ -24,6 +24,17 @@ NodeName = Annotated[Name, msgspec.Meta(extra={"names": "node"})]
 NodeNames = Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, extra={"names": "node"})]
 RecoveryNames = Annotated[tuple[Name, ...], msgspec.Meta(extra={"names": "recovery module"})]
 
+TopicHeard = Annotated[str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "heard"})]
+"""Key of a topic, below `rampart/`, that the node hears because its parameters say so."""
+TopicPublished = Annotated[
+    str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "published"})]
+"""Key of a topic that the node publishes because its parameters say so."""
+FieldName = Annotated[str, msgspec.Meta(
+    pattern=r"^[^:]+:[^:]+\Z", extra={"names": "field", "way": "heard"})]
+"""A field of the messages of a topic, "topic:field", as of `rampart.actors.bus.fields`."""
+FieldNames = Annotated[tuple[FieldName, ...], msgspec.Meta(min_length=1, extra={
+    "names": "field", "way": "heard"})]
+
 ControlTimeout = Annotated[float, msgspec.Meta(gt=0, extra={"period": "control_period_s"})]
 """How long, s, to wait for what comes as often as commands, poses and scans."""
 HeartbeatTimeout = Annotated[float, msgspec.Meta(gt=0, extra={"period": "heartbeat_period_s"})]
@@ -64,6 +75,22 @@ def read_parameters(kind: type[P], given: Mapping[str, Any] | msgspec.Struct, fi
     raise SpecificationError(file, f"{path}.{name}", problem, *value)
 
 
+def topics_named(parameters: msgspec.Struct) -> dict[str, list[tuple[str, str, str]]]:
+    """Return which topics a node's parameters have it hear and publish.
+
+    Returns:
+        For "heard" and "published": name of the parameter, key of a topic, and a field or "".
+    """
+    found: dict[str, list[tuple[str, str, str]]] = {"heard": [], "published": []}
+    for name, marks in _marks(type(parameters)).items():
+        said = getattr(parameters, name)
+        if "way" in marks and said:
+            for text in [said] if isinstance(said, str) else said:
+                key, _, field = text.partition(":")
+                found[marks["way"]].append((name, key, field))
+    return found
+
+
 def _explain(kind: type[msgspec.Struct], given: Mapping[str, Any], error: str) -> tuple[str, str]:
     """Return which parameter msgspec refuses, and what would be right."""
     known = kind.__struct_fields__
@@ -98,7 +125,8 @@ def _misfits(kind: type[msgspec.Struct], given: Mapping[str, Any],
     for field, marks in _marks(kind).items():
         if field not in given:
             continue
-        if what := marks.get("names"):
+        what = marks.get("names")
+        if what in {"node", "recovery module"}:
             known = [row.name for row in (spec.nodes if what == "node" else spec.recoveries)]
             for name in [given[field]] if isinstance(given[field], str) else given[field]:
                 if name not in known:

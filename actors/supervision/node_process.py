@@ -55,7 +55,7 @@ def make_actor(
         register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
-        members=frozenset(layout.members)))
+        members=frozenset(layout.members), topics=layout.topics))
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:

@@ -1,0 +1,105 @@
+"""Fields of messages by name: `pose.x_m`, `cells[2].voltage_v`, `ranges_m[min]`.
+
+A path is names separated by dots. Of a list, brackets choose one item by its number (from 0; -1
+is the last), the least or greatest (`[min]`, `[max]`), or how many there are (`[len]`).
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable
+from enum import Enum
+from typing import Any
+
+import msgspec
+from msgspec import inspect
+
+_STEP = re.compile(r"\.?([A-Za-z_]\w*)|\[(-?\d+|min|max|len)\]")
+_FOLDS: dict[str, Callable[[Any], Any]] = {"min": min, "max": max, "len": len}
+_LISTS = (inspect.VarTupleType, inspect.ListType, inspect.TupleType)
+_SIMPLE: dict[type[inspect.Type], str] = {
+    inspect.FloatType: "number", inspect.IntType: "number", inspect.BoolType: "truth",
+    inspect.StrType: "text", inspect.EnumType: "text", inspect.LiteralType: "text"}
+
+
+class Field:
+    """A field of the messages of a type.
+
+    Args:
+        message: type of the messages.
+        path: of the field.
+
+    Attributes:
+        kind: "number", "text" or "truth".
+
+    Raises:
+        ValueError: there is no such field, or it is none of these; one line.
+    """
+
+    def __init__(self, message: type[msgspec.Struct], path: str) -> None:
+        self.path = path
+        self._steps = _steps(path)
+        info: inspect.Type = inspect.type_info(message)
+        for step in self._steps:
+            info = _follow(_plain(info), step, path)
+        kind = _SIMPLE.get(type(_plain(info)))
+        if kind is None:
+            raise ValueError(f"{path}: not a number, a text or a truth value")
+        self.kind = kind
+
+    def __call__(self, message: Any) -> Any:
+        """Return the field of a message; None where an optional part or an item is missing."""
+        value = message
+        for step in self._steps:
+            if value is None:
+                return None
+            if isinstance(step, int):
+                value = value[step] if -len(value) <= step < len(value) else None
+            elif step in _FOLDS:
+                value = _FOLDS[step](value) if len(value) or step == "len" else None
+            else:
+                value = getattr(value, step)
+        return value.value if isinstance(value, Enum) else value
+
+
+def _steps(path: str) -> list[str | int]:
+    steps: list[str | int] = []
+    at = 0
+    while at < len(path):
+        found = _STEP.match(path, at)
+        if found is None or (at == 0 and path[0] == "."):
+            raise ValueError(f"{path}: no path of a field, e.g. pose.x_m or ranges_m[0]")
+        name, index = found.groups()
+        steps.append(name or (index if index in _FOLDS else int(index)))
+        at = found.end()
+    if not steps:
+        raise ValueError("a field has to be named")
+    return steps
+
+
+def _plain(info: inspect.Type) -> inspect.Type:
+    """Return a type without what is said of it and without None."""
+    if isinstance(info, inspect.Metadata):
+        return _plain(info.type)
+    if isinstance(info, inspect.UnionType):
+        left = [each for each in info.types if not isinstance(each, inspect.NoneType)]
+        return _plain(left[0]) if len(left) == 1 else info
+    return info
+
+
+def _follow(info: inspect.Type, step: str | int, path: str) -> inspect.Type:
+    if isinstance(step, int) or (step in _FOLDS and isinstance(info, _LISTS)):
+        if not isinstance(info, _LISTS):
+            raise ValueError(f"{path}: [{step}] of what is no list")
+        if step == "len":
+            return inspect.IntType()
+        return info.item_types[0] if isinstance(info, inspect.TupleType) else info.item_type
+    if not isinstance(info, inspect.StructType):
+        raise ValueError(f"{path}: {step} of what has no fields")
+    known = {field.name: field.type for field in info.fields}
+    if step not in known:
+        near = difflib.get_close_matches(step, known, 1)
+        hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(known) or 'none'}"
+        raise ValueError(f"{path}: {info.cls.__name__} has no field {step!r}; {hint}")
+    return known[step]

@@ -1,0 +1,95 @@
+"""`Threshold`: a number in a message is too large, too small, or none."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+
+from rampart.actors.detection.finding import Sustained
+from rampart.actors.detection.module import DetectionModule
+from rampart.actors.detection.suspects import Suspects
+from rampart.actors.runtime.actor import Context, Header
+from rampart.actors.runtime.parameters import FieldName
+from rampart.manager.spec.tables import NonNegative
+
+
+class Limits(msgspec.Struct, frozen=True):
+    """Between which a number is in order.
+
+    A number that has been out of them is in order again when it lies inside by `hysteresis`.
+    """
+
+    above: float | None
+    below: float | None
+    hysteresis: float
+
+    def problem(self, value: float, *, was_out: bool) -> str:
+        """Return what is wrong with a number, "" if nothing is."""
+        margin = self.hysteresis if was_out else 0.0
+        if not math.isfinite(value):
+            return f"{value} is no number"
+        if self.above is not None and value > self.above - margin:
+            return f"{value:g} is above {self.above:g}"
+        if self.below is not None and value < self.below + margin:
+            return f"{value:g} is below {self.below:g}"
+        return ""
+
+
+class Threshold(DetectionModule):
+    """Active while a field is above one limit or below another, for long enough."""
+
+    class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
+        """Which number, and its limits.
+
+        Attributes:
+            value: of what, as "topic:field".
+            above: active when the number is greater.
+            below: active when it is smaller; with both: when it is outside.
+            absolute: whether its sign does not matter.
+            for_s: how long it has to be so, s.
+            clear_s: how long it has to be in order before the module is idle again, s.
+            hysteresis: how far inside the limits it then has to be.
+            suspects: names of nodes to be respawned when it is active; none by default.
+        """
+
+        value: FieldName
+        above: float | None = None
+        below: float | None = None
+        absolute: bool = False
+        for_s: NonNegative = 0.0
+        clear_s: NonNegative = 0.2
+        hysteresis: NonNegative = 0.0
+        suspects: Suspects = ()
+
+        def __post_init__(self) -> None:
+            """Refuse limits that are none."""
+            if self.above is None and self.below is None:
+                raise ValueError("above: missing; give above, below or both")
+            if (self.above is not None and self.below is not None
+                    and not self.below + 2 * self.hysteresis < self.above):
+                raise ValueError("below: must be smaller than above, by twice the hysteresis at "
+                                 "least")
+
+    parameters: Parameters
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        said = self.parameters
+        self._limits = Limits(said.above, said.below, said.hysteresis)
+        self.monitor = self.judged_by(Sustained(
+            said.for_s, said.clear_s, self.known_after_s(said.for_s + said.clear_s)))
+        self._out = False
+        self.hear_field(said.value, self.heard)
+
+    def heard(self, value: Any, header: Header) -> None:
+        """Take note of a number."""
+        if value is None:
+            return
+        number = abs(value) if self.parameters.absolute else value
+        why = self._limits.problem(number, was_out=self._out)
+        self._out = bool(why)
+        self.monitor.note(f"{self.parameters.value}: {why}" if why else "", self.clock.now(),
+                          self.accused(self.parameters.suspects, header))
+        self.follow()
