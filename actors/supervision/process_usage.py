@@ -11,6 +11,7 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
@@ -81,10 +82,9 @@ class UsageMeter:
         now: real seconds on the clock of `ProcessCount.started_s`.
     """
 
-    def __init__(
-        self, read: Callable[[int], ProcessCount | None] = read_count,
-        now: Callable[[], float] = lambda: time.clock_gettime(time.CLOCK_BOOTTIME),
-    ) -> None:
+    def __init__(self, read: Callable[[int], ProcessCount | None] = read_count,
+                 now: Callable[[], float] = partial(
+                     time.clock_gettime, time.CLOCK_BOOTTIME)) -> None:
         self._read = read
         self._now = now
         self._last: dict[int, tuple[float, ProcessCount]] = {}
@@ -99,13 +99,11 @@ class UsageMeter:
                 continue
             now_s = self._now()
             self._last[pid] = (now_s, count)
-            since_s, start = before.get(pid, (count.started_s, None))
+            since_s, start = before.get(pid, (0.0, None))
             if start is None or start.started_s != count.started_s:  # new, or its number is reused
-                since_s, spent_s = count.started_s, count.cpu_s
-            else:
-                spent_s = count.cpu_s - start.cpu_s
-            span_s = now_s - since_s
+                since_s, start = count.started_s, ProcessCount(0.0, 0, count.started_s)
+            spent_s, span_s = max(0.0, count.cpu_s - start.cpu_s), now_s - since_s
             found[pid] = ProcessUsage(
-                max(0.0, spent_s) / span_s if span_s > 0 else 0.0, count.cpu_s,
-                count.memory_bytes, max(0.0, now_s - count.started_s))
+                spent_s / span_s if span_s > 0 else 0.0, count.cpu_s, count.memory_bytes,
+                max(0.0, now_s - count.started_s))
         return found
