@@ -73,17 +73,15 @@ class RecoveryModule(Actor):
         self.phase = RecoveryPhase.IDLE
         self.decision = 0
         self.ordered_s = -math.inf
-        self.deadline_s = self._contract_deadline_s()
+        contracts = context.run.system.recoveries
+        self.deadline_s = next(
+            (c.deadline_s for c in contracts if c.name == self.name), DEFAULT_DEADLINE_S)
         self._reason = ""
         self._due_s = math.inf
         self._deadline: Timer | None = None
         self._excused = False
         self._release: RecoveryCommand | None = None
         self._told: RecoveryReport | None = None
-
-    def _contract_deadline_s(self) -> float:
-        contracts = self.context.run.system.recoveries
-        return next((c.deadline_s for c in contracts if c.name == self.name), DEFAULT_DEADLINE_S)
 
     @classmethod
     def names(
@@ -188,9 +186,7 @@ class RecoveryModule(Actor):
         if not self.activated:
             self.ordered_s = self.clock.now()
             self._begin(message.reason)
-            self.act(message, renewed=False)
-        else:
-            self.act(message, renewed=renewed)
+        self.act(message, renewed=renewed)
         self._tell_change()
 
     def _obey_release(self, message: RecoveryCommand) -> None:

@@ -13,20 +13,25 @@ process and its liveliness token are still there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import msgspec
 
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
+from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from rampart.actors.bus.limits import RateLimit, ReportLimit
 from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection
+from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT
-from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
-from rampart.actors.runtime.context import Context
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
+from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.declaration import BASE_INPUTS, BASE_OUTPUTS, Declared, every, on
 from rampart.actors.runtime.injected_faults import InjectedFaults
 from rampart.actors.runtime.mailbox import IDLE, Dispatcher
@@ -43,6 +48,39 @@ _HELLOS_PER_S = 100
 
 _STRANGE_HELLOS_PER_S = 5
 """Of those that are no nodes of the system."""
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What an actor is given when it is made.
+
+    Attributes:
+        name: the node's name, unique in the system.
+        incarnation: which process of the node this is, counted from 1.
+        clock: simulated time.
+        bus: this actor's access to the bus, not yet open.
+        parameters: the node's parameters, as the system spec gives them or read already.
+        run: what all actors of the run have in common, loaded once.
+        pid: number of the process that it runs in.
+        checkpoints: where this node's state is kept.
+        heartbeat_period_s: simulated seconds between two heartbeats.
+        failed: told of the error that ends the actor, while its peers still see it alive.
+        register: returns the incarnation of a node that was issued last, None if it is not known.
+        members: names of all nodes of the system; what others make it remember is bounded.
+    """
+
+    name: str
+    incarnation: int
+    clock: Clock
+    bus: Bus
+    parameters: Mapping[str, Any] | msgspec.Struct = field(default_factory=dict)
+    run: RunContext = field(default_factory=RunContext)
+    pid: int = field(default_factory=os.getpid)
+    checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
+    heartbeat_period_s: float = 0.1
+    failed: Callable[[Exception], None] = lambda _error: None
+    register: Register = lambda _node: None
+    members: frozenset[str] = frozenset()
 
 
 class Actor(Declared):
@@ -97,10 +135,8 @@ class Actor(Declared):
 
     # -- what a subclass calls ------------------------------------------------------------------
 
-    def publish(
-        self, topic: Topic[Any], body: msgspec.Struct, stamp: float | None = None,
-        name: str | None = None,
-    ) -> None:
+    def publish(self, topic: Topic[Any], body: msgspec.Struct, stamp: float | None = None,
+                name: str | None = None) -> None:
         """Send a message.
 
         Args:
@@ -202,8 +238,7 @@ class Actor(Declared):
                 continue
             handler = getattr(self, method)
             names = self.names(topic, self.name, self.parameters) if topic.is_family else None
-            keys = [topic.at(n) for n in names] if names is not None else [topic.pattern]
-            for key in keys:
+            for key in [topic.pattern] if names is None else map(topic.at, names):
                 self._bus.subscribe(topic, key, self._receiver(topic, handler))
         for node in self.watches(self.name, self.parameters):
             self._bus.watch(node, self._peer_changed)
@@ -236,9 +271,8 @@ class Actor(Declared):
 
     # -- mail -----------------------------------------------------------------------------------
 
-    def _receiver(
-        self, topic: Topic[Any], handler: Callable[[Any, Header], None]
-    ) -> Callable[[str, bytes], None]:
+    def _receiver(self, topic: Topic[Any],
+                  handler: Callable[[Any, Header], None]) -> Callable[[str, bytes], None]:
         command, name, members = topic.qos is Qos.COMMAND, handler.__name__, self.context.members
         dispatcher, mailbox = self._dispatcher, self._dispatcher.mailbox
 
@@ -270,9 +304,8 @@ class Actor(Declared):
         self.report_diagnostic("many sources", f"more than {STRANGERS} that are no nodes of the "
                                "system; those heard first are forgotten", self.name)
 
-    def send(
-        self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float, copies: int = 1
-    ) -> None:
+    def send(self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float,
+             copies: int = 1) -> None:
         """Send a message as it is, past all fault injections; `publish` is what actors call."""
         self._sequence = sequence = self._sequence + 1
         self._last_sent[key] = (body, stamp)

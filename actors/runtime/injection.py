@@ -12,19 +12,13 @@ counts although it is refused on arrival.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
 from rampart.actors.bus.messages import Injection
 from rampart.actors.bus.topic import ROOT
-from rampart.actors.bus.topics import (
-    INJECT,
-    INJECTION_REPORT,
-    INJECTION_REQUEST,
-    INJECTION_RESULT,
-)
+from rampart.actors.bus.topics import INJECT, INJECTION_REPORT, INJECTION_REQUEST, INJECTION_RESULT
 from rampart.actors.runtime.corruption import InjectionError, check_fields, corrupt
 
 MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp", "corrupt")
@@ -96,8 +90,7 @@ class FaultGate:
             now_s: now, simulated seconds.
             kind: type of the topic's messages, if known, to check the fields against.
         """
-        reason = flaw(injection, kind)
-        if reason:
+        if reason := flaw(injection, kind):
             return reason
         before = self.in_force.pop(injection.injection, None)
         self.in_force[injection.injection] = _Active(
@@ -117,8 +110,6 @@ class FaultGate:
         leaves the message alone.
         """
         out = Outgoing(body, stamp)
-        if not self.in_force:
-            return out
         for active in [a for a in self.in_force.values() if a.key == key]:
             if not active.strikes(now_s):
                 active.frozen = None  # the next freeze repeats what is healthy now
@@ -140,8 +131,6 @@ class FaultGate:
 
     def take_news(self) -> list[News]:
         """Return what has become of injections since the last call."""
-        if not self._news:
-            return self._news
         news, self._news = self._news, []
         return news
 
@@ -177,15 +166,13 @@ def flaw(order: Injection, kind: type[Any] | None = None) -> str:
         order: the injection.
         kind: type of the topic's messages; None leaves the fields unchecked.
     """
-    for wrong in (_wrong_kind, _wrong_time, _wrong_number):
-        if reason := wrong(order):
-            return reason
-    if kind is not None and order.mode == "corrupt":
+    reason = _wrong_kind(order) or _wrong_time(order) or _wrong_number(order)
+    if not reason and kind is not None and order.mode == "corrupt":
         try:
             check_fields(kind, order)
         except InjectionError as error:
             return str(error)
-    return ""
+    return reason
 
 
 def _wrong_kind(order: Injection) -> str:
@@ -203,8 +190,8 @@ def _wrong_kind(order: Injection) -> str:
 def _wrong_time(order: Injection) -> str:
     if not order.duration_s >= 0:
         return f"duration_s = {order.duration_s:g}: must be 0 or more, inf for permanent"
-    for name, value_s in (("delay_s", order.delay_s), ("on_s", order.on_s),
-                          ("off_s", order.off_s)):
+    for name, value_s in (
+            ("delay_s", order.delay_s), ("on_s", order.on_s), ("off_s", order.off_s)):
         if not (value_s >= 0 and math.isfinite(value_s)):
             return f"{name} = {value_s:g}: must be seconds, 0 or more"
     if (order.on_s > 0) != (order.off_s > 0):
@@ -221,12 +208,11 @@ def _wrong_time(order: Injection) -> str:
 def _wrong_number(order: Injection) -> str:
     if not 0 <= order.share <= 1:
         return f"share = {order.share:g}: must be between 0 and 1"
-    rules: tuple[tuple[str, dict[str, float], Callable[[float], bool], str], ...] = (
-        ("ramp_fields", order.ramp_fields, math.isfinite, "finite"),
-        ("add_fields", order.add_fields, math.isfinite, "finite"),
-        ("noise_fields", order.noise_fields, lambda x: 0 <= x < math.inf, "finite, 0 or more"))
-    for what, numbers, fits, right in rules:
+    for what, numbers, least, right in (
+            ("ramp_fields", order.ramp_fields, -math.inf, "finite"),
+            ("add_fields", order.add_fields, -math.inf, "finite"),
+            ("noise_fields", order.noise_fields, 0.0, "finite, 0 or more")):
         for path, value in numbers.items():
-            if not fits(value):
+            if not (math.isfinite(value) and value >= least):
                 return f"{what} {path!r} = {value:g}: must be {right}"
     return ""

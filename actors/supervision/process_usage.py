@@ -11,7 +11,6 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
@@ -82,9 +81,10 @@ class UsageMeter:
         now: real seconds on the clock of `ProcessCount.started_s`.
     """
 
-    def __init__(self, read: Callable[[int], ProcessCount | None] = read_count,
-                 now: Callable[[], float] = partial(
-                     time.clock_gettime, time.CLOCK_BOOTTIME)) -> None:
+    def __init__(
+        self, read: Callable[[int], ProcessCount | None] = read_count,
+        now: Callable[[], float] = lambda: time.clock_gettime(time.CLOCK_BOOTTIME),
+    ) -> None:
         self._read = read
         self._now = now
         self._last: dict[int, tuple[float, ProcessCount]] = {}
