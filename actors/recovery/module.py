@@ -27,7 +27,7 @@ from rampart.actors.ftm.messages import (
     RecoveryReport,
     RecoveryState,
 )
-from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.actor import Actor, Context, Header, Members, every, on
 from rampart.actors.runtime.timer import Timer
 
 _P = RecoveryPhase
@@ -84,9 +84,7 @@ class RecoveryModule(Actor):
         self._told: RecoveryReport | None = None
 
     @classmethod
-    def names(
-        cls, topic: Topic[Any], name: str, parameters: Any  # noqa: ARG003
-    ) -> tuple[str, ...] | None:
+    def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
         """Hear the commands to itself."""
         return (name,) if topic is topics.RECOVERY_COMMAND else None
 

@@ -32,13 +32,20 @@ from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
 from rampart.actors.runtime.clock import Clock
-from rampart.actors.runtime.declaration import BASE_INPUTS, BASE_OUTPUTS, Declared, every, on
-from rampart.actors.runtime.injected_faults import InjectedFaults
+from rampart.actors.runtime.declaration import (
+    BASE_INPUTS,
+    BASE_OUTPUTS,
+    Declared,
+    Members,
+    every,
+    on,
+)
+from rampart.actors.runtime.injection import InjectedFaults
 from rampart.actors.runtime.mailbox import IDLE, Dispatcher
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.actors.runtime.timer import Timer, Timers
 
-__all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every", "on"]
+__all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "Members", "every", "on"]
 
 _REPEATED_SOON_HZ = 7.0
 """A state that is repeated this often anyway is not repeated for a newcomer."""

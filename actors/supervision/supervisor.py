@@ -35,7 +35,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import Layout, adapted_system
-from rampart.actors.runtime.actor import Context, Header, every, on
+from rampart.actors.runtime.actor import Context, Header, Members, every, on
 from rampart.actors.runtime.timer import Timer
 from rampart.actors.supervision.patience import Patience
 from rampart.actors.supervision.processes import (
@@ -140,9 +140,7 @@ class Supervisor(Relay):
         self._checked_s = self._loop.time()
 
     @classmethod
-    def names(
-        cls, topic: Topic[Any], name: str, parameters: Parameters  # noqa: ARG003
-    ) -> tuple[str, ...] | None:
+    def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
         """Hear the heartbeats of the nodes that it starts."""
         return parameters.nodes if topic is bus_topics.HEARTBEAT else None
 
