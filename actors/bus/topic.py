@@ -62,6 +62,16 @@ class Topic(Generic[T]):
         """The full key expression that covers every member."""
         return f"{ROOT}/{self.key.replace('{name}', '*')}"
 
+    def member(self, key: str) -> str | None:
+        """Return which member of this family a key below the root is, "" of a plain topic.
+
+        None if the key is not one of this topic's.
+        """
+        head, family, tail = self.key.partition("{name}")
+        name = key[len(head):len(key) - len(tail)]
+        fits = key == f"{head}{name}{tail}" and not set("/*{}") & set(name)
+        return name if fits and bool(name) == bool(family) else None
+
     def at(self, name: str | None = None) -> str:
         """Return the full concrete key.
 

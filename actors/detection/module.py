@@ -26,12 +26,6 @@ from rampart.actors.ftm.messages import DetectionReport, DetectionState
 from rampart.actors.runtime.actor import Actor, Context, every
 from rampart.manager.spec.tables import NonNegative
 
-TRANSITIONS = {
-    DetectionState.IDLE: frozenset({DetectionState.ACTIVE}),
-    DetectionState.ACTIVE: frozenset({DetectionState.IDLE}),
-}
-"""The state machine of every detection module (paper, figure 4)."""
-
 ABSENCE_S = 0.3
 """A module that has not run for so long, though it repeats its report each 0.2 s, was stopped."""
 
@@ -125,12 +119,13 @@ class DetectionModule(Actor):
         """Go from idle to active; when active already, renew reason and nodes. Report changes."""
         reason = clip(reason)
         nodes = tuple(clip(name, NAME_CHARS) for name in nodes)
+        since_s = self.clock.now()
         if self.state is DetectionState.ACTIVE:
-            if (reason, nodes) != (self._report.reason, self._report.nodes):
-                self._tell(DetectionReport(self.state, reason, nodes, self._report.since_s))
-            return
-        self._enter(DetectionState.ACTIVE)
-        self._tell(DetectionReport(self.state, reason, nodes, self.clock.now()))
+            since_s = self._report.since_s
+            if (reason, nodes) == (self._report.reason, self._report.nodes):
+                return
+        self.state = DetectionState.ACTIVE
+        self._tell(DetectionReport(self.state, reason, nodes, since_s))
 
     def clear(self) -> None:
         """Go from active to idle and report it.
@@ -138,7 +133,9 @@ class DetectionModule(Actor):
         Raises:
             IllegalTransitionError: it is idle.
         """
-        self._enter(DetectionState.IDLE)
+        if self.state is DetectionState.IDLE:
+            raise IllegalTransitionError(f"{self.name}: no transition from idle to idle")
+        self.state = DetectionState.IDLE
         self._tell(DetectionReport(self.state, "", (), self.clock.now()))
 
     def know_idle(self) -> None:
@@ -147,12 +144,6 @@ class DetectionModule(Actor):
             self.clear()
         elif not self._told:
             self._tell(self._report)
-
-    def _enter(self, state: DetectionState) -> None:
-        if state not in TRANSITIONS[self.state]:
-            raise IllegalTransitionError(
-                f"{self.name}: no transition from {self.state} to {state}")
-        self.state = state
 
     def _tell(self, report: DetectionReport) -> None:
         self._report = report

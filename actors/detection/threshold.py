@@ -6,10 +6,10 @@ import math
 from typing import Any
 
 import msgspec
+from rampart.actors.detection.suspects import Suspects
 
 from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
-from rampart.actors.detection.suspects import Suspects
 from rampart.actors.runtime.actor import Context, Header
 from rampart.actors.runtime.parameters import FieldName
 from rampart.manager.spec.tables import NonNegative

@@ -1,16 +1,138 @@
-"""DM4, DM5 and DM7: crash of a control node, a non-control node, the localization node."""
+"""DM4, DM5 and DM7: crash of a control node, a non-control node, the localization node.
+
+Three failures, two signs. A process that dies takes its liveliness token with it: seen at once.
+A process that is stopped, or whose loop hangs, keeps the token: only its heartbeat is missing.
+
+Processes of a node are told apart by their incarnation. The end of one may be reported when the
+next is already at work, and a heartbeat of the old one may arrive after the news of its end;
+neither may be believed of the new one. Being back is proved by a heartbeat, not by a token: a
+process that exists does not work yet.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 from rampart.actors.bus import messages as m
 from rampart.actors.bus import topics
+from rampart.actors.bus.plausible import is_possible
 from rampart.actors.bus.topic import Topic
 from rampart.actors.detection.module import DetectionModule, Waiting
-from rampart.actors.detection.watchdog_core import WatchdogCore
-from rampart.actors.runtime.actor import Context, Header, on
+from rampart.actors.runtime.actor import Context, Header, Members, on
 from rampart.actors.runtime.parameters import HeartbeatTimeout, NodeNames
+
+
+@dataclass(slots=True)
+class _Watched:
+    """What is known of a watched node: its newest incarnation and how that one is."""
+
+    due_s: float
+    incarnation: int = 0
+    heard: bool = False
+    gone_s: float | None = None
+    failure: str = ""
+
+
+_failure = attrgetter("failure")
+
+
+class WatchdogCore:
+    """Active while one of the nodes has failed; `nodes` names those.
+
+    Args:
+        nodes: the watched nodes.
+        timeout_s: a node without a heartbeat for so long has failed, s.
+        start_s: now.
+        grace_s: how long the first heartbeat of a node may take, s.
+        known: whether idle may be claimed before all nodes were heard.
+    """
+
+    def __init__(self, nodes: Iterable[str], timeout_s: float, start_s: float, grace_s: float,
+                 *, known: bool = True) -> None:
+        self.timeout_s = timeout_s
+        self._known = known
+        self._watched = {node: _Watched(due_s=start_s + grace_s) for node in nodes}
+
+    @property
+    def active(self) -> bool:
+        """Whether a node has failed."""
+        return any(map(_failure, self._watched.values()))  # asked with every heartbeat
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """The failed nodes."""
+        return tuple(node for node, one in self._watched.items() if one.failure)
+
+    @property
+    def reason(self) -> str:
+        """What happened to each failed node."""
+        return "; ".join(
+            f"{node}: {one.failure}" for node, one in self._watched.items() if one.failure)
+
+    @property
+    def known(self) -> bool:
+        """Whether each node was heard, or missed."""
+        return self._known or all(one.heard or one.failure for one in self._watched.values())
+
+    @property
+    def due_s(self) -> float:
+        """When the next heartbeat is overdue."""
+        due_s = math.inf
+        for one in self._watched.values():
+            if one.due_s < due_s and not one.failure:
+                due_s = one.due_s
+        return due_s
+
+    def beat(self, node: str, incarnation: int, stamp_s: float, now_s: float) -> None:
+        """Take note of a heartbeat that was sent at `stamp_s`."""
+        one = self._watched.get(node)
+        if one is None or incarnation < one.incarnation:
+            return
+        if incarnation > one.incarnation:
+            self._succeed(one, incarnation)
+        elif one.gone_s is not None and (
+                stamp_s <= one.gone_s or not is_possible(stamp_s, now_s)):
+            return  # sent before it died, and under way since; or nobody knows when
+        one.gone_s = None
+        one.heard = True
+        one.failure = ""
+        one.due_s = now_s + self.timeout_s
+
+    def peer(self, node: str, incarnation: int, alive: bool, now_s: float) -> None:
+        """Take note of a liveliness token that appears or vanishes."""
+        one = self._watched.get(node)
+        if one is None or incarnation < one.incarnation:
+            return
+        if alive:
+            if incarnation > one.incarnation:
+                first = one.incarnation == 0
+                self._succeed(one, incarnation)
+                if not first:  # at the very start the grace is longer, and still runs
+                    one.due_s = now_s + self.timeout_s
+            else:
+                one.gone_s = None
+            return
+        one.incarnation = incarnation
+        one.gone_s = now_s
+        one.failure = f"process of incarnation {incarnation} is gone"
+
+    def expire(self, now_s: float) -> None:
+        """Conclude from the time that has passed without a heartbeat."""
+        for one in self._watched.values():
+            if not one.failure and now_s >= one.due_s:
+                one.failure = f"no heartbeat for {self.timeout_s:g} s" if one.heard \
+                    else "never heard"
+
+    @staticmethod
+    def _succeed(one: _Watched, incarnation: int) -> None:
+        """Expect the next process; a failure stays until its first heartbeat."""
+        one.incarnation = incarnation
+        one.gone_s = None
+        one.heard = False
 
 
 class Watchdog(DetectionModule):
@@ -37,9 +159,7 @@ class Watchdog(DetectionModule):
             self.grace_s(timeout_s), known=self.first_life))
 
     @classmethod
-    def names(
-        cls, topic: Topic[Any], name: str, parameters: Parameters  # noqa: ARG003
-    ) -> tuple[str, ...] | None:
+    def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
         """Hear the heartbeats of the watched nodes."""
         return parameters.watch
 

@@ -79,16 +79,7 @@ def published_keys(spec: SystemSpec) -> tuple[str, ...]:
 
 def find_topic(key: str, known: Iterable[Topic[Any]]) -> Topic[Any] | None:
     """Return the topic of a key below the root, one member's if it is a family, or None."""
-    for topic in known:
-        if not topic.is_family:
-            if key == topic.key:
-                return topic
-            continue
-        head, tail = topic.key.split("{name}")
-        member = key[len(head):len(key) - len(tail)]
-        if key == f"{head}{member}{tail}" and member and not set("/*{}") & set(member):
-            return topic
-    return None
+    return next((topic for topic in known if topic.member(key) is not None), None)
 
 
 def _actors(spec: SystemSpec) -> Iterator[str]:

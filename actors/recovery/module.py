@@ -27,7 +27,7 @@ from rampart.actors.ftm.messages import (
     RecoveryReport,
     RecoveryState,
 )
-from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.actor import Actor, Context, Header, Members, every, on
 from rampart.actors.runtime.timer import Timer
 
 _P = RecoveryPhase
@@ -73,7 +73,9 @@ class RecoveryModule(Actor):
         self.phase = RecoveryPhase.IDLE
         self.decision = 0
         self.ordered_s = -math.inf
-        self.deadline_s = self._contract_deadline_s()
+        contracts = context.run.system.recoveries
+        self.deadline_s = next(
+            (c.deadline_s for c in contracts if c.name == self.name), DEFAULT_DEADLINE_S)
         self._reason = ""
         self._due_s = math.inf
         self._deadline: Timer | None = None
@@ -81,14 +83,8 @@ class RecoveryModule(Actor):
         self._release: RecoveryCommand | None = None
         self._told: RecoveryReport | None = None
 
-    def _contract_deadline_s(self) -> float:
-        contracts = self.context.run.system.recoveries
-        return next((c.deadline_s for c in contracts if c.name == self.name), DEFAULT_DEADLINE_S)
-
     @classmethod
-    def names(
-        cls, topic: Topic[Any], name: str, parameters: Any  # noqa: ARG003
-    ) -> tuple[str, ...] | None:
+    def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
         """Hear the commands to itself."""
         return (name,) if topic is topics.RECOVERY_COMMAND else None
 
@@ -188,9 +184,7 @@ class RecoveryModule(Actor):
         if not self.activated:
             self.ordered_s = self.clock.now()
             self._begin(message.reason)
-            self.act(message, renewed=False)
-        else:
-            self.act(message, renewed=renewed)
+        self.act(message, renewed=renewed)
         self._tell_change()
 
     def _obey_release(self, message: RecoveryCommand) -> None:

@@ -2,11 +2,28 @@
 
 Both do the same; what differs is in the nodes: a control node comes back from its checkpoint
 (backward recovery), a memoryless one needs none (masking).
+
+For each failed node the supervisor is asked for a new process, and that proves itself by a
+heartbeat. What makes this more than one message is that a request names the *failed incarnation*,
+so that asking twice, or asking about a node that is back already, kills no process that is well:
+
+* An incarnation whose token has vanished, or whose heartbeat is overdue, has failed: it is named.
+* One that was heard a moment ago is not accused. The request names its predecessor, and the
+  supervisor, which holds the process's pidfd and knows better, respawns it or answers that it is
+  there. This happens when this module was itself respawned and is commanded again, and when a
+  stopped process was continued just in time.
+* A node that is well by all signs may be wrong all the same: a module that has compared what it
+  says names the incarnation, `NAME#INCARNATION`, and that one is accused, a later one is not.
+* A new process that dies, or is not heard within a while, has failed as well: the next request
+  names it. The supervisor counts, and gives up when there are too many.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, NamedTuple
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Heartbeat
@@ -14,11 +31,200 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import ProcessEvent, RecoveryCommand, RespawnRequest
 from rampart.actors.recovery.module import RecoveryModule
-from rampart.actors.recovery.respawn_core import RespawnCore
-from rampart.actors.runtime.actor import Context, Header, on
+from rampart.actors.runtime.actor import Context, Header, Members, on
 from rampart.actors.runtime.parameters import NodeNames
 
-_REQUESTS_PER_LIFE = 1_000_000
+_REQUESTS_PER_INCARNATION = 1_000_000
+
+
+class Stage(Enum):
+    """How far the respawn of one node is."""
+
+    NONE = "not asked for"
+    ASKED = "asked for"
+    STARTED = "started"
+    BACK = "back"
+    FAILED = "failed"
+
+
+_WAITING = (Stage.ASKED, Stage.STARTED)
+
+
+class Ask(NamedTuple):
+    """A request to the supervisor; repeated with the same number until it is answered."""
+
+    request: int
+    node: str
+    failed_incarnation: int
+
+
+_NOTHING_ASKED = Ask(0, "", 0)
+
+
+@dataclass(slots=True)
+class _Node:
+    """What is known of one node. Times are simulated seconds."""
+
+    heard_s: float
+    incarnation: int = 0
+    gone_s: float | None = None
+    stage: Stage = Stage.NONE
+    ask: Ask = _NOTHING_ASKED
+    asked_s: float = 0.0
+    started_s: float = 0.0
+    problem: str = ""
+
+
+class RespawnCore:
+    """The respawns of one recovery module. Requests pile up until `take_requests`.
+
+    Args:
+        nodes: the nodes that it may respawn.
+        first_request: number of the first request.
+        start_s: now.
+        overdue_s: age at which a heartbeat is overdue.
+        start_timeout_s: how long a new process may take to be heard.
+    """
+
+    def __init__(self, nodes: Iterable[str], first_request: int, start_s: float,
+                 overdue_s: float = 0.25, start_timeout_s: float = 1.0) -> None:
+        self._nodes = {name: _Node(heard_s=start_s) for name in nodes}
+        self._next_request = first_request
+        self._overdue_s = overdue_s
+        self._start_timeout_s = start_timeout_s
+        self._strangers: tuple[str, ...] = ()
+        self._requests: list[Ask] = []
+
+    # -- orders ---------------------------------------------------------------------------------
+
+    def order(self, nodes: Iterable[str], now_s: float, *, renewed: bool) -> bool:
+        """Have nodes respawned: all that are named and not on their way already.
+
+        Args:
+            nodes: names, each perhaps with the incarnation that is wrong, `NAME#INCARNATION`.
+            now_s: now.
+            renewed: it is a new order, so that what was given up is to be tried again.
+
+        Returns:
+            Whether there was anything to ask for.
+        """
+        requests = len(self._requests)
+        named = tuple(map(accused, nodes))
+        self._strangers = tuple(name for name, _ in named if name not in self._nodes)
+        for name, wrong in named:
+            node = self._nodes.get(name)
+            if node is None:
+                continue
+            if node.stage is Stage.NONE or (node.stage is Stage.FAILED and renewed) or (
+                    node.stage is Stage.BACK
+                    and (self._has_failed(node, now_s) or wrong >= node.incarnation > 0)):
+                self._ask(name, node, now_s, wrong)
+        return len(self._requests) > requests
+
+    def release(self) -> None:
+        """Forget all orders."""
+        self._strangers = ()
+        self._requests.clear()
+        for node in self._nodes.values():
+            node.stage = Stage.NONE
+
+    def take_requests(self) -> list[Ask]:
+        """Return the requests to send now, each once."""
+        requests, self._requests = self._requests, []
+        return requests
+
+    # -- what is heard --------------------------------------------------------------------------
+
+    def beat(self, name: str, incarnation: int, stamp_s: float, now_s: float) -> None:
+        """Take note of a heartbeat sent at `stamp_s`."""
+        node = self._nodes.get(name)
+        if node is None or incarnation < node.incarnation:
+            return
+        if incarnation == node.incarnation and node.gone_s is not None \
+                and stamp_s <= node.gone_s:
+            return  # sent before it died, and under way since
+        node.incarnation = incarnation
+        node.gone_s = None
+        node.heard_s = now_s
+        # A heartbeat that was under way when the order came proves nothing.
+        if node.stage in (Stage.ASKED, Stage.STARTED, Stage.FAILED) \
+                and incarnation > node.ask.failed_incarnation and stamp_s >= node.asked_s:
+            node.stage = Stage.BACK
+
+    def peer(self, name: str, incarnation: int, alive: bool, now_s: float) -> None:
+        """Take note of a process that appears or is gone."""
+        node = self._nodes.get(name)
+        if node is None or incarnation < node.incarnation:
+            return
+        if incarnation > node.incarnation:
+            node.incarnation = incarnation
+            node.heard_s = now_s  # not heard yet, but not overdue either
+        node.gone_s = None if alive else now_s
+        if not alive and incarnation > node.ask.failed_incarnation \
+                and node.stage in _WAITING:
+            self._ask(name, node, now_s)
+
+    def event(self, name: str, event: str, incarnation: int, detail: str, now_s: float) -> None:
+        """Take note of what the supervisor says of a process."""
+        node = self._nodes.get(name)
+        if node is None:
+            return
+
+        if event == "respawned" and node.stage is Stage.ASKED:
+            node.stage = Stage.STARTED
+            node.started_s = now_s
+            node.ask = node.ask._replace(
+                failed_incarnation=max(node.ask.failed_incarnation, incarnation - 1))
+        elif event == "crashed":
+            self.peer(name, incarnation, False, now_s)
+        elif event in ("refused", "given up") and node.stage in _WAITING:
+            node.stage = Stage.FAILED
+            node.problem = f"{name}: {event}{f', {detail}' if detail else ''}"
+
+    def retry(self, now_s: float) -> None:
+        """Repeat requests that are unanswered; ask anew for a new process that is not heard."""
+        for name, node in self._nodes.items():
+            if node.stage is Stage.ASKED:
+                self._requests.append(node.ask)
+            elif node.stage is Stage.STARTED and now_s - node.started_s >= self._start_timeout_s:
+                self._ask(name, node, now_s)
+
+    # -- how it stands --------------------------------------------------------------------------
+
+    @property
+    def pending(self) -> tuple[str, ...]:
+        """Nodes that are ordered and neither back nor given up."""
+        return tuple(name for name, node in self._nodes.items() if node.stage in _WAITING)
+
+    @property
+    def back(self) -> tuple[str, ...]:
+        """Nodes that are back."""
+        return tuple(name for name, node in self._nodes.items() if node.stage is Stage.BACK)
+
+    @property
+    def problem(self) -> str:
+        """Why it cannot succeed; "" if it still may."""
+        problems = [n.problem for n in self._nodes.values() if n.stage is Stage.FAILED]
+        problems += [f"{name}: not among the nodes that this module may respawn"
+                     for name in self._strangers]
+        return "; ".join(problems)
+
+    def _has_failed(self, node: _Node, now_s: float) -> bool:
+        return node.gone_s is not None or now_s - node.heard_s >= self._overdue_s
+
+    def _ask(self, name: str, node: _Node, now_s: float, wrong: int = 0) -> None:
+        failed = node.incarnation if self._has_failed(node, now_s) else node.incarnation - 1
+        node.ask = Ask(self._next_request, name, max(0, failed, wrong))
+        node.stage = Stage.ASKED
+        node.asked_s = now_s
+        self._next_request += 1
+        self._requests.append(node.ask)
+
+
+def accused(node: str) -> tuple[str, int]:
+    """Return name and incarnation of `NAME#INCARNATION`; 0 if it names none."""
+    name, _, incarnation = node.partition("#")
+    return name, int(incarnation) if incarnation.isdecimal() else 0
 
 
 class Respawn(RecoveryModule):
@@ -41,12 +247,10 @@ class Respawn(RecoveryModule):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self._core = RespawnCore(self.parameters.nodes,
-                                 context.incarnation * _REQUESTS_PER_LIFE, self.clock.now())
+                                 context.incarnation * _REQUESTS_PER_INCARNATION, self.clock.now())
 
     @classmethod
-    def names(
-        cls, topic: Topic[Any], name: str, parameters: Parameters
-    ) -> tuple[str, ...] | None:
+    def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:
         """Hear the heartbeats of its nodes."""
         if topic is bus_topics.HEARTBEAT:
             return parameters.nodes
@@ -54,7 +258,7 @@ class Respawn(RecoveryModule):
 
     @classmethod
     def watches(cls, name: str, parameters: Parameters) -> tuple[str, ...]:  # noqa: ARG003
-        """Watch the life of its nodes, to know which incarnation has failed."""
+        """Hear of the processes of its nodes, to know which incarnation has failed."""
         return parameters.nodes
 
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
@@ -65,7 +269,7 @@ class Respawn(RecoveryModule):
         self._settle()
 
     def let_go(self) -> None:
-        """Forget the nodes: they are back, or somebody else's concern."""
+        """Forget the nodes: they are back, or no longer this module's concern."""
         self._core.release()
 
     def repeat(self) -> None:

@@ -13,28 +13,40 @@ process and its liveliness token are still there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import msgspec
 
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
+from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
+from rampart.actors.bus.fields import Field
 from rampart.actors.bus.limits import RateLimit, ReportLimit
 from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection
-from rampart.actors.bus.fields import Field
+from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT
-from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
-from rampart.actors.runtime.context import Context
-from rampart.actors.runtime.declaration import BASE_INPUTS, BASE_OUTPUTS, Declared, every, on
-from rampart.actors.runtime.injected_faults import InjectedFaults
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
+from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.declaration import (
+    BASE_INPUTS,
+    BASE_OUTPUTS,
+    Declared,
+    Members,
+    every,
+    on,
+)
+from rampart.actors.runtime.injection import InjectedFaults
 from rampart.actors.runtime.mailbox import IDLE, Dispatcher
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.actors.runtime.timer import Timer, Timers
 
-__all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every", "on"]
+__all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "Members", "every", "on"]
 
 _REPEATED_SOON_HZ = 7.0
 """A state that is repeated this often anyway is not repeated for a newcomer."""
@@ -44,6 +56,41 @@ _HELLOS_PER_S = 100
 
 _STRANGE_HELLOS_PER_S = 5
 """Of those that are no nodes of the system."""
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What an actor is given when it is made.
+
+    Attributes:
+        name: the node's name, unique in the system.
+        incarnation: which process of the node this is, counted from 1.
+        clock: simulated time.
+        bus: this actor's access to the bus, not yet open.
+        parameters: the node's parameters, as the system spec gives them or read already.
+        run: what all actors of the run have in common, loaded once.
+        pid: number of the process that it runs in.
+        checkpoints: where this node's state is kept.
+        heartbeat_period_s: simulated seconds between two heartbeats.
+        failed: told of the error that ends the actor, while its peers still see it alive.
+        register: returns the incarnation of a node that was issued last, None if it is not known.
+        members: names of all nodes of the system; what others make it remember is bounded.
+        topics: those that parameters of the system's nodes name, by key.
+    """
+
+    name: str
+    incarnation: int
+    clock: Clock
+    bus: Bus
+    parameters: Mapping[str, Any] | msgspec.Struct = field(default_factory=dict)
+    run: RunContext = field(default_factory=RunContext)
+    pid: int = field(default_factory=os.getpid)
+    checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
+    heartbeat_period_s: float = 0.1
+    failed: Callable[[Exception], None] = lambda _error: None
+    register: Register = lambda _node: None
+    members: frozenset[str] = frozenset()
+    topics: Mapping[str, Topic[Any]] = field(default_factory=dict)
 
 
 class Actor(Declared):
@@ -137,10 +184,8 @@ class Actor(Declared):
         except KeyError:
             raise ValueError(f"{self.name}: no topic {key!r}") from None
 
-    def publish(
-        self, topic: Topic[Any], body: msgspec.Struct, stamp: float | None = None,
-        name: str | None = None,
-    ) -> None:
+    def publish(self, topic: Topic[Any], body: msgspec.Struct, stamp: float | None = None,
+                name: str | None = None) -> None:
         """Send a message.
 
         Args:
@@ -242,8 +287,7 @@ class Actor(Declared):
                 continue
             handler = getattr(self, method)
             names = self.names(topic, self.name, self.parameters) if topic.is_family else None
-            keys = [topic.at(n) for n in names] if names is not None else [topic.pattern]
-            for key in keys:
+            for key in [topic.pattern] if names is None else map(topic.at, names):
                 self._bus.subscribe(topic, key, self._receiver(topic, handler))
         for topic, key, handler in self._chosen:
             self._bus.subscribe(topic, f"{ROOT}/{key}", self._receiver(topic, handler))
@@ -278,11 +322,10 @@ class Actor(Declared):
 
     # -- mail -----------------------------------------------------------------------------------
 
-    def _receiver(
-        self, topic: Topic[Any], handler: Callable[[Any, Header], None]
-    ) -> Callable[[str, bytes], None]:
+    def _receiver(self, topic: Topic[Any],
+                  handler: Callable[[Any, Header], None]) -> Callable[[str, bytes], None]:
         command, members = topic.qos is Qos.COMMAND, self.context.members
-        name = getattr(handler, "__qualname__", "")
+        slot = id(handler)  # two handlers of one topic wait side by side
         dispatcher, mailbox = self._dispatcher, self._dispatcher.mailbox
 
         def take(key: str, message: Envelope[Any]) -> None:
@@ -294,7 +337,7 @@ class Actor(Declared):
             if command:
                 mailbox.put(item, reserved=reserved)
             else:
-                mailbox.put_message(f"{key} {name}", item, reserved=reserved)
+                mailbox.put_message(f"{key} {slot}", item, reserved=reserved)
 
         return self._guard.receiver(topic, take, self._reject)
 
@@ -313,9 +356,8 @@ class Actor(Declared):
         self.report_diagnostic("many sources", f"more than {STRANGERS} that are no nodes of the "
                                "system; those heard first are forgotten", self.name)
 
-    def send(
-        self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float, copies: int = 1
-    ) -> None:
+    def send(self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float,
+             copies: int = 1) -> None:
         """Send a message as it is, past all fault injections; `publish` is what actors call."""
         self._sequence = sequence = self._sequence + 1
         self._last_sent[key] = (body, stamp)
@@ -340,7 +382,8 @@ class Actor(Declared):
 
     @on(INJECT)
     def _on_injection(self, order: Injection, _header: Header) -> None:
-        topic = self.published(order.topic, self.name, self.parameters)
+        topic = self.published(order.topic, self.name, self.parameters) or (
+            self.context.topics[order.topic] if order.topic in self._may_publish else None)
         if topic is not None:
             self._injections.order(order, topic)
 

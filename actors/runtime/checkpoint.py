@@ -15,7 +15,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import msgspec
 
@@ -58,8 +58,7 @@ class StateError(ValueError):
     """Bytes that are no state of this node; the text is one line that says why."""
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
+class Record(NamedTuple):
     """One generation of a node's state, its checksum found right."""
 
     generation: int
@@ -83,8 +82,11 @@ class Loaded:
     failures: int = 0
 
 
-class CheckpointStore(Protocol):
-    """Keeps the states of one node, for one of its incarnations."""
+class CheckpointStore:
+    """Keeps the states of one node, for one of its incarnations.
+
+    This class itself keeps nothing: see `NoCheckpoints`.
+    """
 
     def load(self) -> Loaded:
         """Return what was kept, and claim the store: older incarnations are refused from now on.
@@ -95,6 +97,7 @@ class CheckpointStore(Protocol):
             SupersededError: a newer incarnation has claimed it.
             CheckpointError: it cannot be read.
         """
+        return Loaded()
 
     def save(self, version: int, state: bytes) -> None:
         """Keep a state, whole or not at all; after the return it survives the process.
@@ -113,30 +116,14 @@ class CheckpointStore(Protocol):
 
     def trouble(self) -> str:
         """Return what went wrong behind the node's back since the last call; "" if nothing."""
+        return ""
 
     def close(self) -> None:
         """Release all that is open. Harmless when repeated."""
 
 
-class NoCheckpoints:
+class NoCheckpoints(CheckpointStore):
     """Keeps nothing: a respawned node starts afresh, as in the paper."""
-
-    def load(self) -> Loaded:
-        """Return nothing."""
-        return Loaded()
-
-    def save(self, version: int, state: bytes) -> None:
-        """Forget the state."""
-
-    def note_failures(self, failures: int) -> None:
-        """Forget it."""
-
-    def trouble(self) -> str:
-        """Return that there is none."""
-        return ""
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 @dataclass(slots=True)
@@ -148,7 +135,7 @@ class Shelf:
     failures: int = 0
 
 
-class MemoryCheckpoints:
+class MemoryCheckpoints(CheckpointStore):
     """Keeps states on a shelf, for virtual time and for tests."""
 
     def __init__(self, shelf: Shelf, incarnation: int) -> None:
@@ -175,21 +162,10 @@ class MemoryCheckpoints:
         self._check()
         self._shelf.failures = failures
 
-    def trouble(self) -> str:
-        """Return that there is none."""
-        return ""
-
-    def close(self) -> None:
-        """Nothing is open."""
-
     def _check(self) -> None:
         if self._incarnation < self._shelf.incarnation:
             raise SupersededError(f"incarnation {self._incarnation} was superseded by "
                                   f"{self._shelf.incarnation}")
-
-
-def _no_objection(_state: Any) -> str:
-    return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +186,7 @@ class StateFormat(Generic[S]):
     version: int = 1
     upgrades: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = field(
         default_factory=dict)
-    objection: Callable[[S], str] = _no_objection
+    objection: Callable[[S], str] = lambda _state: ""
 
     def encode(self, state: S) -> bytes:
         """Return a state as bytes."""
@@ -372,9 +348,8 @@ def _in_words(error: Exception) -> str:
     return str(error) if isinstance(error, CheckpointError) else f"{type(error).__name__}: {error}"
 
 
-def newest_sound(
-    form: StateFormat[S], records: tuple[Record, ...]
-) -> tuple[S | None, tuple[str, ...]]:
+def newest_sound(form: StateFormat[S],
+                 records: tuple[Record, ...]) -> tuple[S | None, tuple[str, ...]]:
     """Return the first of the records (newest first) that is a sound state, and what was not."""
     problems: list[str] = []
     for record in records:

@@ -13,12 +13,13 @@ the disk or the machine, which would meet a new file as well.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import sqlite3
 import stat
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -90,6 +91,17 @@ class Found:
     owner: Owner | None = None
     records: list[Record] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+
+    @property
+    def incarnation(self) -> int:
+        """The one that has claimed it, as far as that is known."""
+        return self.owner.incarnation if self.owner else max(
+            (record.incarnation for record in self.records), default=0)
+
+    @property
+    def failures(self) -> int:
+        """How many processes in a row failed."""
+        return self.owner.failures if self.owner else 0
 
 
 # -- before anything is opened -------------------------------------------------------------------
@@ -175,23 +187,31 @@ def connect(file: Path) -> sqlite3.Connection:
 
 def make_tables(connection: sqlite3.Connection) -> None:
     """Make the tables, if there is nothing at all."""
-    if any(_pragma(connection, name) for name in ("user_version", "application_id")) or (
-            _schema(connection)):
+    if (_pragma(connection, "user_version") or _pragma(connection, "application_id")
+            or _schema(connection)):
         return
     connection.execute("PRAGMA synchronous = OFF")  # nothing in it that could be lost yet
     connection.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
     connection.execute("PRAGMA journal_mode = WAL")
-    connection.execute("BEGIN IMMEDIATE")
-    try:
+    with transaction(connection):
         for table in _TABLES.values():
             connection.execute(table.decode())
         connection.execute(f"PRAGMA application_id = {APPLICATION}")
         connection.execute(f"PRAGMA user_version = {STORE_FORMAT}")
+    connection.execute("PRAGMA synchronous = NORMAL")
+
+
+@contextlib.contextmanager
+def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
+    """Commit at the end of a `with` block, or change nothing."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield connection
         connection.execute("COMMIT")
     finally:
         if connection.in_transaction:
-            connection.execute("ROLLBACK")
-    connection.execute("PRAGMA synchronous = NORMAL")
+            with contextlib.suppress(sqlite3.Error):
+                connection.execute("ROLLBACK")
 
 
 # -- reading -------------------------------------------------------------------------------------
@@ -268,25 +288,22 @@ def _read_record(connection: sqlite3.Connection, slot: int, run: str) -> Record 
 def _check_header(connection: sqlite3.Connection) -> None:
     if _pragma(connection, "application_id") != APPLICATION:
         raise Unsound("no checkpoints of a node")
-    form = _pragma(connection, "user_version")
-    if form != STORE_FORMAT:
+    if (form := _pragma(connection, "user_version")) != STORE_FORMAT:
         raise Unsound(f"format {form}; this program's is {STORE_FORMAT}")
     if _pragma(connection, "journal_mode") != b"wal":
         raise Unsound("no write-ahead log")
 
 
 def _check_pages(connection: sqlite3.Connection) -> None:
-    answer = _pragma(connection, "quick_check(1)")
-    if answer != b"ok":
+    if (answer := _pragma(connection, "quick_check(1)")) != b"ok":
         raise Unsound(words(answer))
 
 
 def _check_rows(connection: sqlite3.Connection) -> None:
     """Make sure that there is no row but those that were looked for."""
-    (rows,) = connection.execute("SELECT count(*) FROM checkpoint").fetchone()
-    (known,) = connection.execute("SELECT count(*) FROM checkpoint WHERE slot >= 0 AND slot < ?",
-                                  (GENERATIONS,)).fetchone()
-    (owners,) = connection.execute("SELECT count(*) FROM owner").fetchone()
+    rows, known, owners = connection.execute(
+        "SELECT count(*), coalesce(sum(slot >= 0 AND slot < ?), 0), (SELECT count(*) FROM owner)"
+        " FROM checkpoint", (GENERATIONS,)).fetchone()
     if rows != known:
         raise Unsound("one is out of its place")
     if rows and not owners:
@@ -295,8 +312,7 @@ def _check_rows(connection: sqlite3.Connection) -> None:
 
 def _schema(connection: sqlite3.Connection) -> dict[object, object]:
     """Return the definitions of all tables, views and triggers by name."""
-    rows = connection.execute("SELECT name, sql FROM sqlite_schema LIMIT 9").fetchall()
-    return dict(rows)
+    return dict(connection.execute("SELECT name, sql FROM sqlite_schema LIMIT 9").fetchall())
 
 
 def _pragma(connection: sqlite3.Connection, name: str) -> object:
@@ -332,9 +348,9 @@ def is_damage(error: Exception, file: Path) -> bool:
         return False
     code = primary_code(error)
     if code in _PERHAPS_THE_FILES:  # also said of a full table of descriptors
-        paths = [path for path in (beside(file, suffix) for suffix in SUFFIXES)
-                 if os.path.lexists(path)]
-        refused = not all(os.access(path, os.R_OK | os.W_OK) for path in paths)
+        paths = (beside(file, suffix) for suffix in SUFFIXES)
+        refused = any(os.path.lexists(path) and not os.access(path, os.R_OK | os.W_OK)
+                      for path in paths)
         replaceable = os.access(file.parent, os.W_OK | os.X_OK)
         return replaceable and (refused or code != sqlite3.SQLITE_CANTOPEN)
     return code not in _THE_MACHINES

@@ -41,6 +41,7 @@ from rampart.actors.runtime.checkpoint import (
     GENERATIONS,
     BusyError,
     CheckpointError,
+    CheckpointStore,
     Loaded,
     Record,
     SupersededError,
@@ -59,7 +60,7 @@ _PUT = ("REPLACE INTO checkpoint (slot, generation, incarnation, version, state,
         " (SELECT 1 FROM owner WHERE run = ? AND incarnation = ?)")
 
 
-class SqliteCheckpoints:
+class SqliteCheckpoints(CheckpointStore):
     """The `CheckpointStore` of one node.
 
     Args:
@@ -90,8 +91,7 @@ class SqliteCheckpoints:
 
     def load(self) -> Loaded:
         """Return what was kept, and claim the file if that is possible; see `CheckpointStore`."""
-        loaded, _ = self._load_and_claim()
-        return loaded
+        return self._load_and_claim()[0]
 
     def save(self, version: int, state: bytes) -> None:
         """Keep a state; see `CheckpointStore`."""
@@ -102,7 +102,9 @@ class SqliteCheckpoints:
         try:
             self._insert(version, state)
         except Exception as error:
-            self._trouble = self._replace(disk.Found(problems=[self._damage(error)]))
+            if not disk.is_damage(error, self._file):
+                raise self._error(error) from None
+            self._trouble = self._replace(disk.Found(problems=[disk.words(error)]))
             try:
                 self._insert(version, state)
             except Exception as second:
@@ -176,13 +178,14 @@ class SqliteCheckpoints:
         try:
             connection = self._open()
             found = disk.read(connection, self._file, self._run)
-            self._refuse_if_superseded(found)
+            if found.incarnation > self._incarnation:
+                raise self._superseded()
             was_read = True
             if not found.problems:
                 self._claim(found)
+        except SupersededError:
+            raise
         except Exception as error:
-            if isinstance(error, SupersededError):
-                raise
             if disk.is_damage(error, self._file):
                 found.problems.append(disk.words(error))
             else:
@@ -197,7 +200,7 @@ class SqliteCheckpoints:
                 unclaimed, problem = error, str(error)
         self._generation = max((record.generation for record in found.records), default=0)
         return Loaded(tuple(found.records), (problem,) if problem else (),
-                      found.owner.failures if found.owner else 0), unclaimed
+                      found.failures), unclaimed
 
     def _open(self) -> sqlite3.Connection:
         """Return the connection to a file that has tables; what is in them is not known yet.
@@ -220,13 +223,11 @@ class SqliteCheckpoints:
         """Notice that the file was taken away: SQLite would go on writing into nowhere."""
         if self._connection is None:
             return
-        try:
-            same = self._file.lstat().st_ino == self._inode
-        except OSError:
-            same = False
-        if not same:
-            self._close_connection()
-            self._trouble = f"{self._file} has vanished; begun anew"
+        with contextlib.suppress(OSError):
+            if self._file.lstat().st_ino == self._inode:
+                return
+        self._close_connection()
+        self._trouble = f"{self._file} has vanished; begun anew"
 
     def _close_connection(self) -> None:
         if self._connection is not None:
@@ -239,8 +240,8 @@ class SqliteCheckpoints:
     def _claim(self, found: disk.Found) -> None:
         """Claim the file; the states of another run do not stay, those that were saved do."""
         assert self._connection is not None  # noqa: S101 for the type checker
-        failures = found.owner.failures if found.owner else 0
-        with _transaction(self._connection) as connection:
+        failures = found.failures
+        with disk.transaction(self._connection) as connection:
             owner = disk.read_owner(connection)
             if owner is None or owner.run != self._run:
                 connection.execute("DELETE FROM checkpoint")
@@ -269,10 +270,9 @@ class SqliteCheckpoints:
         self._generation = record.generation
 
     def _put(self, connection: sqlite3.Connection, record: Record) -> int:
-        return connection.execute(_PUT, (
-            record.generation % GENERATIONS, record.generation, record.incarnation, record.version,
-            record.state, disk.record_checksum(self._run, record), self._run, self._incarnation,
-        )).rowcount
+        values = (record.generation % GENERATIONS, *record,
+                  disk.record_checksum(self._run, record), self._run, self._incarnation)
+        return connection.execute(_PUT, values).rowcount
 
     # -- damage ---------------------------------------------------------------------------------
 
@@ -297,28 +297,12 @@ class SqliteCheckpoints:
             raise self._error(error) from None
         return f"{line}; kept as {aside}, begun anew"
 
-    def _damage(self, error: Exception) -> str:
-        """Return in words what is damaged.
-
-        Raises:
-            CheckpointError: nothing is, it was something else.
-        """
-        if not disk.is_damage(error, self._file):
-            raise self._error(error) from None
-        return disk.words(error)
-
     def _error(self, error: Exception) -> CheckpointError:
         if isinstance(error, CheckpointError):
             return error
         kind = BusyError if disk.primary_code(error) in _LOCKED else CheckpointError
         why = getattr(error, "strerror", None) or disk.words(error)
         return kind(f"{self._file}: {why}")
-
-    def _refuse_if_superseded(self, found: disk.Found) -> None:
-        incarnations = [record.incarnation for record in found.records]
-        if (found.owner.incarnation if found.owner else max(incarnations, default=0)
-                ) > self._incarnation:
-            raise self._superseded()
 
     def _superseded(self) -> SupersededError:
         return SupersededError(f"{self._file}: incarnation {self._incarnation} was superseded")
@@ -335,8 +319,7 @@ class SqliteCheckpoints:
 
     def _cut_log(self) -> None:
         log = disk.beside(self._file, "-wal")
-        connection = disk.connect(self._file)
-        try:
+        with contextlib.closing(disk.connect(self._file)) as connection:
             for _ in range(_COPIES):  # syncs, while saves go on
                 _, entries, copied = connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
                 if entries == copied:
@@ -347,35 +330,7 @@ class SqliteCheckpoints:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             connection.execute("PRAGMA synchronous = OFF")  # the lock is not held during the sync
             connection.execute("UPDATE owner SET checksum = checksum")
-        finally:
-            connection.close()
         _sync_to_disk(log)
-
-
-class _transaction:  # noqa: N801 used as a statement
-    """`with` block that commits at its end or changes nothing."""
-
-    def __init__(self, connection: sqlite3.Connection) -> None:
-        self._connection = connection
-
-    def __enter__(self) -> sqlite3.Connection:
-        self._connection.execute("BEGIN IMMEDIATE")
-        return self._connection
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            try:
-                self._connection.execute("COMMIT")
-                return
-            except sqlite3.Error:
-                self._undo()
-                raise
-        self._undo()
-
-    def _undo(self) -> None:
-        if self._connection.in_transaction:
-            with contextlib.suppress(sqlite3.Error):
-                self._connection.execute("ROLLBACK")
 
 
 def _sync_to_disk(path: Path) -> None:

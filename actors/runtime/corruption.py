@@ -57,12 +57,9 @@ def check_fields(kind: type[Any], order: Injection) -> None:
     """
     for path, value in order.set_fields.items():
         _check_value(kind, path, value)
-    for path in order.add_fields:
-        _check_number(kind, path, "add_fields", whole=True)
-    for path in order.ramp_fields:
-        _check_number(kind, path, "ramp_fields", whole=False)
-    for path in order.noise_fields:
-        _check_number(kind, path, "noise_fields", whole=False)
+    for what in ("add_fields", "ramp_fields", "noise_fields"):
+        for path in getattr(order, what):
+            _check_number(kind, path, what, whole=what == "add_fields")
     for path in order.keep_ends:
         if getattr(bare(field_type(kind, path)), "__origin__", None) not in (tuple, list):
             raise InjectionError(f"keep_ends {path!r}: not a list")

@@ -15,6 +15,9 @@ from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJE
 
 F = TypeVar("F", bound=Callable[..., None])
 
+Members = tuple[str, ...] | None
+"""Names of members of a topic family; None for all."""
+
 BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, HELLO, DIAGNOSTIC, INJECTION_REPORT)
 """What every actor publishes besides its own outputs."""
 
@@ -73,9 +76,7 @@ class Declared:
         cls._periodic = tuple((period, name) for name, period in periodic.items())
 
     @classmethod
-    def names(
-        cls, topic: Topic[Any], name: str, parameters: Any  # noqa: ARG003
-    ) -> tuple[str, ...] | None:
+    def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
         """Which members of an input family a node hears, None for all.
 
         Args:
@@ -86,9 +87,7 @@ class Declared:
         return None
 
     @classmethod
-    def output_names(
-        cls, topic: Topic[Any], name: str, parameters: Any  # noqa: ARG003
-    ) -> tuple[str, ...] | None:
+    def output_names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
         """Which members of an output family a node publishes, likewise; None for any."""
         return (name,)
 
@@ -106,12 +105,9 @@ class Declared:
     def published(cls, key: str, name: str, parameters: Any) -> Topic[Any] | None:
         """Return the topic of a key below `rampart/`, if the node `name` publishes it."""
         for topic in (*cls.outputs, *BASE_OUTPUTS):
-            head, family, tail = topic.key.partition("{name}")
-            if not family:
-                if topic.key == key:
-                    return topic
-            elif key.startswith(head) and key.endswith(tail):
-                names = cls.output_names(topic, name, parameters)
-                if names is None or key[len(head):len(key) - len(tail)] in names:
+            member = topic.member(key)
+            if member is not None:
+                names = cls.output_names(topic, name, parameters) if member else None
+                if names is None or member in names:
                     return topic
         return None

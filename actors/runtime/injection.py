@@ -7,6 +7,9 @@ What counts as affected is a message that left otherwise than it came: a freeze 
 stands still, or a speed set to the value it has anyway, is no effect, and a fault that never had
 one must not be counted as survived. What the readers make of it is not known here: a duplicate
 counts although it is refused on arrival.
+
+`FaultGate` decides what happens to a message, and is pure; `InjectedFaults` has the timers and the
+reports of one actor.
 """
 
 from __future__ import annotations
@@ -15,19 +18,25 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random
-from typing import Any
+from typing import Any, Protocol
 
-from rampart.actors.bus.messages import Injection
-from rampart.actors.bus.topic import ROOT
-from rampart.actors.bus.topics import (
-    INJECT,
-    INJECTION_REPORT,
-    INJECTION_REQUEST,
-    INJECTION_RESULT,
-)
+import msgspec
+
+from rampart.actors.bus.bounds import clip
+from rampart.actors.bus.messages import Injection, InjectionReport
+from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.bus.topics import INJECT, INJECTION_REPORT, INJECTION_REQUEST, INJECTION_RESULT
+from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.corruption import InjectionError, check_fields, corrupt
+from rampart.actors.runtime.timer import Timer
 
 MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp", "corrupt")
+
+MAX_IN_FORCE = 64
+"""Injections of one actor at a time."""
+
+MAX_DELAYED = 10_000
+"""Messages of one actor that an injection may hold back at a time; more are lost, and reported."""
 
 UNTOUCHED = (INJECT.key, INJECTION_REPORT.key, INJECTION_REQUEST.key, INJECTION_RESULT.key)
 """Keys that carry injections and their results, and therefore cannot be disturbed."""
@@ -96,8 +105,7 @@ class FaultGate:
             now_s: now, simulated seconds.
             kind: type of the topic's messages, if known, to check the fields against.
         """
-        reason = flaw(injection, kind)
-        if reason:
+        if reason := flaw(injection, kind):
             return reason
         before = self.in_force.pop(injection.injection, None)
         self.in_force[injection.injection] = _Active(
@@ -117,8 +125,6 @@ class FaultGate:
         leaves the message alone.
         """
         out = Outgoing(body, stamp)
-        if not self.in_force:
-            return out
         for active in [a for a in self.in_force.values() if a.key == key]:
             if not active.strikes(now_s):
                 active.frozen = None  # the next freeze repeats what is healthy now
@@ -140,8 +146,6 @@ class FaultGate:
 
     def take_news(self) -> list[News]:
         """Return what has become of injections since the last call."""
-        if not self._news:
-            return self._news
         news, self._news = self._news, []
         return news
 
@@ -177,15 +181,13 @@ def flaw(order: Injection, kind: type[Any] | None = None) -> str:
         order: the injection.
         kind: type of the topic's messages; None leaves the fields unchecked.
     """
-    for wrong in (_wrong_kind, _wrong_time, _wrong_number):
-        if reason := wrong(order):
-            return reason
-    if kind is not None and order.mode == "corrupt":
+    reason = _wrong_kind(order) or _wrong_time(order) or _wrong_number(order)
+    if not reason and kind is not None and order.mode == "corrupt":
         try:
             check_fields(kind, order)
         except InjectionError as error:
             return str(error)
-    return ""
+    return reason
 
 
 def _wrong_kind(order: Injection) -> str:
@@ -203,8 +205,8 @@ def _wrong_kind(order: Injection) -> str:
 def _wrong_time(order: Injection) -> str:
     if not order.duration_s >= 0:
         return f"duration_s = {order.duration_s:g}: must be 0 or more, inf for permanent"
-    for name, value_s in (("delay_s", order.delay_s), ("on_s", order.on_s),
-                          ("off_s", order.off_s)):
+    for name, value_s in (
+            ("delay_s", order.delay_s), ("on_s", order.on_s), ("off_s", order.off_s)):
         if not (value_s >= 0 and math.isfinite(value_s)):
             return f"{name} = {value_s:g}: must be seconds, 0 or more"
     if (order.on_s > 0) != (order.off_s > 0):
@@ -221,12 +223,104 @@ def _wrong_time(order: Injection) -> str:
 def _wrong_number(order: Injection) -> str:
     if not 0 <= order.share <= 1:
         return f"share = {order.share:g}: must be between 0 and 1"
-    rules: tuple[tuple[str, dict[str, float], Callable[[float], bool], str], ...] = (
-        ("ramp_fields", order.ramp_fields, math.isfinite, "finite"),
-        ("add_fields", order.add_fields, math.isfinite, "finite"),
-        ("noise_fields", order.noise_fields, lambda x: 0 <= x < math.inf, "finite, 0 or more"))
-    for what, numbers, fits, right in rules:
+    for what, numbers, least, right in (
+            ("ramp_fields", order.ramp_fields, -math.inf, "finite"),
+            ("add_fields", order.add_fields, -math.inf, "finite"),
+            ("noise_fields", order.noise_fields, 0.0, "finite, 0 or more")):
         for path, value in numbers.items():
-            if not fits(value):
+            if not (math.isfinite(value) and value >= least):
                 return f"{what} {path!r} = {value:g}: must be {right}"
     return ""
+
+
+class Publisher(Protocol):
+    """What publishes the messages that faults are put upon; an actor is one."""
+
+    name: str
+    clock: Clock
+
+    def publish(self, topic: Topic[Any], body: msgspec.Struct) -> None:
+        """Send a message through the faults in force."""
+
+    def send(self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float,
+             copies: int = 1) -> None:
+        """Send a message past all faults."""
+
+    def call_later(self, delay_s: float, call: Callable[[], None]) -> Timer:
+        """Have `call` made after `delay_s` simulated seconds."""
+
+    def report_diagnostic(self, context: str, reason: str, offender: str) -> None:
+        """Publish an error report."""
+
+
+class InjectedFaults:
+    """The injections of one actor.
+
+    Attributes:
+        gate: Those in force, and what was sent last.
+    """
+
+    def __init__(self, publisher: Publisher) -> None:
+        self.gate = FaultGate()
+        self._publisher = publisher
+        self._ends: dict[str, Timer] = {}
+        self._delayed = 0
+
+    def order(self, order: Injection, topic: Topic[Any]) -> None:
+        """Put an injection in force on a topic that the actor publishes, and report it."""
+        in_force = self.gate.in_force
+        if len(in_force) >= MAX_IN_FORCE and order.injection not in in_force:
+            reason = f"{MAX_IN_FORCE} injections are in force; wait for one to end"
+        else:
+            reason = self.gate.order(order, self._publisher.clock.now(), topic.type)
+        self._report(order.injection, 0, bool(reason), reason)
+        if reason:
+            return
+        self._forget_end(order.injection)  # of an earlier order with the same id
+        if order.duration_s <= 0:
+            self._over(order.injection)
+        elif order.duration_s < math.inf:
+            self._ends[order.injection] = self._publisher.call_later(
+                order.duration_s, lambda: self._over(order.injection))
+
+    def send(self, topic: Topic[Any], key: str, body: msgspec.Struct, stamp: float) -> None:
+        """Send what the injections in force leave of a message, when they let it go."""
+        publisher = self._publisher
+        out = self.gate.apply(key, body, stamp, publisher.clock.now())
+        if out is not None and out.delay_s > 0:
+            self._send_later(out.delay_s, lambda: publisher.send(
+                topic, key, out.body, out.stamp, out.copies))
+        elif out is not None:
+            publisher.send(topic, key, out.body, out.stamp, out.copies)
+        for news in self.gate.take_news():  # the first effect of one, or that it ended early
+            if news.finished:
+                self._forget_end(news.injection)
+                publisher.report_diagnostic("fault injection", news.reason, news.topic)
+            self._report(news.injection, news.affected, news.finished, news.reason)
+
+    def _send_later(self, delay_s: float, send: Callable[[], None]) -> None:
+        if self._delayed >= MAX_DELAYED:
+            self._publisher.report_diagnostic(
+                "fault injection", f"more than {MAX_DELAYED} messages are delayed; one was dropped",
+                self._publisher.name)
+            return
+
+        def due() -> None:
+            self._delayed -= 1
+            send()
+
+        self._delayed += 1
+        self._publisher.call_later(delay_s, due)
+
+    def _over(self, injection: str) -> None:
+        self._forget_end(injection)
+        self._report(injection, self.gate.expire(injection), True)
+
+    def _report(self, injection: str, affected: int, finished: bool, reason: str = "") -> None:
+        self._publisher.publish(INJECTION_REPORT, InjectionReport(
+            injection, self._publisher.name, affected, finished, clip(reason)))
+
+    def _forget_end(self, injection: str) -> None:
+        timer = self._ends.pop(injection, None)
+        if timer is not None:
+            timer.cancel()

@@ -16,20 +16,19 @@ from rampart.actors.runtime.mailbox import Dispatcher
 class Timer:
     """A pending `call_later`; `cancel` is harmless after it has run."""
 
-    __slots__ = ("_call", "_release")
+    __slots__ = ("_call", "_pending", "handle")
 
-    def __init__(self, call: Callable[[], None]) -> None:
+    def __init__(self, call: Callable[[], None], pending: set[Timer]) -> None:
         self._call: Callable[[], None] | None = call
-        self._release: Callable[[], None] = lambda: None
-
-    def arm(self, release: Callable[[], None]) -> None:
-        """Keep what takes the timer from the loop."""
-        self._release = release
+        self._pending = pending
+        self.handle: asyncio.TimerHandle | None = None
 
     def cancel(self) -> None:
         """Make sure the call does not happen (any more)."""
         self._call = None
-        self._release()
+        self._pending.discard(self)
+        if self.handle is not None:
+            self.handle.cancel()
 
     def fire(self) -> None:
         """Make the call, unless it was cancelled while it waited in the mailbox."""
@@ -50,7 +49,7 @@ class Timers:
         self._clock = clock
         self._dispatcher = dispatcher
         self._count = 0
-        self._pending: set[asyncio.TimerHandle] = set()
+        self._pending: set[Timer] = set()
         self._periodic: list[_Ticker] = []
 
     def __len__(self) -> int:
@@ -58,22 +57,17 @@ class Timers:
 
     def later(self, delay_s: float, call: Callable[[], None]) -> Timer:
         """Have `call` made after `delay_s` simulated seconds."""
-        timer = Timer(call)
+        timer = Timer(call, self._pending)
+        self._pending.add(timer)
         self._count += 1
         slot = f"later {self._count}"
 
-        def fire() -> None:
-            self._pending.discard(handle)
+        def due() -> None:
+            self._pending.discard(timer)
             self._dispatcher.put(slot, timer.fire)
 
-        def release() -> None:
-            handle.cancel()
-            self._pending.discard(handle)
-
-        handle = asyncio.get_running_loop().call_at(
-            self._clock.source_time(self._clock.now() + delay_s), fire)
-        self._pending.add(handle)
-        timer.arm(release)
+        timer.handle = asyncio.get_running_loop().call_at(
+            self._clock.source_time(self._clock.now() + delay_s), due)
         return timer
 
     def every(self, period_s: float, name: str, call: Callable[[], None]) -> None:
@@ -83,9 +77,8 @@ class Timers:
 
     def cancel(self) -> None:
         """Make none of the calls any more."""
-        for handle in self._pending:
-            handle.cancel()
-        self._pending.clear()
+        for timer in list(self._pending):
+            timer.cancel()
         for ticker in self._periodic:
             ticker.cancel()
 

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -19,7 +17,8 @@ from collections.abc import Callable, Mapping
 
 from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
 from rampart.actors.supervision.patience import Patience, usage
-from rampart.actors.supervision.process_title import RunProcess, find_processes
+from rampart.actors.supervision.process_title import RunProcess, find_processes, kill
+from rampart.actors.supervision.processes import OsHandle
 from rampart.actors.supervision.spawner import NAMES
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import RestartPolicy
@@ -35,6 +34,7 @@ LOAD_PATIENCE_S = 20.0
 """A spawner that could have loaded for so long is hung; it takes a second or two."""
 
 _ASK_AGAIN_S = 0.01
+_SPAWNERS = {f"spawner_{name}": name for name in NAMES}
 
 
 class Guard:
@@ -64,8 +64,7 @@ class Guard:
         self._spawners = spawners
         self._load = load
         self._loaded: subprocess.Popen[bytes] | None = None
-        self._patience = {
-            name: Patience(2 * PERIOD_S) for name in (SUPERVISOR, *(f"spawner_{n}" for n in NAMES))}
+        self._patience = {name: Patience(2 * PERIOD_S) for name in (SUPERVISOR, *_SPAWNERS)}
         self._load_patience = Patience(2 * PERIOD_S)
         self._hung: set[str] = set()
         self._supervisor_due_s: float | None = None
@@ -116,12 +115,11 @@ class Guard:
     async def look_after(self) -> bool:
         """Bring back whichever guard is missing; False if that was not possible."""
         living: dict[str, RunProcess] = {}
-        for process in find_processes(self._plan.base_port):
-            if process.launcher == self._plan.launcher_pid:
-                for name in process.names:  # a child bears its spawner's name for a moment
-                    living.setdefault(name, process)
+        for process in find_processes(self._plan.base_port, self._plan.launcher_pid):
+            for name in process.names:  # a child bears its spawner's name for a moment
+                living.setdefault(name, process)
         all_there = True
-        turning = {f"spawner_{n}": self._spawners.turns(n) for n in NAMES}
+        turning = {name: self._spawners.turns(short) for name, short in _SPAWNERS.items()}
         for name, turns in turning.items():
             if turns:
                 self._patience[name].answered()
@@ -137,53 +135,38 @@ class Guard:
             self.supervisor_incarnation = max(self.supervisor_incarnation, supervisor.incarnation)
             if self._is_hung(SUPERVISOR, supervisor.pid):
                 self._patience[SUPERVISOR].answered()
-                _kill(supervisor.pid)
+                kill(supervisor.pid)
                 await self.supervisor_gone(PERIOD_S)  # its port is free only then
                 supervisor = None
-        if supervisor is not None:
-            self._supervisor_due_s = None
-            return all_there
-        return await self._bring_supervisor_back() and all_there
+        if supervisor is None:
+            return await self._bring_supervisor_back() and all_there
+        self._supervisor_due_s = None
+        return all_there
 
     async def supervisor_gone(self, timeout_s: float) -> None:
         """Wait until the supervisor has ended, or so many seconds."""
-        loop = asyncio.get_running_loop()
+        gone = asyncio.Event()
         try:
-            pidfd = os.pidfd_open(self.supervisor_pid)
+            handle = OsHandle(self.supervisor_pid, gone.set)
         except (ProcessLookupError, ValueError):  # it has ended, or there was none yet
             return
         except OSError:  # no descriptor left
             await asyncio.sleep(timeout_s)
             return
-        gone = loop.create_future()
-
-        def readable() -> None:
-            if not gone.done():
-                gone.set_result(None)
-
-        loop.add_reader(pidfd, readable)
-        try:
-            await asyncio.wait_for(gone, timeout_s)
-        except TimeoutError:
-            pass
-        finally:
-            loop.remove_reader(pidfd)
-            os.close(pidfd)
+        with contextlib.suppress(TimeoutError), contextlib.closing(handle):
+            await asyncio.wait_for(gone.wait(), timeout_s)
 
     def end(self) -> None:
         """End a process that still loads."""
         if self._loaded is not None:
-            self._loaded.kill()
-            self._loaded.wait()
-            if self._loaded.stdout is not None:
-                self._loaded.stdout.close()
+            with self._loaded:  # which closes its output and waits for it
+                self._loaded.kill()
 
     # -- inside ---------------------------------------------------------------------------------
 
     def _is_hung(self, name: str, pid: int) -> bool:
-        limit_s = SPAWNER_PATIENCE_S
-        if name == SUPERVISOR:
-            limit_s = SUPERVISOR_PATIENCE_S / min(1.0, self._plan.rate)
+        limit_s = (SUPERVISOR_PATIENCE_S / min(1.0, self._plan.rate) if name == SUPERVISOR
+                   else SPAWNER_PATIENCE_S)
         return self._patience[name].look(time.monotonic(), pid, usage(pid)) >= limit_s
 
     def _judge(self, name: str, pid: int, turning: Mapping[str, bool]) -> bool:
@@ -194,12 +177,11 @@ class Guard:
         if any(turning.values()) or self._hung.issuperset(turning):
             self._hung.discard(name)
             self._patience[name].answered()
-            _kill(pid)
+            kill(pid)
         return False
 
     async def _bring_spawner_back(self, name: str, living: Mapping[str, RunProcess]) -> bool:
-        others = [n for n in self._patience if n not in {name, SUPERVISOR}]
-        if any(n in living and n not in self._hung for n in others):
+        if any(n in living and n not in self._hung for n in _SPAWNERS if n != name):
             try:
                 await self.fork(name, 1)
             except SpawnerUnavailableError as error:
@@ -215,19 +197,20 @@ class Guard:
 
         False while that is under way.
         """
-        if self._loaded is not None and self._loaded.poll() is None:
-            pid = self._loaded.pid
-            if self._load_patience.look(time.monotonic(), pid, usage(pid)) >= LOAD_PATIENCE_S:
-                self._loaded.kill()
+        loaded = self._loaded
+        if loaded is not None and loaded.poll() is None:
+            spent_s = self._load_patience.look(time.monotonic(), loaded.pid, usage(loaded.pid))
+            if spent_s >= LOAD_PATIENCE_S:
+                loaded.kill()
             return False
-        if self._loaded is not None and self._loaded.stdout is not None:
-            with self._loaded.stdout as output:
+        if loaded is not None and loaded.stdout is not None:
+            with loaded.stdout as output:
                 said = output.read().decode(errors="replace").strip()
             self._loaded = None
             if said.startswith("error: "):
                 self._tell(f"a spawner does not load: {said.removeprefix('error: ')}")
                 return False  # the other one may, if it is missing too
-        self._loaded = self._load(name.removeprefix("spawner_"))
+        self._loaded = self._load(_SPAWNERS[name])
         return True
 
     async def _bring_supervisor_back(self) -> bool:
@@ -264,8 +247,3 @@ class Guard:
 
 def _to_stderr(text: str) -> None:
     print(f"rampart: {text}", file=sys.stderr, flush=True)
-
-
-def _kill(pid: int) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)

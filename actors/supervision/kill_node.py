@@ -11,14 +11,8 @@ import sys
 from rampart.actors.supervision.process_title import RunProcess, find_processes
 from rampart.files import streams
 
-SIGNALS = {
-    "KILL": signal.SIGKILL,
-    "STOP": signal.SIGSTOP,
-    "CONT": signal.SIGCONT,
-    "TERM": signal.SIGTERM,
-    "SEGV": signal.SIGSEGV,
-    "WEDGE": signal.SIGUSR2,
-}
+SIGNALS = {name: signal.Signals[f"SIG{name}"] for name in ("KILL", "STOP", "CONT", "TERM", "SEGV")}
+SIGNALS["WEDGE"] = signal.SIGUSR2
 
 _EPILOG = """\
 signals:

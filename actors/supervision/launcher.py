@@ -30,6 +30,7 @@ from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.actors.supervision.guard import Guard
 from rampart.actors.supervision.lifeline import kill_leftovers
+from rampart.actors.supervision.process_title import kill
 from rampart.actors.supervision.spawner import NAMES, Loaded
 from rampart.actors.supervision.spawner_client import (
     START_PATIENCE_S,
@@ -92,21 +93,21 @@ class Launcher:
         Raises:
             LaunchError: another run has the base port, or there is no place for the run's sockets.
         """
-        self._info = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        try:
-            self._info.bind(run_info.address(self.plan.base_port))
-        except OSError:
-            self._info.close()
-            self._info = None
-            raise LaunchError(f"--port {self.plan.base_port}: in use by another run; "
-                              "choose another --port") from None
-        try:
-            folder = run_folder.make(self.plan.base_port, os.getpid())
-            run_folder.issue(folder, (OBSERVER,), 1)
-        except OSError as error:
-            self._info.close()
-            self._info = None
-            raise LaunchError(f"no folder for the run's sockets: {error}") from None
+        port = self.plan.base_port
+        with contextlib.ExitStack() as on_failure:
+            info = on_failure.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+            try:
+                info.bind(run_info.address(port))
+            except OSError:
+                raise LaunchError(f"--port {port}: in use by another run; "
+                                  "choose another --port") from None
+            try:
+                folder = run_folder.make(port, os.getpid())
+                run_folder.issue(folder, (OBSERVER,), 1)
+            except OSError as error:
+                raise LaunchError(f"no folder for the run's sockets: {error}") from None
+            on_failure.pop_all()
+        self._info = info
         self.plan = msgspec.structs.replace(self.plan, folder=folder)
         self._spawners.folder = folder
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
@@ -135,11 +136,10 @@ class Launcher:
             LaunchError: spec, airport or mission are unsound, or fewer files may be open than the
                 run needs.
         """
-        assert self._first is not None  # noqa: S101
-        assert self._first.stdout is not None  # noqa: S101
+        output = self._first.stdout if self._first else None
+        assert output is not None  # noqa: S101 for the type checker
         try:
-            line = await asyncio.wait_for(
-                asyncio.to_thread(self._first.stdout.readline), LOAD_TIMEOUT_S)
+            line = await asyncio.wait_for(asyncio.to_thread(output.readline), LOAD_TIMEOUT_S)
         except TimeoutError:
             raise LaunchError(f"the spawner did not load within {LOAD_TIMEOUT_S:.0f} s") from None
         self._load_s = time.monotonic() - self._begun_s
@@ -174,7 +174,10 @@ class Launcher:
             await self.guard.start_supervisor(START_PATIENCE_S)
         except SpawnerUnavailableError as error:
             raise LaunchError(str(error)) from None
-        self._answer_tools(loop)
+        if self._info is not None:
+            self._info.listen(8)
+            self._info.setblocking(False)
+            loop.add_reader(self._info, self._answer_one, self._info)
         self._keeping = asyncio.create_task(self.guard.keep())
         watch(self._keeping, "the guard of supervisor and spawners", self.failed)
 
@@ -203,18 +206,9 @@ class Launcher:
 
     # -- tools ----------------------------------------------------------------------------------
 
-    def _answer_tools(self, loop: asyncio.AbstractEventLoop) -> None:
-        if self._info is None:
-            return
-        self._info.listen(8)
-        self._info.setblocking(False)
-        loop.add_reader(self._info, self._answer_one)
-
-    def _answer_one(self) -> None:
-        if self._info is None:
-            return
+    def _answer_one(self, info: socket.socket) -> None:
         with contextlib.suppress(OSError):
-            connection, _ = self._info.accept()
+            connection, _ = info.accept()
             with connection:
                 if is_same_user(connection):
                     connection.send(msgspec.json.encode(self.info()))
@@ -234,8 +228,7 @@ class Launcher:
             self._keeping.cancel()
             await asyncio.gather(self._keeping, return_exceptions=True)
         if self.guard.supervisor_pid:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(self.guard.supervisor_pid, signal.SIGTERM)
+            kill(self.guard.supervisor_pid, signal.SIGTERM)
             await self.guard.supervisor_gone(STOP_TIMEOUT_S)
         self.abort()
         if self._info is not None:
@@ -252,10 +245,8 @@ class Launcher:
         self._lifeline = (-1, -1)
         self.guard.end()
         if self._first is not None:
-            self._first.kill()
-            self._first.wait()
-            if self._first.stdout is not None:
-                self._first.stdout.close()
+            with self._first:  # which closes its output and waits for it
+                self._first.kill()
         deadline = time.monotonic() + 1.0
         while kill_leftovers(self.plan.launcher_pid) and time.monotonic() < deadline:
             time.sleep(0.01)

@@ -15,13 +15,11 @@ stopped process cannot read. Two things end it all the same:
 
 from __future__ import annotations
 
-import contextlib
 import os
-import signal
 import threading
 
 from rampart.actors.bus.run_folder import remove
-from rampart.actors.supervision.process_title import find_processes
+from rampart.actors.supervision.process_title import find_processes, kill
 
 
 def exit_with_launcher(read_end: int, launcher: int, folder: str) -> None:
@@ -32,18 +30,12 @@ def exit_with_launcher(read_end: int, launcher: int, folder: str) -> None:
             pass
         kill_leftovers(launcher)
         remove(folder)
-        os.kill(os.getpid(), signal.SIGKILL)
+        kill(os.getpid())
 
     threading.Thread(target=wait, name="lifeline", daemon=True).start()
 
 
 def kill_leftovers(launcher: int) -> list[int]:
     """SIGKILL all processes of a launcher's run except this one; return their pids."""
-    killed = []
-    for process in find_processes():
-        if process.launcher != launcher or process.pid == os.getpid():
-            continue
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(process.pid, signal.SIGKILL)
-            killed.append(process.pid)
-    return killed
+    return [process.pid for process in find_processes(launcher=launcher)
+            if process.pid != os.getpid() and kill(process.pid)]

@@ -41,10 +41,9 @@ EXIT_FAILED = 1
 EXIT_BUS = 3
 
 
-def make_actor(
-    layout: Layout, name: str, incarnation: int, run: RunContext,
-    loop: asyncio.AbstractEventLoop, *, failed: Callable[[Exception], None] = lambda _error: None,
-) -> Actor:
+def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
+               loop: asyncio.AbstractEventLoop, *,
+               failed: Callable[[Exception], None] = lambda _error: None) -> Actor:
     """Build one actor of the system with its bus, not yet running; `failed` is told its error."""
     member = layout.members[name]
     clock = Clock(layout.plan.origin_s, layout.plan.rate, loop.time)
@@ -63,14 +62,11 @@ def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:
     plan = layout.plan
     if not (plan.checkpoints and layout.spec.layers.checkpoints):
         return NoCheckpoints()
-    return SqliteCheckpoints(
-        Path(plan.checkpoints) / f"{name}.sqlite", plan.run_id, incarnation)
+    return SqliteCheckpoints(Path(plan.checkpoints, f"{name}.sqlite"), plan.run_id, incarnation)
 
 
-def node_main(
-    layout: Layout, names: tuple[str, ...], incarnation: int, run: RunContext,
-    lifeline: int, *, born: Callable[[], None] = lambda: None,
-) -> int:
+def node_main(layout: Layout, names: tuple[str, ...], incarnation: int, run: RunContext,
+              lifeline: int, *, born: Callable[[], None] = lambda: None) -> int:
     """Run the actors of one process to their end and return the exit code.
 
     Args:
@@ -82,14 +78,14 @@ def node_main(
         born: called as soon as the process has its title, before it does anything that others see.
     """
     told: list[Exception] = []
+    launcher, who = layout.plan.launcher_pid, f"{'+'.join(names)} #{incarnation}"
 
     def tell(error: Exception) -> None:  # at once: what replaces this process may kill it
         told.append(error)
-        _complain(f"{'+'.join(names)} #{incarnation} failed: {type(error).__name__}: {error}")
-        _log_traceback(layout, names, incarnation, error)
+        _complain(f"{who} failed: {type(error).__name__}: {error}")
+        _log_traceback(layout.plan.error_log, who, error)
 
     try:
-        launcher = layout.plan.launcher_pid
         set_title(layout.plan.base_port, launcher, names, incarnation)
         born()
         if any(node.kind is Kind.WORLD for node in layout.spec.nodes if node.name in names):
@@ -98,7 +94,7 @@ def node_main(
         for number in (signal.SIGINT, signal.SIGHUP):  # ctrl-C is the launcher's to handle
             signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGUSR2, wedge)
-        asyncio.run(_live(layout, names, incarnation, run, tell))
+        asyncio.run(_run_actors(layout, names, incarnation, run, tell))
     except BusError as error:
         if error not in told:
             _complain(f"{'+'.join(names)}: {error}")
@@ -110,10 +106,8 @@ def node_main(
     return EXIT_OK
 
 
-async def _live(
-    layout: Layout, names: tuple[str, ...], incarnation: int, run: RunContext,
-    failed: Callable[[Exception], None],
-) -> None:
+async def _run_actors(layout: Layout, names: tuple[str, ...], incarnation: int, run: RunContext,
+                      failed: Callable[[Exception], None]) -> None:
     loop = asyncio.get_running_loop()
     tell_of_callbacks(loop, lambda line: _complain(f"{'+'.join(names)} #{incarnation}: {line}"))
     actors = [make_actor(layout, name, incarnation, run, loop, failed=failed) for name in names]
@@ -152,13 +146,12 @@ def _complain(line: str) -> None:
     print(f"rampart: {one_line(line)}", file=sys.stderr, flush=True)
 
 
-def _log_traceback(layout: Layout, names: tuple[str, ...], incarnation: int,
-                   failed: Exception) -> None:
-    if not layout.plan.error_log:
+def _log_traceback(file: str, who: str, failed: Exception) -> None:
+    if not file:
         return
     try:
-        with Path(layout.plan.error_log).open("a", encoding="utf-8") as log:
-            log.write(f"--- {'+'.join(names)} #{incarnation} pid {os.getpid()}\n")
+        with Path(file).open("a", encoding="utf-8") as log:
+            log.write(f"--- {who} pid {os.getpid()}\n")
             traceback.print_exception(failed, file=log)
     except OSError as error:
-        _complain(f"cannot write {layout.plan.error_log}: {error}")
+        _complain(f"cannot write {file}: {error}")

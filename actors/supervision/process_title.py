@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 
 import setproctitle
 
 _TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
-_STATE_STOPPED = ("T", "t")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +44,14 @@ def parse_title(pid: int, title: str) -> RunProcess | None:
     return RunProcess(pid, int(match[1]), int(match[2]), tuple(match[3].split("+")), int(match[4]))
 
 
-def find_processes(port: int | None = None) -> list[RunProcess]:
-    """Return the living processes of all runs of this user, or of the run on one base port.
+def find_processes(port: int | None = None, launcher: int | None = None) -> list[RunProcess]:
+    """Return the running processes of all runs of this user, or of one base port or launcher.
 
     Zombies are left out: they run no code and hold nothing.
     """
     found = [process for entry in Path("/proc").iterdir() if entry.name.isdecimal()
-             and (process := find_process(int(entry.name))) and port in {None, process.port}]
+             and (process := find_process(int(entry.name)))
+             and port in {None, process.port} and launcher in {None, process.launcher}]
     return sorted(found, key=lambda p: (p.port, p.pid))
 
 
@@ -76,6 +77,10 @@ def process_state(pid: int) -> str:
     return stat.rpartition(")")[2].split()[0]
 
 
-def is_stopped(pid: int) -> bool:
-    """Whether the process was stopped by a signal."""
-    return process_state(pid) in _STATE_STOPPED
+def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> bool:
+    """Send a signal to a process; False if it is gone."""
+    try:
+        os.kill(pid, number)
+    except ProcessLookupError:
+        return False
+    return True

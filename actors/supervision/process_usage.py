@@ -99,13 +99,11 @@ class UsageMeter:
                 continue
             now_s = self._now()
             self._last[pid] = (now_s, count)
-            since_s, start = before.get(pid, (count.started_s, None))
+            since_s, start = before.get(pid, (0.0, None))
             if start is None or start.started_s != count.started_s:  # new, or its number is reused
-                since_s, spent_s = count.started_s, count.cpu_s
-            else:
-                spent_s = count.cpu_s - start.cpu_s
-            span_s = now_s - since_s
+                since_s, start = count.started_s, ProcessCount(0.0, 0, count.started_s)
+            spent_s, span_s = max(0.0, count.cpu_s - start.cpu_s), now_s - since_s
             found[pid] = ProcessUsage(
-                max(0.0, spent_s) / span_s if span_s > 0 else 0.0, count.cpu_s,
-                count.memory_bytes, max(0.0, now_s - count.started_s))
+                spent_s / span_s if span_s > 0 else 0.0, count.cpu_s, count.memory_bytes,
+                max(0.0, now_s - count.started_s))
         return found

@@ -18,15 +18,10 @@ from typing import NamedTuple, Protocol
 
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.supervision.patience import AT_LEISURE, Usage, usage
-from rampart.actors.supervision.process_title import find_processes, is_stopped
-from rampart.actors.supervision.spawner_client import (
-    SpawnerBusyError,
-    SpawnerClient,
-    SpawnerUnavailableError,
-)
+from rampart.actors.supervision.process_title import find_processes, process_state
+from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
-__all__ = ["Hold", "Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerBusyError",
-           "SpawnerUnavailableError"]
+__all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerUnavailableError"]
 
 
 class Living(NamedTuple):
@@ -37,26 +32,42 @@ class Living(NamedTuple):
     incarnation: int
 
 
-class ProcessHandle(Protocol):
-    """One process, held so that its number cannot come to mean another one."""
+class ProcessHandle:
+    """One process, held so that its number cannot come to mean another one.
+
+    This class itself is the hold on none: see `NO_PROCESS` and `NOT_HELD`.
+    """
+
+    def __init__(self, *, is_gone: bool) -> None:
+        self._is_gone = is_gone
 
     def kill(self) -> None:
         """End it at once (SIGKILL), if it is still there."""
 
     def gone(self) -> bool:
-        """Whether it runs no more and holds nothing, its ports included."""
+        """Whether it certainly runs no more and holds nothing, its ports included."""
+        return self._is_gone
 
     def stopped(self) -> bool:
-        """Whether it was stopped from outside (SIGSTOP) and runs nothing."""
+        """Whether it was stopped from outside (SIGSTOP); False if that cannot be known."""
+        return False
 
     def usage(self) -> Usage:
-        """Return what it has run, and waited for a processor."""
+        """Return what it has run, and waited for a processor, as far as that is known."""
+        return AT_LEISURE
 
     def ignore(self) -> None:
         """Do not report its end any more."""
 
     def close(self) -> None:
         """Let go of it."""
+
+
+NO_PROCESS = ProcessHandle(is_gone=True)
+"""In the place of a handle where there is no process."""
+
+NOT_HELD = ProcessHandle(is_gone=False)
+"""In the place of a handle on a process for which no descriptor was left."""
 
 
 class Processes(Protocol):
@@ -93,50 +104,7 @@ class Processes(Protocol):
         """Let go of everything."""
 
 
-class Hold:
-    """The hold on a process that may not be there, or for which no descriptor was left.
-
-    Attributes:
-        handle: What it is held by, None if it is not.
-    """
-
-    def __init__(self) -> None:
-        self.handle: ProcessHandle | None = None
-        self._is_lacking = False
-
-    def take(self, machine: Processes, pid: int, ended: Callable[[], None]) -> None:
-        """Take hold of a process; raises as `Processes.hold`, and counts then as not gone."""
-        self._is_lacking = True
-        self.handle = machine.hold(pid, ended)
-        self._is_lacking = False
-
-    def is_gone(self) -> bool:
-        """Whether it certainly runs no more and holds nothing."""
-        return not self._is_lacking and (self.handle is None or self.handle.gone())
-
-    def stopped(self) -> bool:
-        """Whether it was stopped from outside; False if that cannot be known."""
-        return self.handle is not None and self.handle.stopped()
-
-    def usage(self) -> Usage:
-        """Return what it has run, and waited for a processor, as far as that is known."""
-        return self.handle.usage() if self.handle is not None else AT_LEISURE
-
-    def kill(self) -> None:
-        """End it at once, and do not report that."""
-        if self.handle is not None:
-            self.handle.ignore()
-            self.handle.kill()
-
-    def let_go(self) -> None:
-        """Let go of it."""
-        self._is_lacking = False
-        if self.handle is not None:
-            self.handle.close()
-            self.handle = None
-
-
-class _OsHandle:
+class OsHandle(ProcessHandle):
     """A pidfd. It works for processes that are not children, so the living can be adopted."""
 
     def __init__(self, pid: int, ended: Callable[[], None]) -> None:
@@ -154,6 +122,7 @@ class _OsHandle:
         self.send(signal.SIGKILL)
 
     def send(self, number: signal.Signals) -> None:
+        """Send a signal, if it is still there."""
         if self.pidfd >= 0:
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self.pidfd, number)
@@ -168,7 +137,7 @@ class _OsHandle:
         return bool(poll.poll(0))
 
     def stopped(self) -> bool:
-        return is_stopped(self._pid)
+        return process_state(self._pid) in "Tt"
 
     def usage(self) -> Usage:
         return usage(self._pid)
@@ -184,46 +153,25 @@ class _OsHandle:
             self.pidfd = -1
 
 
-class OsProcesses:
-    """Processes of this machine, forked by the run's spawners.
-
-    Args:
-        port: base port of the run.
-        launcher: pid of its launcher.
-        folder: of its sockets.
-    """
-
-    def __init__(self, port: int, launcher: int, folder: str) -> None:
-        self._port = port
-        self._launcher = launcher
-        self._spawner = SpawnerClient(folder, port, launcher)
+class OsProcesses(SpawnerClient):
+    """Processes of this machine; the run's spawners fork them."""
 
     def living(self) -> list[Living]:
         """Return the processes of this run, found in /proc."""
-        return [Living(p.names, p.pid, p.incarnation) for p in find_processes(self._port)
-                if p.launcher == self._launcher]
-
-    def fork(self, names: tuple[str, ...], incarnation: int) -> int:
-        """Have a spawner fork; raises SpawnerUnavailableError while none answers."""
-        return self._spawner.fork(names, incarnation)
+        return [Living(p.names, p.pid, p.incarnation)
+                for p in find_processes(self._port, self._launcher)]
 
     def hold(self, pid: int, ended: Callable[[], None]) -> ProcessHandle:
         """Open a pidfd; raises ProcessLookupError if there is no such process."""
-        return _OsHandle(pid, ended)
-
-    def adapt(self, adapted: AdaptedSystem) -> None:
-        """Tell the spawners."""
-        self._spawner.adapt(adapted)
+        return OsHandle(pid, ended)
 
     def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:
         """SIGTERM to all in their sequence, then SIGKILL for those that are there after a while."""
         poll = select.poll()
-        waiting: dict[int, _OsHandle] = {}
-        for handle in handles:
-            if isinstance(handle, _OsHandle) and handle.pidfd >= 0:
-                handle.send(signal.SIGTERM)
-                poll.register(handle.pidfd, select.POLLIN)
-                waiting[handle.pidfd] = handle
+        waiting = {h.pidfd: h for h in handles if isinstance(h, OsHandle) and h.pidfd >= 0}
+        for fd, handle in waiting.items():
+            handle.send(signal.SIGTERM)
+            poll.register(fd, select.POLLIN)
         deadline = time.monotonic() + grace_s
         while waiting and (left := deadline - time.monotonic()) > 0:
             for fd, _ in poll.poll(left * 1000):
@@ -231,7 +179,3 @@ class OsProcesses:
                 del waiting[fd]
         for handle in waiting.values():
             handle.kill()
-
-    def close(self) -> None:
-        """Close the connections to the spawners."""
-        self._spawner.close()

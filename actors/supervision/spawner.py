@@ -12,18 +12,18 @@ does not wait for it any more has closed the connection (see `spawner_client`).
 
 from __future__ import annotations
 
-import contextlib
+import dataclasses
 import gc
 import os
 import selectors
 import signal
 import socket
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
 
 import msgspec
+from msgspec.structs import replace
 
 from rampart.actors.bus.run_folder import issue, issued, remove, socket_path
 from rampart.actors.bus.unix_peer import is_same_user
@@ -104,8 +104,6 @@ class Spawner:
         self._run = run
         self._lifeline = lifeline
         self._selector = selectors.DefaultSelector()
-        self._listener: socket.socket | None = None
-        self._wakeup: tuple[socket.socket, socket.socket] | None = None
 
     def open(self) -> None:
         """Take the title and the address.
@@ -114,7 +112,12 @@ class Spawner:
             OSError: there is no folder to listen in.
         """
         self.take_title()
-        self._listen(address(self._layout.plan.folder, self.name))
+        where = address(self._layout.plan.folder, self.name)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        Path(where).unlink(missing_ok=True)  # of the one that this replaces
+        listener.bind(where)
+        listener.listen(_BACKLOG)
+        self._selector.register(listener, selectors.EVENT_READ, self._accept)
 
     def take_title(self) -> None:
         """Have /proc show what this process is."""
@@ -123,25 +126,16 @@ class Spawner:
 
     def serve(self) -> NoReturn:
         """Serve until the launcher ends."""
-        for number in (signal.SIGINT, signal.SIGHUP):  # it ends with the lifeline
+        # It ends with the lifeline; no terminal's foreground is here; the kernel reaps children.
+        for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTTIN, signal.SIGTTOU,
+                       signal.SIGCHLD):
             signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         signal.signal(signal.SIGUSR2, wedge)
-        for number in (signal.SIGTTIN, signal.SIGTTOU):  # no terminal's foreground is here
-            signal.signal(number, signal.SIG_IGN)
-        self._reap_on_child_end()
         self._selector.register(self._lifeline, selectors.EVENT_READ, self._launcher_gone)
         while True:
             for key, _ in self._selector.select():
                 key.data(key.fileobj)
-
-    def _listen(self, where: str) -> None:
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with contextlib.suppress(FileNotFoundError):  # of the one that this replaces
-            Path(where).unlink()
-        self._listener.bind(where)
-        self._listener.listen(_BACKLOG)
-        self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
 
     def _accept(self, listener: socket.socket) -> None:
         try:
@@ -178,8 +172,7 @@ class Spawner:
 
     def _obey(self, request: Ping | SetOrigin | Adapt) -> None:
         if isinstance(request, SetOrigin):
-            self._layout.plan = msgspec.structs.replace(
-                self._layout.plan, origin_s=request.origin_s)
+            self._layout.plan = replace(self._layout.plan, origin_s=request.origin_s)
         elif isinstance(request, Adapt):
             adapted = msgspec.json.decode(request.adapted, type=AdaptedSystem)
             self._layout, self._run = adapted_system(self._layout, self._run, adapted)
@@ -203,14 +196,11 @@ class Spawner:
 
         code = 1
         try:
-            signal.set_wakeup_fd(-1)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             lifeline = self._lifeline
             for key in list(self._selector.get_map().values()):
                 if key.fd not in {lifeline, connection.fileno()}:
                     key.fileobj.close()  # type: ignore[union-attr]
-            if self._wakeup:
-                self._wakeup[1].close()
             self._selector.close()
             if request.names[0].startswith("spawner_"):
                 name = request.names[0].removeprefix("spawner_")
@@ -221,27 +211,12 @@ class Spawner:
                 sibling.serve()
             code = node_main(
                 self._layout, request.names, request.incarnation,
-                replace(self._run, known_incarnations=issued(folder)), lifeline, born=born)
+                dataclasses.replace(self._run, known_incarnations=issued(folder)), lifeline,
+                born=born)
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(code)
-
-    def _reap_on_child_end(self) -> None:
-        read_end, write_end = socket.socketpair()
-        read_end.setblocking(False)
-        write_end.setblocking(False)
-        self._wakeup = (read_end, write_end)
-        signal.set_wakeup_fd(write_end.fileno(), warn_on_full_buffer=False)
-        signal.signal(signal.SIGCHLD, lambda *_: None)
-        self._selector.register(read_end, selectors.EVENT_READ, self._reap)
-
-    def _reap(self, read_end: socket.socket) -> None:
-        with contextlib.suppress(BlockingIOError):
-            read_end.recv(4096)
-        with contextlib.suppress(ChildProcessError):
-            while os.waitpid(-1, os.WNOHANG)[0]:
-                pass
 
     def _launcher_gone(self, lifeline: int) -> None:
         if os.read(lifeline, 1):
@@ -279,8 +254,8 @@ def main() -> int:
         return 2
     gc.collect()
     gc.freeze()  # keeps the collector from touching, and so copying, the shared pages
-    spawner = Spawner(name, layout, run, lifeline)
     try:
+        spawner = Spawner(name, layout, run, lifeline)
         spawner.open()
         loaded = Loaded(tuple(layout.members), spec.supervision)
         print(msgspec.json.encode(loaded).decode(), flush=True)

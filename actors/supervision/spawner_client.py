@@ -18,17 +18,16 @@ under the title that was asked for.
 from __future__ import annotations
 
 import contextlib
-import os
 import select
-import signal
 import socket
 import time
 
 import msgspec
 
-from rampart.actors.bus.unix_peer import is_same_user, peer, receive_signed
+from rampart.actors.bus.envelope import UNREADABLE
+from rampart.actors.bus.unix_peer import is_same_user, receive_signed
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.supervision.process_title import find_process
+from rampart.actors.supervision.process_title import find_process, kill
 from rampart.actors.supervision.spawner import (
     MAX_DATAGRAM,
     NAMES,
@@ -65,7 +64,7 @@ class _Asked:
 
     def __init__(self, spawner: str, connection: socket.socket) -> None:
         self.spawner = spawner
-        self.pid = peer(connection)[0]
+
         self._connection = connection
         self._unanswered = 0
         self.sent = False
@@ -109,26 +108,30 @@ class _Asked:
             self._read()
         return self._reply
 
+    def ask(self, request: Request, wait_s: float) -> Reply | None:
+        """Send one request, and return the answer if there is one within so many seconds."""
+        self.send(request)
+        reply = self.reply(wait_s)
+        self.close()
+        return reply
+
     def close(self) -> None:
         """Forget it, answered or not."""
         self._connection.close()
 
     def _read(self) -> None:
+        sender = 0
         try:
             data, sender = receive_signed(self._connection, MAX_DATAGRAM)
+            self._unanswered -= 1
+            if data and self._unanswered > 0:
+                return
+            reply = msgspec.json.decode(data, type=Reply) if data else Reply(error="no answer")
         except OSError as error:
-            self._end(Reply(error=f"no answer ({error.strerror})"))
-            return
-        if not data:
-            self._end(Reply(error="no answer"))
-            return
-        self._unanswered -= 1
-        if self._unanswered <= 0:
-            try:
-                reply = msgspec.json.decode(data, type=Reply)
-            except (msgspec.MsgspecError, ValueError, RecursionError):
-                reply = Reply(error="its answer makes no sense")
-            self._end(msgspec.structs.replace(reply, sender=sender))
+            reply = Reply(error=f"no answer ({error.strerror})")
+        except UNREADABLE:
+            reply = Reply(error="its answer makes no sense")
+        self._end(msgspec.structs.replace(reply, sender=sender))
 
     def _end(self, reply: Reply) -> None:
         self._reply = reply
@@ -152,11 +155,8 @@ class SpawnerClient:
         self._pings: dict[str, _Asked] = {}
         self._slow: set[str] = set()
         self._adapt: Adapt | None = None
-        self._adapted: set[int] = set()
 
-    def fork(
-        self, names: tuple[str, ...], incarnation: int
-    ) -> int:
+    def fork(self, names: tuple[str, ...], incarnation: int) -> int:
         """Fork a process for the named actors and return its pid.
 
         Args:
@@ -168,14 +168,16 @@ class SpawnerClient:
                 incarnation, which goes on waiting.
             SpawnerUnavailableError: no spawner could do it, or none has answered for long.
         """
-        request = ForkRequest(names, incarnation)
+        requests: list[Request] = [ForkRequest(names, incarnation)]
+        if self._adapt is not None:  # a spawner may have loaded the file as it was
+            requests.insert(0, self._adapt)
         asked = self._resumed(names, incarnation)
         queue = [n for n in sorted(NAMES, key=lambda n: n in self._slow)
                  if names != (f"spawner_{n}",) and (asked is None or n != asked.spawner)]
         failures: list[str] = []
         while asked is not None or (asked := self._reach(queue, failures)) is not None:
             if not asked.sent:
-                self._send(asked, request)
+                asked.send(*requests)
             reply, other = asked.reply(0.0 if asked.spawner in self._slow else WAIT_S), None
             if reply is None:
                 self._slow.add(asked.spawner)
@@ -217,24 +219,18 @@ class SpawnerClient:
             SpawnerUnavailableError: it does not answer.
         """
         asked = self._reach([NAMES[0]], [])
-        if asked is not None:
-            asked.send(SetOrigin(origin_s))
-            reply = asked.reply(START_PATIENCE_S)
-            asked.close()
-            if reply is not None and not reply.error:
-                return
-        raise SpawnerUnavailableError("spawner_a: no answer")
+        reply = asked.ask(SetOrigin(origin_s), START_PATIENCE_S) if asked else None
+        if reply is None or reply.error:
+            raise SpawnerUnavailableError("spawner_a: no answer")
 
     def adapt(self, adapted: AdaptedSystem) -> None:
         """Have the spawners fork by a changed system from now on, those still to come included."""
         self._adapt = Adapt(msgspec.json.encode(adapted).decode())
-        self._adapted.clear()
+
         for name in NAMES:
             asked = self._reach([name], [])
             if asked is not None:  # one that does not answer now reads it first when it turns
-                asked.send(self._adapt)
-                asked.reply(0.0 if name in self._slow else WAIT_S)
-                asked.close()
+                asked.ask(self._adapt, 0.0 if name in self._slow else WAIT_S)
 
     def close(self) -> None:
         """Withdraw what is under way."""
@@ -250,15 +246,8 @@ class SpawnerClient:
         if asked is None or before == incarnation:
             return asked
         if child := self._child(asked.withdraw(), names, before):  # its place is another's now
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(child, signal.SIGKILL)
+            kill(child)
         return None
-
-    def _send(self, asked: _Asked, request: ForkRequest) -> None:
-        if self._adapt is None or asked.pid in self._adapted:
-            asked.send(request)
-        else:  # it may have loaded the file as it was
-            asked.send(self._adapt, request)
 
     def _child(self, reply: Reply, names: tuple[str, ...], incarnation: int) -> int:
         """Return who sent an answer, if that is the process that was asked for; else 0."""
@@ -280,12 +269,10 @@ class SpawnerClient:
                 connection.setblocking(False)  # who does not accept must not keep us
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
                 connection.connect(address(self.folder, name))
+                if is_same_user(connection):
+                    return _Asked(name, connection)
+                failures.append(f"spawner_{name}: its name is taken by another user")
             except OSError as error:
-                connection.close()
                 failures.append(f"spawner_{name}: not there ({error.strerror})")
-                continue
-            if is_same_user(connection):
-                return _Asked(name, connection)
             connection.close()
-            failures.append(f"spawner_{name}: its name is taken by another user")
         return None

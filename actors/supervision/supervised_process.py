@@ -284,8 +284,8 @@ class SupervisedProcess:
         late = [name for name, at_s in self.heard_s.items() if now_s - at_s > timeout_s]
         if not self._could_have_been_heard(now_s, since_s, timeout_s, used) or not late:
             return ""
-        return f"no {STATUS}" if late == [STATUS] else (
-            f"no heartbeat from {', '.join(name for name in late if name != STATUS)}")
+        nodes = ", ".join(name for name in late if name != STATUS)
+        return f"no heartbeat from {nodes}" if nodes else f"no {STATUS}"
 
     def _could_have_been_heard(self, now_s: float, since_s: float, limit_s: float,
                                used: Callable[[], Usage]) -> bool:

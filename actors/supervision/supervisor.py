@@ -25,7 +25,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
@@ -35,18 +35,19 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import Layout, adapted_system
-from rampart.actors.runtime.actor import Context, Header, every, on
+from rampart.actors.runtime.actor import Context, Header, Members, every, on
 from rampart.actors.runtime.timer import Timer
 from rampart.actors.supervision.patience import Patience
 from rampart.actors.supervision.processes import (
-    Hold,
+    NO_PROCESS,
+    NOT_HELD,
     Living,
     OsProcesses,
     Processes,
-    SpawnerBusyError,
-    SpawnerUnavailableError,
+    ProcessHandle,
 )
 from rampart.actors.supervision.relay import Relay
+from rampart.actors.supervision.spawner_client import SpawnerBusyError, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import (
     STATUS,
     Action,
@@ -79,17 +80,26 @@ class _Process(SupervisedProcess):
     """A process, and what the supervisor has in hand of it.
 
     Attributes:
-        hold: On the process that is there.
+        handle: On the process that is there.
         next_step: Towards its fork, while that is under way; there is never more than one.
     """
 
-    hold: Hold = field(default_factory=Hold)
+    handle: ProcessHandle = NO_PROCESS
     next_step: Timer | None = None
 
     def take(self, pid: int, incarnation: int) -> None:
         self.forget_step()
-        self.hold.let_go()
+        self.let_go()
         super().take(pid, incarnation)
+
+    def let_go(self) -> None:
+        self.handle.close()
+        self.handle = NO_PROCESS
+
+    def kill(self) -> None:
+        """End it at once, and do not hear of that."""
+        self.handle.ignore()
+        self.handle.kill()
 
     def forget_step(self) -> None:
         if self.next_step is not None:
@@ -113,11 +123,11 @@ class Supervisor(Relay):
         self._plan, self._spec = run.plan, run.system
         self._layout = Layout(self._plan, self._spec)
         self._machine: Processes = processes or OsProcesses(
-            self._plan.base_port, self._plan.launcher_pid, self._plan.folder)
+            self._plan.folder, self._plan.base_port, self._plan.launcher_pid)
         self._processes = {
-            u.name: _Process(u, RestartPolicy(self._spec.supervision),
-                             Patience(2 * _CHECK_S / self._plan.rate))
-            for u in self._layout.units.values()}
+            name: _Process(unit, RestartPolicy(self._spec.supervision),
+                           Patience(2 * _CHECK_S / self._plan.rate))
+            for name, unit in self._layout.units.items()}
         for node, incarnation in run.known_incarnations.items():
             process = self._process_of(node)
             if process is not None:
@@ -130,9 +140,7 @@ class Supervisor(Relay):
         self._checked_s = self._loop.time()
 
     @classmethod
-    def names(
-        cls, topic: Topic[Any], name: str, parameters: Parameters  # noqa: ARG003
-    ) -> tuple[str, ...] | None:
+    def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
         """Hear the heartbeats of the nodes that it starts."""
         return parameters.nodes if topic is bus_topics.HEARTBEAT else None
 
@@ -159,10 +167,11 @@ class Supervisor(Relay):
         handles = []
         for process in reversed(self._processes.values()):
             if not self._dispatcher.stopping:
-                process.hold.let_go()
-            elif process.hold.handle and process.shown is not fm.NodeState.CRASHED:
-                process.hold.handle.ignore()
-                handles.append(process.hold.handle)
+                process.let_go()
+            elif process.handle not in (NO_PROCESS, NOT_HELD) and (
+                    process.shown is not fm.NodeState.CRASHED):
+                process.handle.ignore()
+                handles.append(process.handle)
         self._machine.end(handles, STOP_GRACE_S)
         self._machine.close()
 
@@ -249,9 +258,9 @@ class Supervisor(Relay):
         for process in self._processes.values():
             if stall_s > period_s:
                 process.excuse(now, stall_s)
-            silence = process.silence(now, self._timeout_s, process.hold.usage)
+            silence = process.silence(now, self._timeout_s, process.handle.usage)
             if silence:
-                stopped = process.state is State.RUNNING and process.hold.stopped()
+                stopped = process.state is State.RUNNING and process.handle.stopped()
                 self._on(process, Event.SILENT_STOPPED if stopped else Event.SILENT,
                          detail=silence)
 
@@ -263,7 +272,7 @@ class Supervisor(Relay):
 
     def _ended(self, process: _Process, pid: int, detail: str = "") -> None:
         if process.pid == pid:  # else it was replaced while the news waited in the mailbox
-            process.hold.let_go()
+            process.let_go()
             self._on(process, Event.ENDED, detail=detail)
 
     def _owns(self, process: _Process) -> bool:
@@ -293,7 +302,7 @@ class Supervisor(Relay):
                 case Action.RECOVER:
                     self._recover(process)
                 case Action.KILL:
-                    process.hold.kill()
+                    process.kill()
                 case Action.FORK:
                     self._fork(process, by)
                 case Action.FORK_WHEN_GONE:  # the attempts of one given up are the supervisor's
@@ -315,7 +324,7 @@ class Supervisor(Relay):
 
     def _fork_when_gone(self, process: _Process, by: str, delay_s: float = 0.0) -> None:
         # The socket is free only when the old process is gone: a few more milliseconds.
-        if delay_s > 0 or not process.hold.is_gone():
+        if delay_s > 0 or not process.handle.gone():
             self._fork_in(process, max(delay_s, _GONE_S),
                           lambda: self._fork_when_gone(process, by))
             return
@@ -353,7 +362,7 @@ class Supervisor(Relay):
     def _adopt_living(self, process: _Process, living: Sequence[Living]) -> bool:
         """Adopt the highest incarnation that is there and end the others; False without any."""
         found = sorted((p for p in living if p.names == process.names),
-                       key=lambda p: p.incarnation, reverse=True)
+                       key=lambda p: -p.incarnation)
         for other in found[1:]:
             with contextlib.suppress(OSError):  # gone, or for the next search
                 handle = self._machine.hold(other.pid, lambda: None)
@@ -368,8 +377,9 @@ class Supervisor(Relay):
     def _hold(self, process: _Process, pid: int) -> None:
         if process.pid != pid:  # it was replaced while this waited
             return
+        process.handle = NOT_HELD
         try:
-            process.hold.take(self._machine, pid, lambda: self._dispatcher.put(
+            process.handle = self._machine.hold(pid, lambda: self._dispatcher.put(
                 f"exit {pid}", lambda: self._ended(process, pid)))
         except ProcessLookupError:
             self._ended(process, pid, "it ended before it could be watched")
@@ -378,7 +388,7 @@ class Supervisor(Relay):
             self.call_later(_RETRY_S * self.clock.rate, lambda: self._hold(process, pid))
         else:
             if process.waits:
-                process.hold.kill()
+                process.kill()
 
     # -- what it says ---------------------------------------------------------------------------
 
@@ -388,12 +398,9 @@ class Supervisor(Relay):
                 node.name, event, process.pid, process.incarnation, by, clip(detail)))
 
     def _publish_table(self) -> None:
-        rows = [fm.NodeInfo(
-            self.name, Kind.SUPERVISION.value, self.context.pid, fm.NodeState.RUNNING,
-            self.context.incarnation, self.context.incarnation - 1)]
-        rows += [
-            fm.NodeInfo(node.name, node.kind.value, p.pid, p.shown, p.incarnation,
-                     max(0, p.incarnation - 1))
-            for p in self._processes.values() for node in p.unit.nodes
-        ]
-        self.publish(topics.NODES, fm.NodeTable(tuple(rows)))
+        own = fm.NodeInfo(self.name, Kind.SUPERVISION.value, self.context.pid,
+                          fm.NodeState.RUNNING, self._incarnation, self._incarnation - 1)
+        rows = (fm.NodeInfo(node.name, node.kind.value, p.pid, p.shown, p.incarnation,
+                            max(0, p.incarnation - 1))
+                for p in self._processes.values() for node in p.unit.nodes)
+        self.publish(topics.NODES, fm.NodeTable((own, *rows)))

@@ -22,11 +22,10 @@ import msgspec
 import tomli_w
 
 from rampart.actors.bus import run_folder, topics
-from rampart.actors.bus.bus import BusError
+from rampart.actors.bus.bus import BusError, SharedBus
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.messages import Message
 from rampart.actors.bus.recorder_connection import RecorderConnection
-from rampart.actors.bus.shared_bus import SharedBus
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint

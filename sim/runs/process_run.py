@@ -6,8 +6,8 @@ import asyncio
 from collections.abc import Sequence
 from typing import Any
 
+from rampart.actors.bus.bus import SharedBus
 from rampart.actors.bus.run_folder import register_of
-from rampart.actors.bus.shared_bus import SharedBus
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.layout.system_topics import system_topics

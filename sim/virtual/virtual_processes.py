@@ -27,7 +27,6 @@ from rampart.actors.runtime.checkpoint import (
 )
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.guard import PERIOD_S, SUPERVISOR_PATIENCE_S
-from rampart.actors.supervision.patience import AT_LEISURE, Usage
 from rampart.actors.supervision.processes import Living, ProcessHandle, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.supervision.supervisor import Supervisor
@@ -63,7 +62,7 @@ class VirtualProcess:
         self.gone = False
 
 
-class _Handle:
+class _Handle(ProcessHandle):
     """The supervisor's hold on a process."""
 
     def __init__(self, machine: VirtualMachine, process: VirtualProcess,
@@ -81,9 +80,6 @@ class _Handle:
 
     def stopped(self) -> bool:
         return self._process.condition is Condition.STOPPED
-
-    def usage(self) -> Usage:
-        return AT_LEISURE
 
     def ignore(self) -> None:
         if self._ended in self._process.holders:

@@ -27,7 +27,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, on
-from rampart.actors.runtime.injected_faults import MAX_DELAYED, MAX_IN_FORCE
+from rampart.actors.runtime.injection import MAX_DELAYED, MAX_IN_FORCE
 from rampart.actors.runtime.mailbox import Mailbox
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture

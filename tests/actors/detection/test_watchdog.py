@@ -7,8 +7,7 @@ import math
 
 import pytest
 
-from rampart.actors.detection.watchdog import Watchdog
-from rampart.actors.detection.watchdog_core import WatchdogCore
+from rampart.actors.detection.watchdog import Watchdog, WatchdogCore
 from rampart.actors.ftm import messages as m
 from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.runtime.actor import Actor

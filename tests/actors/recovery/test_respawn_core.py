@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rampart.actors.recovery.respawn_core import Ask, RespawnCore
+from rampart.actors.recovery.respawn import Ask, RespawnCore
 
 
 def core(*nodes: str) -> RespawnCore:

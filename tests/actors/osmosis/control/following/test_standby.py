@@ -18,7 +18,7 @@ from rampart.actors.osmosis.control.pilot.command_pair import FORGET_S, CommandP
 from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate, Stamped
 from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.osmosis.messages import PilotMode
-from rampart.actors.recovery.respawn_core import Ask, RespawnCore, accused_life
+from rampart.actors.recovery.respawn import Ask, RespawnCore, accused
 
 PERIOD_S = 0.05
 LIMITS = PairLimits()
@@ -376,4 +376,4 @@ def test_a_stranger_is_named_without_its_life():
 @pytest.mark.parametrize(("text", "expected"), [
     ("a", ("a", 0)), ("a#12", ("a", 12)), ("a#", ("a", 0)), ("a#x", ("a", 0))])
 def test_name_and_life(text, expected):
-    assert accused_life(text) == expected
+    assert accused(text) == expected
