@@ -55,13 +55,16 @@ class Sustained(Finding):
         for_s: how long it has to be wrong, simulated seconds.
         clear_s: how long it has to be well again.
         known_after_s: when idle may be claimed without anything heard; -inf for at once.
+
+    Attributes:
+        accused: whom to name when it becomes active; up to the owner.
     """
 
     def __init__(self, for_s: float, clear_s: float, known_after_s: float = -math.inf) -> None:
         super().__init__(known_after_s)
         self._wrong, self._well = Lasting(for_s), Lasting(clear_s)
         self._why = ""
-        self._accused: tuple[str, ...] = ()
+        self.accused: tuple[str, ...] = ()
 
     @property
     def due_s(self) -> float:
@@ -69,14 +72,14 @@ class Sustained(Finding):
         lasted_s = math.inf if self.active else self._wrong.since_s + self._wrong.enough_s
         return min(lasted_s, super().due_s)
 
-    def note(self, why: str, now_s: float, accused: tuple[str, ...] = ()) -> None:
-        """Take note of what is wrong now, "" if all is well, and of who may be the cause."""
+    def note(self, why: str, now_s: float) -> None:
+        """Take note of what is wrong now, "" if all is well."""
         self.known = True
-        self._why, self._accused = why, accused
+        self._why = why
         lasted = self._wrong.note(bool(why), now_s)
         cured = self._well.note(not why, now_s)
         if lasted and not self.active:
-            self.reason, self.nodes = why, accused
+            self.reason, self.nodes = why, self.accused
         elif cured and self.active:
             self.clear()
 
@@ -84,4 +87,10 @@ class Sustained(Finding):
         """Conclude from the time that has passed."""
         super().expire(now_s)
         if self._why:
-            self.note(self._why, now_s, self._accused)
+            self.note(self._why, now_s)
+
+    def doubt(self) -> None:
+        """Take note that nothing can be said now: what lasted until now begins anew."""
+        self._why = ""
+        self._wrong.forget()
+        self._well.forget()

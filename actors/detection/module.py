@@ -23,7 +23,7 @@ from rampart.actors.bus.bounds import NAME_CHARS, clip
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DetectionReport, DetectionState
-from rampart.actors.runtime.actor import Actor, Context, every
+from rampart.actors.runtime.actor import Actor, Context, Header, every
 from rampart.manager.spec.tables import NonNegative
 
 ABSENCE_S = 0.3
@@ -156,6 +156,14 @@ class DetectionModule(Actor):
         self._note_absence()
         if self._told or self.first_life:
             self.publish(topics.DETECTION, self._report)
+
+    def accused(self, suspects: tuple[str, ...], header: Header) -> tuple[str, ...]:
+        """Return the suspects; the one that sent a message by the incarnation that did.
+
+        A later incarnation has done nothing yet, and a recovery leaves it alone.
+        """
+        return tuple(f"{name}#{header.incarnation}" if name == header.source else name
+                     for name in suspects)
 
     # -- the monitor ----------------------------------------------------------------------------
 

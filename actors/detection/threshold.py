@@ -6,16 +6,15 @@ import math
 from typing import Any
 
 import msgspec
-from rampart.actors.detection.suspects import Suspects
 
 from rampart.actors.detection.finding import Sustained
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.runtime.actor import Context, Header
-from rampart.actors.runtime.parameters import FieldName
+from rampart.actors.runtime.parameters import FieldName, Suspects
 from rampart.manager.spec.tables import NonNegative
 
 
-class Limits(msgspec.Struct, frozen=True):
+class _Limits(msgspec.Struct, frozen=True):
     """Between which a number is in order.
 
     A number that has been out of them is in order again when it lies inside by `hysteresis`.
@@ -77,7 +76,7 @@ class Threshold(DetectionModule):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         said = self.parameters
-        self._limits = Limits(said.above, said.below, said.hysteresis)
+        self._limits = _Limits(said.above, said.below, said.hysteresis)
         self.monitor = self.judged_by(Sustained(
             said.for_s, said.clear_s, self.known_after_s(said.for_s + said.clear_s)))
         self._out = False
@@ -90,6 +89,6 @@ class Threshold(DetectionModule):
         number = abs(value) if self.parameters.absolute else value
         why = self._limits.problem(number, was_out=self._out)
         self._out = bool(why)
-        self.monitor.note(f"{self.parameters.value}: {why}" if why else "", self.clock.now(),
-                          self.accused(self.parameters.suspects, header))
+        self.monitor.accused = self.accused(self.parameters.suspects, header)
+        self.monitor.note(f"{self.parameters.value}: {why}" if why else "", self.clock.now())
         self.follow()

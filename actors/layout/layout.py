@@ -9,7 +9,14 @@ import msgspec
 
 from rampart.actors.bus.zenoh_bus import endpoint
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.layout.wiring import Member, import_class, load_class, load_member, partners
+from rampart.actors.layout.wiring import (
+    Member,
+    choose_topics,
+    import_class,
+    load_class,
+    load_member,
+    partners,
+)
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan, load_document, tailor
@@ -70,9 +77,11 @@ class Layout:
         world = {"seed": plan.seed, **(application or Application()).world_parameters(),
                  "dead_man": spec.layers.dead_man,
                  "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
-        self.members: dict[str, Member] = {m.name: m for m in (*own, *(
+        members = [*own, *(
             load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
-            for n in spec.actors()))}
+            for n in spec.actors())]
+        self.members, self.topics = choose_topics(
+            members, application_class(spec).topics, plan.system_file)
         self._partners = partners(self.members.values())
 
     def listen(self, node: str) -> str:

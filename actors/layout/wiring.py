@@ -7,10 +7,11 @@ process of the system.
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import traceback
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -18,15 +19,19 @@ from typing import Any, TypeVar
 import msgspec
 
 import rampart
+from rampart.actors.bus.fields import Field
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
-from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.runtime.parameters import messages_said, read_parameters, topics_named
 from rampart.files import working_folder
 from rampart.manager.spec.checks import modules
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
 T = TypeVar("T")
+
+Names = Mapping[str, tuple[str, ...] | None]
+"""Key of a topic → names of the members of a family; None for all, or for no family."""
 
 REPORTS_ON: Mapping[Kind, Topic[Any]] = {
     Kind.DETECTION: topics.DETECTION, Kind.RECOVERY: topics.RECOVERY}
@@ -37,28 +42,106 @@ _ROOMS_OF_0_6 = ("actors", "manager", "sim")
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One actor of the system: its name, class and parameters."""
+    """One actor of the system: its name, class and parameters.
+
+    `hears` and `publishes` are the topics that its parameters name, as `heard` and `published` have
+    them.
+    """
 
     name: str
     actor: type[Actor]
     parameters: Actor.Parameters
+    hears: Names = field(default_factory=dict)
+    publishes: Names = field(default_factory=dict)
 
 
 def published(member: Member) -> dict[str, tuple[str, ...] | None]:
     """Return topic key → names of the family members published (None: any, or not a family)."""
-    return {
+    return _together({
         t.key: member.actor.output_names(t, member.name, member.parameters) if t.is_family else None
         for t in (*member.actor.outputs, *BASE_OUTPUTS)
-    }
+    }, member.publishes)
 
 
 def heard(member: Member) -> dict[str, tuple[str, ...] | None]:
     """Return topic key → names of the family members heard (None: all, or not a family)."""
-    return {
+    return _together({
         t.key: member.actor.names(t, member.name, member.parameters) if t.is_family else None
         for t in member.actor.inputs()
         if t not in BASE_INPUTS  # tools dial for themselves; hellos use the links there are
-    }
+    }, member.hears)
+
+
+def _together(declared: dict[str, tuple[str, ...] | None], chosen: Names
+              ) -> dict[str, tuple[str, ...] | None]:
+    for key, names in chosen.items():
+        there = declared.get(key, ())
+        declared[key] = None if there is None or names is None else (*there, *names)
+    return declared
+
+
+def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: str
+                  ) -> tuple[dict[str, Member], dict[str, Topic[Any]]]:
+    """Return the members with the topics that their parameters name, and those topics by key.
+
+    Args:
+        members: all of a system.
+        known: topics besides those of their classes.
+        file: name of the spec, for messages.
+
+    Raises:
+        ValueError: no actor of the system has such a topic, no actor publishes what is to be heard,
+            or its messages have no such field; the message names node, parameter and value.
+    """
+    everyone = list(members)
+    every: dict[str, Topic[Any]] = {topic.key: topic for topic in known}
+    for member in everyone:
+        for topic in (*member.actor.outputs, *BASE_OUTPUTS, *member.actor.inputs()):
+            every.setdefault(topic.key, topic)
+    found: dict[str, Topic[Any]] = {}
+    chosen: dict[str, Member] = {}
+    for member in everyone:
+        ways: dict[str, dict[str, tuple[str, ...] | None]] = {"heard": {}, "published": {}}
+        for way, named in topics_named(member.parameters).items():
+            for parameter, key, path in named:
+                where = f"{file}: {member.name}: parameters.{parameter}"
+                found[key] = topic = _topic(key, every, where)
+                if way == "heard" and topic in member.actor.inputs():
+                    raise ValueError(f"{where}: {member.actor.__name__} hears {key!r} anyway")
+                if path:
+                    _check_field(topic, path, where)
+                name = topic.member(key)
+                there = ways[way].get(topic.key, ())
+                ways[way][topic.key] = (*(there or ()), name) if name else None
+        _check_messages(member, found, file)
+        chosen[member.name] = replace(member, hears=ways["heard"], publishes=ways["published"])
+    return chosen, found
+
+
+def _topic(key: str, known: Mapping[str, Topic[Any]], where: str) -> Topic[Any]:
+    topic = next((t for t in known.values() if t.member(key) is not None), None)
+    if topic is None:
+        near = difflib.get_close_matches(key, known, 3)
+        hint = f"; the nearest: {', '.join(near)}" if near else ""
+        raise ValueError(f"{where}: no actor has a topic {key!r}{hint}")
+    return topic
+
+
+def _check_messages(member: Member, chosen: Mapping[str, Topic[Any]], file: str) -> None:
+    for name, said in messages_said(member.parameters).items():
+        topic = chosen[said.topic]
+        try:
+            msgspec.convert(said.fields, topic.type)
+        except ValueError as error:
+            raise ValueError(f"{file}: {member.name}: parameters.{name}: topic {topic.key}: "
+                             f"{error}") from None
+
+
+def _check_field(topic: Topic[Any], path: str, where: str) -> None:
+    try:
+        Field(topic.type, path)
+    except ValueError as error:
+        raise ValueError(f"{where}: topic {topic.key}: {error}") from None
 
 
 def partners(members: Iterable[Member]) -> dict[str, tuple[str, ...]]:

@@ -191,6 +191,10 @@ class RespawnCore:
 
     # -- how it stands --------------------------------------------------------------------------
 
+    def accuse(self, name: str) -> str:
+        """Return a node with its newest incarnation, to be respawned though it is well."""
+        return f"{name}#{self._nodes[name].incarnation}"
+
     @property
     def pending(self) -> tuple[str, ...]:
         """Nodes that are ordered and neither back nor given up."""

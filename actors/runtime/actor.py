@@ -14,7 +14,7 @@ process and its liveliness token are still there.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -43,8 +43,9 @@ from rampart.actors.runtime.declaration import (
 )
 from rampart.actors.runtime.injection import InjectedFaults
 from rampart.actors.runtime.mailbox import IDLE, Dispatcher
-from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.runtime.parameters import read_parameters, topics_named
 from rampart.actors.runtime.timer import Timer, Timers
+from rampart.actors.runtime.usage import Usage, read_usage
 
 __all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "Members", "every", "on"]
 
@@ -76,6 +77,7 @@ class Context:
         register: returns the incarnation of a node that was issued last, None if it is not known.
         members: names of all nodes of the system; what others make it remember is bounded.
         topics: those that parameters of the system's nodes name, by key.
+        usage: returns what a process uses of the machine; in virtual time there are none.
     """
 
     name: str
@@ -91,6 +93,17 @@ class Context:
     register: Register = lambda _node: None
     members: frozenset[str] = frozenset()
     topics: Mapping[str, Topic[Any]] = field(default_factory=dict)
+    usage: Callable[[int], Usage | None] = read_usage
+
+
+def _all_of(handlers: Sequence[Callable[[Any, Header], None]]) -> Callable[[Any, Header], None]:
+    """Return a handler that calls some in order; a message is for one receiver of an actor."""
+
+    def handle(message: Any, header: Header) -> None:
+        for handler in handlers:
+            handler(message, header)
+
+    return handle
 
 
 class Actor(Declared):
@@ -124,7 +137,9 @@ class Actor(Declared):
         self._states: dict[str, tuple[Topic[Any], msgspec.Struct, float]] = {}
         self._outlets: dict[str | tuple[str, str], tuple[str, bool]] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
-        self._chosen: list[tuple[Topic[Any], str, Callable[[Any, Header], None]]] = []
+        self._may_publish.update(
+            self.chosen_topic(key).key for _, key, _ in topics_named(self.parameters)["published"])
+        self._chosen: dict[str, list[Callable[[Any, Header], None]]] = {}
 
     # -- what a subclass may override, besides what `Declared` has ---------------------------------
 
@@ -146,7 +161,7 @@ class Actor(Declared):
 
     # -- what a subclass calls ------------------------------------------------------------------
 
-    def hear(self, key: str, handler: Callable[[Any, Header], None]) -> Topic[Any]:
+    def hear_topic(self, key: str, handler: Callable[[Any, Header], None]) -> Topic[Any]:
         """Hear a topic that the node's parameters name; to be called when it is made.
 
         Args:
@@ -160,7 +175,7 @@ class Actor(Declared):
             ValueError: the system has no such topic.
         """
         topic = self.chosen_topic(key)
-        self._chosen.append((topic, key, handler))
+        self._chosen.setdefault(key, []).append(handler)
         return topic
 
     def hear_field(self, name: str, handler: Callable[[Any, Header], None]) -> None:
@@ -171,7 +186,7 @@ class Actor(Declared):
         """
         key, _, path = name.partition(":")
         field = Field(self.chosen_topic(key).type, path)
-        self.hear(key, lambda message, header: handler(field(message), header))
+        self.hear_topic(key, lambda message, header: handler(field(message), header))
 
     def chosen_topic(self, key: str) -> Topic[Any]:
         """Return a topic that the node's parameters name.
@@ -289,8 +304,9 @@ class Actor(Declared):
             names = self.names(topic, self.name, self.parameters) if topic.is_family else None
             for key in [topic.pattern] if names is None else map(topic.at, names):
                 self._bus.subscribe(topic, key, self._receiver(topic, handler))
-        for topic, key, handler in self._chosen:
-            self._bus.subscribe(topic, f"{ROOT}/{key}", self._receiver(topic, handler))
+        for key, handlers in self._chosen.items():
+            topic = self.chosen_topic(key)
+            self._bus.subscribe(topic, f"{ROOT}/{key}", self._receiver(topic, _all_of(handlers)))
         for node in self.watches(self.name, self.parameters):
             self._bus.watch(node, self._peer_changed)
         self.on_start()
@@ -383,7 +399,8 @@ class Actor(Declared):
     @on(INJECT)
     def _on_injection(self, order: Injection, _header: Header) -> None:
         topic = self.published(order.topic, self.name, self.parameters) or (
-            self.context.topics[order.topic] if order.topic in self._may_publish else None)
+            next((self.context.topics[key] for _, key, _ in
+                  topics_named(self.parameters)["published"] if key == order.topic), None))
         if topic is not None:
             self._injections.order(order, topic)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import inspect
@@ -22,6 +22,8 @@ P = TypeVar("P", bound=msgspec.Struct)
 
 NodeName = Annotated[Name, msgspec.Meta(extra={"names": "node"})]
 NodeNames = Annotated[tuple[Name, ...], msgspec.Meta(min_length=1, extra={"names": "node"})]
+Suspects = Annotated[tuple[Name, ...], msgspec.Meta(extra={"names": "node"})]
+"""Nodes that a detection module names while it is active, for a recovery that respawns."""
 RecoveryNames = Annotated[tuple[Name, ...], msgspec.Meta(extra={"names": "recovery module"})]
 
 TopicHeard = Annotated[str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "heard"})]
@@ -32,8 +34,13 @@ TopicPublished = Annotated[
 FieldName = Annotated[str, msgspec.Meta(
     pattern=r"^[^:]+:[^:]+\Z", extra={"names": "field", "way": "heard"})]
 """A field of the messages of a topic, "topic:field", as of `rampart.actors.bus.fields`."""
+OptionalFieldName = Annotated[str, msgspec.Meta(
+    pattern=r"^([^:]+:[^:]+)?\Z", extra={"names": "field", "way": "heard"})]
 FieldNames = Annotated[tuple[FieldName, ...], msgspec.Meta(min_length=1, extra={
     "names": "field", "way": "heard"})]
+
+MessageOf = Annotated[dict[str, Any], msgspec.Meta(extra={"message_of": "topic"})]
+"""Fields of a message on the topic that the parameter `topic` names."""
 
 ControlTimeout = Annotated[float, msgspec.Meta(gt=0, extra={"period": "control_period_s"})]
 """How long, s, to wait for what comes as often as commands, poses and scans."""
@@ -89,6 +96,20 @@ def topics_named(parameters: msgspec.Struct) -> dict[str, list[tuple[str, str, s
                 key, _, field = text.partition(":")
                 found[marks["way"]].append((name, key, field))
     return found
+
+
+class Said(NamedTuple):
+    """A message that a parameter says: the topic's key, and the fields."""
+
+    topic: str
+    fields: dict[str, Any]
+
+
+def messages_said(parameters: msgspec.Struct) -> dict[str, Said]:
+    """Return the messages that a node's parameters say, by the name of the parameter."""
+    return {name: Said(getattr(parameters, marks["message_of"]), fields)
+            for name, marks in _marks(type(parameters)).items()
+            if "message_of" in marks and (fields := getattr(parameters, name)) is not None}
 
 
 def _explain(kind: type[msgspec.Struct], given: Mapping[str, Any], error: str) -> tuple[str, str]:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, Self, TypeVar
 
@@ -68,6 +68,7 @@ class VirtualSystem:
         context: what all actors have in common; by default no system and no application.
         layout: class and parameters of the nodes that `start_node` starts.
         keeps_checkpoints: whether an incarnation finds what the one before it kept.
+        topics: that parameters of the actors may name.
 
     Attributes:
         bus: the tester's own access to the bus, for payloads that `say` would not make.
@@ -77,7 +78,7 @@ class VirtualSystem:
     """
 
     def __init__(self, context: RunContext | None = None, layout: Layout | None = None, *,
-                 keeps_checkpoints: bool = False) -> None:
+                 keeps_checkpoints: bool = False, topics: Iterable[Topic[Any]] = ()) -> None:
         self.hub = Hub()
         self.run = context or RunContext()
         self.layout = layout
@@ -85,6 +86,7 @@ class VirtualSystem:
         self.clock = Clock(loop.time(), source=loop.time)
         self.incarnations: dict[str, int] = {}
         self.members = frozenset(layout.members if layout else ())
+        self._topics = tuple(topics)
         self._shelves: dict[str, Shelf] | None = {} if keeps_checkpoints else None
         self.register: Register = self.incarnations.get
         self.actors: dict[str, Actor] = {}
@@ -129,7 +131,17 @@ class VirtualSystem:
             self._shelves.setdefault(name, Shelf()), incarnation)
         return Context(name, incarnation, self.clock, VirtualBus(self.hub, name, incarnation),
                        parameters, self.run, checkpoints=kept, members=self.members,
-                       register=self.register)
+                       register=self.register, topics=self._named(parameters),
+                       usage=lambda _pid: None)
+
+    def _named(self, parameters: dict[str, Any]) -> dict[str, Topic[Any]]:
+        """Return the topics that parameters may name, by their keys there."""
+        keys = {key for value in parameters.values()
+                for text in (value if isinstance(value, list | tuple) else [value])
+                if isinstance(text, str) for key in [text.partition(":")[0]]}
+        found = dict(self.layout.topics) if self.layout else {}
+        return found | {key: topic for key in keys for topic in self._topics
+                        if topic.member(key) is not None}
 
     def start(self, name: str, cls: Callable[..., A], *others: Any, **parameters: Any) -> A:
         """Start an actor, or its next incarnation.

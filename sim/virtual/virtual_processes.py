@@ -297,7 +297,8 @@ class VirtualMachine:
                     name, process.incarnation, self._clock, bus, member.parameters, self._run,
                     process.pid, self._store(name, process.incarnation),
                     self._layout.spec.timing.heartbeat_period_s, register=self._known.get,
-                    members=frozenset(self._layout.members), topics=self._layout.topics)
+                    members=frozenset(self._layout.members), topics=self._layout.topics,
+                    usage=lambda _pid: None)
                 actor = (Supervisor(context, self) if name == SUPERVISOR
                          else member.actor(context))
             except Exception as error:

@@ -1,0 +1,109 @@
+"""`ProcessUsage`: a node takes more processor time or memory than it should."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.messages import Heartbeat
+from rampart.actors.bus.topic import Topic
+from rampart.actors.detection.finding import Sustained
+from rampart.actors.detection.module import DetectionModule
+from rampart.actors.runtime.actor import Context, Header, Members, every, on
+from rampart.actors.runtime.parameters import NodeNames
+from rampart.actors.runtime.usage import Usage
+from rampart.manager.spec.tables import NonNegative, Positive
+
+PERIOD_S = 0.5
+_MB = 1e6
+
+
+class _Look(NamedTuple):
+    """A process, when it was looked at (seconds of this machine), and what it had used then."""
+
+    pid: int
+    incarnation: int
+    at_s: float
+    usage: Usage
+
+
+class ProcessUsage(DetectionModule):
+    """Active while one of the watched nodes uses too much, for long enough.
+
+    Nodes that share a process share what it uses. In virtual time there are no processes, and
+    the module is idle.
+    """
+
+    class Parameters(DetectionModule.Parameters, frozen=True, kw_only=True):
+        """Whom it watches, and how much is too much.
+
+        Attributes:
+            watch: names of the nodes.
+            processor_share: of one core, that a process may use.
+            memory_mb: resident memory that it may have, MB (10^6 bytes).
+            for_s: how long it has to be more, s.
+            clear_s: how long it has to be less before the module is idle again, s.
+        """
+
+        watch: NodeNames
+        processor_share: Positive | None = None
+        memory_mb: Positive | None = None
+        for_s: NonNegative = 2.0
+        clear_s: NonNegative = 2.0
+
+        def __post_init__(self) -> None:
+            """Refuse limits that are none."""
+            if self.processor_share is None and self.memory_mb is None:
+                raise ValueError("memory_mb: missing; give it, processor_share or both")
+
+    parameters: Parameters
+
+    def __init__(self, context: Context, now: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(context)
+        said = self.parameters
+        self._now = now
+        self._looks: dict[str, _Look] = {}
+        self._running: dict[str, tuple[int, int]] = {}
+        self.monitor = self.judged_by(Sustained(
+            said.for_s, said.clear_s, self.known_after_s(said.for_s + 2 * PERIOD_S)))
+
+    @classmethod
+    def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:  # noqa: ARG003
+        """Hear the heartbeats of the watched nodes, which say the number of their process."""
+        return parameters.watch
+
+    @on(bus_topics.HEARTBEAT)
+    def heartbeat(self, message: Heartbeat, header: Header) -> None:
+        """Hear which process a node runs in."""
+        if header.incarnation >= self._running.get(header.source, (0, 0))[1]:
+            self._running[header.source] = message.pid, header.incarnation
+
+    @every(PERIOD_S)
+    def look(self) -> None:
+        """See what the processes use."""
+        wrong = {node: why for node, (pid, incarnation) in self._running.items()
+                 if (why := self._problem(node, pid, incarnation))}
+        self.monitor.accused = tuple(f"{node}#{self._running[node][1]}" for node in wrong)
+        if self._running:
+            self.monitor.note("; ".join(f"{node}: {why}" for node, why in wrong.items()),
+                              self.clock.now())
+        self.follow()
+
+    def _problem(self, node: str, pid: int, incarnation: int) -> str:
+        usage, now_s = self.context.usage(pid), self._now()
+        before = self._looks.pop(node, None)
+        if usage is None:
+            return ""
+        self._looks[node] = _Look(pid, incarnation, now_s, usage)
+        said = self.parameters
+        if said.memory_mb is not None and usage.memory_bytes > said.memory_mb * _MB:
+            return f"{usage.memory_bytes / _MB:.0f} MB of memory, more than {said.memory_mb:g} MB"
+        if said.processor_share is None or before is None or now_s <= before.at_s or (
+                before.pid, before.incarnation) != (pid, incarnation):
+            return ""
+        share = (usage.processor_s - before.usage.processor_s) / (now_s - before.at_s)
+        if share > said.processor_share:
+            return f"{share:.2f} of a core, more than {said.processor_share:g}"
+        return ""

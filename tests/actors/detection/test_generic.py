@@ -1,0 +1,312 @@
+"""Detection modules that a specification alone makes: timelines, and what they say on the bus."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.detection.disagreement import Disagreement, Vote, agreeing, apart
+from rampart.actors.detection.finding import Sustained
+from rampart.actors.detection.process_usage import ProcessUsage
+from rampart.actors.detection.progress import Progress, ProgressMonitor, Step
+from rampart.actors.detection.rate import Rate, RateMonitor
+from rampart.actors.detection.threshold import Threshold
+from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.runtime.usage import Usage, read_usage
+from rampart.testing import Ear, VirtualSystem, play, run, table
+from tests.tank import LEVEL, PUMP, SECOND, THIRD, TOPICS, Level, Phase, Pump
+
+
+def noted(monitor: Sustained):
+    def handle(event: str, now_s: float) -> None:
+        if event == "?":
+            monitor.doubt()
+        else:
+            monitor.note("wrong" if event == "w" else "", now_s)
+
+    return handle
+
+
+# g: all is well, w: something is wrong, ?: nothing can be said; wrong for 300 ms, well for 200 ms.
+@pytest.mark.parametrize(("events", "expected"), **table({
+    "well": ("gggg", "----"),
+    "wrong for long enough": ("gwwwwgggg", "----AAA--"),
+    "wrong for a moment": ("gwwgww", "------"),
+    "wrong, then silence: what was said last stands": ("gw......", "----AAAA"),
+    "well, then silence: not cured": ("wwwwg...", "---AAAAA"),
+    "a source that stutters": ("wwwwgwgwggg", "---AAAAAAA-"),
+    "nothing can be said: what lasted begins anew": ("ww?wwww", "------A"),
+}))
+def test_what_lasts(events, expected):
+    monitor = Sustained(0.3, 0.2)
+    assert play(monitor, noted(monitor), events) == expected
+
+
+# m: a message. At least 10 Hz within 300 ms (3), at most 20 Hz (6).
+@pytest.mark.parametrize(("least", "most", "events", "expected"), **table({
+    "as often as it should": (10.0, math.inf, "mmmmmm", "------"),
+    "the start is forgiven for 500 ms": (10.0, math.inf, "........", "-----AAA"),
+    "too seldom": (10.0, math.inf, "mmmmm.mmmm", "-----AAA--"),
+    "it stops": (10.0, math.inf, "mmmmmmm...", "-------AAA"),
+    "it comes back": (10.0, math.inf, "mmmmmm..mmmmm", "------AAAA---"),
+    "too often": (0.0, 8.0, "m.m.mmmm....", "------AA----"),
+    "silence is not too often": (0.0, 8.0, ".....", "-----"),
+}))
+def test_how_often(least, most, events, expected):
+    monitor = RateMonitor(least, most, 0.3, 0.0, 0.5)
+    assert play(monitor, lambda _event, now_s: monitor.heard(now_s), events) == expected
+
+
+def test_a_rate_that_was_too_high_is_in_order_again_after_a_while_of_silence():
+    monitor = RateMonitor(0.0, 8.0, 0.3, 0.0, 0.5, clear_s=0.4)
+    found = play(monitor, lambda _event, now_s: monitor.heard(now_s), "mmmm" + "." * 8)
+    assert found == "--AAAAAA----"
+
+
+def followed(monitor: ProgressMonitor):
+    def handle(event: str, now_s: float) -> None:
+        if event == "b":
+            monitor.busy(now_s + 0.5)
+        else:
+            monitor.heard(event, now_s)
+
+    return handle
+
+
+STEPS = (Step("1", 0.4), Step("2", 0.3, ("3", "1")), Step("3"))
+
+
+# 1, 2, 3: a step; b: busy for 500 ms.
+@pytest.mark.parametrize(("events", "expected"), **table({
+    "in order": ("1122311", "-------"),
+    "in another order that is allowed": ("121123", "------"),
+    "a step that is left out": ("1133.1", "--AAA-"),
+    "a step that takes too long": ("1.....2", "----AA-"),
+    "the last one may take as long as it likes": ("123......", "---------"),
+    "busy": ("1b.....2", "------A-"),
+    "no step at all": ("1x.2", "-AA-"),
+    "it begins in the middle": ("23", "--"),
+    "late, and busy only then": ("1....b", "----AA"),
+}))
+def test_steps(events, expected):
+    monitor = ProgressMonitor("task", STEPS, busy_at_most_s=1.0)
+    assert play(monitor, followed(monitor), events) == expected
+
+
+def test_a_step_is_not_busy_for_longer_than_it_may_be():
+    monitor = ProgressMonitor("task", STEPS, busy_at_most_s=0.2)
+    monitor.heard("1", 0.0)
+    monitor.busy(1e6)
+    assert monitor.due_s == pytest.approx(0.6)
+    monitor.busy(math.nan)
+    assert monitor.due_s == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(("one", "other", "angle", "distance"), [
+    (1.0, 3.0, False, 2.0), (3.0, -3.0, True, math.tau - 6.0), ("a", "a", False, 0.0),
+    ("a", "b", False, math.inf), (True, False, False, math.inf), (1.0, math.nan, False, math.inf),
+    (math.inf, math.inf, False, math.inf)])
+def test_how_far_apart(one, other, angle, distance):
+    assert apart(one, other, angle=angle) == pytest.approx(distance)
+
+
+@pytest.mark.parametrize(("values", "places"), [
+    ((1.0, 1.1, 5.0), [0, 1]), ((1.0, None, 5.0), [0]), ((None, None), []),
+    (("a", "b", "b"), [1, 2]), ((0.0, 0.1, 0.2), [0, 1, 2])])
+def test_who_agrees(values, places):
+    assert agreeing(values, 0.1 + 1e-9, angle=False) == places
+
+
+# -- on the bus --------------------------------------------------------------------------------
+
+
+def reports(kind: type, script: list[tuple[float, Any, Any]], until_s: float,
+            respawned: bool = False, **parameters: Any) -> list[tuple[float, str, str]]:
+    """Return when a module said what, and why; of a script of (time, topic, message)."""
+
+    async def scenario() -> list[tuple[float, str, str]]:
+        async with VirtualSystem(topics=TOPICS) as system:
+            ear = system.start("ear", Ear)
+            system.incarnations["D"] = 1 if respawned else 0
+            system.start("D", kind, **parameters)
+            for at_s, topic, message in script:
+                await asyncio.sleep(max(0.0, at_s - system.clock.now()))
+                system.say(topic, message, "gauge")
+            await asyncio.sleep(until_s - system.clock.now())
+            found: list[tuple[float, str, str]] = []
+            for at_s, report in ear.heard:
+                if not found or found[-1][1] != report.state.value:
+                    found.append((round(at_s, 3), report.state.value, report.reason))
+            return found
+
+    return run(scenario)
+
+
+def levels(*heights: float, topic: Any = LEVEL) -> list[tuple[float, Any, Any]]:
+    return [(round((i + 1) * 0.1, 3), topic, Level(height)) for i, height in enumerate(heights)]
+
+
+@pytest.mark.parametrize(("heights", "limits", "expected"), **table({
+    "above": ((1, 1, 3, 3, 3), {"above": 2.0},
+              [(0.3, "active", "tank/level:height_m: 3 is above 2")]),
+    "below": ((1, -1, 1), {"below": 0.0}, [(0.2, "active", "tank/level:height_m: -1 is below 0")]),
+    "outside": ((1, 1, 9), {"below": 0.0, "above": 8.0},
+                [(0.3, "active", "tank/level:height_m: 9 is above 8")]),
+    "no number": ((1, math.nan), {"above": 2.0},
+                  [(0.2, "active", "tank/level:height_m: nan is no number")]),
+    "its sign does not matter": ((1, -3), {"above": 2.0, "absolute": True},
+                                 [(0.2, "active", "tank/level:height_m: 3 is above 2")]),
+    "on the limit": ((2, 2), {"above": 2.0, "below": 2.0 - 1e-6}, []),
+    "for a moment": ((1, 3, 1, 1), {"above": 2.0, "for_s": 0.2}, []),
+    "hysteresis": ((3, 1.9, 1.9, 1.9, 1.9), {"above": 2.0, "hysteresis": 0.5},
+                   [(0.1, "active", "tank/level:height_m: 3 is above 2")]),
+}))
+def test_threshold(heights, limits, expected):
+    found = reports(Threshold, levels(*heights), 1.0, value="tank/level:height_m", **limits)
+    assert [entry for entry in found if entry[1] == "active"] == expected
+
+
+def test_a_threshold_is_idle_again_when_all_is_well():
+    found = reports(Threshold, levels(3, 3, 1, 1, 1, 1), 1.0, value="tank/level:height_m",
+                    above=2.0)
+    assert [(at_s, state) for at_s, state, _ in found][-2:] == [(0.1, "active"), (0.5, "idle")]
+
+
+@pytest.mark.parametrize(("kind", "parameters"), [
+    (Threshold, {"value": "tank/level:height_m", "above": 2.0}),
+    (Rate, {"topic": "tank/level", "at_least_hz": 5.0}),
+    (Disagreement, {"one": "tank/level:height_m", "other": "tank/second:height_m"}),
+    (Progress, {"value": "tank/pump:phase", "steps": [{"at": "idle"}, {"at": "filling"}]})])
+def test_a_respawned_module_claims_nothing_before_it_knows(kind, parameters):
+    assert reports(kind, [], 0.15, respawned=True, **parameters) == []
+
+
+def test_a_rate_is_reported():
+    found = reports(Rate, levels(*[1.0] * 10), 3.0, topic="tank/level", at_least_hz=5.0,
+                    startup_grace_s=0.0)
+    assert [(state, why) for _, state, why in found] == [
+        ("idle", ""), ("active", "fewer than 5 messages in 1 s")]
+    assert found[1][0] == pytest.approx(1.6)  # the fifth from last came at 0.6
+
+
+def test_two_gauges_that_disagree():
+    script = sorted(levels(1, 1, 1, 1) + levels(1, 2, 2, 2, topic=SECOND), key=lambda e: e[0])
+    assert reports(Disagreement, script, 1.0, one="tank/level:height_m",
+                   other="tank/second:height_m", more_than=0.5, for_s=0.1)[-1] == (
+        0.3, "active", "tank/level:height_m is 1, tank/second:height_m is 2")
+
+
+def test_a_gauge_that_is_silent_is_not_compared():
+    script = [*levels(1), *levels(*[9.0] * 30, topic=SECOND)]
+    found = reports(Disagreement, sorted(script, key=lambda e: e[0]), 3.0, stale_s=0.3, for_s=0.5,
+                    one="tank/level:height_m", other="tank/second:height_m", more_than=0.5)
+    assert {state for _, state, _ in found} == {"idle"}
+
+
+def test_two_of_three_have_to_agree():
+    fields = [f"{topic.key}:height_m" for topic in (LEVEL, SECOND, THIRD)]
+    script = sorted([*levels(1, 1, 1, 1, 1), *levels(1, 1, 5, 5, 5, topic=SECOND),
+                     *levels(1, 1, 1, 9, 9, topic=THIRD)], key=lambda e: e[0])
+    found = reports(Vote, script, 1.0, values=fields, agree=2, within=0.5, for_s=0.0)
+    assert found[-1] == (0.4, "active", "1 of 3 agree, 2 have to: tank/second:height_m is 5, "
+                         "tank/third:height_m is 9")
+    assert [state for _, state, _ in found] == ["idle", "active"]
+
+
+def test_a_pump_that_leaves_out_a_step():
+    steps = [{"at": "idle", "to": ["filling"]}, {"at": "filling", "within_s": 1.0},
+             {"at": "draining"}]
+    script = [(0.1, PUMP, Pump(Phase.IDLE)), (0.2, PUMP, Pump(Phase.DRAINING)),
+              (0.4, PUMP, Pump(Phase.IDLE)), (0.5, PUMP, Pump(Phase.FILLING, busy_until_s=2.0))]
+    found = reports(Progress, script, 3.0, value="tank/pump:phase", steps=steps,
+                    busy_until="tank/pump:busy_until_s")
+    assert [(at_s, state) for at_s, state, _ in found] == [
+        (0.0, "idle"), (0.2, "active"), (0.4, "idle"), (2.0, "active")]
+    assert found[1][2] == "tank/pump:phase is 'draining' after 'idle'; right is 'filling'"
+
+
+def test_suspects_are_named_by_the_incarnation_that_was_heard():
+    async def scenario() -> None:
+        async with VirtualSystem(topics=TOPICS) as system:
+            ear = system.start("ear", Ear)
+            system.start("D", Threshold, value="tank/level:height_m", above=2.0,
+                         suspects=["gauge", "pump"])
+            await asyncio.sleep(0.1)
+            system.say(LEVEL, Level(3.0), "gauge", incarnation=4)
+            await system.settle()
+            assert ear.heard[-1][1].nodes == ("gauge#4", "pump")
+
+    run(scenario)
+
+
+@pytest.mark.parametrize(("kind", "parameters", "words"), [
+    (Threshold, {"value": "a:b"}, "above = *: missing; give above, below or both"),
+    (Threshold, {"value": "a:b", "above": 1.0, "below": 2.0}, "below = 2.0: must be smaller"),
+    (Threshold, {"value": "tank", "above": 1.0}, "value = 'tank'"),
+    (Rate, {"topic": "a"}, "at_least_hz: missing"),
+    (Rate, {"topic": "a", "at_least_hz": 5.0, "at_most_hz": 5.0}, "at_most_hz = 5.0: must be"),
+    (Vote, {"values": ["a:b", "c:d"], "agree": 3}, "agree = 3: there are 2 values only"),
+    (Progress, {"value": "a:b", "steps": [{"at": "x"}, {"at": "x"}]}, "'x' stands twice"),
+    (Progress, {"value": "a:b", "steps": [{"at": "x", "to": ["z"]}, {"at": "y"}]},
+     "'x' leads to 'z', which is no step"),
+    (ProcessUsage, {"watch": ["a"]}, "memory_mb: missing"),
+])
+def test_parameters_that_make_no_sense_are_refused_by_name(kind, parameters, words):
+    with pytest.raises(ValueError, match=r".") as caught:
+        read_parameters(kind.Parameters, parameters, "x.toml", "D.parameters")
+    text = str(caught.value)
+    assert "\n" not in text
+    assert words.replace(" = *", "") in text.replace(" = None", "")
+
+
+# -- processes ---------------------------------------------------------------------------------
+
+
+def test_a_node_that_takes_too_much_is_named():
+    used = {"busy": 0.0, "memory": 1_000_000}
+
+    async def scenario() -> None:
+        async with VirtualSystem() as system:
+            ear = system.start("ear", Ear)
+            context = system.context("D", {"watch": ["a"], "processor_share": 0.5,
+                                           "memory_mb": 50, "for_s": 1.0, "clear_s": 1.0})
+            context = replace(
+                context, usage=lambda pid: Usage(used["busy"], int(used["memory"])))
+            module = ProcessUsage(context, system.clock.now)
+            task = asyncio.create_task(module.run())
+            for _ in range(20):
+                system.say(bus_topics.HEARTBEAT, bm.Heartbeat(77, 1, 0.1, 0, 0), "a", incarnation=3)
+                used["busy"] += 0.02
+                await asyncio.sleep(0.1)
+            assert ear.states == ["idle"]
+            for _ in range(20):
+                used["busy"] += 0.08
+                await asyncio.sleep(0.1)
+            assert ear.states == ["idle", "active"]
+            assert ear.heard[-1][1].nodes == ("a#3",)
+            assert "of a core, more than 0.5" in ear.heard[-1][1].reason
+            await asyncio.sleep(2.0)
+            assert ear.states == ["idle", "active", "idle"]
+            used["memory"] = 60e6
+            await asyncio.sleep(2.0)
+            assert ear.heard[-1][1].reason == "a: 60 MB of memory, more than 50 MB"
+            module.stop()
+            await task
+
+    run(scenario)
+
+
+def test_the_kernel_is_asked_what_a_process_uses():
+    usage = read_usage(os.getpid())
+    assert usage is not None
+    assert usage.memory_bytes > 1_000_000
+    assert usage.processor_s > 0
+    assert read_usage(2**22 + 1) is None
+

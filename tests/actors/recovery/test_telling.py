@@ -1,0 +1,302 @@
+"""Recovery modules that a specification alone makes: `Hold`, `SwitchMode`, `Call`."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from rampart.actors.ftm import messages as m
+from rampart.actors.ftm import topics
+from rampart.actors.layout.layout import Layout
+from rampart.actors.recovery.telling import Call, Hold, SwitchMode
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.actor import Actor, Header, on
+from rampart.actors.runtime.parameters import read_parameters
+from rampart.manager.spec.specification import parse_specification
+from rampart.testing import VirtualSystem, run
+from tests.tank import LEVEL, ORDER, TOPICS, VALVE, Level, Valve
+
+SHUT = {"topic": "tank/order", "message": {"shut": True, "opening": 0}}
+
+
+class Case:
+    """A recovery module and what it says, with a manager who commands it."""
+
+    def __init__(self, system: VirtualSystem, kind: type, **parameters: Any) -> None:
+        self.system, self.kind, self.parameters = system, kind, parameters
+        self.said = system.hear(ORDER)
+        self.reports = system.hear(topics.RECOVERY)
+        self.start()
+
+    def start(self) -> None:
+        self.system.start("R", self.kind, **self.parameters)
+
+    def command(self, decision: int, activate: bool = True) -> None:
+        self.system.say(topics.RECOVERY_COMMAND, m.RecoveryCommand(
+            activate, decision, (), "why"), "manager", member="R")
+
+    @property
+    def phase(self) -> str:
+        return self.reports[-1].message.phase.value
+
+    @property
+    def orders(self) -> list[Valve]:
+        return [heard.message for heard in self.said]
+
+
+def play(kind: type, script: Any, **parameters: Any) -> None:
+    async def scenario() -> None:
+        async with VirtualSystem(topics=TOPICS) as system:
+            case = Case(system, kind, **parameters)
+            await asyncio.sleep(0.05)
+            await script(system, case)
+
+    run(scenario)
+
+
+def test_a_message_is_held_for_as_long_as_the_recovery_is_in_force():
+    async def script(system: VirtualSystem, case: Case) -> None:
+        case.command(1)
+        await system.settle()
+        assert case.orders == [Valve(True, 0.0)], "before any time has passed"
+        assert case.phase == "degraded"
+        await asyncio.sleep(1.05)
+        assert case.orders == [Valve(True, 0.0)] * 6
+        case.command(1)  # the same again is one command
+        await asyncio.sleep(0.4)
+        assert len(case.orders) == 8
+        case.command(2, activate=False)
+        await asyncio.sleep(5.0)
+        assert case.orders[8:] == [Valve(False)] * 6, "the end is said for a second"
+        assert case.phase == "idle"
+
+    play(Hold, script, **SHUT, repeat_s=0.2, back={"shut": False})
+
+
+def test_without_a_message_for_the_end_it_just_stops():
+    async def script(system: VirtualSystem, case: Case) -> None:
+        case.command(1)
+        await asyncio.sleep(0.35)
+        said = len(case.orders)
+        case.command(2, activate=False)
+        await asyncio.sleep(2.0)
+        assert len(case.orders) == said
+
+    play(Hold, script, **SHUT)
+
+
+CONFIRMED = {**SHUT, "confirm": "tank/valve:shut", "equals": True}
+
+
+def test_a_mode_is_reached_when_the_node_says_so_and_lost_when_it_no_longer_does():
+    async def script(system: VirtualSystem, case: Case) -> None:
+        system.say(VALVE, Valve(True))  # before the order: says nothing
+        case.command(1)
+        await asyncio.sleep(0.1)
+        assert case.phase == "acting"
+        system.say(VALVE, Valve(True))
+        await system.settle()
+        assert case.phase == "degraded"
+        for _ in range(30):
+            system.say(VALVE, Valve(False))
+            await asyncio.sleep(0.1)
+        assert case.phase == "failed"
+        assert "tank/valve:shut is False" in case.reports[-1].message.reason
+        case.command(2, activate=False)
+        await system.settle()
+        assert case.orders[-1] == Valve(False)
+
+    play(SwitchMode, script, **CONFIRMED, back={"shut": False})
+
+
+def test_what_is_never_confirmed_fails_at_its_deadline():
+    async def script(_system: VirtualSystem, case: Case) -> None:
+        case.command(1)
+        await asyncio.sleep(2.1)
+        assert case.phase == "failed"
+
+    play(Hold, script, **CONFIRMED)
+
+
+def test_a_respawned_hold_takes_back_what_its_predecessor_left():
+    async def script(system: VirtualSystem, case: Case) -> None:
+        case.command(1)
+        await asyncio.sleep(0.1)
+        await system.kill("R")
+        case.start()
+        await asyncio.sleep(0.1)
+        before = len(case.orders)
+        case.command(2, activate=False)
+        await system.settle()
+        assert case.orders[before:] == [Valve(False)]
+
+    play(Hold, script, **SHUT, back={"shut": False})
+
+
+ANSWER = {"answer": "tank/valve:shut", "equals": True}
+
+
+def test_a_call_is_repeated_until_it_is_answered_and_then_never_again():
+    async def script(system: VirtualSystem, case: Case) -> None:
+        system.say(VALVE, Valve(True))  # before the command: no answer to it
+        case.command(1)
+        await asyncio.sleep(1.1)
+        assert (len(case.orders), case.phase) == (3, "acting")
+        system.say(VALVE, Valve(False))
+        await system.settle()
+        assert case.phase == "acting"
+        system.say(VALVE, Valve(True))
+        await system.settle()
+        assert case.phase == "done"
+        case.command(1)
+        await asyncio.sleep(2.0)
+        assert len(case.orders) == 3
+        case.command(2)  # the cause has come back: a new order
+        await system.settle()
+        assert (len(case.orders), case.phase) == (4, "acting")
+
+    play(Call, script, **SHUT, **ANSWER)
+
+
+def test_a_call_that_is_not_answered_fails_and_names_the_answer():
+    async def script(_system: VirtualSystem, case: Case) -> None:
+        case.command(1)
+        await asyncio.sleep(2.2)
+        assert case.phase == "failed"
+        assert "tank/valve:shut is not True" in case.reports[-1].message.reason
+        assert len(case.orders) == 1
+
+    play(Call, script, **SHUT, **ANSWER, repeat_s=0)
+
+
+@pytest.mark.parametrize(("kind", "parameters", "words"), [
+    (Hold, {"message": {}}, "topic: missing"),
+    (Hold, {"topic": "a", "message": 3}, "message = 3"),
+    (Hold, {**SHUT, "confirm": "a:b"}, "equals: missing"),
+    (Hold, {**SHUT, "equals": 1}, "confirm"),
+    (SwitchMode, CONFIRMED, "back: missing"),
+    (Call, SHUT, "answer: missing"),
+])
+def test_parameters_that_make_no_sense_are_refused_by_name(kind, parameters, words):
+    with pytest.raises(ValueError, match=r".") as caught:
+        read_parameters(kind.Parameters, parameters, "x.toml", "R.parameters")
+    assert "\n" not in str(caught.value)
+    assert words in str(caught.value)
+
+
+# -- in a specification ------------------------------------------------------------------------
+
+
+class Gauge(Actor):
+    """Publishes the level and hears orders."""
+
+    outputs = (LEVEL, VALVE)
+
+    @on(ORDER)
+    def order(self, message: Valve, _header: Header) -> None:
+        """Obey."""
+
+
+SYSTEM = """
+name = "tank"
+title = "A tank"
+[timing]
+heartbeat_timeout_s = 0.5
+command_timeout_s = 1.0
+localization_timeout_s = 1.0
+scan_timeout_s = 1.0
+dead_man_timeout_s = 1.0
+manager_timeout_s = 1.0
+detection_silence_timeout_s = 1.0
+[[node]]
+name = "gauge"
+actor = "tests.actors.recovery.test_telling:Gauge"
+kind = "control"
+[[node]]
+name = "manager"
+actor = "rampart.manager.actor:FtmManager"
+kind = "manager"
+[[detection]]
+name = "D"
+title = "Too full"
+actor = "rampart.actors.detection.threshold:Threshold"
+within_s = 0.2
+parameters = { value = "VALUE", above = 2.0 }
+[[recovery]]
+name = "R"
+title = "Shut"
+actor = "rampart.actors.recovery.telling:Hold"
+kind = "forward"
+claims = ["valve"]
+parameters = { topic = "TOPIC", message = { MESSAGE } }
+[[mechanism]]
+name = "M"
+detect = "D"
+recover = "R"
+event = "overflow"
+against = { within_s = 20.0, hazard = "it runs over" }
+[[event]]
+name = "overflow"
+[orders.safer]
+R = []
+"""
+FITTING = {"VALUE": "tank/level:height_m", "TOPIC": "tank/order", "MESSAGE": "shut = true"}
+
+
+def layout(**changes: str) -> Layout:
+    text = SYSTEM
+    for name, value in {**FITTING, **changes}.items():
+        text = text.replace(name, value)
+    return Layout(RunPlan(system_file="tank.toml"), parse_specification(text, "tank.toml"))
+
+
+def test_the_topics_that_parameters_name_make_partners():
+    found = layout()
+    assert "gauge" in found._partners["D"]
+    assert "gauge" in found._partners["R"]
+    assert found.topics == {"tank/level": LEVEL, "tank/order": ORDER}
+
+
+@pytest.mark.parametrize(("changes", "line"), [
+    ({"VALUE": "tank/levle:height_m"},
+     "tank.toml: D: parameters.value: no actor has a topic 'tank/levle'; the nearest: tank/level, "
+     "tank/valve, tank/order"),
+    ({"VALUE": "tank/level:hieght_m"},
+     "tank.toml: D: parameters.value: topic tank/level: hieght_m: Level has no field 'hieght_m'; "
+     "did you mean height_m?"),
+    ({"TOPIC": "tank/orders"},
+     "tank.toml: R: parameters.topic: no actor has a topic 'tank/orders'; the nearest: "
+     "tank/order, inject/order"),
+    ({"MESSAGE": "shut = 3"},
+     "tank.toml: R: parameters.message: topic tank/order: Expected `bool`, got `int` - at "
+     "`$.shut`"),
+    ({"MESSAGE": ""},
+     "tank.toml: R: parameters.message: topic tank/order: Object missing required field `shut`"),
+    ({"MESSAGE": "shut = true, colour = 3"},
+     "tank.toml: R: parameters.message: topic tank/order: Object contains unknown field `colour`"),
+])
+def test_what_a_specification_names_wrongly_is_refused_before_anything_runs(changes, line):
+    with pytest.raises(ValueError, match=r".") as caught:
+        layout(**changes)
+    assert str(caught.value) == line
+
+
+def test_the_whole_runs_from_the_specification():
+    async def scenario() -> None:
+        found = layout()
+        async with VirtualSystem(layout=found) as system:
+            orders = system.hear(ORDER)
+            gauge = system.start_node("gauge")
+            for name in ("D", "R"):
+                system.start_node(name)
+            await asyncio.sleep(0.3)
+            gauge.publish(LEVEL, Level(3.0))
+            await system.settle()
+            system.say(topics.RECOVERY_COMMAND, m.RecoveryCommand(True, 1, (), "too full"),
+                       "manager", member="R")
+            await system.settle()
+            assert [heard.message for heard in orders] == [Valve(True)]
+
+    run(scenario)

@@ -1,0 +1,49 @@
+"""A tank with a level, a pump and a valve: topics for tests of modules that know no robot."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from rampart.actors.bus.messages import Message
+from rampart.actors.bus.topic import Qos, Topic
+
+
+class Phase(StrEnum):
+    """What the pump does."""
+
+    IDLE = "idle"
+    FILLING = "filling"
+    DRAINING = "draining"
+
+
+class Level(Message):
+    """How full the tank is."""
+
+    height_m: float
+    cells: tuple[float, ...] = ()
+    heading_rad: float = 0.0
+
+
+class Pump(Message):
+    """What the pump does, and until when it is busy with it."""
+
+    phase: Phase
+    busy_until_s: float = 0.0
+    running: bool = True
+
+
+class Valve(Message):
+    """An order to the valve, or its state."""
+
+    shut: bool
+    opening: float = 1.0
+
+
+LEVEL = Topic("tank/level", Level, Qos.SENSOR, 10.0, "", "How full the tank is.")
+SECOND = Topic("tank/second", Level, Qos.SENSOR, 10.0, "", "The same by another gauge.")
+THIRD = Topic("tank/third", Level, Qos.SENSOR, 10.0, "", "The same by a third gauge.")
+PUMP = Topic("tank/pump", Pump, Qos.STATE, 5.0, "", "What the pump does.")
+ORDER = Topic("tank/order", Valve, Qos.COMMAND, 0.0, "", "Orders to the valve.")
+VALVE = Topic("tank/valve", Valve, Qos.STATE, 5.0, "", "The state of the valve.")
+GAUGE = Topic("tank/gauge/{name}", Level, Qos.SENSOR, 10.0, "", "The level by one of many gauges.")
+TOPICS = (LEVEL, SECOND, THIRD, PUMP, ORDER, VALVE, GAUGE)
