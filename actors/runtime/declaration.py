@@ -45,20 +45,9 @@ def every(period_s: float) -> Callable[[F], F]:
     return mark
 
 
-class Declared:
-    """Base of all actors, as far as their classes alone tell.
+class Handlers:
+    """Base of what hears topics by methods that are marked with `on`, or acts by `every`."""
 
-    Class attributes:
-        outputs: topics it publishes; publishing another one raises.
-        Parameters: what the system spec may say of it, by field: type, range and default. A class
-            that takes more derives its own from that of its base class.
-    """
-
-    class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-        """None, unless a subclass declares some."""
-
-    parameters: Parameters
-    outputs: ClassVar[tuple[Topic[Any], ...]] = ()
     _handlers: ClassVar[tuple[tuple[Topic[Any], str], ...]] = ()
     _periodic: ClassVar[tuple[tuple[float, str], ...]] = ()
 
@@ -74,6 +63,22 @@ class Declared:
                     periodic[name] = member._rampart_period_s
         cls._handlers = tuple(handlers.values())
         cls._periodic = tuple((period, name) for name, period in periodic.items())
+
+
+class Declared(Handlers):
+    """Base of all actors, as far as their classes alone tell.
+
+    Class attributes:
+        outputs: topics it publishes; publishing another one raises.
+        Parameters: what the system spec may say of it, by field: type, range and default. A class
+            that takes more derives its own from that of its base class.
+    """
+
+    class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+        """None, unless a subclass declares some."""
+
+    parameters: Parameters
+    outputs: ClassVar[tuple[Topic[Any], ...]] = ()
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003
