@@ -1,6 +1,6 @@
 """How much of what was heard pages are shown. Pure.
 
-Whoever is on the bus may say as much as a message holds; a page is for a person, and has to be
+A node on the bus may say as much as a message holds; a page is for a person, and has to be
 drawn. Texts are clipped, lists end, and how many entries were left out is counted and shown. Each
 list has its own room, so that a long one takes nothing from what stands beside it: the recoveries
 that wait for a reset, for instance.

@@ -97,7 +97,7 @@ class RequestReader:
 
 
 class Pending(Generic[R]):
-    """The one message of a kind that is sent again and again until somebody answers.
+    """The one message of a kind that is sent again and again until it is answered.
 
     Args:
         prefix: of the messages' ids; another one for each incarnation of the node.
@@ -140,7 +140,7 @@ class Pending(Generic[R]):
         return self.name
 
     def expire(self, now_s: float) -> str:
-        """Withdraw a message that nobody answers, and return what to tell; "" if none."""
+        """Withdraw a message that stays without an answer, and return what to tell; "" if none."""
         if self.pending is None or now_s < self._give_up_s:
             return ""
         return f"{self.settle()} {self._unanswered}"

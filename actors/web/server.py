@@ -219,7 +219,7 @@ class WebServer:
         self._state = ServerState()
         self._accepting: asyncio.Task[None] | None = None
 
-    async def start(self) -> None:
+    def start(self) -> None:
         """Begin to serve, on the running loop."""
         self._listening.setblocking(False)
         self._listening.listen(QUEUE)

@@ -135,7 +135,7 @@ async def repeated(say, period_s: float = 0.02):
 
 
 async def served(hmi: OsmosisHmi) -> str:
-    await eventually(lambda: hmi._starting is not None and hmi._starting.done())
+    await eventually(lambda: hmi._server is not None)
     return f"127.0.0.1:{hmi.page_port}"
 
 
