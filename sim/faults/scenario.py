@@ -104,10 +104,7 @@ def parse_fault(text: str) -> PlannedFault:
 
 
 def _seconds(text: str, value: str, what: str, *, infinite: bool = False) -> float:
-    try:
-        seconds = float(value)
-    except ValueError:
-        seconds = math.nan
+    seconds = _number(value)
     if not seconds >= 0 or (not infinite and math.isinf(seconds)):
         raise ScenarioError(f"fault {text!r}: {what} {value!r}: must be simulated seconds"
                             + (", or inf" if infinite else ", or goalN, or goalN:SECONDS"))
@@ -154,14 +151,19 @@ def number(fault: str, details: Sequence[str], default: float, most: float = 1.0
     """
     if not details:
         return default
-    try:
-        value = float(details[0])
-    except ValueError:
-        value = math.nan
+    value = _number(details[0])
     if not 0 <= value <= most or len(details) > 1:
         raise ScenarioError(f"fault {fault!r}: {':'.join(details)!r}: must be one number "
                             f"between 0 and {most:g}")
     return value
+
+
+def _number(text: str) -> float:
+    """Return the number in a text, which is none (nan) of one that is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 class FaultOutcome(msgspec.Struct, frozen=True):

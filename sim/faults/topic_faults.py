@@ -35,7 +35,7 @@ DURATION_S = 10.0
 
 DELAY_S = 1.5
 """Delay of `delay:TOPIC`: half as long again as the longest freshness timeout that is derived
-for the shipped system (0.99 s), so that a delay is one that somebody should see."""
+for the shipped system (0.99 s), so that a delay is one that should be detected."""
 
 SPREADS: tuple[tuple[str, float, float], ...] = (
     ("_m", 0.5, 3.0), ("_rad", 0.3, 1.5), ("_mps", 0.2, 0.8), ("_radps", 0.2, 1.0),
@@ -48,7 +48,7 @@ numbers without a unit, such as ratios and stick positions."""
 _ONLY_GROW = ("_s", "_lux", "_cd")
 
 STAMPS_S = (0.02, 5.0)
-"""Least and greatest error of a stamp: from one that nobody need notice to one beyond every
+"""Least and greatest error of a stamp: from one that need not be noticed to one beyond every
 freshness timeout. Drawn by its logarithm, so that the small ones are as frequent as the large."""
 
 _TITLES = {
@@ -84,9 +84,7 @@ def topic_fault(mode: str, key: str, seed: int, known: Sequence[Topic[Any]]) -> 
     if topic is None:
         raise UnknownFaultError(f"unknown fault {f'{mode}:{key}'!r}: no topic has this key; "
                                 "see `rampart topic list`")
-    if reason := _closed(short):
-        raise UnknownFaultError(f"no fault {f'{mode}:{key}'!r}: {reason}")
-    if reason := _senseless(mode, topic.type):
+    if reason := _closed(short) or _senseless(mode, topic.type):
         raise UnknownFaultError(f"no fault {f'{mode}:{key}'!r}: {reason}")
     draw = Random(f"{short} {seed}")  # noqa: S311 no secret
     title, offsets = _TITLES[mode].format(short), {}
