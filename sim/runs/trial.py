@@ -144,13 +144,11 @@ class Trial:
     def summary(self, record: RunRecord) -> dict[str, Any]:
         """Return what scripts rely on: the last line of stdout with --json."""
         return {
-            "mission": record.mission, "safety": record.safety, "reasons": list(record.reasons),
-            "duration_s": round(record.duration_s, 2),
-            "decisions": [msgspec.to_builtins(decision) for decision in record.decisions],
-            "restarts": record.restarts,
+            "mission": record.mission, "safety": record.safety, "reasons": record.reasons,
+            "duration_s": round(record.duration_s, 2), "restarts": record.restarts,
+            "decisions": msgspec.to_builtins(record.decisions),
             "faults": [{**msgspec.to_builtins(fault), "effective": fault.effective}
-                       for fault in record.faults],
-        }
+                       for fault in record.faults]}
 
     def figures(self, record: RunRecord) -> dict[str, Any]:
         """Return the fields of a campaign's `RunResult` that only a judge knows."""

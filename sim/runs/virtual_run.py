@@ -156,7 +156,7 @@ class VirtualRun:
         if not isinstance(loop, VirtualLoop):
             raise TypeError(f"{loop!r}: a virtual run needs a virtual loop")
         clock = VirtualClock(loop, loop.time() + LEAD_S)
-        hub = Hub(SeededNetwork(self._network, self.plan.seed, local=(OBSERVER, INJECTOR)))
+        hub = Hub(SeededNetwork(self._network, self.plan.seed, local=(OBSERVER, INJECTOR)).link)
         trace = Trace()
         hub.taps.append(trace)
         hub.taps += [_tap(take, loop.time() + LEAD_S) for take in self._taps]

@@ -15,8 +15,6 @@ from typing import Any
 from rampart.sim.virtual.timing import Stock, Timing, drawer, measured
 from rampart.sim.virtual.virtual_bus import Link
 
-__all__ = ["NETWORKS", "NetworkModel", "SeededNetwork", "find_network"]
-
 
 @dataclass(frozen=True, slots=True)
 class NetworkModel:
