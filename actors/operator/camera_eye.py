@@ -59,9 +59,8 @@ class CameraEye:
         self._process: Process | None = None
         self._lock = asyncio.Lock()
         self._picture = b""
-        self._taken_s = -PERIOD_S
         self._failure = ""
-        self._failed_s = 0.0
+        self._until_s = 0.0  # so long holds the picture, or the failure
         self._idle: asyncio.TimerHandle | None = None
         self._ending: set[asyncio.Task[int]] = set()
 
@@ -83,26 +82,26 @@ class CameraEye:
     async def _newest(self) -> bytes:
         loop = asyncio.get_running_loop()
         async with self._lock:  # those who ask meanwhile get the same picture
-            if loop.time() - self._taken_s < PERIOD_S:
-                return self._picture
-            if self._failure and loop.time() - self._failed_s < RETRY_S:
+            if loop.time() >= self._until_s:
+                await self._renew()
+            if self._failure:
                 raise CameraError(self._failure)
-            view = self._view()
-            if view is None:
-                raise CameraError("the robot's pose is not known")
-            try:
-                self._picture = await self._take(view)
-            except asyncio.CancelledError:
-                self.close()  # it may be in the middle of a picture
-                raise
-            except (TimeoutError, OSError, CameraError) as error:
-                self._failure = str(error) or "the renderer does not answer"
-                self._failed_s = loop.time()
-                self.close()
-                raise CameraError(self._failure) from None
-            self._failure = ""
-            self._taken_s = loop.time()
             return self._picture
+
+    async def _renew(self) -> None:
+        view = self._view()
+        if view is None:
+            raise CameraError("the robot's pose is not known")
+        self._failure, lasts_s = "", PERIOD_S
+        try:
+            self._picture = await self._take(view)
+        except asyncio.CancelledError:
+            self.close()  # it may be in the middle of a picture
+            raise
+        except (TimeoutError, OSError, CameraError) as error:
+            self._failure, lasts_s = str(error) or "the renderer does not answer", RETRY_S
+            self.close()
+        self._until_s = asyncio.get_running_loop().time() + lasts_s
 
     def _rest(self) -> None:
         if not self._lock.locked():  # else a page looks, and will set the timer again

@@ -93,7 +93,6 @@ class Feed:
         self._look = look
         self._pages: set[PageFeed] = set()
         self._frames: dict[int, str] = {}
-        self._frames_version = -1
         self._timer: asyncio.TimerHandle | None = None
         self._looker: asyncio.TimerHandle | None = None
         self._last_s = 0.0
@@ -140,19 +139,17 @@ class Feed:
 
     def frame(self, since: int) -> str:
         """Return what changed since a version; encoded once for all pages that are there."""
-        version = self._state.picture.version
-        if version != self._frames_version:
-            self._frames.clear()
-            self._frames_version = version
         if since not in self._frames:
+            picture = self._state.picture
             self._frames[since] = _encode({
-                "type": "state", "version": version, "time_s": round(self._now(), 3),
-                **self._state.picture.changes(since)})
+                "type": "state", "version": picture.version, "time_s": round(self._now(), 3),
+                **picture.changes(since)})
         return self._frames[since]
 
     # -- when -----------------------------------------------------------------------------------
 
     def _changed(self, urgent: bool) -> None:
+        self._frames.clear()
         if not self._pages:
             return
         loop = asyncio.get_running_loop()

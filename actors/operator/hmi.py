@@ -28,6 +28,7 @@ from rampart.actors.operator.state import HmiState
 from rampart.actors.operator.system import draw_system
 from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.web.access import AccessError
 from rampart.manager.spec.specification import SystemSpec, check_document
 
 REPEAT_S = 0.5
@@ -104,11 +105,6 @@ class Hmi(Actor):
         """Without a page, hear only what this node does without one."""
         return bool(self._port) or topic not in self.shown
 
-    @property
-    def page_port(self) -> int | None:
-        """Port on which the page is served, or None."""
-        return self._server.port if self._server else None
-
     def on_start(self) -> None:
         """Open the page's port; the robot drives without the page."""
         self._repeat()
@@ -122,7 +118,8 @@ class Hmi(Actor):
                 Handlers(self.requests, operating.introduction, self._fulfil, operating.left),
                 plan.hmi_host, plan.hmi_token, camera=self._camera)
         except Exception as error:
-            why = str(error) if isinstance(error, PortError) else f"{type(error).__name__}: {error}"
+            known = isinstance(error, (AccessError, PortError))
+            why = str(error) if known else f"{type(error).__name__}: {error}"
             self.report_diagnostic("operator's page", why, f"port {self._port}")
 
     def on_stop(self) -> None:
@@ -134,12 +131,12 @@ class Hmi(Actor):
             self._server.stop()
 
     def _look(self) -> None:
-        self._state.usage(self._observer.look(self._table))
+        self._state.picture.put("usage", self._observer.look(self._table), urgent=False)
 
     def _show_system(self, system: SystemSpec, version: int) -> None:
         if self._port and system is not NO_SYSTEM and version > self._version:
             self._version = version
-            self._state.system(draw_system(system))
+            self._state.picture.put("system", draw_system(system))
 
     # -- hearing --------------------------------------------------------------------------------
 

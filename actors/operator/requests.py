@@ -80,8 +80,9 @@ class RequestReader:
         kinds: of requests that there are.
     """
 
-    def __init__(self, kinds: Sequence[type[Request]] = REQUESTS) -> None:
-        self._decoder = msgspec.json.Decoder(Union[tuple(kinds)])  # noqa: UP007 known at run time
+    def __init__(self, kinds: Sequence[type[Request]]) -> None:
+        self._decoder: msgspec.json.Decoder[Request] = msgspec.json.Decoder(
+            Union[tuple(kinds)])  # noqa: UP007 known at run time
 
     def read(self, text: str | bytes | None) -> Request:
         """Decode a message of a page.
@@ -90,10 +91,9 @@ class RequestReader:
             RequestError: it is none.
         """
         try:
-            request: Request = self._decoder.decode(text or b"")
+            return self._decoder.decode(text or b"")
         except UNREADABLE as error:
             raise RequestError(f"message not understood: {error}") from None
-        return request
 
 
 class Pending(Generic[R]):

@@ -14,7 +14,6 @@ import asyncio
 import contextlib
 import socket
 from collections.abc import Callable, Coroutine, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ from rampart.actors.operator.camera_eye import CameraError, CameraEye
 from rampart.actors.operator.feed import SEND_TIMEOUT_S, Feed, PageFeed
 from rampart.actors.operator.limits import MessageBudget, Verdict
 from rampart.actors.operator.requests import RefusedError, Request, RequestError, RequestReader
-from rampart.actors.web.access import SUBPROTOCOL, Access, AccessError, is_loopback, shown_token
+from rampart.actors.web.access import SUBPROTOCOL, Access, is_loopback, shown_token
 from rampart.actors.web.server import WebServer, is_known, served
 
 NO_TOKEN = 4401
@@ -57,16 +56,14 @@ _HEADERS = {
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
         "img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; "
         "require-trusted-types-for 'script'; trusted-types 'none'"),  # no text becomes HTML
-    "x-content-type-options": "nosniff",
-    "referrer-policy": "no-referrer",
-}
+    "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
+
 
 class PortError(OSError):
     """The page's port cannot be bound."""
 
 
-@dataclass(frozen=True, slots=True)
-class Handlers:
+class Handlers(msgspec.Struct, frozen=True):
     """What deals with the pages. A page is known by its number in this incarnation of the node.
 
     Attributes:
@@ -94,7 +91,8 @@ class PageServer:
         camera: where pictures come from, or None.
 
     Raises:
-        PortError: the address cannot be bound, or must not without a token.
+        PortError: the address cannot be bound.
+        AccessError: it must not without a token.
     """
 
     def __init__(self, port: int, feed: Feed, handlers: Handlers, host: str, token: str, *,
@@ -104,10 +102,7 @@ class PageServer:
         self._handlers = handlers
         self._reader = RequestReader(handlers.requests)
         self._count = 0
-        try:
-            Access(host, port, token)  # refused before anything is bound
-        except AccessError as error:
-            raise PortError(str(error)) from None
+        Access(host, port, token)  # refused before anything is bound
         listening = _listen(host, port)
         self.port: int = listening.getsockname()[1]
         names = () if is_loopback(host) else (socket.gethostname(),)

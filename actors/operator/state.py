@@ -6,7 +6,7 @@ nothing, and nothing is turned into JSON unless somebody looks (`picture`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -125,14 +125,6 @@ class HmiState:
     def log(self, now_s: float, kind: str, text: str) -> None:
         """Add a line to the event log; `kind` is fault, clear or note."""
         self.picture.add("events", {"t": round(now_s, 2), "kind": kind, "text": clip(text)})
-
-    def system(self, drawing: Mapping[str, Any] | None) -> None:
-        """Keep the drawing of the system's fault tree and order (`system`)."""
-        self.picture.put("system", drawing)
-
-    def usage(self, usage: Mapping[str, Any]) -> None:
-        """Keep what the processes use."""
-        self.picture.put("usage", usage, urgent=False)
 
     # -- showing --------------------------------------------------------------------------------
 

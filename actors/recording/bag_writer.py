@@ -104,8 +104,7 @@ class BagWriter:
         self._view_channels: dict[str, int] = {}
         self._writer = Writer(file, compression=CompressionType.LZ4)
         self._writer.start(PROFILE, f"rampart {documents.version}")
-        self._writer.add_metadata(
-            RUN, {**documents.metadata(), "time_zero_s": f"{time_zero_s:g}"})
+        self._writer.add_metadata(RUN, {**documents.metadata(), "time_zero_s": f"{time_zero_s:g}"})
         for name, media_type, data in documents.files:
             self._writer.add_attachment(0, 0, name, media_type, data)
         if views is not None:

@@ -21,8 +21,9 @@ import ipaddress
 import re
 import secrets
 from collections.abc import Iterable
-from dataclasses import dataclass
 from urllib.parse import quote, urlsplit
+
+import msgspec
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 TOKEN_PREFIX = "token."  # noqa: S105 it is not one
@@ -61,8 +62,7 @@ def page_url(host: str, port: int, token: str = "") -> str:
     return f"http://{host}:{port}/" + (f"#token={quote(token)}" if token else "")
 
 
-@dataclass(frozen=True)
-class Access:
+class Access(msgspec.Struct, frozen=True):
     """The rules for a page served at a host and port.
 
     Args:

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
+
+import msgspec
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import InjectionReport
@@ -41,8 +42,7 @@ def can_be_hit(spec: SystemSpec) -> tuple[str, ...]:
     return (SUPERVISOR, *(node.name for node in spec.actors() if node.kind is not Kind.WORLD))
 
 
-@dataclass(slots=True, eq=False)
-class PlannedAction:
+class PlannedAction(msgspec.Struct, eq=False):
     """A planned fault and what has become of it.
 
     Attributes:

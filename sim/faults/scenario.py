@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -70,8 +69,7 @@ class PlannedFault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return f"{self.fault}@{when}{lasts}" + (f" [{', '.join(more)}]" if more else "")
 
 
-@dataclass(frozen=True, slots=True)
-class OnProcess:
+class OnProcess(msgspec.Struct, frozen=True):
     """Something done to the process of a node; `pace_s` is for slow."""
 
     what: str

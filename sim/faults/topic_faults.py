@@ -40,8 +40,7 @@ for the shipped system (0.99 s), so that a delay is one that should be detected.
 SPREADS: tuple[tuple[str, float, float], ...] = (
     ("_m", 0.5, 3.0), ("_rad", 0.3, 1.5), ("_mps", 0.2, 0.8), ("_radps", 0.2, 1.0),
     ("_mps2", 0.5, 2.0), ("_s", 1.0, 10.0), ("_lux", 200.0, 1000.0), ("_cd", 50.0, 150.0),
-    ("_f32", 0.3, 1.5), ("waypoints", 0.5, 3.0), ("", 0.1, 0.5),
-)
+    ("_f32", 0.3, 1.5), ("waypoints", 0.5, 3.0), ("", 0.1, 0.5))
 """End of a field's name → least and greatest offset; the first that fits counts. The last is for
 numbers without a unit, such as ratios and stick positions."""
 
@@ -58,8 +57,7 @@ _TITLES = {
     "delay": "{} arrives " + f"{DELAY_S:g} s late",
     "duplicate": "each message on {} is sent twice",
     "restamp": "the stamps on {} are wrong by a constant",
-    "corrupt": "each number on {} is wrong by a constant",
-}
+    "corrupt": "each number on {} is wrong by a constant"}
 
 
 def topic_fault(mode: str, key: str, seed: int, known: Sequence[Topic[Any]]) -> Fault:

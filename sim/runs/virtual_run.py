@@ -14,7 +14,7 @@ import struct
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -39,8 +39,7 @@ _CHUNK = 3000
 _HEAD = struct.Struct("<dI").pack
 
 
-@dataclass(frozen=True, slots=True)
-class VirtualResult:
+class VirtualResult(msgspec.Struct, frozen=True):
     """What came of a virtual run.
 
     Attributes:

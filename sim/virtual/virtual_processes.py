@@ -12,6 +12,8 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import Enum
+from functools import partial
+from itertools import count
 from typing import Any
 
 from rampart.actors.ftm.messages import AdaptedSystem, NodeTable
@@ -121,7 +123,7 @@ class VirtualMachine:
         self._death_s = drawer(timing.death_ms, dice)
         self._supervisor_back_s = drawer(timing.supervisor_back_ms, dice)
         self._loop = asyncio.get_running_loop()
-        self._next_pid = FIRST_PID
+        self._pids = count(FIRST_PID)
         self._processes: dict[int, VirtualProcess] = {}
         self._slow: dict[str, float] = {}
         self._known: dict[str, int] = {}
@@ -189,8 +191,7 @@ class VirtualMachine:
         """Start a process; its first word comes after the measured time."""
         if self._down:
             raise SpawnerUnavailableError("the machine is down")
-        pid = self._next_pid
-        self._next_pid += 1
+        pid = next(self._pids)
         process = self._processes[pid] = VirtualProcess(pid, names, incarnation)
         for name in names:
             self._known[name] = max(self._known.get(name, 0), incarnation)
@@ -277,8 +278,7 @@ class VirtualMachine:
                 actor.slow_down(self._slow[name])
             task = self._loop.create_task(actor.run())
             process.actors.append((actor, bus, task))
-            task.add_done_callback(
-                lambda done, n=name: self._task_done(process, n, done))  # type: ignore[misc]
+            task.add_done_callback(partial(self._task_done, process, name))
 
     def _store(self, name: str, incarnation: int) -> checkpoint.CheckpointStore:
         if not self._layout.spec.layers.checkpoints:
@@ -287,12 +287,9 @@ class VirtualMachine:
         return checkpoint.MemoryCheckpoints(shelf, incarnation)
 
     def _task_done(self, process: VirtualProcess, name: str, task: asyncio.Task[None]) -> None:
-        if process.condition is Condition.ENDED:
-            if not task.cancelled():
-                task.exception()  # it was being killed: its error is not read
-            return
         error = None if task.cancelled() else task.exception()
-        self._failed(process, name, error or RuntimeError("ended by itself"))
+        if process.condition is not Condition.ENDED:  # else it was being killed
+            self._failed(process, name, error or RuntimeError("ended by itself"))
 
     def _failed(self, process: VirtualProcess, name: str, error: BaseException) -> None:
         self.failures.append((name, error))
@@ -301,9 +298,8 @@ class VirtualMachine:
     def _end(self, process: VirtualProcess) -> None:
         process.condition = Condition.ENDED
         self._processes.pop(process.pid, None)
-        for _, bus, _ in process.actors:
+        for actor, bus, task in process.actors:
             bus.cut()
-        for actor, _, task in process.actors:
             actor.abandon()
             task.cancel()
 

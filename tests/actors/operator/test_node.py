@@ -207,7 +207,7 @@ async def test_without_a_free_port_the_hmi_works_without_a_page_and_says_why(wor
         port = taken.getsockname()[1]
         async with world.hmi(hmi_port=port, mission=AIRPORT.mission("A")) as hmi:
             await eventually(lambda: bool(world.others.diagnostics and world.others.requests))
-            assert hmi.page_port is None
+            assert hmi._server is None
     report = world.others.diagnostics[0]
     assert report.offender == f"port {port}"
     assert "Address already in use" in report.reason

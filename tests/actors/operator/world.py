@@ -136,7 +136,7 @@ async def repeated(say, period_s: float = 0.02):
 
 async def served(hmi: OsmosisHmi) -> str:
     await eventually(lambda: hmi._server is not None)
-    return f"127.0.0.1:{hmi.page_port}"
+    return f"127.0.0.1:{hmi._server.port}"
 
 
 async def hear(page, *kinds: str) -> dict:
