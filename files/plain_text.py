@@ -32,8 +32,5 @@ def one_line(text: str, chars: int = LINE_CHARS) -> str:
 
 
 def _escaped(character: str) -> str:
-    code = ord(character)
-    if code < 0x10000:
-        return f"\\u{code:04x}"
-    code -= 0x10000
-    return f"\\u{0xD800 + (code >> 10):04x}\\u{0xDC00 + (code & 0x3FF):04x}"
+    units = character.encode("utf-16-be", "surrogatepass")
+    return r"\u" + units.hex(",", 2).replace(",", r"\u")

@@ -6,7 +6,7 @@ changes the exit code. After `secure` nothing is raised: what cannot be written 
 why, and the program goes on. A descriptor that is closed is opened on /dev/null, so that no file or
 socket takes its number and gets the story written into it.
 
-Nor does the loop of a program wait for somebody who does not read: stderr that takes nothing for
+Nor does the loop of a program wait for a reader that does not read: stderr that takes nothing for
 `PATIENCE_S` loses lines until it does again. stdout is waited for; it is the result.
 """
 
@@ -25,12 +25,15 @@ PATIENCE_S = 0.5
 
 
 class _Unfailing(io.FileIO):
-    """A file descriptor that takes everything; why it kept something from nobody is `failure`."""
+    """A file descriptor that takes everything; `failure` says why something of it was lost.
 
-    def __init__(self, descriptor: int, patience_s: float | None) -> None:
+    Without patience it waits until it is read.
+    """
+
+    def __init__(self, descriptor: int, patience_ms: float | None) -> None:
         super().__init__(descriptor, "wb", closefd=False)
         self.failure: OSError | None = None
-        self._patience_s = patience_s
+        self._patience_ms = patience_ms
         self._stuck = False
 
     def write(self, data: Any, /) -> int:
@@ -44,13 +47,9 @@ class _Unfailing(io.FileIO):
         return size
 
     def _takes(self) -> bool:
-        if self._patience_s is None:
-            wait_ms = None
-        else:
-            wait_ms = 0.0 if self._stuck else 1000 * self._patience_s
         poll = select.poll()
         poll.register(self.fileno(), select.POLLOUT)
-        self._stuck = not poll.poll(wait_ms)
+        self._stuck = not poll.poll(0.0 if self._stuck else self._patience_ms)
         return not self._stuck
 
 
@@ -65,13 +64,13 @@ def secure() -> None:
         except OSError:  # those below it are open, so it gets this number
             os.open(os.devnull, flags)
             os.set_inheritable(descriptor, True)
-    for name, descriptor, patience_s in (("stdout", 1, None), ("stderr", 2, PATIENCE_S)):
+    for name, descriptor, patience_ms in (("stdout", 1, None), ("stderr", 2, 1000 * PATIENCE_S)):
         before = getattr(sys, name)
         if before is not getattr(sys, f"__{name}__") or _raw(before) is not None:
             continue
         with contextlib.suppress(OSError, AttributeError):
             before.flush()
-        raw = _Unfailing(descriptor, patience_s)
+        raw = _Unfailing(descriptor, patience_ms)
         made = io.TextIOWrapper(
             io.BufferedWriter(raw), encoding=getattr(before, "encoding", None) or "utf-8",
             errors="backslashreplace", line_buffering=name == "stderr" or raw.isatty())
@@ -79,9 +78,9 @@ def secure() -> None:
         setattr(sys, f"__{name}__", made)
 
 
-def lost(stream: Any = None) -> OSError | None:
-    """Return why something of a secured stream, or of stdout, was lost; None if nothing was."""
-    raw = _raw(sys.stdout if stream is None else stream)
+def lost() -> OSError | None:
+    """Return why something of stdout was lost; None if nothing was."""
+    raw = _raw(sys.stdout)
     return raw.failure if raw else None
 
 

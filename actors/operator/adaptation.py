@@ -12,7 +12,7 @@ from rampart.actors.ftm import messages as m
 from rampart.actors.operator.requests import Pending, RefusedError
 
 GIVE_UP_S = 5.0
-"""Simulated seconds after which a request that nobody answers is withdrawn."""
+"""Simulated seconds after which a request without an answer is withdrawn."""
 
 
 class StrategyChoice(Pending[m.AdaptationRequest]):
@@ -49,9 +49,9 @@ class StrategyChoice(Pending[m.AdaptationRequest]):
         request = self.new_id()
         if name == current:
             raise RefusedError(f"strategy {name} is in force already")
+        value = msgspec.json.encode({"value": name}).decode()
         return self.put(f"strategy {name}", m.AdaptationRequest(
-            request, "set", "strategy",
-            msgspec.json.encode({"value": name}).decode(), self._by), now_s)
+            request, "set", "strategy", value, self._by), now_s)
 
     def answer(self, answer: m.AdaptationAnswer) -> str:
         """Return what the answer to the pending request means, "" if it is another's."""

@@ -1,6 +1,6 @@
 """How much of what was heard pages are shown. Pure.
 
-Whoever is on the bus may say as much as a message holds; a page is for a person, and has to be
+A node on the bus may say as much as a message holds; a page is for a person, and has to be
 drawn. Texts are clipped, lists end, and how many entries were left out is counted and shown. Each
 list has its own room, so that a long one takes nothing from what stands beside it: the recoveries
 that wait for a reset, for instance.
@@ -12,8 +12,7 @@ mark that turns the direction of writing like another name.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from enum import Enum
+from itertools import islice
 from typing import Any
 
 import msgspec
@@ -26,8 +25,7 @@ _UNPRINTABLE = re.compile(r"[^\S ]|[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e
                           r"\ud800-\udfff]")
 
 
-@dataclass(frozen=True, slots=True)
-class Bounds:
+class Bounds(msgspec.Struct, frozen=True):
     """How much is shown of a value.
 
     Attributes:
@@ -57,8 +55,7 @@ def clip(text: str, characters: int = SHOWN.text) -> str:
     return kept if kept.isprintable() else _UNPRINTABLE.sub("�", kept)
 
 
-@dataclass(slots=True)
-class _Room:
+class _Room(msgspec.Struct):
     left: int
 
 
@@ -79,16 +76,12 @@ class _Fitting:
         if isinstance(value, (list, tuple)):
             return self._list(value, room or _Room(self._bounds.room))
         _take(room, _NUMBER_BYTES)
-        return value.value if isinstance(value, Enum) else value
+        return value
 
     def _mapping(self, value: dict[Any, Any], room: _Room | None) -> dict[str, Any]:
-        shown: dict[str, Any] = {}
-        for key, entry in value.items():
-            if len(shown) == self._bounds.items:
-                self.left_out += len(value) - len(shown)
-                break
-            shown[self.value(str(key), room)] = self.value(entry, room)
-        return shown
+        self.left_out += max(0, len(value) - self._bounds.items)
+        return {self.value(str(key), room): self.value(entry, room)
+                for key, entry in islice(value.items(), self._bounds.items)}
 
     def _list(self, value: list[Any] | tuple[Any, ...], room: _Room) -> list[Any]:
         shown: list[Any] = []

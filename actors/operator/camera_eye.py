@@ -1,9 +1,9 @@
-"""Gets pictures from a renderer, a program of its own that is started when somebody looks.
+"""Gets pictures from a renderer, a program of its own that is started when a page asks for one.
 
-The renderer, which the robot's page names, lives as long as
-pictures are asked for and `IDLE_S` longer. All pages share its pictures, `PERIOD_S` apart. It may
-fail, hang or be killed: then the page is told why, and the next try is made after `RETRY_S`.
-Nothing else waits for it, and it costs nothing while nobody looks.
+The renderer, which the robot's page names, runs as long as pictures are asked for and `IDLE_S`
+longer. All pages share its pictures, `PERIOD_S` apart. It may fail, hang or be killed: then the
+page is told why, and the next try is made after `RETRY_S`. Nothing else waits for it, and it costs
+nothing while no page asks.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import contextlib
 import os
 import struct
 import sys
+from asyncio.subprocess import PIPE, Process
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -51,18 +52,15 @@ class CameraEye:
         view: returns the line for the next picture, or None while there is nothing to show.
     """
 
-    def __init__(
-        self, command: Sequence[str], order: Any, view: Callable[[], Any],
-    ) -> None:
+    def __init__(self, command: Sequence[str], order: Any, view: Callable[[], Any]) -> None:
         self._command = command
         self._order = order
         self._view = view
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: Process | None = None
         self._lock = asyncio.Lock()
         self._picture = b""
-        self._taken_s = -PERIOD_S
         self._failure = ""
-        self._failed_s = 0.0
+        self._until_s = 0.0  # so long holds the picture, or the failure
         self._idle: asyncio.TimerHandle | None = None
         self._ending: set[asyncio.Task[int]] = set()
 
@@ -83,30 +81,30 @@ class CameraEye:
 
     async def _newest(self) -> bytes:
         loop = asyncio.get_running_loop()
-        async with self._lock:  # whoever comes meanwhile gets the same picture
-            if loop.time() - self._taken_s < PERIOD_S:
-                return self._picture
-            if self._failure and loop.time() - self._failed_s < RETRY_S:
+        async with self._lock:  # those who ask meanwhile get the same picture
+            if loop.time() >= self._until_s:
+                await self._renew()
+            if self._failure:
                 raise CameraError(self._failure)
-            view = self._view()
-            if view is None:
-                raise CameraError("the robot's pose is not known")
-            try:
-                self._picture = await self._take(view)
-            except asyncio.CancelledError:
-                self.close()  # it may be in the middle of a picture
-                raise
-            except (TimeoutError, OSError, CameraError) as error:
-                self._failure = str(error) or "the renderer does not answer"
-                self._failed_s = loop.time()
-                self.close()
-                raise CameraError(self._failure) from None
-            self._failure = ""
-            self._taken_s = loop.time()
             return self._picture
 
+    async def _renew(self) -> None:
+        view = self._view()
+        if view is None:
+            raise CameraError("the robot's pose is not known")
+        self._failure, lasts_s = "", PERIOD_S
+        try:
+            self._picture = await self._take(view)
+        except asyncio.CancelledError:
+            self.close()  # it may be in the middle of a picture
+            raise
+        except (TimeoutError, OSError, CameraError) as error:
+            self._failure, lasts_s = str(error) or "the renderer does not answer", RETRY_S
+            self.close()
+        self._until_s = asyncio.get_running_loop().time() + lasts_s
+
     def _rest(self) -> None:
-        if not self._lock.locked():  # else somebody looks, and will set the timer again
+        if not self._lock.locked():  # else a page looks, and will set the timer again
             self.close()
 
     def close(self) -> None:
@@ -129,8 +127,7 @@ class CameraEye:
         async with asyncio.timeout(START_S if fresh else PICTURE_S):
             if process is None or fresh:
                 self._process = process = await asyncio.create_subprocess_exec(
-                    *self._command, stdin=asyncio.subprocess.PIPE,
-                    stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+                    *self._command, stdin=PIPE, stdout=PIPE, stderr=PIPE,
                     env={**_ENVIRONMENT, **os.environ})
             ask, answer, complaint = process.stdin, process.stdout, process.stderr
             if ask is None or answer is None or complaint is None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
@@ -30,12 +31,12 @@ RIDE_S = 0.1
 """What is not urgent waits so long for company at most."""
 
 LOOK_S = 1.0
-"""Between two looks at what nobody sends: who has fallen silent, what the processes use."""
+"""Between two looks at what no message says: who has fallen silent, what the processes use."""
 
 SEND_TIMEOUT_S = 5.0
 IN_FLIGHT = 2
 
-_SEEN = b'{"type":"seen","version":'
+_SEEN = re.compile(rb'\{"type":"seen","version":(\d{1,33})\}')
 
 
 class PageFeed:
@@ -84,17 +85,14 @@ class Feed:
         look: called once a second while a page is open, before staleness is checked.
     """
 
-    def __init__(
-        self, state: HmiState, now: Callable[[], float], hello: Callable[[], Any],
-        look: Callable[[], None] = lambda: None,
-    ) -> None:
+    def __init__(self, state: HmiState, now: Callable[[], float], hello: Callable[[], Any],
+                 look: Callable[[], None] = lambda: None) -> None:
         self._state = state
         self._now = now
         self._hello = hello
         self._look = look
         self._pages: set[PageFeed] = set()
         self._frames: dict[int, str] = {}
-        self._frames_version = -1
         self._timer: asyncio.TimerHandle | None = None
         self._looker: asyncio.TimerHandle | None = None
         self._last_s = 0.0
@@ -135,30 +133,23 @@ class Feed:
     def heard(self, page: PageFeed, text: str | bytes | None) -> bool:
         """Take note if a message says that a frame was drawn; tell whether it was such a one."""
         raw = text.encode(errors="replace") if isinstance(text, str) else text or b""
-        if not raw.startswith(_SEEN) or len(raw) > 60:
-            return False
-        number = raw[len(_SEEN):-1]
-        if not (number.isdigit() and raw.endswith(b"}")):
-            return False
-        page.seen(int(number))
-        return True
+        if found := _SEEN.fullmatch(raw):
+            page.seen(int(found[1]))
+        return found is not None
 
     def frame(self, since: int) -> str:
         """Return what changed since a version; encoded once for all pages that are there."""
-        version = self._state.picture.version
-        if version != self._frames_version:
-            self._frames.clear()
-            self._frames_version = version
-        text = self._frames.get(since)
-        if text is None:
-            text = self._frames[since] = _encode({
-                "type": "state", "version": version, "time_s": round(self._now(), 3),
-                **self._state.picture.changes(since)})
-        return text
+        if since not in self._frames:
+            picture = self._state.picture
+            self._frames[since] = _encode({
+                "type": "state", "version": picture.version, "time_s": round(self._now(), 3),
+                **picture.changes(since)})
+        return self._frames[since]
 
     # -- when -----------------------------------------------------------------------------------
 
     def _changed(self, urgent: bool) -> None:
+        self._frames.clear()
         if not self._pages:
             return
         loop = asyncio.get_running_loop()

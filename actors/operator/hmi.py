@@ -7,7 +7,6 @@ is derived from it. What is shown is collected in `state`, the page is served by
 
 from __future__ import annotations
 
-import asyncio
 from typing import Any, ClassVar
 
 import msgspec
@@ -23,18 +22,13 @@ from rampart.actors.operator.camera_eye import CameraEye
 from rampart.actors.operator.feed import Feed
 from rampart.actors.operator.operating import Operating
 from rampart.actors.operator.processes import ProcessObserver
-from rampart.actors.operator.requests import (
-    REQUESTS,
-    RefusedError,
-    Request,
-    RequestReader,
-    ResetRequest,
-)
-from rampart.actors.operator.server import Handlers, PageServer, PortError, Visitor
+from rampart.actors.operator.requests import REQUESTS, RefusedError, Request, ResetRequest
+from rampart.actors.operator.server import Handlers, PageServer, PortError
 from rampart.actors.operator.state import HmiState
 from rampart.actors.operator.system import draw_system
 from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.web.access import AccessError
 from rampart.manager.spec.specification import SystemSpec, check_document
 
 REPEAT_S = 0.5
@@ -65,7 +59,6 @@ class Hmi(Actor):
         self._camera = self._make_camera()
         self._table: fm.NodeTable | None = None
         self._server: PageServer | None = None
-        self._starting: asyncio.Task[None] | None = None
         self._observer = ProcessObserver(plan.base_port, plan.launcher_pid)
         self._version = -1
         self._show_system(run.system, run.adapted.version if run.adapted else 0)
@@ -86,14 +79,14 @@ class Hmi(Actor):
         return {"type": "hello", "run_id": self.context.run.plan.run_id, "rate": self.clock.rate,
                 "camera": self._camera is not None}
 
-    def _fulfil(self, request: Request, visitor: Visitor) -> str | dict[str, Any]:
-        """Act on a request of a page and return what to tell it.
+    def _fulfil(self, request: Request, page: int) -> str | dict[str, Any]:
+        """Act on a request of a page, known by its number, and return what to tell it.
 
         Raises:
             RefusedError: it cannot be met; the text says why.
         """
         if not isinstance(request, ResetRequest):
-            return self._operating.fulfil(request, visitor.number)
+            return self._operating.fulfil(request, page)
         if request.recovery not in self._state.latched:
             waiting = ", ".join(self._state.latched) or "none"
             raise RefusedError(f"{request.recovery[:40]!r} does not wait for a reset; "
@@ -112,55 +105,38 @@ class Hmi(Actor):
         """Without a page, hear only what this node does without one."""
         return bool(self._port) or topic not in self.shown
 
-    @property
-    def page_port(self) -> int | None:
-        """Port on which the page is served, or None."""
-        return self._server.port if self._server else None
-
     def on_start(self) -> None:
         """Open the page's port; the robot drives without the page."""
         self._repeat()
         if not self._port:
             return
         self._operating.start()
-        plan = self.context.run.plan
+        plan, operating = self.context.run.plan, self._operating
         try:
             self._server = PageServer(
                 self._port, Feed(self._state, self.clock.now, self._hello, self._look),
-                Handlers(RequestReader(self.requests),
-                         lambda page: self._operating.introduction(page.number), self._fulfil,
-                         lambda page: self._operating.left(page.number)),
-                plan.hmi_host, plan.hmi_token,
-                camera=self._camera)
-        except PortError as error:
-            self.report_diagnostic("operator's page", str(error), f"port {self._port}")
-            return
-        self._starting = asyncio.get_running_loop().create_task(self._server.start())
-        self._starting.add_done_callback(self._page_started)
+                Handlers(self.requests, operating.introduction, self._fulfil, operating.left),
+                plan.hmi_host, plan.hmi_token, camera=self._camera)
+        except Exception as error:
+            known = isinstance(error, (AccessError, PortError))
+            why = str(error) if known else f"{type(error).__name__}: {error}"
+            self.report_diagnostic("operator's page", why, f"port {self._port}")
 
     def on_stop(self) -> None:
         """Close the page."""
         self._operating.stop()
         if self._camera is not None:
             self._camera.close()
-        if self._starting is not None:
-            self._starting.cancel()
         if self._server is not None:
             self._server.stop()
 
-    def _page_started(self, task: asyncio.Task[None]) -> None:
-        if not task.cancelled() and (error := task.exception()) is not None:
-            self._server = None
-            self.report_diagnostic("operator's page", f"{type(error).__name__}: {error}",
-                                   f"port {self._port}")
-
     def _look(self) -> None:
-        self._state.usage(self._observer.look(self._table))
+        self._state.picture.put("usage", self._observer.look(self._table), urgent=False)
 
     def _show_system(self, system: SystemSpec, version: int) -> None:
         if self._port and system is not NO_SYSTEM and version > self._version:
             self._version = version
-            self._state.system(draw_system(system))
+            self._state.picture.put("system", draw_system(system))
 
     # -- hearing --------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ with the number of messages that it changed. None at all is *no effect*, and is 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +19,11 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NamedFault
+from rampart.actors.layout.system_topics import declared_topics, find_topic, published_keys
+from rampart.actors.operator.requests import RefusedError
 from rampart.actors.runtime.fault_watch import FIRST_EFFECT_S, FaultWatch, Order
 from rampart.actors.runtime.injection import UNTOUCHED, flaw
+from rampart.manager.spec.schema import SystemSpec
 
 TAKE_HOLD_S = 3.0
 """Simulated seconds within which a publisher reports, even one that is being respawned."""
@@ -33,7 +36,7 @@ DELAY_S = 1.5
 
 OWN_DURATION_S = 10.0
 STAMP_S = 0.5
-"""Error of `restamp:TOPIC`: ahead, and more than anybody accepts."""
+"""Error of `restamp:TOPIC`: ahead, and more than any reader accepts."""
 
 MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp")
 """Modes that fit any topic; what to corrupt in a message is for the catalogue."""
@@ -41,10 +44,6 @@ MODES = ("drop", "freeze", "stuck", "delay", "duplicate", "restamp")
 MAX_WAITING = 16
 
 _KEPT = 20
-
-
-class FaultError(ValueError):
-    """A fault that cannot be injected; one line."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -78,7 +77,7 @@ class Injections:
     """The faults that were ordered from the page.
 
     Args:
-        prefix: of the ids; another one for each life of the HMI.
+        prefix: of the ids; another one for each incarnation of the HMI.
         catalogue: faults that have a name.
         places: keys of topics that can be disturbed.
         robots: topics of the robot, on one of which a fault of the catalogue may be ordered.
@@ -90,20 +89,16 @@ class Injections:
         self._prefix = prefix
         self._robots = {topic.key: topic for topic in robots}
         self._overhead_s = overhead_s
-        self._catalogue: Mapping[str, NamedFault] = {f.name: f for f in catalogue}
+        self._catalogue = {f.name: f for f in catalogue}
         self._places = tuple(places)
         self._count = 0
         self._ordered: list[Ordered] = []
 
     def choice(self) -> dict[str, Any]:
         """Return what can be injected, for the page."""
-        return {
-            "faults": [{"name": f.name, "title": f.title, "group": f.group,
-                        "duration_s": f.duration_s} for f in self._catalogue.values()],
-            "modes": list(MODES),
-            "topics": list(self._places),
-            "duration_s": OWN_DURATION_S,
-        }
+        return {"faults": [{"name": f.name, "title": f.title, "group": f.group,
+                            "duration_s": f.duration_s} for f in self._catalogue.values()],
+                "modes": MODES, "topics": self._places, "duration_s": OWN_DURATION_S}
 
     def view(self, now_s: float) -> list[dict[str, Any]]:
         """Return what was ordered, newest first, for the page."""
@@ -123,28 +118,27 @@ class Injections:
             now_s: now, simulated seconds.
 
         Raises:
-            FaultError: there is none of this name, or too many wait.
+            RefusedError: there is none of this name, or too many wait.
         """
         if sum(not o.outcome for o in self._ordered) >= MAX_WAITING:
-            raise FaultError(f"{MAX_WAITING} faults are under way; wait for one to end")
+            raise RefusedError(f"{MAX_WAITING} faults are under way; wait for one to end")
         self._count += 1
         name = f"{self._prefix}.{self._count}"
         orders, own_s = self._find(fault, name)
         lasts_s = own_s if duration_s is None else duration_s
-        ordered = Ordered(
-            tuple(o.with_(duration_s=lasts_s) for o in orders), injection=name, fault=fault,
-            begins_s=now_s + delay_s, duration_s=lasts_s)
+        ordered = Ordered([o.with_(duration_s=lasts_s) for o in orders], injection=name,
+                          fault=fault, begins_s=now_s + delay_s, duration_s=lasts_s)
         self._ordered.append(ordered)
         ended = [o for o in self._ordered if o.outcome]
         for old in ended[:max(0, len(self._ordered) - _KEPT)]:
             self._ordered.remove(old)
         return ordered
 
-    def end(self, injection: str, now_s: float) -> tuple[Order, ...]:
+    def end(self, injection: str, now_s: float) -> Sequence[Order]:
         """End a fault now: return the orders that do it.
 
         Raises:
-            FaultError: there is no such fault under way.
+            RefusedError: there is no such fault under way.
         """
         for ordered in self._ordered:
             if ordered.injection == injection and not ordered.outcome:
@@ -152,31 +146,28 @@ class Injections:
                     ordered.outcome = "withdrawn before it took hold"
                 ordered.ending = True
                 ordered.duration_s = max(now_s - ordered.begins_s, 0.0)
-                over = tuple(o.with_(duration_s=0.0) for o in ordered.orders)
-                ordered.orders = over
-                return over
-        raise FaultError(f"no fault {injection[:60]!r} is under way")
+                ordered.orders = [o.with_(duration_s=0.0) for o in ordered.orders]
+                return ordered.orders
+        raise RefusedError(f"no fault {injection[:60]!r} is under way")
 
-    def _find(self, fault: str, injection: str
-              ) -> tuple[tuple[Order, ...], float]:
-        named = self._catalogue.get(fault)
-        if named is not None:
-            return tuple(o.with_(injection=f"{injection}.{i}")
-                         for i, o in enumerate(self._orders(named), start=1)), named.duration_s
+    def _find(self, fault: str, injection: str) -> tuple[list[Order], float]:
+        if named := self._catalogue.get(fault):
+            return [o.with_(injection=f"{injection}.{i}")
+                    for i, o in enumerate(self._orders(named), start=1)], named.duration_s
         mode, colon, key = fault.partition(":")
         if not colon:
-            raise FaultError(f"no fault {fault[:60]!r}; choose one of the list, or MODE:TOPIC")
+            raise RefusedError(f"no fault {fault[:60]!r}; choose one of the list, or MODE:TOPIC")
         if mode not in MODES:
-            raise FaultError(f"mode {mode[:40]!r}: must be one of {', '.join(MODES)}")
+            raise RefusedError(f"mode {mode[:40]!r}: must be one of {', '.join(MODES)}")
         if key not in self._places:
-            raise FaultError(f"topic {key[:60]!r}: this system has none of that key that can be "
-                             "disturbed")
+            raise RefusedError(f"topic {key[:60]!r}: this system has none of that key that can be "
+                               "disturbed")
         order = bm.Injection(f"{injection}.1", key, mode, OWN_DURATION_S,
-                            delay_s=DELAY_S if mode == "delay" else 0.0,
-                            stamp_s=STAMP_S if mode == "restamp" else 0.0)
+                             delay_s=DELAY_S if mode == "delay" else 0.0,
+                             stamp_s=STAMP_S if mode == "restamp" else 0.0)
         if reason := flaw(order):
-            raise FaultError(reason)
-        return (Order(bus_topics.INJECTION_REQUEST, order),), OWN_DURATION_S
+            raise RefusedError(reason)
+        return [Order(bus_topics.INJECTION_REQUEST, order)], OWN_DURATION_S
 
     def _orders(self, named: NamedFault) -> Iterator[Order]:
         for injection in named.injections:
@@ -188,7 +179,7 @@ class Injections:
     # -- the run --------------------------------------------------------------------------------
 
     def due(self, now_s: float) -> list[Order]:
-        """Return the orders to send now, first or again: those that nobody has answered."""
+        """Return the orders to send now, first or again: those without an answer."""
         begun = [o for o in self._ordered if not o.outcome and now_s >= o.begins_s]
         for ordered in begun:
             ordered.sent = True
@@ -217,8 +208,7 @@ class Injections:
                 where = ", ".join(x.place for x in o.unanswered)
                 o.reason = f"nobody that publishes {where} answers"
                 told.append(self._conclude(o))
-            elif (math.isfinite(o.duration_s)
-                  and now_s > o.begins_s + o.duration_s + LATE_END_S):
+            elif now_s > o.begins_s + o.duration_s + LATE_END_S:  # never of one that is permanent
                 o.reason = "its publisher did not report the end, it was restarted"
                 told.append(self._conclude(o))
             elif (math.isinf(o.duration_s) and o.effective is None
@@ -240,30 +230,20 @@ class Injections:
         return f"fault {o.fault}: {o.outcome}"
 
 
-def places(all_topics: Iterable[Topic[Any]], nodes: Iterable[str], detections: Iterable[str],
-           recoveries: Iterable[str]) -> tuple[str, ...]:
-    """Return the keys of topics that can be disturbed, families spelt out.
+def places_of(system: SystemSpec) -> tuple[str, ...]:
+    """Return the keys of topics that can be disturbed: the common ones, then the robot's own.
 
-    Left out are the judge's (`world/`), those of the injections, and greetings and error reports.
-
-    Args:
-        all_topics: declared topics.
-        nodes: names of all nodes.
-        detections: names of detection modules.
-        recoveries: names of recovery modules.
+    Families are spelt out. Left out are the judge's (`world/`), those of the injections, and
+    greetings and error reports.
     """
-    members: Mapping[str, Iterable[str]] = {
+    known = declared_topics(system)
+    nodes, detections, recoveries = (
+        [one.name for one in part] for part in (system.nodes, system.detections, system.recoveries))
+    members = {
         bus_topics.HEARTBEAT.key: [*nodes, *detections, *recoveries],
         topics.DETECTION.key: detections,
-        topics.RECOVERY.key: recoveries,
-        topics.RECOVERY_COMMAND.key: recoveries,
-    }
-    found = []
-    for topic in all_topics:
-        if topic.key.startswith(("world/", "stub/")) or topic.key in UNTOUCHED:
-            continue
-        if topic.is_family:
-            found += [topic.key.replace("{name}", n) for n in members.get(topic.key, ())]
-        else:
-            found.append(topic.key)
-    return tuple(found)
+        topics.RECOVERY.key: recoveries, topics.RECOVERY_COMMAND.key: recoveries}
+    common = [topic.key.replace("{name}", name) for topic in known
+              if not topic.key.startswith(("world/", "stub/")) and topic.key not in UNTOUCHED
+              for name in (members.get(topic.key, ()) if topic.is_family else ("",))]
+    return (*common, *(key for key in published_keys(system) if find_topic(key, known) is None))

@@ -1,7 +1,7 @@
 """How many messages a page may send: a bucket that fills with time. Pure.
 
-A page that drives and draws sends some 45 messages a second. Whoever sends far more is not a
-person: it is told once, what is too much is dropped unread, and if it goes on it is closed.
+A page that drives and draws sends some 45 messages a second. One that sends far more is not used by
+a person: it is told once, what is too much is dropped unread, and if it goes on it is closed.
 """
 
 from __future__ import annotations

@@ -8,24 +8,17 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.layout.system_topics import declared_topics, find_topic, published_keys
+from rampart.actors.operator import requests
 from rampart.actors.operator.adaptation import StrategyChoice
-from rampart.actors.operator.injection import FaultError, Injections, places
-from rampart.actors.operator.requests import (
-    EndFaultRequest,
-    InjectRequest,
-    RefusedError,
-    Request,
-    SignalRequest,
-    StrategyRequest,
-)
+from rampart.actors.operator.injection import Injections, places_of
+from rampart.actors.operator.requests import RefusedError, Request
 from rampart.actors.supervision.kill_node import SIGNALS, SignalError, signal_node
-from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
 
 if TYPE_CHECKING:
@@ -37,7 +30,7 @@ OVERHEAD_S = 1.0
 """Real seconds granted for what does not run in simulated time: sockets, scheduling, a respawn."""
 
 OWN_DEATH_S = 0.2
-"""Real seconds between the answer to whoever kills the page's node itself, and its death."""
+"""Real seconds between the answer to a page that has its own node killed, and that node's death."""
 
 
 class Operating:
@@ -72,9 +65,8 @@ class Operating:
 
     def introduction(self, page: int) -> dict[str, Any]:
         """Return what a page needs to know to offer all this."""
-        return {"type": "operating", "page": page, "strategies": list(self._choice.strategies),
-                "signals": list(SIGNALS) if self._has_processes else [],
-                **self._injections.choice()}
+        return {"type": "operating", "page": page, "strategies": self._choice.strategies,
+                "signals": [*SIGNALS] if self._has_processes else [], **self._injections.choice()}
 
     def fulfil(self, request: Request, page: int) -> str | dict[str, Any]:
         """Act on a request of a page and return what to tell it.
@@ -84,21 +76,20 @@ class Operating:
         """
         try:
             match request:
-                case StrategyRequest():
+                case requests.StrategyRequest():
                     self._actor.publish(ftm_topics.ADAPT, self._choice.ask(
                         request.name, self._strategy, self._now()))
                     told = f"strategy {request.name} asked for"
-                case SignalRequest():
+                case requests.SignalRequest():
                     told = self._send_signal(request, page)
-                case InjectRequest():
+                case requests.InjectRequest():
                     told = self._inject(request)
-                case EndFaultRequest():
-                    for order in self._injections.end(request.injection, self._now()):
-                        self._order(order)
+                case requests.EndFaultRequest():
+                    self._order(self._injections.end(request.injection, self._now()))
                     told = "end of the fault asked for"
                 case _:
                     raise RefusedError("this page does not offer that")
-        except (FaultError, SignalError) as error:
+        except SignalError as error:
             raise RefusedError(str(error)) from None
         self.show()
         return told
@@ -106,13 +97,13 @@ class Operating:
     def left(self, page: int) -> None:
         """Take note that a page was closed."""
 
-    def _send_signal(self, request: SignalRequest, page: int) -> str:
+    def _send_signal(self, request: requests.SignalRequest, page: int) -> str:
         if not self._has_processes:
             raise SignalError("the nodes of this run have no processes that could be signalled")
         node, name, port = request.node, request.signal, self._actor.context.run.plan.base_port
         if name not in SIGNALS:
             raise SignalError(f"unknown signal {name[:20]!r}; known: {', '.join(SIGNALS)}")
-        if node == self._actor.name:  # whoever asked is to be told first
+        if node == self._actor.name:  # the page that asked is to be told first
             asyncio.get_running_loop().call_later(
                 OWN_DEATH_S, lambda: signal_node(node, name, port))
             told = f"{node}: {name}; the page will be back"
@@ -122,21 +113,18 @@ class Operating:
         self._state.log(self._now(), "note", f"page {page} sent {told}")
         return told
 
-    def _inject(self, request: InjectRequest) -> str:
+    def _inject(self, request: requests.InjectRequest) -> str:
         lasts_s = math.inf if request.permanent else request.duration_s
         ordered = self._injections.order(request.fault, request.delay_s, lasts_s, self._now())
-        self._send_due()
+        self._order(self._injections.due(self._now()))
         when = f" in {request.delay_s:g} s" if request.delay_s else ""
         lasts = ("until its process ends" if math.isinf(ordered.duration_s)
                  else f"for {ordered.duration_s:g} s")
         return f"fault {request.fault} asked for{when}, {lasts}"
 
-    def _send_due(self) -> None:
-        for order in self._injections.due(self._now()):
-            self._order(order)
-
-    def _order(self, order: Order) -> None:
-        self._actor.publish(order.topic, order.message)
+    def _order(self, orders: Sequence[Order]) -> None:
+        for order in orders:
+            self._actor.publish(order.topic, order.message)
 
     # -- what it hears --------------------------------------------------------------------------
 
@@ -148,7 +136,7 @@ class Operating:
             self._actor.publish(ftm_topics.ADAPT, self._choice.pending)
         for told in self._injections.expire(now):
             self._announce(told)
-        self._send_due()
+        self._order(self._injections.due(now))
         self.show()
 
     def answered(self, message: fm.AdaptationAnswer) -> None:
@@ -190,12 +178,3 @@ class Operating:
 
     def _now(self) -> float:
         return self._actor.clock.now()
-
-
-def places_of(system: SystemSpec) -> tuple[str, ...]:
-    """Return the keys at which the page offers to inject: the common ones, then the robot's own."""
-    known = declared_topics(system)
-    common = places(known, [n.name for n in system.nodes],
-                    [d.name for d in system.detections], [r.name for r in system.recoveries])
-    own = [key for key in published_keys(system) if find_topic(key, known) is None]
-    return (*common, *own)

@@ -2,7 +2,7 @@
 
 Each change of anything gives the picture a new version. A page that has seen version *v* is sent
 the sections that changed since, and of a journal the lines that were added since; one that has
-seen nothing (version 0) is sent all. So nobody has to remember what a page missed: a page that
+seen nothing (version 0) is sent all. So what a page missed need not be remembered: a page that
 was suspended, or could not keep up, gets the newest of everything and no backlog.
 
 A section is turned into JSON when it is sent for the first time, and that once for all pages; then
@@ -28,11 +28,10 @@ _JSON = msgspec.json.Encoder()
 class Section:
     """The latest value of something, and the version in which it became so."""
 
-    __slots__ = (
-        "_bounds", "_encoded", "_show", "_shown_version", "left_out", "value", "version")
+    __slots__ = ("_bounds", "_encoded", "_show", "_shown_version", "left_out", "value", "version")
 
-    def __init__(self, show: Callable[[Any], Any], bounds: Bounds = SHOWN) -> None:
-        self.value: Any = None
+    def __init__(self, value: Any, show: Callable[[Any], Any], bounds: Bounds) -> None:
+        self.value = value
         self.version = 0
         self.left_out = 0
         self._show = show
@@ -40,14 +39,10 @@ class Section:
         self._encoded = msgspec.Raw(b"null")
         self._shown_version = -1
 
-    def shown(self) -> Any:
-        """Return the value as pages see it, before it is JSON."""
-        return self._show(self.value)
-
-    def encoded(self) -> msgspec.Raw:
-        """Return it as JSON; encoded anew only if it has changed."""
+    def since(self, _version: int) -> msgspec.Raw:
+        """Return the whole value as JSON; encoded anew only if it has changed."""
         if self._shown_version != self.version:
-            shown, self.left_out = self._bounds.fit(self.shown())
+            shown, self.left_out = self._bounds.fit(self._show(self.value))
             self._encoded = msgspec.Raw(_JSON.encode(shown))
             self._shown_version = self.version
         return self._encoded
@@ -59,27 +54,22 @@ class Journal:
     __slots__ = ("_bytes", "_lines", "version")
 
     def __init__(self) -> None:
-        self._lines: deque[tuple[int, Any, bytes]] = deque()
+        self._lines: deque[tuple[int, bytes]] = deque()
         self._bytes = 0
         self.version = 0
 
     def add(self, line: Any, version: int) -> None:
         """Add a line, cut to its bounds; the oldest are dropped that there is no room for."""
-        shown, _ = LINE.fit(line)
-        encoded = _JSON.encode(shown)
-        self._lines.append((version, shown, encoded))
+        encoded = _JSON.encode(LINE.fit(line)[0])
+        self._lines.append((version, encoded))
         self._bytes += len(encoded)
         while len(self._lines) > JOURNAL_LINES or self._bytes > JOURNAL_BYTES:
-            self._bytes -= len(self._lines.popleft()[2])
+            self._bytes -= len(self._lines.popleft()[1])
         self.version = version
 
-    def lines(self) -> list[Any]:
-        """Return all lines, the oldest first."""
-        return [line for _, line, _ in self._lines]
-
     def since(self, version: int) -> list[msgspec.Raw]:
-        """Return, as JSON, the lines that were added after a version."""
-        return [msgspec.Raw(encoded) for added, _, encoded in self._lines if added > version]
+        """Return, as JSON, the lines that were added after a version, the oldest first."""
+        return [msgspec.Raw(encoded) for added, encoded in self._lines if added > version]
 
 
 class Table:
@@ -137,8 +127,7 @@ class Picture:
     def section(self, name: str, value: Any = None, show: Callable[[Any], Any] = lambda v: v,
                 bounds: Bounds = SHOWN) -> None:
         """Declare a section, its first value, how to show a value and how much of it."""
-        self._sections[name] = made = Section(show, bounds)
-        made.value = value
+        self._sections[name] = Section(value, show, bounds)
 
     def table(self, name: str, rows: int) -> None:
         """Declare a table of so many rows at most."""
@@ -177,27 +166,15 @@ class Picture:
         self._journals[name].add(line, self.version)
         self.on_change(True)
 
-    def all(self) -> dict[str, Any]:
-        """Return everything as it is shown."""
-        return {**{name: section.shown() for name, section in self._sections.items()},
-                **{name: table.rows() for name, table in self._tables.items()},
-                **{name: journal.lines() for name, journal in self._journals.items()}}
-
     def changes(self, since: int) -> dict[str, Any]:
         """Return what changed after a version, each value as JSON already; since 0, everything.
 
         If that has changed as well, `left_out` says of which sections how many entries are missing.
         """
-        whole = since == 0
-        changed: dict[str, Any] = {
-            name: section.encoded() for name, section in self._sections.items()
-            if whole or section.version > since}
-        for name, table in self._tables.items():
-            if whole or table.version > since:
-                changed[name] = table.since(since)
-        for name, journal in self._journals.items():
-            if whole or journal.version > since:
-                changed[name] = journal.since(since)
+        parts: dict[str, Section | Table | Journal] = {
+            **self._sections, **self._tables, **self._journals}
+        changed: dict[str, Any] = {name: part.since(since) for name, part in parts.items()
+                                   if since == 0 or part.version > since}
         left_out = {n: section.left_out for n, section in self._sections.items()
                     if section.left_out}
         if left_out != self._left_out:  # known only now that the sections are encoded

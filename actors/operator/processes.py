@@ -36,11 +36,9 @@ class ProcessObserver:
         state: the kernel's state letter of a process, "X" if there is none.
     """
 
-    def __init__(
-        self, port: int, launcher: int, meter: UsageMeter | None = None,
-        find: Callable[[int], Sequence[RunProcess]] = find_processes,
-        state: Callable[[int], str] = process_state,
-    ) -> None:
+    def __init__(self, port: int, launcher: int, meter: UsageMeter | None = None,
+                 find: Callable[[int], Sequence[RunProcess]] = find_processes,
+                 state: Callable[[int], str] = process_state) -> None:
         self._port = port
         self._launcher = launcher
         self._meter = meter or UsageMeter()
@@ -60,21 +58,20 @@ class ProcessObserver:
         nodes = table.nodes[:MAX_NODES] if table else ()
         known = {node.name for node in nodes}
         if self._port and self._looks % SEARCH_EVERY == 0:
+            found = self._find(self._port) if nodes else ()
             self._guards = {
-                "+".join(p.names): (p.pid, p.incarnation) for p in self._find(self._port)
-                if p.launcher == self._launcher and known.isdisjoint(p.names)
-            } if nodes else {}
+                "+".join(p.names): (p.pid, p.incarnation) for p in found
+                if p.launcher == self._launcher and known.isdisjoint(p.names)}
             self._guards |= {LAUNCHER: (self._launcher, 1)} if self._launcher else {}
-        # Until there is a table nobody knows who is a guard: search again at the next look.
+        # Without a table it is not known which are guards: search again at the next look.
         self._looks = self._looks + 1 if nodes else 0
         pids = {node.name: node.pid for node in nodes} | {
             name: pid for name, (pid, _) in self._guards.items()}
         usage = self._meter.look(set(pids.values()))
         return {"nodes": figures(pids, usage), "guards": [
-            {"name": name, "kind": GUARD_KIND, "pid": pid,
+            {"name": name, "kind": GUARD_KIND, "pid": pid, "incarnation": incarnation,
              "state": _STATES.get(self._state(pid), "running"),
-             "incarnation": incarnation, "restarts": max(0, incarnation - 1),
-             "signals": name != LAUNCHER}
+             "restarts": max(0, incarnation - 1), "signals": name != LAUNCHER}
             for name, (pid, incarnation) in sorted(self._guards.items())]}
 
 

@@ -80,8 +80,9 @@ class RequestReader:
         kinds: of requests that there are.
     """
 
-    def __init__(self, kinds: Sequence[type[Request]] = REQUESTS) -> None:
-        self._decoder = msgspec.json.Decoder(Union[tuple(kinds)])  # noqa: UP007 known at run time
+    def __init__(self, kinds: Sequence[type[Request]]) -> None:
+        self._decoder: msgspec.json.Decoder[Request] = msgspec.json.Decoder(
+            Union[tuple(kinds)])  # noqa: UP007 known at run time
 
     def read(self, text: str | bytes | None) -> Request:
         """Decode a message of a page.
@@ -90,14 +91,13 @@ class RequestReader:
             RequestError: it is none.
         """
         try:
-            request: Request = self._decoder.decode(text or b"")
+            return self._decoder.decode(text or b"")
         except UNREADABLE as error:
             raise RequestError(f"message not understood: {error}") from None
-        return request
 
 
 class Pending(Generic[R]):
-    """The one message of a kind that is sent again and again until somebody answers.
+    """The one message of a kind that is sent again and again until it is answered.
 
     Args:
         prefix: of the messages' ids; another one for each incarnation of the node.
@@ -140,7 +140,7 @@ class Pending(Generic[R]):
         return self.name
 
     def expire(self, now_s: float) -> str:
-        """Withdraw a message that nobody answers, and return what to tell; "" if none."""
+        """Withdraw a message that stays without an answer, and return what to tell; "" if none."""
         if self.pending is None or now_s < self._give_up_s:
             return ""
         return f"{self.settle()} {self._unanswered}"

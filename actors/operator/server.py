@@ -13,8 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Callable, Coroutine
-from dataclasses import dataclass
+from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +31,9 @@ from rampart.actors.operator.camera_eye import CameraError, CameraEye
 from rampart.actors.operator.feed import SEND_TIMEOUT_S, Feed, PageFeed
 from rampart.actors.operator.limits import MessageBudget, Verdict
 from rampart.actors.operator.requests import RefusedError, Request, RequestError, RequestReader
-from rampart.actors.web.access import SUBPROTOCOL, Access, AccessError, is_loopback, shown_token
+from rampart.actors.web.access import SUBPROTOCOL, Access, is_loopback, shown_token
 from rampart.actors.web.server import WebServer, is_known, served
 
-LOOPBACK = "127.0.0.1"
 NO_TOKEN = 4401
 """Close code of a WebSocket without the token; its page asks for it."""
 
@@ -45,22 +43,10 @@ CLOSE_TIMEOUT_S = 1.0
 """Real seconds for a goodbye to get into the socket."""
 
 _PAGE = Path(__file__).with_name("page")
-_FILES = {
-    "/": ("index.html", "text/html"),
-    "/style.css": ("style.css", "text/css"),
-    "/map.js": ("map.js", "text/javascript"),
-    "/tree.js": ("tree.js", "text/javascript"),
-    "/nodes.js": ("nodes.js", "text/javascript"),
-    "/log.js": ("log.js", "text/javascript"),
-    "/camera.js": ("camera.js", "text/javascript"),
-    "/dom.js": ("dom.js", "text/javascript"),
-    "/drive.js": ("drive.js", "text/javascript"),
-    "/faults.js": ("faults.js", "text/javascript"),
-    "/access.js": ("access.js", "text/javascript"),
-    "/operate.js": ("operate.js", "text/javascript"),
-    "/operate.css": ("operate.css", "text/css"),
-    "/app.js": ("app.js", "text/javascript"),
-}
+_TYPES = {".css": "text/css", ".js": "text/javascript"}
+_FILES = {"/": ("index.html", "text/html")} | {
+    f"/{file.name}": (file.name, _TYPES[file.suffix])
+    for file in sorted(_PAGE.iterdir()) if file.suffix in _TYPES}
 _CAMERA = "/camera.jpg"
 _REFUSAL = ("This page is for the user who runs the robot; you are another one of this machine. "
             "With a token others get in too: launch.py --hmi-token-file FILE.")
@@ -70,96 +56,75 @@ _HEADERS = {
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
         "img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; "
         "require-trusted-types-for 'script'; trusted-types 'none'"),  # no text becomes HTML
-    "x-content-type-options": "nosniff",
-    "referrer-policy": "no-referrer",
-}
+    "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
+
 
 class PortError(OSError):
     """The page's port cannot be bound."""
 
 
-@dataclass(frozen=True, slots=True)
-class Visitor:
-    """An open page: its number in this incarnation of the node."""
-
-    number: int
-
-
-@dataclass(frozen=True, slots=True)
-class Handlers:
-    """Who deals with the pages.
+class Handlers(msgspec.Struct, frozen=True):
+    """What deals with the pages. A page is known by its number in this incarnation of the node.
 
     Attributes:
-        reader: of what pages ask for.
+        requests: what pages may ask for.
         came: returns what a new page is told first.
         fulfil: acts on a page's request and returns what to tell it; raises RefusedError.
         left: hears of a page that was closed.
     """
 
-    reader: RequestReader
-    came: Callable[[Visitor], dict[str, Any]]
-    fulfil: Callable[[Request, Visitor], str | dict[str, Any]]
-    left: Callable[[Visitor], None]
+    requests: Sequence[type[Request]]
+    came: Callable[[int], dict[str, Any]]
+    fulfil: Callable[[Request, int], str | dict[str, Any]]
+    left: Callable[[int], None]
 
 
 class PageServer:
-    """Serves the operator's page.
+    """Serves the operator's page, from when it is made, on the running loop.
 
     Args:
         port: TCP port; 0 lets the system choose one.
         feed: what pages are shown.
-        handlers: who deals with the pages.
+        handlers: what deals with the pages.
         host: address to bind to.
         token: what everybody has to show; "" for nothing, on loopback only.
         camera: where pictures come from, or None.
 
     Raises:
-        PortError: the address cannot be bound, or must not without a token.
+        PortError: the address cannot be bound.
+        AccessError: it must not without a token.
     """
 
-    def __init__(
-        self, port: int, feed: Feed, handlers: Handlers, host: str = LOOPBACK, token: str = "",
-        *, camera: CameraEye | None = None,
-    ) -> None:
+    def __init__(self, port: int, feed: Feed, handlers: Handlers, host: str, token: str, *,
+                 camera: CameraEye | None) -> None:
         self._feed = feed
         self._camera = camera
         self._handlers = handlers
-        self._visitors = 0
-        try:
-            Access(host, port, token)  # refused before anything is bound
-        except AccessError as error:
-            raise PortError(str(error)) from None
-        self._socket = _listen(host, port)
-        self.port: int = self._socket.getsockname()[1]
+        self._reader = RequestReader(handlers.requests)
+        self._count = 0
+        Access(host, port, token)  # refused before anything is bound
+        listening = _listen(host, port)
+        self.port: int = listening.getsockname()[1]
         names = () if is_loopback(host) else (socket.gethostname(),)
         self._access = Access(host, self.port, token, names)
         self.pages = 0
-        self._server: WebServer | None = None
-
-    async def start(self) -> None:
-        """Begin to serve; to be awaited on the actor's loop."""
         files = {path: (_PAGE / name).read_bytes() for path, (name, _) in _FILES.items()}
 
         async def file(request: HttpRequest) -> Response:
             path = request.url.path
             return Response(files[path], media_type=_FILES[path][1], headers=_HEADERS)
 
-        app = Starlette(
-            routes=[*(Route(path, file) for path in _FILES), Route(_CAMERA, self._picture),
-                    WebSocketRoute("/ws", self._page)],
-            middleware=[Middleware(_Door, access=self._access)],
-        )
+        routes = [*(Route(path, file) for path in _FILES), Route(_CAMERA, self._picture),
+                  WebSocketRoute("/ws", self._page)]
         self._server = WebServer(
-            app, self._socket, refusal="" if self._access.token else _REFUSAL,
-            known=not self._access.token, ws_max_size=MAX_MESSAGE_BYTES)
-        await self._server.start()
+            Starlette(routes=routes, middleware=[Middleware(_Door, access=self._access)]),
+            listening, refusal="" if token else _REFUSAL, known=not token,
+            ws_max_size=MAX_MESSAGE_BYTES)
+        self._server.start()
 
     def stop(self) -> None:
-        """Stop listening and say goodbye to the pages; harmless when not started."""
-        if self._server is None:
-            self._socket.close()
-        else:
-            self._server.stop()
+        """Stop listening and say goodbye to the pages."""
+        self._server.stop()
 
     async def _picture(self, request: HttpRequest) -> Response:
         if request.headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}:
@@ -183,20 +148,18 @@ class PageServer:
             await socket_.close(1013, f"more than {MAX_PAGES} pages")
             return
         self.pages += 1
-        self._visitors += 1
-        visitor = Visitor(self._visitors)
+        self._count = number = self._count + 1
         try:
             with served(socket_.scope), self._feed.page() as page:
-                await _send(socket_, self._handlers.came(visitor))
-                await _until_one_ends(self._talk(socket_, page, visitor),
-                                      self._push(socket_, page))
+                await _send(socket_, self._handlers.came(number))
+                await _until_one_ends(self._talk(socket_, page, number), self._push(socket_, page))
         except (WebSocketDisconnect, RuntimeError, TimeoutError):
             return  # the page has gone while it was being answered
         finally:
             self.pages -= 1
-            self._handlers.left(visitor)
+            self._handlers.left(number)
 
-    async def _talk(self, socket_: WebSocket, page: PageFeed, visitor: Visitor) -> None:
+    async def _talk(self, socket_: WebSocket, page: PageFeed, number: int) -> None:
         loop = asyncio.get_running_loop()
         budget = MessageBudget(loop.time())
         while True:
@@ -207,7 +170,7 @@ class PageServer:
             text = message.get("text") or message.get("bytes")
             if verdict is Verdict.READ:
                 if not self._feed.heard(page, text):
-                    await _send(socket_, self._answer(text, visitor))
+                    await _send(socket_, self._answer(text, number))
             elif verdict is Verdict.TELL:
                 await _send(socket_, {"type": "error", "text": "too many messages from this page; "
                                       "those beyond the limit are not read"})
@@ -222,16 +185,16 @@ class PageServer:
             except TimeoutError:
                 await _close(socket_, 1013, "this page does not keep up")
 
-    def _answer(self, text: str | bytes | None, visitor: Visitor) -> dict[str, Any]:
+    def _answer(self, text: str | bytes | None, number: int) -> dict[str, Any]:
         try:
-            told = self._handlers.fulfil(self._handlers.reader.read(text), visitor)
+            told = self._handlers.fulfil(self._reader.read(text), number)
         except (RequestError, RefusedError) as error:
             return {"type": "error", "text": str(error)}
         return {"type": "done", "text": told} if isinstance(told, str) else told
 
 
 class _Door:
-    """Turns away whoever is not meant, before anything else is done."""
+    """Turns away foreign hosts and origins, and requests without the token, before all else."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
@@ -278,7 +241,7 @@ async def _until_one_ends(*parts: Coroutine[Any, Any, None]) -> None:
 
 
 async def _close(socket_: WebSocket, code: int, reason: str) -> None:
-    """Say goodbye; whoever takes nothing does not hear it."""
+    """Say goodbye; a page that takes nothing does not hear it."""
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(socket_.close(code, reason), CLOSE_TIMEOUT_S)
 

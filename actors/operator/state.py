@@ -6,7 +6,7 @@ nothing, and nothing is turned into JSON unless somebody looks (`picture`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -93,19 +93,13 @@ class HmiState:
 
     def decision(self, record: fm.DecisionRecord, now_s: float) -> None:
         """Add a decision of the manager to the decision log."""
+        r = record
         self.picture.add("decisions", {
-            "t": round(now_s, 2),
-            "number": record.decision,
-            "active": record.active,
-            "block": record.rule,
-            "strategy": record.strategy,
-            "recoveries": record.recoveries,
-            "words": decision_in_words(
-                record.active, record.rule, record.recoveries, record.strategy),
-            "rule": f"{record.rule} of {record.strategy}",
-            "path": record.path,
-            "rejected": [f"{name}: {why}" for name, why in record.rejected],
-        })
+            "t": round(now_s, 2), "number": r.decision, "active": r.active, "block": r.rule,
+            "strategy": r.strategy, "recoveries": r.recoveries, "path": r.path,
+            "words": decision_in_words(r.active, r.rule, r.recoveries, r.strategy),
+            "rule": f"{r.rule} of {r.strategy}",
+            "rejected": [f"{name}: {why}" for name, why in r.rejected]})
 
     def process_event(self, event: fm.ProcessEvent, now_s: float) -> None:
         """Log what happened to a process; that all start at the start is no news."""
@@ -132,14 +126,6 @@ class HmiState:
         """Add a line to the event log; `kind` is fault, clear or note."""
         self.picture.add("events", {"t": round(now_s, 2), "kind": kind, "text": clip(text)})
 
-    def system(self, drawing: Mapping[str, Any] | None) -> None:
-        """Keep the drawing of the system's fault tree and order (`system`)."""
-        self.picture.put("system", drawing)
-
-    def usage(self, usage: Mapping[str, Any]) -> None:
-        """Keep what the processes use."""
-        self.picture.put("usage", usage, urgent=False)
-
     # -- showing --------------------------------------------------------------------------------
 
     @property
@@ -158,13 +144,6 @@ class HmiState:
             if name == "manager":
                 self._show_detections(True)
 
-    def snapshot(self, now_s: float) -> dict[str, Any]:
-        """Return everything the page shows, ready for JSON; times in simulated seconds."""
-        self.grow_old(now_s)
-        return {"type": "state", "time_s": round(now_s, 2), **self.picture.all()}
-
     def _show_detections(self, stale: bool) -> None:
-        self.picture.put("detections", [
-            {"name": name, "active": view.active, "reason": view.reason, "nodes": view.nodes,
-             "stale": stale}
-            for name, view in self._detections.items()])
+        self.picture.put("detections", [{**msgspec.structs.asdict(view), "stale": stale}
+                                        for view in self._detections.values()])

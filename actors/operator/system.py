@@ -8,7 +8,6 @@ is in the manager's status; the drawing changes only when the system is adapted.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -18,7 +17,7 @@ from rampart.manager.drawing.placing import place
 from rampart.manager.spec.schema import SystemSpec
 
 MAX_BOXES = 300
-"""A larger tree is not drawn: nobody could read it, and the layout would keep the node busy."""
+"""A larger tree is not drawn: it could not be read, and the layout would keep the node busy."""
 
 LETTERS = 23
 """In a line of a box."""
@@ -87,14 +86,10 @@ def draw_system(spec: SystemSpec) -> dict[str, Any]:
     note = ""
     if len(tree.boxes) > MAX_BOXES:
         note = f"The fault tree has {len(tree.boxes)} events; up to {MAX_BOXES} are drawn."
-    return {
-        "title": spec.title or spec.name,
-        "strategy": spec.strategy,
-        "criteria": spec.criteria,
-        "note": note,
-        "tree": _fault_tree(spec, tree) if 0 < len(tree.boxes) <= MAX_BOXES else None,
-        "order": _order(ranks) if 0 < len(ranks.boxes) <= MAX_BOXES else None,
-    }
+    return {"title": spec.title or spec.name, "strategy": spec.strategy, "criteria": spec.criteria,
+            "note": note,
+            "tree": _fault_tree(spec, tree) if 0 < len(tree.boxes) <= MAX_BOXES else None,
+            "order": _order(ranks) if 0 < len(ranks.boxes) <= MAX_BOXES else None}
 
 
 def _fault_tree(spec: SystemSpec, diagram: Diagram) -> Drawing:
@@ -114,11 +109,12 @@ def _fault_tree(spec: SystemSpec, diagram: Diagram) -> Drawing:
     for box in diagram.boxes:
         at = placing.places[box.name]
         mechanism = mechanisms.get(box.mechanism)
+        qualifier = "&" if box.gate == "and" else f"≥{box.required}" if box.gate else ""
         boxes.append(Shape(
             box.name, box.title or box.name, texts[box.name], at.top + stem, at.left, BOX_WIDTH,
-            tall[box.name], _qualifier(box.gate, box.required), box.mechanism, box.detect,
-            box.recover, mechanism.detections if mechanism else (),
-            mechanism.recoveries if mechanism else (), _way(box.name, above, barriers)))
+            tall[box.name], qualifier, box.mechanism, box.detect, box.recover,
+            mechanism.detections if mechanism else (), mechanism.recoveries if mechanism else (),
+            _way(box.name, above, barriers)))
     lines = tuple(Line(upper, lower, tuple((y, x) for x, y in points))
                   for (upper, lower), points in zip(diagram.edges, placing.lines, strict=True))
     return Drawing(diagram.title, placing.height, placing.width, tuple(boxes), lines,
@@ -130,19 +126,12 @@ def _order(diagram: Diagram) -> Drawing:
     tall = {name: LINE * len(lines) + 14 for name, lines in texts.items()}
     placing = place({box.name: (BOX_WIDTH, tall[box.name]) for box in diagram.boxes},
                     diagram.edges, square=False)
-    boxes = tuple(Shape(box.name, box.title or box.name, texts[box.name], at.left, at.top,
-                        BOX_WIDTH, tall[box.name])
-                  for box in diagram.boxes for at in (placing.places[box.name],))
+    at = placing.places
+    boxes = tuple(Shape(box.name, box.title or box.name, texts[box.name], at[box.name].left,
+                        at[box.name].top, BOX_WIDTH, tall[box.name]) for box in diagram.boxes)
     lines = tuple(Line(upper, lower, points) for (upper, lower), points
                   in zip(diagram.edges, placing.lines, strict=True))
-    return Drawing(diagram.title, placing.width, placing.height, boxes, lines,
-                   _in_words(diagram))
-
-
-def _qualifier(gate: str, required: int) -> str:
-    if not gate:
-        return ""
-    return "&" if gate == "and" else f"≥{required}"
+    return Drawing(diagram.title, placing.width, placing.height, boxes, lines, _in_words(diagram))
 
 
 def _way(event: str, above: dict[str, list[str]], barriers: set[str]) -> tuple[str, ...]:
@@ -167,12 +156,13 @@ def _in_words(diagram: Diagram) -> str:
     names = {box.name: box.title or box.name for box in diagram.boxes}
     for upper, lower in diagram.edges:
         below.setdefault(upper, []).append(names[lower])
-    parts: list[str] = []
+    parts = []
     for box in diagram.boxes:
-        said: Sequence[str] = (
-            names[box.name] if box.title else box.name,
-            f"barrier {box.barrier_words}" if box.mechanism else "",
-            f"{box.gate_words} of {', '.join(below[box.name])}" if box.gate
-            else f"above {', '.join(below[box.name])}" if box.name in below else "")
-        parts.append(f"{'; '.join(filter(None, said))}.")
+        said = [names[box.name]]
+        if box.mechanism:
+            said.append(f"barrier {box.barrier_words}")
+        if box.name in below:
+            how = f"{box.gate_words} of" if box.gate else "above"
+            said.append(f"{how} {', '.join(below[box.name])}")
+        parts.append(f"{'; '.join(said)}.")
     return " ".join(parts)

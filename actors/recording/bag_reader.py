@@ -8,34 +8,15 @@ said so; the rest counts.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    Channel,
-    Chunk,
-    DataEnd,
-    Header,
-    McapRecord,
-    Message,
-    Metadata,
-    Schema,
-)
+from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Message, Metadata, Schema
 
-from rampart.actors.recording.bag_records import (
-    COMPRESSIONS,
-    HEAD,
-    MAX_RECORD_BYTES,
-    TORN,
-    WANTED,
-    ExpansionError,
-    record_of,
-    records_in,
-    unpacked,
-)
+from rampart.actors.recording import bag_records as br
 from rampart.actors.recording.bag_writer import END, KEY, RUN, BagError
 from rampart.actors.recording.run_documents import MAX_FILE_BYTES
 from rampart.files.reading import shown
@@ -134,8 +115,9 @@ class BagReader:
         """Return the records as far as they can be read."""
         whole = file.seek(len(_MAGIC))
         while True:
-            head = file.read(HEAD.size)
-            kind, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, self.size_bytes)
+            head = file.read(br.HEAD.size)
+            kind, length = (
+                br.HEAD.unpack(head) if len(head) == br.HEAD.size else (0, self.size_bytes))
             if length > self.size_bytes - file.tell():
                 self._damaged(f"cut off after byte {whole}")
                 return
@@ -144,39 +126,38 @@ class BagReader:
                 if file.read(len(_MAGIC)) != _MAGIC:
                     self._damaged("the last bytes")
                 return
-            if kind not in WANTED or length > MAX_RECORD_BYTES:
-                if kind in WANTED:
-                    self._damaged(f"a record of {length} bytes, at most {MAX_RECORD_BYTES} are "
+            if kind not in br.WANTED or length > br.MAX_RECORD_BYTES:
+                if kind in br.WANTED:
+                    self._damaged(f"a record of {length} bytes, at most {br.MAX_RECORD_BYTES} are "
                                   "read")
                 whole = file.seek(length, 1)
                 continue
             try:
-                record = record_of(kind, file.read(length))
-            except TORN:
+                record = br.record_of(kind, file.read(length))
+            except br.TORN:
                 self._damaged(f"cut off after byte {whole}")
                 return
             whole = file.tell()
-            if isinstance(record, DataEnd):
-                self.closed = True
-            elif not self.closed:  # after it comes the index, which says everything once more
+            self.closed = self.closed or kind == Opcode.DATA_END
+            if not self.closed:  # after it comes the index, which says everything once more
                 yield record
 
     def _messages(self, chunk: Chunk) -> Iterator[McapRecord]:
-        if chunk.compression not in COMPRESSIONS:
+        if chunk.compression not in br.COMPRESSIONS:
             raise BagError(f"{self.path}: compressed by {shown(chunk.compression)}; known are lz4, "
                            "zstd and none")
         try:
-            data = unpacked(chunk)
+            data = br.unpacked(chunk)
             self._unpacked_bytes += len(data)
             at_least, times = MAX_EXPANSION
             if self._unpacked_bytes > at_least + times * self.size_bytes:
                 raise BagError(f"{self.path}: unpacks to more than {times} times its size; no "
                                "recording does")
-            for record in records_in(data):
+            for record in br.records_in(data):
                 yield from self._content(record)
-        except ExpansionError as error:
+        except br.ExpansionError as error:
             raise BagError(f"{self.path}: {error}") from None
-        except TORN as error:
+        except br.TORN as error:
             self._damaged(f"a chunk ({type(error).__name__})")
 
     def _content(self, record: Any) -> Iterator[Message]:
@@ -185,11 +166,10 @@ class BagReader:
             self._keep(self.schemas, record.id, record)
         elif isinstance(record, Channel):
             self._keep(self.channels, record.id, record)
+        elif isinstance(record, Message) and record.channel_id in self.channels:
+            yield record
         elif isinstance(record, Message):
-            if record.channel_id in self.channels:
-                yield record
-            else:
-                self._damaged("messages of a channel that was lost")
+            self._damaged("messages of a channel that was lost")
 
     def _keep(self, kept: dict[Any, Any], name: int | str, what: Any) -> None:
         self._kept_bytes += _bytes_of(what) - _bytes_of(kept.get(name))
@@ -239,17 +219,17 @@ class Summary:
 
     def __init__(self, reader: BagReader) -> None:
         self.reader = reader
-        self.counts: dict[int, int] = {}
+        self.counts = Counter[int]()
         self.files: list[tuple[str, str, bytes]] = []
         self.first_ns: int | None = None
         self.last_ns = 0
         left = MAX_FILE_BYTES
         for record in reader.records():
             if isinstance(record, Message):
-                self.counts[record.channel_id] = self.counts.get(record.channel_id, 0) + 1
-                if self.first_ns is None or record.log_time < self.first_ns:
-                    self.first_ns = record.log_time
-                self.last_ns = max(self.last_ns, record.log_time)
+                self.counts[record.channel_id] += 1
+                at_ns = record.log_time
+                self.first_ns = at_ns if self.first_ns is None else min(self.first_ns, at_ns)
+                self.last_ns = max(self.last_ns, at_ns)
             elif isinstance(record, Attachment):
                 data = record.data if len(record.data) <= left else b""
                 left -= len(data)
@@ -260,7 +240,7 @@ class Summary:
     @property
     def messages(self) -> int:
         """How many, of all channels."""
-        return sum(self.counts.values())
+        return self.counts.total()
 
     @property
     def duration_s(self) -> float:
@@ -279,19 +259,16 @@ class Summary:
     @property
     def keys(self) -> dict[str, int]:
         """Full key → messages, of the channels of the bus."""
-        return {key: self.counts.get(number, 0)
-                for number, channel in self.reader.channels.items()
+        return {key: self.counts[number] for number, channel in self.reader.channels.items()
                 if (key := key_of(channel)) is not None}
 
     def table(self) -> list[dict[str, Any]]:
         """Return one row per channel, by name."""
         rows = []
         for number, channel in self.reader.channels.items():
-            schema = self.reader.schemas.get(channel.schema_id)
-            count = self.counts.get(number, 0)
+            schema, count = self.reader.schemas.get(channel.schema_id), self.counts[number]
             rows.append({
                 "channel": channel.topic, "schema": schema.name if schema else "",
-                "messages": count,
-                "rate_hz": round(count / self.duration_s, 2) if self.duration_s > 0 else None,
-                "bus": key_of(channel) is not None})
+                "messages": count, "bus": key_of(channel) is not None,
+                "rate_hz": round(count / self.duration_s, 2) if self.duration_s > 0 else None})
         return sorted(rows, key=lambda row: str(row["channel"]))

@@ -14,21 +14,11 @@ from io import BytesIO
 
 import lz4.frame
 import zstandard
+from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    Channel,
-    Chunk,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Message,
-    Metadata,
-    Schema,
-)
+from mcap.records import Chunk, McapRecord, Message
 
 MAX_RECORD_BYTES = (64 << 20) + (64 << 10)
 """Of a record: an attached file of 64 MB and what stands round it."""
@@ -69,10 +59,10 @@ class _Exact(ReadDataStream):
 
 
 _READ: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
-    Opcode.HEADER: Header.read, Opcode.FOOTER: Footer.read, Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read, Opcode.ATTACHMENT: Attachment.read,
-    Opcode.METADATA: Metadata.read, Opcode.DATA_END: DataEnd.read,
-}
+    Opcode.HEADER: records.Header.read, Opcode.SCHEMA: records.Schema.read,
+    Opcode.CHANNEL: records.Channel.read, Opcode.CHUNK: Chunk.read,
+    Opcode.ATTACHMENT: records.Attachment.read, Opcode.METADATA: records.Metadata.read,
+    Opcode.DATA_END: records.DataEnd.read}
 WANTED = frozenset({*_READ, Opcode.MESSAGE})
 """Kinds of records that are read; the others are an index, which says everything once more."""
 
@@ -98,21 +88,19 @@ def unpacked(chunk: Chunk) -> bytes:
         ExpansionError: it is too large.
         TORN: it is damaged.
     """
-    most = MAX_CHUNK_BYTES
-    if chunk.uncompressed_size > most:
-        raise ExpansionError(f"a chunk of {chunk.uncompressed_size} bytes, unpacked; at most "
-                             f"{most} are read")
+    most, told = MAX_CHUNK_BYTES, chunk.uncompressed_size
+    if told > most:
+        raise ExpansionError(f"a chunk of {told} bytes, unpacked; at most {most} are read")
     if chunk.compression == "lz4":
         data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most + 1)
     elif chunk.compression == "zstd":
         with zstandard.ZstdDecompressor(max_window_size=_LARGEST_WINDOW).stream_reader(
                 chunk.data) as stream:
-            data = stream.read(chunk.uncompressed_size + 1)
+            data = stream.read(told + 1)
     else:
         data = chunk.data
     if len(data) > most:
-        raise ExpansionError(f"a chunk that unpacks to more than {most} bytes, and says "
-                             f"{chunk.uncompressed_size}")
+        raise ExpansionError(f"a chunk that unpacks to more than {most} bytes, and says {told}")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise ValueError("not what was written, by its checksum")
     return bytes(data)

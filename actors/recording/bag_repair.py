@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from itertools import chain
 from pathlib import Path
 
 from mcap.records import Attachment, Message, Metadata
@@ -32,20 +33,18 @@ def repair(reader: BagReader, target: Path, *, overwrite: bool = False) -> int:
         writer.start(reader.profile, reader.library)
         schemas: dict[int, int] = {0: 0}
         channels: dict[int, int] = {}
-        while first is not None:
-            if isinstance(first, Attachment):
+        for it in chain([first], records):
+            if isinstance(it, Attachment):
                 writer.add_attachment(
-                    first.create_time, first.log_time, first.name, first.media_type, first.data)
-            elif isinstance(first, Metadata):
-                writer.add_metadata(first.name, first.metadata)
-            elif isinstance(first, Message):
-                number = first.channel_id
-                if number not in channels:
-                    channels[number] = _channel(writer, reader, number, schemas)
-                writer.add_message(channels[number], first.log_time, first.data,
-                                   first.publish_time, first.sequence)
+                    it.create_time, it.log_time, it.name, it.media_type, it.data)
+            elif isinstance(it, Metadata):
+                writer.add_metadata(it.name, it.metadata)
+            elif isinstance(it, Message):
+                if it.channel_id not in channels:
+                    channels[it.channel_id] = _channel(writer, reader, it.channel_id, schemas)
+                writer.add_message(channels[it.channel_id], it.log_time, it.data, it.publish_time,
+                                   it.sequence)
                 copied += 1
-            first = next(records, None)
         writer.finish()
         file.close()
     except BaseException as error:

@@ -12,7 +12,6 @@ readers of MCAP alike.
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -21,10 +20,10 @@ from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
 
-from rampart.actors.bus.topic import ROOT
+from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.json_schema import plain_schema
-from rampart.actors.recording.message_form import Forms, MessageForm, Recorded
+from rampart.actors.recording.message_form import Forms, Recorded
 from rampart.actors.recording.run_documents import Documents
 from rampart.actors.recording.sequence_gaps import SequenceGaps
 from rampart.actors.recording.views import View, Views, encode
@@ -38,7 +37,6 @@ KEY = "key"
 """Channel metadata that only channels of the bus have: the full key."""
 
 _MAX_NS = (1 << 64) - 1
-_Entry = tuple[int, MessageForm]
 
 
 class BagError(Exception):
@@ -67,8 +65,10 @@ def open_target(path: Path, *, overwrite: bool, probe: bool = False) -> BinaryIO
         file = path.open("ab" if probe else "wb" if overwrite else "xb")
         if probe and not existed:
             path.unlink()
+    except FileNotFoundError:
+        raise BagError(f"{path}: cannot be written: there is no such directory") from None
     except OSError as error:
-        raise BagError(f"{path}: cannot be written: {_why(error)}") from None
+        raise BagError(f"{path}: cannot be written: {error.strerror or error}") from None
     return file
 
 
@@ -86,12 +86,10 @@ class BagWriter:
             can be told.
     """
 
-    def __init__(
-        self, file: BinaryIO, documents: Documents, *, time_zero_s: float = 0.0,
-        begin_s: float | None = None, views: Views | None = None,
-        wants: Callable[[str], bool] = lambda _key: True,
-        from_start: bool = False,
-    ) -> None:
+    def __init__(self, file: BinaryIO, documents: Documents, *, time_zero_s: float = 0.0,
+                 begin_s: float | None = None, views: Views | None = None,
+                 wants: Callable[[str], bool] = lambda _key: True,
+                 from_start: bool = False) -> None:
         self.messages = 0
         self.garbage = 0
         self.untranslated = 0
@@ -102,11 +100,13 @@ class BagWriter:
         self._views = views
         self._wants = wants
         self._schemas: dict[str, int] = {}
-        self._channels: dict[str, _Entry | None] = {}
+        self._channels: dict[str, int | None] = {}
         self._view_channels: dict[str, int] = {}
         self._writer = Writer(file, compression=CompressionType.LZ4)
         self._writer.start(PROFILE, f"rampart {documents.version}")
-        self._describe(documents)
+        self._writer.add_metadata(RUN, {**documents.metadata(), "time_zero_s": f"{time_zero_s:g}"})
+        for name, media_type, data in documents.files:
+            self._writer.add_attachment(0, 0, name, media_type, data)
         if views is not None:
             begin_ns = 0 if begin_s is None else self._ns(begin_s)
             self._show(views, views.start(begin_ns), begin_ns)
@@ -123,29 +123,27 @@ class BagWriter:
         Raises:
             OSError: it cannot be written.
         """
-        channel = self._channels.get(key, ...)
-        if channel is ...:
-            channel = self._channels[key] = self._channel(key) if self._wants(key) else None
-        form = self._forms.of(key) if channel is None else channel[1]
+        form = self._forms.of(key)
         text, header, body = form.recorded(payload)
         if header is not None:
             self.gaps.hear(header)
-        if channel is None:
+        if key not in self._channels:
+            self._channels[key] = self._channel(key, form.topic) if self._wants(key) else None
+        number = self._channels[key]
+        if number is None:
             return
-        log_ns = self._ns(at_s)
+        log_ns = stamp_ns = self._ns(at_s)
         if header is None:
             self.garbage += 1
-            self._writer.add_message(channel[0], log_ns, text, log_ns)
-        else:
-            stamp_ns = self._ns(header.stamp) if math.isfinite(header.stamp) else log_ns
-            self._writer.add_message(
-                channel[0], log_ns, text, stamp_ns, header.sequence & 0xFFFFFFFF)
+        elif math.isfinite(header.stamp):
+            stamp_ns = self._ns(header.stamp)
+        sequence = header.sequence & 0xFFFFFFFF if header else 0
+        self._writer.add_message(number, log_ns, text, stamp_ns, sequence)
         self.messages += 1
         if self._views is None or header is None or form.topic is None:
             return
         try:
-            self._show(self._views,
-                       self._views.of(form.topic, key, header, body, log_ns), log_ns)
+            self._show(self._views, self._views.of(form.topic, key, header, body, log_ns), log_ns)
         except (ValueError, TypeError, OverflowError):  # the message itself is recorded
             self.untranslated += 1
 
@@ -177,19 +175,15 @@ class BagWriter:
 
     # -- channels -------------------------------------------------------------------------------
 
-    def _channel(self, key: str) -> _Entry:
-        form = self._forms.of(key)
-        topic = form.topic
-        described = {KEY: key}
-        schema = 0
+    def _channel(self, key: str, topic: Topic[Any] | None) -> int:
+        described, schema = {KEY: key}, 0
         if topic is not None:
             name = topic.type.__name__
             schema = self._schema(f"rampart.{name}", Recorded[topic.type])  # type: ignore[name-defined]
             described |= {"qos": topic.qos.value, "rate_hz": f"{topic.rate_hz:g}",
                           "frame": topic.frame, "about": topic.doc}
-        number = self._writer.register_channel(
+        return self._writer.register_channel(
             key.removeprefix(f"{ROOT}/"), "json", schema, described)
-        return number, form
 
     def _schema(self, name: str, kind: Any) -> int:
         if name not in self._schemas:
@@ -199,25 +193,12 @@ class BagWriter:
 
     def _show(self, views: Views, found: list[View], log_ns: int) -> None:
         for name, view in found:
-            number = self._view_channels.get(name)
-            if number is None:
+            if name not in self._view_channels:
                 kind = views.channels[name]
-                number = self._view_channels[name] = self._writer.register_channel(
+                self._view_channels[name] = self._writer.register_channel(
                     name, "json", self._schema(fg.schema_name(kind), kind))
-            self._writer.add_message(number, log_ns, encode(view), log_ns)
-
-    def _describe(self, documents: Documents) -> None:
-        self._writer.add_metadata(
-            RUN, {**documents.metadata(), "time_zero_s": f"{self._zero_s:g}"})
-        for name, media_type, data in documents.files:
-            self._writer.add_attachment(0, 0, name, media_type, data)
+            self._writer.add_message(self._view_channels[name], log_ns, encode(view), log_ns)
 
     def _ns(self, at_s: float) -> int:
         seconds = (at_s - self._zero_s) if math.isfinite(at_s) else 0.0
         return round(min(max(0.0, seconds * 1e9), _MAX_NS))
-
-
-def _why(error: OSError) -> str:
-    if error.errno == errno.ENOENT:
-        return "there is no such directory"
-    return error.strerror or str(error)

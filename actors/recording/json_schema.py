@@ -23,8 +23,7 @@ def _plain(node: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     if "$ref" in node:
         return _plain(definitions[node["$ref"].rpartition("/")[2]], definitions)
     if "anyOf" in node:  # a number, or null: viewers plot the number
-        return _plain(
-            next(n for n in node["anyOf"] if n.get("type") != "null"), definitions)
+        return _plain(next(n for n in node["anyOf"] if n.get("type") != "null"), definitions)
     found = {key: node[key] for key in _KEPT if key in node}
     kind = node.get("type", "string" if _is_text(node.get("enum", ())) else None)
     if kind is not None:

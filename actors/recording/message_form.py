@@ -25,8 +25,8 @@ class Recorded(msgspec.Struct, Generic[B], frozen=True, omit_defaults=True):
 
     Attributes:
         source: node that sent it; empty for garbage.
-        incarnation: life of the node, counted from 1; 0 for garbage.
-        sequence: how many-th message of that life, over all keys; 0 for garbage.
+        incarnation: of the node, counted from 1; 0 for garbage.
+        sequence: how many-th message of that incarnation, over all keys; 0 for garbage.
         stamp: simulated seconds at which the content was true; null if that is no finite number.
         body: the message; numbers that are not finite are null here. None for garbage.
         raw: the payload as it was sent, if it cannot be made anew from the rest.
@@ -50,8 +50,8 @@ class MessageForm:
     """The form of one topic's messages.
 
     Args:
-        topic: the contract of the key; None for a key of the robot's own, or of nobody: whatever
-            has a header is a message there.
+        topic: the contract of the key; None for a key without one: there each payload that has a
+            header is a message.
     """
 
     def __init__(self, topic: Topic[Any] | None) -> None:
@@ -71,7 +71,8 @@ class MessageForm:
                 header, body = decode(self.topic, payload)
         except UNREADABLE as error:
             name = self.topic.type.__name__ if self.topic else "message"
-            return _garbage(payload, f"not a {name}: {error}"), None, None
+            return _encode(Recorded("", 0, 0, None, raw=payload,
+                                    error=f"not a {name}: {error}")), None, None
         parts = (header.source, header.incarnation, header.sequence, header.stamp)
         try:
             text = _encode(Recorded(*parts, body))
@@ -100,9 +101,8 @@ class MessageForm:
         except OverflowError as error:  # JSON has larger numbers than MessagePack
             raise ValueError(str(error)) from None
 
-    def _is_exact(
-        self, text: bytes, parts: tuple[str, int, int, float], body: Any, payload: bytes
-    ) -> bool:
+    def _is_exact(self, text: bytes, parts: tuple[str, int, int, float], body: Any,
+                  payload: bytes) -> bool:
         """Whether the JSON gives the payload again."""
         if self._is_plain:  # nothing but null for a number that is not finite can go wrong in JSON
             return b"null" not in text and pack((*parts, body)) == payload
@@ -112,23 +112,19 @@ class MessageForm:
             return False
 
 
-def renumbered(payload: bytes, lives: int, later_s: float) -> bytes:
-    """Return a payload as of a later life of its node, stamped later; garbage stays as it is.
+def renumbered(payload: bytes, restarts: int, later_s: float) -> bytes:
+    """Return a payload as of a later incarnation, stamped later; garbage stays as it is.
 
     Args:
         payload: as it was sent.
-        lives: how many lives later.
+        restarts: how many incarnations later.
         later_s: simulated seconds later.
     """
     try:
         message = _any_message.decode(payload)
-    except UNREADABLE:
-        return payload
-    head = (message.source, message.incarnation + lives, message.sequence,
-            message.stamp + later_s)
-    try:
-        return _encode_msgpack((*head, message.body))
-    except OverflowError:  # no life comes after the last number there is
+        return _encode_msgpack((message.source, message.incarnation + restarts, message.sequence,
+                                message.stamp + later_s, message.body))
+    except (*UNREADABLE, OverflowError):  # no incarnation comes after the last number there is
         return payload
 
 
@@ -166,10 +162,6 @@ class Forms:
 @cache
 def _decoder(kind: Any) -> Callable[[bytes], Recorded[Any]]:
     return msgspec.json.Decoder(Recorded[kind]).decode
-
-
-def _garbage(payload: bytes, reason: str) -> bytes:
-    return _encode(Recorded("", 0, 0, None, raw=payload, error=reason))
 
 
 def _is_plain(kind: Any) -> bool:

@@ -133,10 +133,9 @@ def told(recorder: Recorder) -> str:
     if not recorder.path.exists():
         return f"{recorder.path}: was taken away while it was written: nothing is recorded"
     lost = sum(writer.gaps.lost().values())
-    parts = [f"{writer.messages} messages in {recorder.path}",
-             *([f"{writer.garbage} of them garbage"] if writer.garbage else []),
-             f"{lost} lost" if lost else "none lost"]
-    return "recorded " + ", ".join(parts)
+    garbage = f", {writer.garbage} of them garbage" if writer.garbage else ""
+    return (f"recorded {writer.messages} messages in {recorder.path}{garbage}, "
+            f"{lost or 'none'} lost")
 
 
 def _answer(text: str) -> None:

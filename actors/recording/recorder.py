@@ -1,6 +1,6 @@
 """The recorder: takes what the nodes hand over, and writes it down.
 
-It is a process of its own, and neither a node nor on the bus: whatever becomes of it, nobody waits
+It is a process of its own, and neither a node nor on the bus: whatever becomes of it, no node waits
 for it, and the robot drives on. It sleeps most of the time: some twenty times a second it empties
 all sockets at once, puts what it found into order by time of sending, and writes; every 0.8 s it
 hands the file to the kernel. It ends when it is told to, or when the launcher of the run has ended,
@@ -109,8 +109,9 @@ class Recorder:
         try:
             while not why:
                 if pidfd < 0 and self._launcher is not None:
-                    pidfd = _pidfd(self._launcher)
-                    if pidfd < 0:
+                    try:
+                        pidfd = os.pidfd_open(self._launcher)
+                    except OSError:
                         why, over = _RUN_ENDED, True
                         break
                     poller.register(pidfd, select.POLLIN)
@@ -123,6 +124,10 @@ class Recorder:
                     why = f"its {duration_s:g} s are over"
                 self._turn()
             self._finish(why, run_is_over=over)
+        except OSError as error:
+            written = self.writer.messages if self.writer else 0
+            raise BagError(f"{self.path}: {error.strerror or error}: the recording ends after "
+                           f"{written} messages, the robot goes on") from None
         finally:
             if pidfd >= 0:
                 os.close(pidfd)
@@ -155,20 +160,12 @@ class Recorder:
         writer, info = self.writer, self._info
         if writer is None or info is None:
             return
-        try:
-            for at_s, key, payload in sorted(frames, key=itemgetter(0)):
-                writer.take((at_s - info.origin_s) * info.rate, key, payload)
-            now_s = time.monotonic()
-            if now_s >= self._next_flush_s:
-                self._next_flush_s = now_s + FLUSH_S
-                writer.flush()
-        except OSError as error:
-            self._give_up(error)
-
-    def _give_up(self, error: OSError) -> None:
-        written = self.writer.messages if self.writer else 0
-        raise BagError(f"{self.path}: {error.strerror or error}: the recording ends after "
-                       f"{written} messages, the robot goes on") from None
+        for at_s, key, payload in sorted(frames, key=itemgetter(0)):
+            writer.take((at_s - info.origin_s) * info.rate, key, payload)
+        now_s = time.monotonic()
+        if now_s >= self._next_flush_s:
+            self._next_flush_s = now_s + FLUSH_S
+            writer.flush()
 
     def _finish(self, why: str, *, run_is_over: bool) -> None:
         deadline = time.monotonic() + LAST_S
@@ -176,12 +173,8 @@ class Recorder:
             time.sleep(self._period_s())
             self._turn()
         self._turn()
-        if self.writer is None:
-            return
-        try:
+        if self.writer is not None:
             self.writer.close({"ended": why, "stopped": _wall()})
-        except OSError as error:
-            self._give_up(error)
 
     def _period_s(self) -> float:
         """Return how long to sleep: at a high rate the sockets fill sooner."""
@@ -203,13 +196,9 @@ class Recorder:
         begin_s = (min((f[0] for f in self._waiting), default=now_s) - info.origin_s) * info.rate
         zero_s = min(0.0, float(math.floor(begin_s)))
         file = open_target(self.path, overwrite=self._overwrite)
-        try:
-            self.writer = BagWriter(
-                file, documents, time_zero_s=zero_s, begin_s=begin_s,
-                views=documents.known.views(), wants=self._wants,
-                from_start=self._from_start)
-        except OSError as error:
-            self._give_up(error)
+        self.writer = BagWriter(
+            file, documents, time_zero_s=zero_s, begin_s=begin_s, wants=self._wants,
+            views=documents.known.views(), from_start=self._from_start)
         return True
 
     # -- sockets --------------------------------------------------------------------------------
@@ -253,13 +242,6 @@ def describe(info: RunInfo) -> Documents:
     """Return what a recording keeps of a run."""
     return collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
                    nodes=tuple(info.nodes), started=_wall())
-
-
-def _pidfd(pid: int) -> int:
-    try:
-        return os.pidfd_open(pid)
-    except OSError:
-        return -1
 
 
 def _wall() -> str:

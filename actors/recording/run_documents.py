@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -34,8 +33,7 @@ File = tuple[str, str, bytes]
 """Name in the recording, media type, content."""
 
 
-@dataclass(frozen=True, slots=True)
-class Known:
+class Known(msgspec.Struct, frozen=True):
     """What could be loaded of a run: a viewer or recorder makes do without the rest.
 
     Attributes:
@@ -89,10 +87,9 @@ class Documents(msgspec.Struct, frozen=True):
         options = {**self.plan, **(msgspec.structs.asdict(chosen) if chosen else {})}
         told = {name: PurePosixPath(str(value)).name or str(value)
                 for name, value in options.items() if name != "system_file"}
-        return {
-            **told, "format": FORMAT, "run_id": self.run_id, "title": self.title,
-            "rate": f"{self.rate:g}", "started": self.started, "rampart_version": self.version,
-            "nodes": json.dumps(self.nodes)}
+        return {**told, "format": FORMAT, "run_id": self.run_id, "title": self.title,
+                "rate": f"{self.rate:g}", "started": self.started,
+                "rampart_version": self.version, "nodes": json.dumps(self.nodes)}
 
 
 NOT_CHOSEN = ("format", "run_id", "title", "rate", "started", "rampart_version", "nodes",
@@ -120,8 +117,11 @@ def collect(plan: Mapping[str, Any], **described: Any) -> Documents:
         except (OSError, FileError):
             continue
         files.append((name, _MEDIA.get(path.suffix.lower(), "text/plain"), data))
-    return Documents(plan=plan, files=tuple(files), version=own_version(), known=known,
-                     **described)
+    try:
+        own_version = version("rampart")
+    except PackageNotFoundError:
+        own_version = "unknown"
+    return Documents(plan=plan, files=tuple(files), version=own_version, known=known, **described)
 
 
 def known_of(plan: Mapping[str, Any]) -> Known:
@@ -142,14 +142,6 @@ def known_of(plan: Mapping[str, Any]) -> Known:
             msgspec.structs.replace(run, options=options), system))
     except (OSError, ValueError):
         return Known(system, kind)
-
-
-def own_version() -> str:
-    """Return the version of the installed program."""
-    try:
-        return version("rampart")
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def restore(files: Sequence[File], directory: Path) -> None:

@@ -66,8 +66,7 @@ class Views:
         del at_ns
         return []
 
-    def of(self, topic: Topic[Any], key: str, header: Header, body: Any, at_ns: int
-           ) -> list[View]:
+    def of(self, topic: Topic[Any], key: str, header: Header, body: Any, at_ns: int) -> list[View]:
         """Return what a message makes visible.
 
         Args:

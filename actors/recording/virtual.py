@@ -39,9 +39,8 @@ class VirtualRecording:
                             nodes=tuple(nodes), started="")
         file = open_target(path, overwrite=overwrite)
         try:
-            self._writer = BagWriter(
-                file, documents, time_zero_s=-lead_s, views=documents.known.views(),
-                from_start=True)
+            self._writer = BagWriter(file, documents, time_zero_s=-lead_s,
+                                     views=documents.known.views(), from_start=True)
         except OSError as error:
             file.close()
             raise BagError(f"{path}: {error.strerror or error}") from None

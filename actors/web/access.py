@@ -1,6 +1,6 @@
 """Who may talk to a web page that a node serves. Pure.
 
-Whoever reaches the operator's page can drive the robot, kill its nodes and release its emergency
+A user who reaches the operator's page can drive the robot, kill its nodes and release its emergency
 stop. So:
 
 * On loopback the user may whose process serves it; other users of this machine need a token
@@ -21,8 +21,9 @@ import ipaddress
 import re
 import secrets
 from collections.abc import Iterable
-from dataclasses import dataclass
 from urllib.parse import quote, urlsplit
+
+import msgspec
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 TOKEN_PREFIX = "token."  # noqa: S105 it is not one
@@ -37,16 +38,21 @@ class AccessError(ValueError):
 
 
 def new_token() -> str:
-    """Return a token that nobody guesses: 128 random bits, safe in a URL."""
+    """Return a token that cannot be guessed: 128 random bits, safe in a URL."""
     return secrets.token_urlsafe(16)
 
 
 def is_loopback(host: str) -> bool:
     """Tell whether only this machine can reach an address to bind to."""
+    address = _address(host)
+    return host == "localhost" or (address is not None and address.is_loopback)
+
+
+def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+        return ipaddress.ip_address(text)
     except ValueError:
-        return False
+        return None
 
 
 def page_url(host: str, port: int, token: str = "") -> str:
@@ -56,8 +62,7 @@ def page_url(host: str, port: int, token: str = "") -> str:
     return f"http://{host}:{port}/" + (f"#token={quote(token)}" if token else "")
 
 
-@dataclass(frozen=True)
-class Access:
+class Access(msgspec.Struct, frozen=True):
     """The rules for a page served at a host and port.
 
     Args:
@@ -116,18 +121,11 @@ class Access:
     def _own_name(self, name: str) -> bool:
         if name in LOOPBACK or name in (self.host.lower(), *(n.lower() for n in self.names)):
             return True
-        if not self.token:
-            return False  # on loopback no other name leads here
-        try:
-            ipaddress.ip_address(name)
-        except ValueError:
-            return False
-        return True
+        return bool(self.token) and _address(name) is not None  # without one, only loopback is here
 
 
-def shown_token(
-    authorization: str | None, query: str | None, subprotocols: Iterable[str] = ()
-) -> str | None:
+def shown_token(authorization: str | None, query: str | None,
+                subprotocols: Iterable[str] = ()) -> str | None:
     """Return the token that a request shows, or None.
 
     Args:

@@ -2,18 +2,18 @@
 
 A server has room for so many connections, and a stranger can hold one without saying a word. So
 
-* whoever comes is let in. If that is one too many, somebody goes: of those who only wait, of the
-  source that has most of them, the one that has waited longest. A flood from one source thus ends
-  its own connections; a flood from many ends nobody who is being served;
-* whoever has shown a token goes after all who have not;
-* who is being served, a page that is open for instance, is never made to go by others;
-* who waits longer than `PATIENCE_S` goes, however busy: a request that comes byte by byte, a body
-  without end, a goodbye that nobody answers;
-* who sends more than a page ever would goes, served or not; so does who asks for more files than
-  all pages would, of whoever has not shown a token.
+* every connection is let in. If that is one too many, another one is closed: of those that only
+  wait, of the source that has most of them, the one that has waited longest. A flood from one
+  source thus ends its own connections; a flood from many ends none that is being served;
+* a connection that has shown a token is closed after all that have not;
+* one that is being served, a page that is open for instance, is never closed for others;
+* one that waits longer than `PATIENCE_S` is closed, however busy: a request that comes byte by
+  byte, a body without end, a goodbye without an answer;
+* one that sends more than a page ever would is closed, served or not; so is one without a token
+  whose source asks for more files than all pages would.
 
 A *source* is an address; within this machine, where all have the same one, a user. How many come in
-a second is bounded as well: who is there already drives.
+a second is bounded as well, so that the pages that are open have their turn.
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ PATIENCE_S = 5.0
 
 BYTES_AT_ONCE = 256_000
 BYTES_PER_S = 64_000
-"""A page that drives sends some 3,000; a hundred wishes of the greatest length are 400,000."""
-
+"""A page that drives sends some 3,000; a hundred requests of the greatest length are 400,000."""
 
 REQUESTS_AT_ONCE = 400
 REQUESTS_PER_S = 100
@@ -100,7 +99,7 @@ class Guest:
 
 
 class Guests(Generic[K]):
-    """All connections, by whatever stands for one; times are real seconds."""
+    """All connections, by a key of the caller's; times are real seconds."""
 
     def __init__(self) -> None:
         self._guests: dict[K, Guest] = {}
@@ -110,20 +109,19 @@ class Guests(Generic[K]):
         return len(self._guests)
 
     def came(self, key: K, source: str, *, known: bool, now_s: float) -> tuple[Guest, list[K]]:
-        """Let somebody in; return the guest, and who has to go for that: itself, at worst."""
+        """Let a connection in; return the guest, and who has to go for that: itself, at worst."""
         requests = self._requests.setdefault(
             source, Bucket(REQUESTS_AT_ONCE, REQUESTS_PER_S, now_s))
         guest = self._guests[key] = Guest(source, known, requests, now_s)
         waiting = Counter(g.source for g in self._guests.values() if not g.served)
-        go: list[K] = []
-        if waiting[source] > WAITING_ROOM or len(self._guests) > ROOM:
-            crowded = waiting[source] > WAITING_ROOM
-            candidates = [k for k, g in self._guests.items() if not g.served and k != key
-                          and (g.source == source or not crowded)]
-            go.append(min(candidates, default=key, key=lambda k: self._rank(k, waiting)))
-        for gone in go:
-            self.left(gone)
-        return guest, go
+        crowded = waiting[source] > WAITING_ROOM
+        if not crowded and len(self._guests) <= ROOM:
+            return guest, []
+        candidates = [k for k, g in self._guests.items() if not g.served and k != key
+                      and (g.source == source or not crowded)]
+        gone = min(candidates, default=key, key=lambda k: self._rank(k, waiting))
+        self.left(gone)
+        return guest, [gone]
 
     def left(self, key: K) -> None:
         """Forget a connection that is closed; harmless if it was made to go."""
@@ -133,8 +131,7 @@ class Guests(Generic[K]):
 
     def overdue(self, now_s: float) -> list[K]:
         """Return who has waited for too long and has to go."""
-        go = [k for k, g in self._guests.items()
-              if not g.served and now_s - g.since_s > PATIENCE_S]
+        go = [k for k, g in self._guests.items() if not g.served and now_s - g.since_s > PATIENCE_S]
         for key in go:
             self.left(key)
         return go

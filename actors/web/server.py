@@ -7,8 +7,8 @@ close an idle connection, to ping a WebSocket, to bound a message.
 
 It runs on the caller's event loop, of uvicorn there are but the two protocols: its server wakes up
 ten times a second, handles signals, and takes as many connections in one turn of the loop as come.
-Here it is one, so that who is there has a turn after each; and whoever is refused costs a tenth of
-whoever is let in. Nothing is done while nobody is connected.
+Here it is one, so that those that are there have a turn after each; and a connection that is
+refused costs a tenth of one that is let in. Nothing is done without connections.
 """
 
 from __future__ import annotations
@@ -27,14 +27,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from uvicorn.server import ServerState
 
-from rampart.actors.web.guests import (
-    COMING_AT_ONCE,
-    COMING_PER_S,
-    REFUSED_COST,
-    Bucket,
-    Guest,
-    Guests,
-)
+from rampart.actors.web import guests
+from rampart.actors.web.guests import Bucket, Guest, Guests
 from rampart.actors.web.tcp_peer import plain_address, user_of_peer
 
 QUEUE = 1024
@@ -114,7 +108,7 @@ class Reception:
         self._guests.left(transport)
 
     def close(self) -> None:
-        """Look after nobody any more."""
+        """Stop looking for connections that have waited too long."""
         if self._sweeper is not None:
             self._sweeper.cancel()
 
@@ -126,7 +120,7 @@ class Reception:
 
 
 def is_known(scope: Scope) -> None:
-    """Take note that whoever makes this request has shown that it may."""
+    """Take note that the maker of this request has shown that it may."""
     guest = scope.get("state", {}).get(_GUEST)
     if guest is not None:
         guest.known = True
@@ -225,7 +219,7 @@ class WebServer:
         self._state = ServerState()
         self._accepting: asyncio.Task[None] | None = None
 
-    async def start(self) -> None:
+    def start(self) -> None:
         """Begin to serve, on the running loop."""
         self._listening.setblocking(False)
         self._listening.listen(QUEUE)
@@ -244,9 +238,9 @@ class WebServer:
     async def _accept(self) -> None:
         """Take one connection after the other, at the pace that leaves time for those there are."""
         loop = asyncio.get_running_loop()
-        coming = Bucket(COMING_AT_ONCE, COMING_PER_S, loop.time())
+        coming = Bucket(guests.COMING_AT_ONCE, guests.COMING_PER_S, loop.time())
         while True:
-            cost = REFUSED_COST
+            cost = guests.REFUSED_COST
             try:
                 connection, _ = await loop.sock_accept(self._listening)
                 source = self.reception.source(connection)

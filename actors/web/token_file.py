@@ -1,4 +1,4 @@
-"""A secret in a file that nobody else can read."""
+"""A secret in a file that only this user can read."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ async def metrics(options: argparse.Namespace) -> int:
     exporter = Exporter()
     server = WebServer(_app(exporter), listening)
     with stopped_by_signals(stop):
-        await server.start()
+        server.start()
         host = f"[{options.host}]" if ":" in options.host else options.host
         say(f"metrics at http://{host}:{listening.getsockname()[1]}/metrics")
         try:

@@ -6,7 +6,6 @@ from typing import Any
 
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.requests import RefusedError, Request
-from rampart.actors.operator.server import Visitor
 
 NAME = "replay_page"
 """Not that of the page of which there is a recording."""
@@ -15,7 +14,7 @@ NAME = "replay_page"
 class ReplayPage(Hmi):
     """A page in front of the past."""
 
-    def _fulfil(self, request: Request, visitor: Visitor) -> str | dict[str, Any]:  # noqa: ARG002
+    def _fulfil(self, request: Request, page: int) -> str | dict[str, Any]:  # noqa: ARG002
         raise RefusedError("this is a replay: there is no robot to obey")
 
     def _look(self) -> None:

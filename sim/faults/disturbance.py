@@ -7,8 +7,10 @@ so what the rest of the system sees is what a real failure of that node would sh
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import asdict, replace
 
 from rampart.actors.bus.messages import Injection
 
@@ -17,18 +19,17 @@ class UnknownFaultError(ValueError):
     """No fault of this name; the message is one line and says where the known ones are."""
 
 
-@dataclass(frozen=True, slots=True)
-class Disturbance:
+class Disturbance(Struct, frozen=True):
     """What happens to one topic; the fields are those of `Injection`."""
 
     topic: str
     mode: str
     delay_s: float = 0.0
-    set_fields: Mapping[str, Any] = field(default_factory=dict)
-    ramp_fields: Mapping[str, float] = field(default_factory=dict)
+    set_fields: Mapping[str, Any] = {}
+    ramp_fields: Mapping[str, float] = {}
     keep_ends: tuple[str, ...] = ()
-    add_fields: Mapping[str, float] = field(default_factory=dict)
-    noise_fields: Mapping[str, float] = field(default_factory=dict)
+    add_fields: Mapping[str, float] = {}
+    noise_fields: Mapping[str, float] = {}
     share: float = 1.0
     on_s: float = 0.0
     off_s: float = 0.0
@@ -37,15 +38,10 @@ class Disturbance:
 
     def order(self, injection: str, duration_s: float) -> Injection:
         """Return the message that orders it, under an id, for simulated seconds."""
-        return Injection(
-            injection, self.topic, self.mode, duration_s, self.delay_s,
-            dict(self.set_fields), dict(self.ramp_fields), self.keep_ends,
-            dict(self.add_fields), dict(self.noise_fields),
-            self.share, self.on_s, self.off_s, self.seed, self.stamp_s)
+        return Injection(injection, duration_s=duration_s, **asdict(self))
 
 
-@dataclass(frozen=True, slots=True)
-class Fault:
+class Fault(Struct, frozen=True):
     """A named fault.
 
     Args:
@@ -87,10 +83,8 @@ class Fault:
             off_s: how long it is away in between, simulated seconds.
             seed: of all that is random; each disturbance gets one of its own. None keeps.
         """
+        given = {"share": share, "on_s": on_s, "off_s": off_s}
+        changed = {name: value for name, value in given.items() if value is not None}
         return replace(self, disturbances=tuple(
-            replace(d,
-                    share=d.share if share is None else share,
-                    on_s=d.on_s if on_s is None else on_s,
-                    off_s=d.off_s if off_s is None else off_s,
-                    seed=d.seed if seed is None else seed + i)
+            replace(d, **changed, seed=d.seed if seed is None else seed + i)
             for i, d in enumerate(self.disturbances)))

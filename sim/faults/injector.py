@@ -8,9 +8,10 @@ robot whose faults are more than that has an injector of its own, derived from t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import msgspec
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import InjectionReport
@@ -24,24 +25,16 @@ from rampart.sim.faults.scenario import FaultOutcome, OnProcess, PlannedFault, a
 
 INJECTOR = "injector"
 
+_ENDS = {"stop": "resume", "slow": "slow"}
+"""What ends that which is done to a process for a while."""
 
-class ProcessControl(Protocol):
-    """Does things to processes; each method returns whether there was somebody to do it to."""
 
-    def kill(self, node: str) -> bool:
-        """SIGKILL."""
+ProcessControl = Callable[[str, str, float], bool]
+"""Does something to the process of a node, and tells whether there was one to do it to.
 
-    def stop(self, node: str) -> bool:
-        """SIGSTOP."""
-
-    def resume(self, node: str) -> bool:
-        """SIGCONT."""
-
-    def wedge(self, node: str) -> bool:
-        """Have its event loop turn no more."""
-
-    def slow_down(self, node: str, pace_s: float) -> bool:
-        """Have each message take so long; 0 ends that."""
+What is `kill`, `stop`, `resume` (SIGKILL, SIGSTOP, SIGCONT), `wedge` (its event loop turns no more)
+or `slow` (each message takes so many seconds, the third argument; 0 ends that).
+"""
 
 
 def can_be_hit(spec: SystemSpec) -> tuple[str, ...]:
@@ -49,8 +42,7 @@ def can_be_hit(spec: SystemSpec) -> tuple[str, ...]:
     return (SUPERVISOR, *(node.name for node in spec.actors() if node.kind is not Kind.WORLD))
 
 
-@dataclass(slots=True, eq=False)
-class PlannedAction:
+class PlannedAction(msgspec.Struct, eq=False):
     """A planned fault and what has become of it.
 
     Attributes:
@@ -157,21 +149,12 @@ class Injector(Actor):
             self.carry_out(fault)
 
     def _hit(self, fault: PlannedAction, action: OnProcess) -> None:
-        node, control = action.node, self._control
-        if action.what == "slow":
-            hit = control.slow_down(node, action.pace_s)
-        else:
-            hit = {"kill": control.kill, "stop": control.stop,
-                   "wedge": control.wedge}[action.what](node)
-        if not hit:
-            fault.reason = f"{node} had no running process"
+        if not self._control(action.what, action.node, action.pace_s):
+            fault.reason = f"{action.node} had no running process"
             return
         fault.hit = 1
-        if action.what == "stop" and math.isfinite(action.duration_s):
-            self.call_later(action.duration_s, lambda: self._end(control.resume(node)))
-        elif action.what == "slow" and math.isfinite(action.duration_s):
-            self.call_later(action.duration_s, lambda: self._end(control.slow_down(node, 0.0)))
+        if action.what in _ENDS and math.isfinite(action.duration_s):
+            self.call_later(action.duration_s, lambda: self._release(action))
 
-    @staticmethod
-    def _end(_done: bool) -> None:
-        """Whether there still was somebody to release does not matter."""
+    def _release(self, action: OnProcess) -> None:
+        self._control(_ENDS[action.what], action.node, 0.0)

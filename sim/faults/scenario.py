@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -70,8 +69,7 @@ class PlannedFault(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return f"{self.fault}@{when}{lasts}" + (f" [{', '.join(more)}]" if more else "")
 
 
-@dataclass(frozen=True, slots=True)
-class OnProcess:
+class OnProcess(msgspec.Struct, frozen=True):
     """Something done to the process of a node; `pace_s` is for slow."""
 
     what: str
@@ -104,10 +102,7 @@ def parse_fault(text: str) -> PlannedFault:
 
 
 def _seconds(text: str, value: str, what: str, *, infinite: bool = False) -> float:
-    try:
-        seconds = float(value)
-    except ValueError:
-        seconds = math.nan
+    seconds = _number(value)
     if not seconds >= 0 or (not infinite and math.isinf(seconds)):
         raise ScenarioError(f"fault {text!r}: {what} {value!r}: must be simulated seconds"
                             + (", or inf" if infinite else ", or goalN, or goalN:SECONDS"))
@@ -154,14 +149,19 @@ def number(fault: str, details: Sequence[str], default: float, most: float = 1.0
     """
     if not details:
         return default
-    try:
-        value = float(details[0])
-    except ValueError:
-        value = math.nan
+    value = _number(details[0])
     if not 0 <= value <= most or len(details) > 1:
         raise ScenarioError(f"fault {fault!r}: {':'.join(details)!r}: must be one number "
                             f"between 0 and {most:g}")
     return value
+
+
+def _number(text: str) -> float:
+    """Return the number in a text, which is none (nan) of one that is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 class FaultOutcome(msgspec.Struct, frozen=True):

@@ -35,20 +35,19 @@ DURATION_S = 10.0
 
 DELAY_S = 1.5
 """Delay of `delay:TOPIC`: half as long again as the longest freshness timeout that is derived
-for the shipped system (0.99 s), so that a delay is one that somebody should see."""
+for the shipped system (0.99 s), so that a delay is one that should be detected."""
 
 SPREADS: tuple[tuple[str, float, float], ...] = (
     ("_m", 0.5, 3.0), ("_rad", 0.3, 1.5), ("_mps", 0.2, 0.8), ("_radps", 0.2, 1.0),
     ("_mps2", 0.5, 2.0), ("_s", 1.0, 10.0), ("_lux", 200.0, 1000.0), ("_cd", 50.0, 150.0),
-    ("_f32", 0.3, 1.5), ("waypoints", 0.5, 3.0), ("", 0.1, 0.5),
-)
+    ("_f32", 0.3, 1.5), ("waypoints", 0.5, 3.0), ("", 0.1, 0.5))
 """End of a field's name → least and greatest offset; the first that fits counts. The last is for
 numbers without a unit, such as ratios and stick positions."""
 
 _ONLY_GROW = ("_s", "_lux", "_cd")
 
 STAMPS_S = (0.02, 5.0)
-"""Least and greatest error of a stamp: from one that nobody need notice to one beyond every
+"""Least and greatest error of a stamp: from one that need not be noticed to one beyond every
 freshness timeout. Drawn by its logarithm, so that the small ones are as frequent as the large."""
 
 _TITLES = {
@@ -58,8 +57,7 @@ _TITLES = {
     "delay": "{} arrives " + f"{DELAY_S:g} s late",
     "duplicate": "each message on {} is sent twice",
     "restamp": "the stamps on {} are wrong by a constant",
-    "corrupt": "each number on {} is wrong by a constant",
-}
+    "corrupt": "each number on {} is wrong by a constant"}
 
 
 def topic_fault(mode: str, key: str, seed: int, known: Sequence[Topic[Any]]) -> Fault:
@@ -84,9 +82,7 @@ def topic_fault(mode: str, key: str, seed: int, known: Sequence[Topic[Any]]) -> 
     if topic is None:
         raise UnknownFaultError(f"unknown fault {f'{mode}:{key}'!r}: no topic has this key; "
                                 "see `rampart topic list`")
-    if reason := _closed(short):
-        raise UnknownFaultError(f"no fault {f'{mode}:{key}'!r}: {reason}")
-    if reason := _senseless(mode, topic.type):
+    if reason := _closed(short) or _senseless(mode, topic.type):
         raise UnknownFaultError(f"no fault {f'{mode}:{key}'!r}: {reason}")
     draw = Random(f"{short} {seed}")  # noqa: S311 no secret
     title, offsets = _TITLES[mode].format(short), {}

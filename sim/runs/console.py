@@ -12,14 +12,7 @@ from rampart.actors.bus.bounds import MANY, clip
 from rampart.actors.bus.limits import RateLimit, Remembered
 from rampart.actors.bus.messages import Diagnostic
 from rampart.actors.bus.topic import Topic
-from rampart.actors.ftm.messages import (
-    DecisionRecord,
-    DetectionReport,
-    DetectionState,
-    ManagerStatus,
-    ProcessEvent,
-    ShadowRecord,
-)
+from rampart.actors.ftm import messages as fm
 from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.files.plain_text import LINE_CHARS, printable
@@ -39,10 +32,10 @@ LINES_PER_S = 50
 class Console:
     """Writes the story of a run to a stream as it happens.
 
-    What it is told comes from the bus, and from anybody: each line is made printable and clipped,
-    and of more lines than can be read the number is told instead. In virtual time nobody else is
-    there, and a second may be a whole mission: there all lines are shown. A robot derives its own
-    for what it has to tell.
+    What it is told comes from the bus, and from any sender: each line is made printable and
+    clipped, and of more lines than can be read the number is told instead. In virtual time there
+    are no other senders, and a second may be a whole mission: there all lines are shown. A robot
+    derives its own for what it has to tell.
 
     Class attributes:
         example: of a node to kill; a system that has it not offers its first that a recovery
@@ -63,7 +56,7 @@ class Console:
         self._others = RateLimit(LINES_PER_S)
         self._live = stream.isatty()
         self._live_text = ""
-        self._detections: dict[str, DetectionState] = Remembered(MANY)
+        self._detections: dict[str, fm.DetectionState] = Remembered(MANY)
         self._silent: tuple[str, ...] = ()
         self._last_live_s = 0.0
 
@@ -90,22 +83,22 @@ class Console:
         """Take one message of the run."""
         at = header.stamp
         self._tell_left_out(at)
-        if isinstance(message, ProcessEvent):
+        if isinstance(message, fm.ProcessEvent):
             if message.event not in _QUIET_EVENTS and message.detail != "already":
                 detail = f" ({message.detail})" if message.detail else ""
                 self.line(at, f"{message.node} {message.event}, incarnation "
                           f"{message.incarnation}{detail}")
-        elif isinstance(message, DetectionReport):
+        elif isinstance(message, fm.DetectionReport):
             self._take_detection(message, header)
-        elif isinstance(message, ManagerStatus):
+        elif isinstance(message, fm.ManagerStatus):
             self._take_silence(message.silent, at)
-        elif isinstance(message, DecisionRecord):
+        elif isinstance(message, fm.DecisionRecord):
             what = " and ".join(message.recoveries) or "nothing to recover"
             word = "block" if message.strategy == "safety-first" else "rule"  # figure 7's word
             block = f", {word} {message.rule}" if message.rule else ""
             self.line(at, f"decision {message.decision}: {what}{block}"
                       + (f" for {', '.join(message.active)}" if message.active else ""))
-        elif isinstance(message, ShadowRecord):
+        elif isinstance(message, fm.ShadowRecord):
             self.line(at, f"  in shadow {message.strategy} would run "
                           f"{' and '.join(message.recoveries) or 'nothing'}")
         elif isinstance(message, Diagnostic):
@@ -123,10 +116,6 @@ class Console:
         if count:
             self.say(f"[{at_s:7.2f} s] {count} more lines were left out")
 
-    def close(self) -> None:
-        """Take the live line away."""
-        self._clear()
-
     def conclusion(self, record: RunRecord, report: Path | None) -> None:
         """Say how it ended, and where the report is, if there is one."""
         for reason in record.reasons:
@@ -134,11 +123,11 @@ class Console:
         if report is not None:
             self.say(f"Report: {report}")
 
-    def _take_detection(self, report: DetectionReport, header: Header) -> None:
-        before = self._detections.get(header.source, DetectionState.IDLE)
+    def _take_detection(self, report: fm.DetectionReport, header: Header) -> None:
+        before = self._detections.get(header.source, fm.DetectionState.IDLE)
         self._detections[header.source] = report.state
         if report.state is not before:
-            what = report.reason if report.state is DetectionState.ACTIVE else "clear"
+            what = report.reason if report.state is fm.DetectionState.ACTIVE else "clear"
             self.line(header.stamp, f"{header.source}: {what}")
 
     def _take_silence(self, silent: tuple[str, ...], at: float) -> None:
@@ -155,18 +144,19 @@ class Console:
         if not self._live or at_s - self._last_live_s < 0.25:
             return
         self._last_live_s = at_s
-        self._clear()
+        self.close()
         self._live_text = printable(text)[:shutil.get_terminal_size().columns - 1]
         self._stream.write(self._live_text)
         self._stream.flush()
 
-    def _clear(self) -> None:
+    def close(self) -> None:
+        """Take the live line away."""
         if self._live_text:
             self._stream.write("\r\x1b[K")
             self._live_text = ""
 
     def say(self, text: str) -> None:
         """Write a line."""
-        self._clear()
+        self.close()
         self._stream.write(printable(text) + "\n")
         self._stream.flush()

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
+
 
 from rampart.actors.bus.bus import SharedBus
 from rampart.actors.bus.run_folder import register_of
-from rampart.actors.bus.topic import Topic
-from rampart.actors.ftm.messages import NodeTable
-from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.run.run_plan import OBSERVER
-from rampart.actors.runtime.actor import Actor, Context, Header
+from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.supervision.kill_node import SignalError, signal_node
 from rampart.actors.supervision.launcher import Launcher
 from rampart.actors.supervision.unseen import watch
-from rampart.sim.faults.faults import faults_of
-from rampart.sim.faults.injector import INJECTOR, can_be_hit
-from rampart.sim.faults.process_signals import ProcessSignals
+from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
-from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.trial import Trial
 
@@ -30,6 +26,18 @@ _STALL_S = 0.5
 _RELINK_S = 4.0
 """Wall seconds in which a launcher that was stopped has its links again: those that it has lost are
 dialled after one second, and after two more."""
+
+_SIGNALS = {"kill": "KILL", "stop": "STOP", "resume": "CONT", "wedge": "WEDGE"}
+"""As `kill-node` sends them. How slow a process is, is up to the machine."""
+
+
+def hit(port: int, what: str, node: str, _pace_s: float) -> bool:
+    """Do something to the newest process of a node of a run, as a `ProcessControl`."""
+    try:
+        signal_node(node, _SIGNALS[what], port)
+    except (SignalError, KeyError):
+        return False
+    return True
 
 
 def excused_s(late_s: float) -> float:
@@ -51,7 +59,7 @@ class ProcessRun:
         scenario: What goes wrong, and when.
 
     Attributes:
-        interrupted: Whoever sets it ends the run for this reason.
+        interrupted: Setting it ends the run for this reason.
         failure: Why it could not go on; "" if it could.
     """
 
@@ -76,35 +84,27 @@ class ProcessRun:
         finally:
             try:
                 await self.launcher.end()
-            except Exception as error:  # the verdict stands; the lifeline ends who is left
+            except Exception as error:  # the verdict stands; the lifeline ends what is left
                 if self._trial.console:
                     self._trial.console.say(f"at the end: {type(error).__name__}: {error}")
 
     async def _observe(self) -> RunRecord:
-        launcher, trial, spec = self.launcher, self._trial, self._trial.run.system
-        plan = launcher.plan
+        launcher, trial = self.launcher, self._trial
+        spec, plan = trial.run.system, launcher.plan
         clock = Clock(plan.origin_s, plan.rate)
         launcher.guard.on_restart = lambda name: trial.brought_back(name, clock.now())
         if console := trial.console:
             launcher.guard.report = lambda text: console.line(clock.now(), text)
 
-        def to_launcher(_topic: Topic[Any], message: Any, _header: Header) -> None:
-            if isinstance(message, NodeTable):
-                launcher.supervisor_heard(message)
-
         bus = launcher.observers_bus()
-        sinks: list[Sink] = [to_launcher, *trial.sinks(clock)]
-        of_the_run: dict[str, Any] = {
-            "register": register_of(plan.folder), "members": frozenset(launcher.names)}
-        actors: list[Actor] = [
-            observer_class(spec)(Context(OBSERVER, 1, clock, bus, **of_the_run), sinks)]
-        injector = None
-        if self._scenario:
-            injector = trial.injector(
-                Context(INJECTOR, 1, clock, SharedBus(bus), **of_the_run), self._scenario,
-                ProcessSignals(plan.base_port), nodes=can_be_hit(spec),
-                known=system_topics(spec), faults=faults_of(spec))
-            actors.append(injector)
+
+        def context(name: str) -> Context:
+            return Context(
+                name, 1, clock, bus if name == OBSERVER else SharedBus(bus),
+                register=register_of(plan.folder), members=frozenset(launcher.names))
+
+        actors = trial.outside(context, launcher.supervisor_heard, self._scenario,
+                               partial(hit, plan.base_port), can_be_hit(spec))
         tasks = [asyncio.create_task(actor.run()) for actor in actors]
         for task, actor in zip(tasks, actors, strict=True):
             watch(task, f"the launcher's {actor.name}", launcher.failed)
@@ -127,5 +127,4 @@ class ProcessRun:
             await asyncio.gather(*tasks, return_exceptions=True)
             if trial.console:
                 trial.console.close()
-        return trial.conclude(clock.now(), self.interrupted or why or "ended",
-                                injector.outcomes() if injector else ())
+        return trial.conclude(clock.now(), self.interrupted or why or "ended")

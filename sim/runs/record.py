@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from typing import Any, Literal
 
 import msgspec
@@ -31,7 +31,7 @@ _RECOVERED = ("respawned", "resumed", "adopted")
 class Interval(msgspec.Struct, frozen=True):
     """Something was so from `from_s` until `to_s` (simulated seconds): `lane` says what kind.
 
-    Lanes: injection, detection, recovery, stop, down (a node without a living process).
+    Lanes: injection, detection, recovery, stop, down (a node without a running process).
     """
 
     lane: str
@@ -74,8 +74,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     Args:
         run_id: name of the run.
-        mission: success or fail; None if nobody judges that.
-        safety: by ground truth; not known if none ever came, None if nobody judges that.
+        mission: success or fail; None without a judge.
+        safety: by ground truth; not known if none ever came, None without a judge.
         reasons: why the mission failed or the run was not safe; empty if all is well.
         duration_s: length of the run.
         events: crashes, detections and injections.
@@ -120,17 +120,14 @@ class RunRecorder:
         self._open: dict[tuple[str, str], tuple[float, str]] = {}
         self._decisions: Remembered[tuple[int, int], DecisionLine] = Remembered(KEPT)
         self._restarts: dict[str, int] = Remembered(KEPT)
-        self._lives: Remembered[tuple[str, int], None] = Remembered(KEPT)
+        self._respawned: Remembered[tuple[str, int], None] = Remembered(KEPT)
         self._injections: dict[str, str] = Remembered(KEPT)
         self._take: dict[str, Callable[[Any, Header], None]] = {
-            ftm_topics.DETECTION.key: self._detection,
-            ftm_topics.MANAGER_STATUS.key: self._manager,
-            ftm_topics.DECISION.key: self._decision,
-            ftm_topics.SHADOW.key: self._shadow,
+            ftm_topics.DETECTION.key: self._detection, ftm_topics.MANAGER_STATUS.key: self._manager,
+            ftm_topics.DECISION.key: self._decision, ftm_topics.SHADOW.key: self._shadow,
             ftm_topics.PROCESS_EVENT.key: self._process_event,
             bus_topics.INJECT.key: self._injection,
-            bus_topics.INJECTION_REPORT.key: self._injection_report,
-        }
+            bus_topics.INJECTION_REPORT.key: self._injection_report}
 
     def feed(self, topic: Topic[Any], message: Any, header: Header) -> None:
         """Take a message; those of other topics are ignored."""
@@ -146,21 +143,15 @@ class RunRecorder:
         """Return what it knows of the fields of a record."""
         still = [Interval(lane, name, from_s, max(from_s, duration_s), reason)
                  for (lane, name), (from_s, reason) in self._open.items()]
+        events = sorted(self._events, key=lambda event: event.t_s)
+        if count := self._left_out + self._decisions.forgotten:
+            events.append(EventLine(duration_s, "fault", f"{count} more events, intervals, "
+                                    "decisions or points of the way were not kept"))
         return {
             "run_id": self._plan.run_id, "seed": self._plan.seed, "rate": self._plan.rate,
-            "strategy": self._strategy, "duration_s": duration_s,
-            "events": (*sorted(self._events, key=lambda event: event.t_s),
-                       *self._crowd(duration_s)),
+            "strategy": self._strategy, "duration_s": duration_s, "events": tuple(events),
             "intervals": tuple(sorted((*self._intervals, *still), key=lambda bar: bar.from_s)),
-            "decisions": tuple(self._decisions.values()),
-            "restarts": dict(self._restarts),
-        }
-
-    def _crowd(self, now_s: float) -> tuple[EventLine, ...]:
-        """Return a line about what there was no room for, if anything."""
-        count = self._left_out + self._decisions.forgotten
-        return (EventLine(now_s, "fault", f"{count} more events, intervals, decisions or points of "
-                          "the way were not kept"),) if count else ()
+            "decisions": tuple(self._decisions.values()), "restarts": dict(self._restarts)}
 
     def _detection(self, report: fm.DetectionReport, header: Header) -> None:
         active = report.state is fm.DetectionState.ACTIVE
@@ -177,11 +168,11 @@ class RunRecorder:
                 self.turn(lane, name, False, header.stamp)
 
     def _decision(self, record: fm.DecisionRecord, header: Header) -> None:
-        self._decisions[header.incarnation, record.decision] = DecisionLine(
-            header.stamp, record.decision, record.strategy, record.active, record.rule,
-            record.recoveries,
-            decision_in_words(record.active, record.rule, record.recoveries, record.strategy),
-            record.path, record.rejected, record.detected_s)
+        r = record
+        self._decisions[header.incarnation, r.decision] = DecisionLine(
+            header.stamp, r.decision, r.strategy, r.active, r.rule, r.recoveries,
+            decision_in_words(r.active, r.rule, r.recoveries, r.strategy), r.path, r.rejected,
+            r.detected_s)
 
     def _shadow(self, record: fm.ShadowRecord, header: Header) -> None:
         key = header.incarnation, record.decision
@@ -202,9 +193,9 @@ class RunRecorder:
             by = f" by {event.by}" if event.by else ""
             self._note(header.stamp, "clear", f"{event.node} {event.event}{by}")
         if event.event == "respawned":
-            life = event.node, event.incarnation
-            if life not in self._lives:
-                self._lives[life] = None
+            one = event.node, event.incarnation
+            if one not in self._respawned:
+                self._respawned[one] = None
                 self._restarts[event.node] = self._restarts.get(event.node, 0) + 1
 
     def _injection(self, order: bm.Injection, _header: Header) -> None:
@@ -213,12 +204,12 @@ class RunRecorder:
     def _injection_report(self, report: bm.InjectionReport, header: Header) -> None:
         what = self._injections.get(report.injection, report.injection)
         if self.turn("injection", report.injection, not report.finished, header.stamp, what):
+            where = f"{what} at {report.node}"
             if report.finished:
-                text = (f"injection over: {what} at {report.node}, "
-                        f"{report.affected} messages changed")
+                self._note(header.stamp, "clear",
+                           f"injection over: {where}, {report.affected} messages changed")
             else:
-                text = f"fault injected: {what} at {report.node}"
-            self._note(header.stamp, "clear" if report.finished else "fault", text)
+                self._note(header.stamp, "fault", f"fault injected: {where}")
 
     # -- for recorders of a robot ---------------------------------------------------------------
 
@@ -227,22 +218,19 @@ class RunRecorder:
         slot = (lane, name)
         if on == (slot in self._open):
             return False
-        if on and len(self._open) >= KEPT:
-            self._left_out += 1
-            return False
-        if on:
+        if not on:
+            from_s, why = self._open.pop(slot)
+            if self.has_room(self._intervals, KEPT):
+                self._intervals.append(Interval(lane, name, from_s, max(from_s, t_s), why))
+        elif self.has_room(self._open, KEPT):
             self._open[slot] = (t_s, reason)
-            return True
-        from_s, why = self._open.pop(slot)
-        if self.has_room(self._intervals, KEPT):
-            self._intervals.append(Interval(lane, name, from_s, max(from_s, t_s), why))
-        return True
+        return on == (slot in self._open)  # it is so now, unless there was no room
 
     def _note(self, t_s: float, kind: str, text: str) -> None:
         if self.has_room(self._events, KEPT):
             self._events.append(EventLine(t_s, kind, text))
 
-    def has_room(self, kept: list[Any], most: int) -> bool:
+    def has_room(self, kept: Sized, most: int) -> bool:
         """Whether one more may be kept; if not it is counted."""
         if len(kept) < most:
             return True

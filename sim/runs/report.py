@@ -19,10 +19,8 @@ import msgspec
 
 from rampart.sim.runs.record import Interval, RunRecord
 
-_LANES = {
-    "injection": "Injected", "down": "Node down", "detection": "Detected",
-    "recovery": "Recovery", "stop": "Stopped",
-}
+_LANES = {"injection": "Injected", "down": "Node down", "detection": "Detected",
+          "recovery": "Recovery", "stop": "Stopped"}
 _TICKS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 3600)
 
 
@@ -55,7 +53,8 @@ def try_report(run: RunRecord, render: Callable[[Any], str], directory: str | Pa
             return None
         return path
 
-    html, data = _paths(run, directory)
+    stem = "inspection-" + (re.sub(r"[^A-Za-z0-9._-]+", "-", run.run_id) or "run")
+    html, data = Path(directory, f"{stem}.html"), Path(directory, f"{stem}.json")
     kept = written(data, lambda: msgspec.json.format(msgspec.json.encode(run), indent=2))
     page = written(html, lambda: render(run).encode())
     return Written(page, kept, "; ".join(
@@ -68,11 +67,6 @@ def in_words(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
-
-
-def _paths(run: RunRecord, directory: str | Path) -> tuple[Path, Path]:
-    stem = "inspection-" + (re.sub(r"[^A-Za-z0-9._-]+", "-", run.run_id) or "run")
-    return Path(directory, f"{stem}.html"), Path(directory, f"{stem}.json")
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -133,7 +127,8 @@ def lanes_of(run: RunRecord) -> list[dict[str, Any]]:
 
 def ticks_of(duration_s: float) -> list[dict[str, Any]]:
     """Return the timeline's ticks: place in percent of the run, and text."""
+    if not duration_s > 0:
+        return []
     step_s = next((t for t in _TICKS if duration_s / t <= 10), 7200)
-    count = int(duration_s // step_s) if duration_s > 0 else 0
     return [{"left": round(100 * i * step_s / duration_s, 3), "text": clock(i * step_s)[:-2]}
-            for i in range(count + 1) if duration_s > 0]
+            for i in range(int(duration_s // step_s) + 1)]

@@ -1,31 +1,35 @@
 """What a run is besides its processes: who hears it, when it is over, and what comes of it.
 
-Whoever runs a system makes a `Trial`, gives its sinks to the observer, asks it now and then whether
-the run is over, and has it conclude. This one is for systems that nobody judges: those that are
-being specified, and those whose world is not simulated here. A robot whose runs end with a verdict
-derives its own, which its application names.
+A run of a system makes a `Trial`, has it make the actors that stand outside of the system, asks it
+now and then whether the run is over, and has it conclude. This one is for systems without a judge:
+those that are being specified, and those whose world is not simulated here. A robot whose runs end
+with a verdict derives its own, which its application names.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
 import msgspec
 
+from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import ProcessEvent
+from rampart.actors.ftm.messages import NodeTable, ProcessEvent
 from rampart.actors.layout.layout import application_class
+from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.layout.wiring import import_class
 from rampart.actors.run.run_context import RunContext
-from rampart.actors.runtime.actor import Header
+from rampart.actors.run.run_plan import OBSERVER
+from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.actors.runtime.clock import Clock
 from rampart.manager.spec.schema import SystemSpec
-from rampart.sim.faults.injector import Injector
-from rampart.sim.faults.scenario import FaultOutcome
+from rampart.sim.faults.faults import faults_of
+from rampart.sim.faults.injector import INJECTOR, Injector, ProcessControl
+from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.runs.console import Console
-from rampart.sim.runs.observer import Sink
+from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord, RunRecorder
 from rampart.sim.runs.report import Written
 
@@ -50,7 +54,7 @@ class Judgement(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Trial:
-    """A run that goes on for a while, and that nobody judges.
+    """A run that goes on for a while, without a judge.
 
     Class attributes:
         judges: whether it ends by itself, with a verdict and a report.
@@ -95,6 +99,7 @@ class Trial:
         self.goals = 0
         self.console = self.tells(stream) if stream else None
         self.recorder = RunRecorder(run.plan, self.strategy)
+        self._injector: Injector | None = None
         self._brought_back = 0
 
     def sinks(self, clock: Clock) -> list[Sink]:
@@ -102,8 +107,38 @@ class Trial:
         del clock
         return [self.recorder.feed, *([self.console.take] if self.console else ())]
 
+    def outside(self, context: Callable[[str], Context], heard: Callable[[NodeTable], None],
+                scenario: Sequence[PlannedFault], control: ProcessControl, nodes: Sequence[str],
+                ) -> list[Actor]:
+        """Return the actors outside of the system: its observer, and the injector of its faults.
+
+        Args:
+            context: returns that of an actor, by its name.
+            heard: is told what the supervisor says of the nodes.
+            scenario: what goes wrong, and when; without it there is no injector.
+            control: by which processes are hit.
+            nodes: names that may be hit.
+        """
+        def take(_topic: Topic[Any], message: Any, _header: Header) -> None:
+            if isinstance(message, NodeTable):
+                heard(message)
+
+        spec, observers = self.run.system, context(OBSERVER)
+        actors: list[Actor] = [
+            observer_class(spec)(observers, [take, *self.sinks(observers.clock)])]
+        if scenario:
+            self._injector = self.injector(
+                context(INJECTOR), scenario, control, nodes=nodes, known=system_topics(spec),
+                faults=faults_of(spec))
+            actors.append(self._injector)
+        return actors
+
+    def outcomes(self) -> tuple[FaultOutcome, ...]:
+        """Return what has become of the faults so far."""
+        return self._injector.outcomes() if self._injector else ()
+
     def brought_back(self, name: str, now_s: float) -> None:
-        """Note that the launcher has brought somebody back."""
+        """Note that the launcher has brought an actor back."""
         self._brought_back += 1
         if self.console:
             self.console.line(now_s, f"{name} brought back")
@@ -121,28 +156,24 @@ class Trial:
             return "its time is over"
         return None
 
-    def conclude(self, now_s: float, why: str, faults: tuple[FaultOutcome, ...] = ()
-                 ) -> RunRecord:
+    def conclude(self, now_s: float, why: str) -> RunRecord:
         """Return the record of the run, with a verdict if there is one.
 
         Args:
             now_s: simulated time.
             why: it is over.
-            faults: what became of them.
         """
         del why
-        return self.recorder.record(now_s, faults=faults)
+        return self.recorder.record(now_s, faults=self.outcomes())
 
     def summary(self, record: RunRecord) -> dict[str, Any]:
         """Return what scripts rely on: the last line of stdout with --json."""
         return {
-            "mission": record.mission, "safety": record.safety, "reasons": list(record.reasons),
-            "duration_s": round(record.duration_s, 2),
-            "decisions": [msgspec.to_builtins(decision) for decision in record.decisions],
-            "restarts": record.restarts,
+            "mission": record.mission, "safety": record.safety, "reasons": record.reasons,
+            "duration_s": round(record.duration_s, 2), "restarts": record.restarts,
+            "decisions": msgspec.to_builtins(record.decisions),
             "faults": [{**msgspec.to_builtins(fault), "effective": fault.effective}
-                       for fault in record.faults],
-        }
+                       for fault in record.faults]}
 
     def judgement(self, record: RunRecord) -> Judgement:
         """Return what only a judge knows of a run that is over."""

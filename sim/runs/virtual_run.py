@@ -14,21 +14,15 @@ import struct
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import msgspec
 
-from rampart.actors.bus.topic import Topic
-from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.layout.layout import Layout
-from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.run.run_plan import OBSERVER
-from rampart.actors.runtime.actor import Actor, Context, Header
-from rampart.sim.faults.faults import faults_of
+from rampart.actors.runtime.actor import Context
 from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
-from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.trial import Judgement, Trial
 from rampart.sim.virtual.network import NETWORKS, NetworkModel, SeededNetwork
@@ -44,8 +38,7 @@ _CHUNK = 3000
 _HEAD = struct.Struct("<dI").pack
 
 
-@dataclass(frozen=True, slots=True)
-class VirtualResult:
+class VirtualResult(msgspec.Struct, frozen=True):
     """What came of a virtual run.
 
     Attributes:
@@ -121,7 +114,7 @@ class VirtualRun:
         ValueError: an actor class named in the spec cannot be had.
 
     Attributes:
-        interrupted: Whoever sets it, perhaps from a signal handler, ends the run for this reason.
+        interrupted: Setting it, perhaps from a signal handler, ends the run for this reason.
     """
 
     def __init__(self, trial: Trial, *, network: NetworkModel | None = None,
@@ -161,30 +154,19 @@ class VirtualRun:
         if not isinstance(loop, VirtualLoop):
             raise TypeError(f"{loop!r}: a virtual run needs a virtual loop")
         clock = VirtualClock(loop, loop.time() + LEAD_S)
-        hub = Hub(SeededNetwork(self._network, self.plan.seed, local=(OBSERVER, INJECTOR)))
+        hub = Hub(SeededNetwork(self._network, self.plan.seed, local=(OBSERVER, INJECTOR)).link)
         trace = Trace()
         hub.taps.append(trace)
         hub.taps += [_tap(take, loop.time() + LEAD_S) for take in self._taps]
         machine = VirtualMachine(self._layout, self._context, hub, clock, seed=self.plan.seed)
         machine.on_restart = lambda name: self.trial.brought_back(name, clock.now())
 
-        def to_machine(_topic: Topic[Any], message: Any, _header: Header) -> None:
-            if isinstance(message, NodeTable):
-                machine.supervisor_heard(message)
+        def context(name: str) -> Context:
+            return Context(name, 1, clock, VirtualBus(hub, name), pid=1,
+                           members=frozenset(self._layout.members))
 
-        sinks: list[Sink] = [to_machine, *self.trial.sinks(clock)]
-        observer = observer_class(self._layout.spec)(Context(
-            OBSERVER, 1, clock, VirtualBus(hub, OBSERVER), pid=1,
-            members=frozenset(self._layout.members)), sinks)
-        actors: list[Actor] = [observer]
-        injector = None
-        if self._scenario:
-            injector = self.trial.injector(
-                Context(INJECTOR, 1, clock, VirtualBus(hub, INJECTOR), pid=1,
-                        members=frozenset(self._layout.members)),
-                self._scenario, machine, nodes=self._nodes, known=system_topics(self._layout.spec),
-                faults=faults_of(self._layout.spec))
-            actors.append(injector)
+        actors = self.trial.outside(
+            context, machine.supervisor_heard, self._scenario, machine.hit, self._nodes)
         watching = [asyncio.create_task(actor.run()) for actor in actors]
         machine.start()
         why = None
@@ -196,8 +178,7 @@ class VirtualRun:
         for actor in actors:
             actor.stop()
         await asyncio.gather(*watching)
-        record = self.trial.conclude(
-            now_s, why or "ended", injector.outcomes() if injector else ())
+        record = self.trial.conclude(now_s, why or "ended")
         return VirtualResult(
             record, self.trial.judgement(record), why or "ended", trace.digest(), trace.messages,
             time.perf_counter() - begun_s,

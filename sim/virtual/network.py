@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
+
+import msgspec
 
 from rampart.sim.virtual.timing import Stock, Timing, drawer, measured
 from rampart.sim.virtual.virtual_bus import Link
 
-__all__ = ["NETWORKS", "NetworkModel", "SeededNetwork", "find_network"]
 
-
-@dataclass(frozen=True, slots=True)
-class NetworkModel:
+class NetworkModel(msgspec.Struct, frozen=True):
     """What a network does to messages.
 
     Args:
@@ -53,8 +51,7 @@ NETWORKS: Mapping[str, NetworkModel] = {model.name: model for model in (
     NetworkModel("ideal", "no delay at all", delay=False),
     NetworkModel("jittery", "up to 20 ms more, in order", extra_s=0.02),
     NetworkModel("lossy", "as between robots: up to 20 ms more, 1 % lost, 1 % twice, 2 % overtaken",
-                 extra_s=0.02, loss=0.01, duplication=0.01, reordering=0.02),
-)}
+                 extra_s=0.02, loss=0.01, duplication=0.01, reordering=0.02))}
 """Networks by name."""
 
 
@@ -77,7 +74,7 @@ class SeededNetwork:
         model: What it does to messages.
         seed: Of all its dice.
         timing: Distribution of the delay; the measured one if None.
-        local: Nodes that share a process with everybody: nothing happens on the way to them.
+        local: Nodes that share a process with all others: nothing happens on the way to them.
     """
 
     def __init__(self, model: NetworkModel, seed: Any, timing: Timing | None = None,
@@ -119,7 +116,7 @@ class SeededNetwork:
         return arrivals
 
     def _troubled(self) -> Link:
-        """Return a link that does to messages whatever the model says."""
+        """Return a link that does to messages what the model says."""
         model, dice, last_s = self.model, self._rng.random, 0.0
 
         def arrivals(now_s: float) -> Sequence[float]:

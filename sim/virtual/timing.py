@@ -7,7 +7,6 @@ is drawn from the distributions that `python -m benchmarks.timing` has measured.
 
 from __future__ import annotations
 
-import bisect
 import random
 import tomllib
 from collections.abc import Callable
@@ -52,16 +51,8 @@ def measured() -> Timing:
         return msgspec.convert(tomllib.load(file), Timing)
 
 
-def draw(quantiles_ms: tuple[float, ...], rng: random.Random) -> float:
-    """Draw from a distribution given by quantiles: linear in between; seconds."""
-    at = rng.random() * (len(quantiles_ms) - 1)
-    low = int(at)
-    here, there = quantiles_ms[low], quantiles_ms[low + 1]
-    return (here + (there - here) * (at - low)) * 1e-3
-
-
 def drawer(quantiles_ms: tuple[float, ...], rng: random.Random) -> Callable[[], float]:
-    """Return a function that draws as `draw` does, bit by bit, for whoever draws all the time."""
+    """Return a function that draws from a distribution: linear between its quantiles; seconds."""
     pieces = [(here, there - here) for here, there in pairwise(quantiles_ms)]
     share, count = rng.random, len(pieces)
 
@@ -75,12 +66,12 @@ def drawer(quantiles_ms: tuple[float, ...], rng: random.Random) -> Callable[[], 
 
 
 class Stock:
-    """Draws in stock, bit by bit those of `draw`; for whoever has the dice for itself alone.
+    """Draws in stock, bit by bit those of a `drawer` that has the dice for itself alone.
 
     numpy's older generator is the same as Python's, and makes a block at once.
 
     Args:
-        quantiles_ms: As for `draw`.
+        quantiles_ms: As for `drawer`.
         rng: The dice, whose further throws are drawn from a copy.
     """
 
@@ -100,14 +91,3 @@ class Stock:
         low = at.astype(int)
         block_s = (self._low_ms[low] + self._rise_ms[low] * (at - low)) * 1e-3
         self.draws_s += block_s[::-1].tolist()
-
-
-def share_below(quantiles_ms: tuple[float, ...], value_ms: float) -> float:
-    """Return the share of a distribution that lies below a value."""
-    if value_ms <= quantiles_ms[0]:
-        return 0.0
-    if value_ms >= quantiles_ms[-1]:
-        return 1.0
-    i = bisect.bisect_right(quantiles_ms, value_ms)
-    low, high = quantiles_ms[i - 1], quantiles_ms[i]
-    return (i - 1 + (value_ms - low) / (high - low)) / (len(quantiles_ms) - 1)

@@ -1,6 +1,6 @@
 """A bus inside one process, for virtual time and tests: no sockets, no threads.
 
-What lies between two nodes is up to a `Network`: it says when each copy of a message arrives,
+What lies between two nodes is up to their `Link`: it says when each copy of a message arrives,
 which takes a virtual loop. Without one everything arrives at once, on any loop.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from rampart.actors.bus.bus import Deliver, PeerChange
 from rampart.actors.bus.topic import Topic
@@ -22,22 +22,20 @@ Link = Callable[[float], Sequence[float]]
 """Way from one node to another: returns when the copies of a message sent now arrive, if any."""
 
 
-class Network(Protocol):
-    """When messages arrive."""
-
-    def link(self, source: str, reader: str) -> Link | None:
-        """Return the one link between two nodes; None if everything arrives at once."""
-
-
 Route = tuple[Link | None, Deliver, Callable[[Deliver, str, bytes], None]]
-"""The way to a reader, who there takes the message, and its bus's `arrive`, for other loops."""
+"""The link to a reader, what there takes the message, and its bus's `arrive`, for other loops."""
 
 
 class Hub:
-    """What the buses of one virtual system share: subscriptions and living nodes."""
+    """What the buses of one virtual system share: subscriptions and running nodes.
 
-    def __init__(self, network: Network | None = None) -> None:
-        self.network = network
+    Args:
+        link: returns the one link from a node to another; None if everything arrives at once.
+    """
+
+    def __init__(self, link: Callable[[str, str], Link | None] = lambda _source, _reader: None
+                 ) -> None:
+        self._link = link
         self.taps: list[Tap] = []
         self.alive: dict[str, set[int]] = {}
         self._subscriptions: list[tuple[re.Pattern[str], Deliver, VirtualBus]] = []
@@ -66,9 +64,8 @@ class Hub:
 
     def route(self, source: str, key: str) -> list[Route]:
         """Return the ways from a node to all who hear a key, in the order of subscription."""
-        link = self.network.link if self.network else _at_once
         found = self.routes_from(source)[key] = [
-            (link(source, bus.node), deliver, bus.arrive)
+            (self._link(source, bus.node), deliver, bus.arrive)
             for pattern, deliver, bus in self._subscriptions if pattern.fullmatch(key)]
         return found
 
@@ -86,10 +83,6 @@ class Hub:
         for watched, changed, bus in list(self._watchers):
             if watched == node:
                 bus.soon(lambda c=changed: c(node, incarnation, alive))  # type: ignore[misc]
-
-
-def _at_once(_source: str, _reader: str) -> Link | None:
-    return None
 
 
 class VirtualBus:
@@ -139,15 +132,15 @@ class VirtualBus:
                     virtual.post_at(at_s, deliver, key, payload)
 
     def arrive(self, deliver: Deliver, key: str, payload: bytes) -> None:
-        """Hand a message over, if somebody is still there to take it.
+        """Hand a message over, if this bus is still open.
 
-        On a virtual loop nobody asks: `cut` takes back what is posted.
+        On a virtual loop that is not asked: `cut` takes back what is posted.
         """
         if self._open:
             deliver(key, payload)
 
     def has_readers(self, key: str) -> bool:
-        """Whether somebody hears a key now."""
+        """Whether any node hears a key now."""
         routes = self._routes.get(key)
         return bool(self._hub.route(self.node, key) if routes is None else routes)
 
@@ -163,7 +156,7 @@ class VirtualBus:
             self.soon(lambda i=incarnation: changed(node, i, True))  # type: ignore[misc]
 
     def cut(self) -> None:
-        """Send and receive nothing any more, as when the process is killed; nobody is told yet."""
+        """Send and receive nothing any more, as when the process is killed; none is told yet."""
         self._open = False
         self._hub.remove(self)
         if self._virtual is not None:

@@ -1,8 +1,8 @@
 """Virtual time: an event loop that does not wait but moves its clock to the next timer.
 
-Whatever runs on it is deterministic, since nothing depends on how fast the machine is, and takes
-only the time that the work itself takes. The actors do not notice: they know a `Clock`, and the
-clock reads `loop.time`.
+What runs on it is deterministic, since nothing depends on how fast the machine is, and takes only
+the time that the work itself takes. The actors do not notice: they know a `Clock`, and the clock
+reads `loop.time`.
 
 Calls and timers are kept in leaner objects than asyncio's, because a virtual run consists of
 little else: a mission makes a quarter of a million of them. Messages and ticks do without any:
@@ -67,7 +67,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     Callbacks run in the order in which they become due, and in that of scheduling if at once.
 
     Attributes:
-        now_s: what `time` returns, for whoever asks all the time.
+        now_s: what `time` returns, for callers that ask all the time.
     """
 
     def __init__(self) -> None:
@@ -86,31 +86,27 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         """Let time pass unseen, as for a machine that was suspended."""
         self.now_s += seconds
 
-    def call_soon(  # type: ignore[override] # what comes back does what a Handle does
-        self, callback: Any, *args: Any, context: Context | None = None
-    ) -> Any:
-        """As asyncio's."""
+    def call_soon(self, callback: Any, *args: Any,  # type: ignore[override]
+                  context: Context | None = None) -> Any:
+        """As asyncio's; what comes back does what a Handle does."""
         call = _Call(callback, args, context, self.now_s)
         self._ready.append(call)  # type: ignore[attr-defined]
         return call
 
-    def call_soon_threadsafe(  # type: ignore[override]
-        self, callback: Any, *args: Any, context: Context | None = None
-    ) -> Any:
+    def call_soon_threadsafe(self, callback: Any, *args: Any,  # type: ignore[override]
+                             context: Context | None = None) -> Any:
         """As asyncio's."""
         call = self.call_soon(callback, *args, context=context)
         self._write_to_self()  # type: ignore[attr-defined]
         return call
 
-    def call_later(  # type: ignore[override]
-        self, delay: float, callback: Any, *args: Any, context: Context | None = None
-    ) -> Any:
+    def call_later(self, delay: float, callback: Any, *args: Any,  # type: ignore[override]
+                   context: Context | None = None) -> Any:
         """As asyncio's."""
         return self.call_at(self.now_s + delay, callback, *args, context=context)
 
-    def call_at(  # type: ignore[override]
-        self, when: float, callback: Any, *args: Any, context: Context | None = None
-    ) -> Any:
+    def call_at(self, when: float, callback: Any, *args: Any,  # type: ignore[override]
+                context: Context | None = None) -> Any:
         """As asyncio's."""
         call = _Call(callback, args, context, when)
         self._count = count = self._count + 1
@@ -186,7 +182,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 class VirtualClock(Clock):
-    """The clock of whatever runs on a virtual loop; read more often than anything else.
+    """The clock of what runs on a virtual loop; read more often than anything else.
 
     Args:
         loop: whose time it shows.

@@ -12,25 +12,22 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import Enum
+from functools import partial
+from itertools import count
 from typing import Any
 
 from rampart.actors.ftm.messages import AdaptedSystem, NodeTable
 from rampart.actors.layout.layout import Layout, adapted_system
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import SUPERVISOR
+from rampart.actors.runtime import checkpoint
 from rampart.actors.runtime.actor import Actor, Context
-from rampart.actors.runtime.checkpoint import (
-    CheckpointStore,
-    MemoryCheckpoints,
-    NoCheckpoints,
-    Shelf,
-)
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.guard import PERIOD_S, SUPERVISOR_PATIENCE_S
 from rampart.actors.supervision.processes import Living, ProcessHandle, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.supervision.supervisor import Supervisor
-from rampart.sim.virtual.timing import Timing, draw, measured
+from rampart.sim.virtual.timing import drawer, measured
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 
 FIRST_PID = 1000
@@ -46,18 +43,22 @@ class Condition(Enum):
     ENDED = "ended"
 
 
+_CHANGES = {
+    "stop": (Condition.RUNNING, Condition.STOPPED),
+    "wedge": (Condition.RUNNING, Condition.WEDGED),
+    "resume": (Condition.STOPPED, Condition.RUNNING)}
+"""What holds or resumes a process: the condition in which it helps, and that after it."""
+
+
 class VirtualProcess:
-    """One process: its actors and their tasks."""
+    """One process: its actors, with their buses and tasks."""
 
     def __init__(self, pid: int, names: tuple[str, ...], incarnation: int) -> None:
         self.pid = pid
         self.names = names
         self.incarnation = incarnation
         self.condition = Condition.STARTING
-        self.failure: BaseException | None = None
-        self.actors: list[Actor] = []
-        self.buses: list[VirtualBus] = []
-        self.tasks: list[asyncio.Task[None]] = []
+        self.actors: list[tuple[Actor, VirtualBus, asyncio.Task[None]]] = []
         self.holders: list[Callable[[], None]] = []
         self.gone = False
 
@@ -85,8 +86,7 @@ class _Handle(ProcessHandle):
         if self._ended in self._process.holders:
             self._process.holders.remove(self._ended)
 
-    def close(self) -> None:
-        self.ignore()
+    close = ignore
 
 
 class VirtualMachine:
@@ -98,7 +98,6 @@ class VirtualMachine:
         hub: Where their buses meet.
         clock: Simulated time; its source is the loop's time.
         seed: Of the dice for how long things take.
-        timing: Distributions; the measured ones if None.
 
     Attributes:
         failures: Actors that ended by an error, with the error.
@@ -106,20 +105,21 @@ class VirtualMachine:
         shelves: What the nodes have kept; it outlives their processes.
     """
 
-    def __init__(self, layout: Layout, run: RunContext, hub: Hub, clock: Clock, *,
-                 seed: Any, timing: Timing | None = None) -> None:
+    def __init__(self, layout: Layout, run: RunContext, hub: Hub, clock: Clock, seed: Any) -> None:
         self.failures: list[tuple[str, BaseException]] = []
         self.on_restart: Callable[[str], None] = lambda _name: None
-        self.slow_start_s: dict[str, float] = {}
-        self.shelves: dict[str, Shelf] = {}
+        self.shelves: dict[str, checkpoint.Shelf] = {}
         self._layout = layout
         self._run = run
         self._hub = hub
         self._clock = clock
-        self._rng = random.Random(f"processes {seed}")  # noqa: S311 no secret
-        self._timing = timing or measured()
+        dice, timing = random.Random(f"processes {seed}"), measured()  # noqa: S311 no secret
+        self._start_s = drawer(timing.start_ms, dice)
+        self._exit_s = drawer(timing.exit_ms, dice)
+        self._death_s = drawer(timing.death_ms, dice)
+        self._supervisor_back_s = drawer(timing.supervisor_back_ms, dice)
         self._loop = asyncio.get_running_loop()
-        self._next_pid = FIRST_PID
+        self._pids = count(FIRST_PID)
         self._processes: dict[int, VirtualProcess] = {}
         self._slow: dict[str, float] = {}
         self._known: dict[str, int] = {}
@@ -169,7 +169,7 @@ class VirtualMachine:
             return
         self._loop.call_later(PERIOD_S, self._guard)
         if self._loop.time() - self._supervisor_heard_s > SUPERVISOR_PATIENCE_S:
-            self.kill(SUPERVISOR)
+            self.hit("kill", SUPERVISOR)
 
     def shut_down(self) -> None:
         """End everything at once: the run is over."""
@@ -187,14 +187,11 @@ class VirtualMachine:
         """Start a process; its first word comes after the measured time."""
         if self._down:
             raise SpawnerUnavailableError("the machine is down")
-        pid = self._next_pid
-        self._next_pid += 1
+        pid = next(self._pids)
         process = self._processes[pid] = VirtualProcess(pid, names, incarnation)
         for name in names:
             self._known[name] = max(self._known.get(name, 0), incarnation)
-        delay_s = draw(self._timing.start_ms, self._rng) + max(
-            self.slow_start_s.get(name, 0.0) for name in names)
-        self._loop.call_later(delay_s, self._begin, process)
+        self._loop.call_later(self._start_s(), self._begin, process)
         return pid
 
     def hold(self, pid: int, ended: Callable[[], None]) -> _Handle:
@@ -218,71 +215,43 @@ class VirtualMachine:
 
     # -- what can happen to a process -----------------------------------------------------------
 
-    def condition(self, node: str) -> Condition:
-        """Return what a node's process is doing."""
-        process = self._process_of(node)
-        return process.condition if process else Condition.ENDED
+    def hit(self, what: str, node: str, pace_s: float = 0.0) -> bool:
+        """Do something to a node's process, as a `ProcessControl`.
 
-    def kill(self, node: str) -> bool:
-        """SIGKILL; return whether there was somebody to kill."""
-        process = self._process_of(node)
-        if process is not None:
-            self.kill_process(process)
-        return process is not None
-
-    def stop(self, node: str) -> bool:
-        """SIGSTOP."""
-        return self._hold(node, Condition.STOPPED)
-
-    def wedge(self, node: str) -> bool:
-        """Have its event loop turn no more, process and token still there."""
-        return self._hold(node, Condition.WEDGED)
-
-    def resume(self, node: str) -> bool:
-        """SIGCONT; helps a stopped process, not a wedged one."""
-        process = self._process_of(node)
-        if process is None or process.condition is not Condition.STOPPED:
+        A wedged process is still there, with its token. A slow node is slow after a restart, too.
+        """
+        if what == "slow":
+            self._slow[node] = pace_s
+        process = next((p for p in reversed(self._processes.values()) if node in p.names), None)
+        if process is None:
             return False
-        process.condition = Condition.RUNNING
-        for actor in process.actors:
-            actor.hold(False)
+        if what == "kill":
+            self.kill_process(process)
+        elif what == "slow":
+            for actor, _, _ in process.actors:
+                if actor.name == node:
+                    actor.slow_down(pace_s)
+        else:
+            before, after = _CHANGES[what]
+            if process.condition is not before:
+                return False
+            process.condition = after
+            for actor, _, _ in process.actors:
+                actor.hold(after is not Condition.RUNNING)
         return True
-
-    def slow_down(self, node: str, pace_s: float) -> bool:
-        """Have each message take a node so long, its successors included; 0 ends that."""
-        self._slow[node] = pace_s
-        process = self._process_of(node)
-        for name, actor in zip(process.names, process.actors, strict=False) if process else ():
-            if name == node:
-                actor.slow_down(pace_s)
-        return process is not None
 
     def kill_process(self, process: VirtualProcess) -> None:
         """End a process, and let it be noticed as fast as a SIGKILL is."""
         if process.condition is Condition.ENDED:
             return
         self._end(process)
-        exit_s = draw(self._timing.exit_ms, self._rng)
-        death_s = draw(self._timing.death_ms, self._rng)
+        exit_s, death_s = self._exit_s(), self._death_s()
         self._loop.call_later(exit_s, self._exited, process)
         if SUPERVISOR in process.names:
-            self._loop.call_later(
-                draw(self._timing.supervisor_back_ms, self._rng), self._bring_supervisor_back)
+            self._loop.call_later(self._supervisor_back_s(), self._bring_supervisor_back)
         self._loop.call_later(max(death_s, exit_s), self._token_gone, process)
 
     # -- inside ---------------------------------------------------------------------------------
-
-    def _process_of(self, node: str) -> VirtualProcess | None:
-        return next((p for p in reversed(self._processes.values()) if node in p.names), None)
-
-    def _hold(self, node: str, condition: Condition) -> bool:
-        process = self._process_of(node)
-        if process is None or process.condition is not Condition.RUNNING:
-            return False
-        process.condition = condition
-        for actor in process.actors:
-            actor.hold(True)
-        return True
 
     def _begin(self, process: VirtualProcess) -> None:
         if process.condition is not Condition.STARTING:
@@ -291,39 +260,33 @@ class VirtualMachine:
         for name in process.names:
             member = self._layout.members[name]
             bus = VirtualBus(self._hub, name, process.incarnation)
-            process.buses.append(bus)
+            context = Context(
+                name, process.incarnation, self._clock, bus, member.parameters, self._run,
+                process.pid, self._store(name, process.incarnation),
+                self._layout.spec.timing.heartbeat_period_s, register=self._known.get,
+                members=frozenset(self._layout.members), topics=self._layout.topics,
+                usage=lambda _pid: None)
             try:
-                context = Context(
-                    name, process.incarnation, self._clock, bus, member.parameters, self._run,
-                    process.pid, self._store(name, process.incarnation),
-                    self._layout.spec.timing.heartbeat_period_s, register=self._known.get,
-                    members=frozenset(self._layout.members), topics=self._layout.topics,
-                    usage=lambda _pid: None)
-                actor = (Supervisor(context, self) if name == SUPERVISOR
-                         else member.actor(context))
+                actor = Supervisor(context, self) if name == SUPERVISOR else member.actor(context)
             except Exception as error:
                 self._failed(process, name, error)
                 return
             if self._slow.get(name):
                 actor.slow_down(self._slow[name])
-            process.actors.append(actor)
             task = self._loop.create_task(actor.run())
-            process.tasks.append(task)
-            task.add_done_callback(
-                lambda done, n=name: self._task_done(process, n, done))  # type: ignore[misc]
+            process.actors.append((actor, bus, task))
+            task.add_done_callback(partial(self._task_done, process, name))
 
-    def _store(self, name: str, incarnation: int) -> CheckpointStore:
+    def _store(self, name: str, incarnation: int) -> checkpoint.CheckpointStore:
         if not self._layout.spec.layers.checkpoints:
-            return NoCheckpoints()
-        return MemoryCheckpoints(self.shelves.setdefault(name, Shelf()), incarnation)
+            return checkpoint.NoCheckpoints()
+        shelf = self.shelves.setdefault(name, checkpoint.Shelf())
+        return checkpoint.MemoryCheckpoints(shelf, incarnation)
 
     def _task_done(self, process: VirtualProcess, name: str, task: asyncio.Task[None]) -> None:
-        if process.condition is Condition.ENDED:
-            if not task.cancelled():
-                task.exception()  # it was being killed: nobody reads what it had to say
-            return
         error = None if task.cancelled() else task.exception()
-        self._failed(process, name, error or RuntimeError("ended by itself"))
+        if process.condition is not Condition.ENDED:  # else it was being killed
+            self._failed(process, name, error or RuntimeError("ended by itself"))
 
     def _failed(self, process: VirtualProcess, name: str, error: BaseException) -> None:
         self.failures.append((name, error))
@@ -332,9 +295,8 @@ class VirtualMachine:
     def _end(self, process: VirtualProcess) -> None:
         process.condition = Condition.ENDED
         self._processes.pop(process.pid, None)
-        for bus in process.buses:
+        for actor, bus, task in process.actors:
             bus.cut()
-        for actor, task in zip(process.actors, process.tasks, strict=False):
             actor.abandon()
             task.cancel()
 

@@ -16,7 +16,6 @@ from rampart.actors.operator.bounds import MAX_NAME, clip
 from rampart.actors.operator.camera_eye import CameraEye, renderer
 from rampart.actors.operator.hmi import Hmi
 from rampart.actors.operator.requests import RefusedError, Request
-from rampart.actors.operator.server import Visitor
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, Mission
@@ -121,7 +120,7 @@ class OsmosisHmi(Hmi):
         if outcome:
             self._state.announce(outcome, self.clock.now(), "order to the mission: ")
 
-    def _fulfil(self, request: Request, visitor: Visitor) -> str | dict[str, Any]:
+    def _fulfil(self, request: Request, page: int) -> str | dict[str, Any]:
         match request:
             case StartRequest():
                 return self._start(request.name)
@@ -129,7 +128,7 @@ class OsmosisHmi(Hmi):
                 order = self._orders.give(request.action, request.reason, self.clock.now())
                 self.publish(topics.MISSION_ORDER, order)
                 return f"{request.action.value} asked for"
-        return super()._fulfil(request, visitor)
+        return super()._fulfil(request, page)
 
     def _start(self, name: str) -> str:
         if name not in self._missions:

@@ -14,7 +14,6 @@ from rampart.actors.osmosis.messages import ControlStatus, GroundTruth, MissionS
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
-from rampart.sim.faults.scenario import FaultOutcome
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.console import MissionConsole
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
@@ -76,12 +75,11 @@ class MissionTrial(Trial):
         """Return why the run is over, or None while it goes on."""
         return self._end.ended(now_s)
 
-    def conclude(self, now_s: float, why: str, faults: tuple[FaultOutcome, ...] = ()
-                 ) -> MissionRecord:
+    def conclude(self, now_s: float, why: str) -> MissionRecord:
         """Return the record of the run with the judge's verdict, and what became of faults."""
         verdict = self.judge.verdict()
         found = self.recorder.record(
-            now_s, faults=faults, mission="success" if verdict.success else "fail",
+            now_s, faults=self.outcomes(), mission="success" if verdict.success else "fail",
             safety=_SAFETY[verdict.safe],
             reasons=() if verdict.success and verdict.safe else (
                 *verdict.reasons, f"ended: {why}"))

@@ -16,8 +16,10 @@ the odometry nor the IMU (`rampart topic info`): these faults change messages th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
+
+from msgspec.structs import replace
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import topics

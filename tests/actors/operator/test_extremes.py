@@ -331,7 +331,8 @@ async def test_markup_in_every_text_of_the_bus_and_of_the_airport_is_inert(world
             for light in airport.lights:
                 hmi._light(m.LightMeasurement(light.name, 0.0, 0.0, m.LightVerdict.OUT),
                            Header("x", 1, 2, 0.0))
-            hmi._state.usage({"nodes": {MARKUP: {"cpu": 1.0, "mb": 1.0, "age_s": 1}}, "guards": [
+            usage = {MARKUP: {"cpu": 1.0, "mb": 1.0, "age_s": 1}}
+            hmi._state.picture.put("usage", {"nodes": usage, "guards": [
                 {"name": f"{MARKUP} guard", "kind": MARKUP, "pid": 1, "state": MARKUP,
                  "incarnation": 1, "restarts": 0, "signals": True}]})
             hmi._state.announce(MARKUP, 1.0)

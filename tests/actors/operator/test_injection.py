@@ -18,11 +18,9 @@ from rampart.actors.operator.injection import (
     LATE_END_S,
     MAX_WAITING,
     TAKE_HOLD_S,
-    FaultError,
     Injections,
-    places,
+    places_of,
 )
-from rampart.actors.operator.operating import places_of
 from rampart.actors.operator.requests import RefusedError
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -35,7 +33,7 @@ from tests.porter_actors import write_porter_system
 
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 OFFERED = OsmosisFaults().offered()
-KEYS = places(topics.ALL, ["localization"], ["DM1"], ["RM1"])
+KEYS = places_of(systems.load("osmosis"))
 
 
 def injections() -> Injections:
@@ -107,7 +105,7 @@ def test_a_planned_fault_waits_for_its_time_and_can_be_withdrawn():
     assert faults.view(10.0)[0]["state"] == "begins at 25 s"
     withdrawn = faults.order("gps-bias", 20.0, None, 5.0)
     assert faults.end(withdrawn.injection, 6.0)[0].message.duration_s == 0.0
-    with pytest.raises(FaultError, match=r"no fault .* is under way"):
+    with pytest.raises(RefusedError, match=r"no fault .* is under way"):
         faults.end(withdrawn.injection, 7.0)
     (order,) = faults.due(25.0)
     assert order.place == "summit_xl/gps"
@@ -167,7 +165,7 @@ def test_a_fault_of_the_base_counts_its_ticks():
     ("drop:detection/DM99", "none of that key"), ("", "no fault ''"),
 ])
 def test_what_cannot_be_injected_is_refused_by_name(fault, why):
-    with pytest.raises(FaultError, match=why):
+    with pytest.raises(RefusedError, match=why):
         injections().order(fault, 0.0, None, 0.0)
 
 
@@ -175,7 +173,7 @@ def test_only_so_many_faults_wait_at_once_and_the_list_stays_short():
     faults = injections()
     for _ in range(MAX_WAITING):
         faults.order("gps-bias", 100.0, None, 0.0)
-    with pytest.raises(FaultError, match="16 faults are under way"):
+    with pytest.raises(RefusedError, match="16 faults are under way"):
         faults.order("gps-bias", 0.0, None, 0.0)
     for i in range(100):
         faults.expire(1000.0 * (i + 1))
@@ -239,7 +237,7 @@ def test_each_fault_is_concluded_once_whatever_is_reported(events):
         elif kind == "end" and names:
             try:
                 faults.end(names[number % len(names)], now_s)
-            except FaultError:
+            except RefusedError:
                 continue
         else:
             told += faults.expire(now_s)

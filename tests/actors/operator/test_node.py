@@ -13,7 +13,7 @@ import websockets
 from rampart.actors.ftm import messages as fm
 from rampart.actors.operator import feed as hmi_feed
 from rampart.actors.operator import server as hmi_server
-from rampart.actors.operator.server import MAX_MESSAGE_BYTES, Visitor
+from rampart.actors.operator.server import MAX_MESSAGE_BYTES
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.page.hmi import OsmosisHmi
@@ -123,7 +123,7 @@ async def test_an_order_is_given_from_the_page_if_it_makes_sense_and_its_answer_
             await page.send('{"type": "order", "action": "pause"}')
             assert (await hear(page, "error"))["text"] == "the Mission Manager was not heard yet"
             world.say(m.MissionPhase.RUNNING, m.MissionAction.PAUSE)
-            await eventually(lambda: hmi._state.snapshot(0.0)["mission"] is not None)
+            await eventually(lambda: hmi._state.picture.value("mission") is not None)
             await page.send('{"type": "order", "action": "resume"}')
             assert (await hear(page, "error"))["text"] == (
                 "resume makes no sense while the mission is running; possible: pause")
@@ -146,13 +146,13 @@ async def test_an_order_without_an_answer_is_repeated_to_a_mission_manager_that_
     async with world.hmi() as hmi:
         world.say(m.MissionPhase.RUNNING, *m.MissionAction)
         await eventually(lambda: hmi._orders._status is not None)
-        hmi._fulfil(OrderRequest(m.MissionAction.HOME), Visitor(1))
+        hmi._fulfil(OrderRequest(m.MissionAction.HOME), 1)
         sent = []
         hmi.publish = lambda topic, body, *_: topic is topics.MISSION_ORDER and sent.append(body)
         await eventually(lambda: len(sent) >= 2)
         await eventually(lambda: hmi._orders.pending is None)
         assert len(set(sent)) == 1
-        assert "does not answer" in hmi._state.snapshot(0.0)["order"]["text"]
+        assert "does not answer" in hmi._state.picture.value("order")["text"]
 
 
 async def test_a_huge_message_closes_that_page_only(world):
@@ -207,7 +207,7 @@ async def test_without_a_free_port_the_hmi_works_without_a_page_and_says_why(wor
         port = taken.getsockname()[1]
         async with world.hmi(hmi_port=port, mission=AIRPORT.mission("A")) as hmi:
             await eventually(lambda: bool(world.others.diagnostics and world.others.requests))
-            assert hmi.page_port is None
+            assert hmi._server is None
     report = world.others.diagnostics[0]
     assert report.offender == f"port {port}"
     assert "Address already in use" in report.reason

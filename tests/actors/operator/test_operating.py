@@ -330,14 +330,14 @@ async def test_with_a_token_the_files_are_open_and_everything_else_is_not(world,
 async def test_a_page_for_everybody_without_a_token_is_not_served_and_the_reason_reported(world):
     async with world.hmi(hmi_port=free_port(), hmi_host="0.0.0.0") as hmi:
         await eventually(lambda: bool(world.others.diagnostics))
-        assert hmi.page_port is None
+        assert hmi._server is None
     assert "needs a token" in world.others.diagnostics[0].reason
 
 
 async def test_on_another_address_a_foreign_host_is_refused_also_with_the_token(world):
     async with world.hmi(hmi_port=free_port(), hmi_host="127.0.0.2", hmi_token=TOKEN) as hmi:
         await served(hmi)
-        at = f"127.0.0.2:{hmi.page_port}"
+        at = f"127.0.0.2:{hmi._server.port}"
         async with httpx.AsyncClient() as client:
             assert (await client.get(f"http://{at}/")).status_code == 200
             for host in ("evil.example", ""):

@@ -101,7 +101,7 @@ def test_whatever_frames_a_page_missed_it_ends_up_with_the_whole_picture(steps):
         else:
             page.take(msgspec.json.encode(picture.changes(version)).decode())
             version = picture.version
-    assert {"events": [], **page.known} == as_json(picture.all())
+    assert {"events": [], **page.known} == as_json(picture.changes(0))
 
 
 def test_silence_is_shown_once_and_the_next_message_ends_it():
@@ -109,11 +109,11 @@ def test_silence_is_shown_once_and_the_next_message_ends_it():
     state.pose(m.Pose(1.0, 2.0, 0.0), 5.0, 5.0)
     state.grow_old(5.0 + STALE_S + 0.1)
     version = state.picture.version
-    assert state.snapshot(7.0)["pose"]["stale"] is True
+    assert as_json(state.picture.changes(0))["pose"]["stale"] is True
     state.grow_old(8.0)
     assert state.picture.version == version
     state.pose(m.Pose(1.0, 2.0, 0.0), 9.0, 9.0)
-    assert state.snapshot(9.0)["pose"]["stale"] is False
+    assert as_json(state.picture.changes(0))["pose"]["stale"] is False
 
 
 # ---- the laser -----------------------------------------------------------------------------------
@@ -208,7 +208,7 @@ async def test_a_page_is_greeted_then_gets_everything_then_changes():
         hello, whole = p.line.frames[:2]
         assert hello == {"type": "hello"}
         assert [e["text"] for e in whole["events"]] == ["before"]
-        assert set(p.state.picture.all()) <= set(whole)
+        assert set(p.state.picture.changes(0)) <= set(whole)
         p.state.keep("pilot", m.PilotStatus(m.PilotMode.STOP, True, "", 0), 1.0)
         await p.line.until(lambda frames: frames[-1].get("pilot"))
         assert set(p.line.frames[-1]) == {"type", "version", "time_s", "pilot"}

@@ -54,7 +54,7 @@ def reception(hmi) -> web_server.Reception:
 async def all_gone(hmi) -> None:
     """Wait until nobody is connected, or in the kernel's queue: who asks last comes last."""
     async with httpx.AsyncClient(timeout=10) as client:
-        assert (await client.get(f"http://127.0.0.1:{hmi.page_port}/")).status_code == 200
+        assert (await client.get(f"http://127.0.0.1:{hmi._server.port}/")).status_code == 200
     await eventually(lambda: len(reception(hmi)) == hmi._server.pages == 0)
 
 

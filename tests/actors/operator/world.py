@@ -135,8 +135,8 @@ async def repeated(say, period_s: float = 0.02):
 
 
 async def served(hmi: OsmosisHmi) -> str:
-    await eventually(lambda: hmi._starting is not None and hmi._starting.done())
-    return f"127.0.0.1:{hmi.page_port}"
+    await eventually(lambda: hmi._server is not None)
+    return f"127.0.0.1:{hmi._server.port}"
 
 
 async def hear(page, *kinds: str) -> dict:

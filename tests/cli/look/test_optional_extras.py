@@ -162,7 +162,7 @@ async def test_prometheus_is_answered_however_many_connections_idle_at_its_port(
     listening = metrics_server.listen("127.0.0.1", 0)
     port = listening.getsockname()[1]
     server = WebServer(metrics_server._app(metrics_server.Exporter()), listening)
-    await server.start()
+    server.start()
     idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(3 * ROOM)]
     async with httpx.AsyncClient() as client:
         answer = await client.get(f"http://127.0.0.1:{port}/metrics")

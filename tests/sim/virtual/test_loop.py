@@ -199,7 +199,7 @@ class _Slow:
 
 def test_what_is_on_its_way_to_a_node_that_is_killed_does_not_arrive():
     async def scenario():
-        hub, seen = Hub(_Slow()), []
+        hub, seen = Hub(_Slow().link), []
         buses = {name: VirtualBus(hub, name) for name in ("talker", "killed", "other")}
         for name, bus in buses.items():
             await bus.open()
