@@ -80,9 +80,7 @@ def _reached_by(nodes: dict[str, tuple[float, float]], area: Any) -> Any:
     return MultiPolygon(parts) if parts else area
 
 
-def read_graph(
-    path: Path,
-) -> tuple[dict[str, tuple[float, float]], tuple[tuple[str, str], ...]]:
+def read_graph(path: Path) -> tuple[dict[str, tuple[float, float]], tuple[tuple[str, str], ...]]:
     """Read nodes and edges of a `.graph` file.
 
     Raises:
@@ -93,8 +91,7 @@ def read_graph(
     except (ValueError, RecursionError) as error:  # a number of thousands of digits; nesting
         raise AirportError(f"{path}: not JSON: {error}: see the format's sample") from None
     if not isinstance(table, dict) or not all(
-        isinstance(table.get(key), list) for key in ("nodes", "edges")
-    ):
+            isinstance(table.get(key), list) for key in ("nodes", "edges")):
         raise AirportError(f"{path}: file: {shown(table)}: needs the lists nodes and edges")
     for key in ("nodes", "edges"):
         check_count(str(path), key, len(table[key]), MAX_COUNTS[key])
@@ -152,10 +149,7 @@ def _node(entry: Any, where: str) -> tuple[str, tuple[float, float]]:
     if not name.isprintable() or len(name) > MAX_NAME:
         raise AirportError(f"{where}.id: {shown(name)}: must be a name of at most {MAX_NAME} "
                            "printable characters")
-    return name, (
-        _number(entry.get("x"), f"{where}.x"),
-        _number(entry.get("y"), f"{where}.y"),
-    )
+    return name, (_number(entry.get("x"), f"{where}.x"), _number(entry.get("y"), f"{where}.y"))
 
 
 def _number(value: Any, where: str) -> float:
@@ -188,8 +182,7 @@ def _image_beside(graph: Path) -> Path:
     if len(own) != 1:
         listed = ", ".join(p.name for p in own) or "none"
         raise AirportError(
-            f"{graph}: area image: {listed}: need exactly one, {graph.stem}_area.jpg or .png"
-        )
+            f"{graph}: area image: {listed}: need exactly one, {graph.stem}_area.jpg or .png")
     return own[0]
 
 

@@ -179,10 +179,8 @@ class Airport:
 
     def nearest_node(self, x_m: float, y_m: float) -> tuple[str, float]:
         """Return the node nearest to a point, and its distance, m."""
-        return min(
-            ((name, math.dist(at, (x_m, y_m))) for name, at in self.nodes.items()),
-            key=lambda found: found[1],
-        )
+        return min(((name, math.dist(at, (x_m, y_m))) for name, at in self.nodes.items()),
+                   key=lambda found: found[1])
 
     def nearest_on_graph(self, x_m: float, y_m: float) -> Attachment:
         """Return the place on an edge, or lone node, nearest to a point."""
@@ -224,9 +222,7 @@ class Airport:
         """
         return float(self.prohibited_distances_m(((x_m, y_m),))[0])
 
-    def prohibited_distances_m(
-        self, points: npt.ArrayLike
-    ) -> npt.NDArray[np.float64]:
+    def prohibited_distances_m(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Return `prohibited_distance_m` for several points at once."""
         at = np.asarray(points, dtype=float)
         ax, ay, dx, dy, square = self._boundary
@@ -276,8 +272,7 @@ class Airport:
         except KeyError:
             known = ", ".join(self.missions) or "none"
             raise AirportError(
-                f"{self.name}: missions: {name!r}: no such mission, there are: {known}"
-            ) from None
+                f"{self.name}: missions: {name!r}: no such mission, there are: {known}") from None
 
 
 def rectangle(x_m: float, y_m: float, yaw_rad: float, length_m: float, width_m: float) -> Any:

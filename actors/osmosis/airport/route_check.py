@@ -68,9 +68,7 @@ class RouteCheck:
         self._limits = limits or RouteLimits()
         self._of_shape = lru_cache(maxsize=8)(self._find_in_shape)
 
-    def fault(
-        self, waypoints: tuple[Point, ...], robot: Point | None, goal: Point | None
-    ) -> str:
+    def fault(self, waypoints: tuple[Point, ...], robot: Point | None, goal: Point | None) -> str:
         """Return what is wrong with a route, or "".
 
         Args:

@@ -49,11 +49,7 @@ from rampart.files.reading import read_text, shown
 Name = Annotated[str, msgspec.Meta(max_length=MAX_NAME)]
 Point = tuple[float, float]
 SurfaceKind = Literal["runway", "taxiway", "apron", "area"]
-_CHOICES = {
-    "mode": GOAL_MODES,
-    "kind": get_args(SurfaceKind),
-    "shape": get_args(ObstacleShape),
-}
+_CHOICES = {"mode": GOAL_MODES, "kind": get_args(SurfaceKind), "shape": get_args(ObstacleShape)}
 _KEY = re.compile(r"\[[^]]*\]|[^.[]+")
 _UNKNOWN = re.compile(r"Object contains unknown field `(.*)`")
 _TYPE_NAMES = {

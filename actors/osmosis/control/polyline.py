@@ -67,9 +67,8 @@ class Hull:
 
 
 @lru_cache(maxsize=4)
-def scan_points(
-    ranges_f32: bytes, angle_min_rad: float, angle_increment_rad: float, range_max_m: float
-) -> Array:
+def scan_points(ranges_f32: bytes, angle_min_rad: float, angle_increment_rad: float,
+                range_max_m: float) -> Array:
     """Return the echoes of a laser sweep as points in `base_link`, shape (n, 2).
 
     A range that is not finite, not positive or at `range_max_m` is no echo. A payload that is

@@ -50,9 +50,8 @@ class BlockageWatch:
         """Begin anew, for another route."""
         self._best_m, self._since_s, self._place = math.inf, None, None
 
-    def update(
-        self, to_go_m: float, pose: tuple[float, float, float], points: Array, now_s: float
-    ) -> Blockage | None:
+    def update(self, to_go_m: float, pose: tuple[float, float, float], points: Array,
+               now_s: float) -> Blockage | None:
         """Return what blocks the robot, or None.
 
         Args:
@@ -73,9 +72,8 @@ class BlockageWatch:
         return Blockage(*self._place, self._since_s)
 
 
-def nearest_ahead(
-    points: Array, pose: tuple[float, float, float], limits: BlockageLimits
-) -> Point | None:
+def nearest_ahead(points: Array, pose: tuple[float, float, float],
+                  limits: BlockageLimits) -> Point | None:
     """Return the nearest echo ahead of the robot as a point in `map`, or None."""
     if not len(points):
         return None

@@ -90,12 +90,8 @@ class LightInspection:
         judged: names of lights that have their measurement already.
     """
 
-    def __init__(
-        self,
-        lights: Iterable[Light],
-        limits: InspectionLimits | None = None,
-        judged: Iterable[str] = (),
-    ) -> None:
+    def __init__(self, lights: Iterable[Light], limits: InspectionLimits | None = None,
+                 judged: Iterable[str] = ()) -> None:
         self._lights = tuple(lights)
         self._limits = limits or InspectionLimits()
         self._places = np.array([(li.x_m, li.y_m) for li in self._lights]).reshape(-1, 2)
@@ -177,11 +173,8 @@ class LightInspection:
             return None
         share = (stamp_s - a.stamp_s) / span_s
         turn = math.remainder(b.yaw_rad - a.yaw_rad, math.tau)
-        return sensor_position(
-            a.x_m + share * (b.x_m - a.x_m),
-            a.y_m + share * (b.y_m - a.y_m),
-            a.yaw_rad + share * turn,
-        )
+        return sensor_position(a.x_m + share * (b.x_m - a.x_m), a.y_m + share * (b.y_m - a.y_m),
+                               a.yaw_rad + share * turn)
 
     def _fit(self, index: int, samples: list[tuple[float, float, float, float]]) -> float | None:
         """Return the intensity in candela by least squares, or None if samples are missing."""

@@ -162,8 +162,7 @@ class LightRow(Follower):
                 return Motion(back.linear_mps, back.angular_radps, False, back.waiting,
                               foot.segment, to_go_m)
             self._back = None
-        if self._arrived or (
-                to_go_m <= limits.overrun_m and abs(foot.n_m) <= limits.goal_reach_m):
+        if self._arrived or (to_go_m <= limits.overrun_m and abs(foot.n_m) <= limits.goal_reach_m):
             return self._arrive()
         if self._passing is not None:
             return self._pass(self._passing, (x_m, y_m, yaw_rad), foot, points, dt_s)
@@ -207,10 +206,8 @@ class LightRow(Follower):
                 self.line.points, self._hull, self._motion,
                 escape=replace(usual, max_deviation_m=min(usual.max_deviation_m, room_m)))
 
-    def _pass(
-        self, follower: PathFollower, pose: tuple[float, float, float], foot: Projection,
-        points: Array, dt_s: float,
-    ) -> Motion:
+    def _pass(self, follower: PathFollower, pose: tuple[float, float, float], foot: Projection,
+              points: Array, dt_s: float) -> Motion:
         """Drive round, and hand back when on the row again with nothing in the way."""
         motion = follower.step(*pose, points, dt_s)
         self._ramp.last = (motion.linear_mps, motion.angular_radps)
@@ -228,16 +225,12 @@ class LightRow(Follower):
         x_to, y_to = self.line.point_at(s_m + self._limits.lookahead_m)
         return wrap_angle(math.atan2(y_to - y_m, x_to - x_m) - yaw_rad)
 
-    def _free(
-        self, x_m: float, y_m: float, yaw_rad: float, points: Array, s_m: float
-    ) -> float:
+    def _free(self, x_m: float, y_m: float, yaw_rad: float, points: Array, s_m: float) -> float:
         """Free distance ahead of the hull in the lane along the row; infinite if all is free."""
         if len(points) == 0:
             return math.inf
         reach_m = 2.0 * self._limits.stop_distance_m + 4.0
-        echoes = self.line.coordinates(
-            to_map(points, x_m, y_m, yaw_rad), s_m - 1.0, s_m + reach_m
-        )
+        echoes = self.line.coordinates(to_map(points, x_m, y_m, yaw_rad), s_m - 1.0, s_m + reach_m)
         half_m = self._hull.half_width_m + self._limits.lane_margin_m
         lane = (np.abs(echoes[:, 1]) < half_m) & (echoes[:, 0] > s_m)
         ahead = echoes[lane, 0]

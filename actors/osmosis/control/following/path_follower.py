@@ -195,9 +195,7 @@ class PathFollower(Follower):
         if self._escape.side == 0:
             self._escape.offset_m = aside_m
 
-    def step(
-        self, x_m: float, y_m: float, yaw_rad: float, points: Array, dt_s: float
-    ) -> Motion:
+    def step(self, x_m: float, y_m: float, yaw_rad: float, points: Array, dt_s: float) -> Motion:
         """Return the command for now.
 
         Args:
@@ -216,9 +214,7 @@ class PathFollower(Follower):
         if self._arrived or passed or (last_leg and direct_m <= limits.arrival_radius_m):
             return self._arrive()
 
-        echoes = line.coordinates(
-            to_map(points, x_m, y_m, yaw_rad), foot.s_m - 2.0, foot.s_m + 5.0
-        )
+        echoes = line.coordinates(to_map(points, x_m, y_m, yaw_rad), foot.s_m - 2.0, foot.s_m + 5.0)
         way = self._escape.update(echoes, foot.s_m, foot.n_m)
         bearing = self._bearing((x_m, y_m, yaw_rad), foot, way, points)
         speed = self._speed(bearing, foot.s_m, direct_m, points) if way.possible else 0.0

@@ -78,9 +78,8 @@ def repulsion(points: Array, hull: Hull, gains: FieldGains) -> tuple[float, floa
     return push_x, push_y
 
 
-def field(
-    target_x_m: float, target_y_m: float, points: Array, hull: Hull, gains: FieldGains
-) -> tuple[float, float]:
+def field(target_x_m: float, target_y_m: float, points: Array, hull: Hull,
+          gains: FieldGains) -> tuple[float, float]:
     """Return the field's vector at the robot, in `base_link`; its direction is where to go.
 
     Args:

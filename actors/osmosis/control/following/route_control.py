@@ -212,9 +212,8 @@ class RouteControl:
         pose, order = self._pose, self._goal
         known = order is not None and order.active and (
             (order.mission_id, order.step) == (route.mission_id, route.step))
-        return self._check.fault(
-            route.waypoints, pose[:2] if pose else None,
-            (order.goal.x_m, order.goal.y_m) if known and order else None)
+        return self._check.fault(route.waypoints, pose[:2] if pose else None,
+                                 (order.goal.x_m, order.goal.y_m) if known and order else None)
 
     def adopt(self, active: ControlStatus, stamp_s: float) -> None:
         """Do as the active one does, by its status of `stamp_s`."""

@@ -235,8 +235,7 @@ class PoseFilter:
             ekf.update_position(x_m, y_m, variance)
             self._take_velocity(ekf, velocity, stamp_s)
 
-    def _take_velocity(self, ekf: PlanarEkf, velocity: tuple[float, float], stamp_s: float
-                       ) -> None:
+    def _take_velocity(self, ekf: PlanarEkf, velocity: tuple[float, float], stamp_s: float) -> None:
         """Take the speed if the wheels are out, and the course if the absolute pose is."""
         along = velocity[0] * math.cos(ekf.yaw_rad) + velocity[1] * math.sin(ekf.yaw_rad)
         if not self._wheels.usable(stamp_s):
@@ -257,8 +256,7 @@ class PoseFilter:
         y_m = source.reading[1] + on_m * math.sin(ekf.yaw_rad)
         # While it is not clear who is wrong, and later of who is, nothing is taken for usual.
         sure = self._pose.trust.reason or self._gps.trust.reason
-        doubted = source.trust.reason if sure else (
-            math.hypot(*self._apart) > self.limits.apart_m)
+        doubted = source.trust.reason if sure else (math.hypot(*self._apart) > self.limits.apart_m)
         source.see((x_m - self._track[0], y_m - self._track[1]), dt_s,
                    math.inf if doubted else self.limits.witness_s)
         return x_m, y_m

@@ -126,9 +126,8 @@ class MissionManager(Actor):
         """Keep the state, if that failed when it was new."""
         self.keep(MISSION_STATE, self.state)
 
-    def _compare(
-        self, mission_id: str, step: int, end: tuple[tuple[float, float], ...] = ()
-    ) -> None:
+    def _compare(self, mission_id: str, step: int,
+                 end: tuple[tuple[float, float], ...] = ()) -> None:
         """End the uncertainty after a respawn: planner or control know the step as well.
 
         A later step than the checkpoint's is believed only with a way to that step's goal: if the

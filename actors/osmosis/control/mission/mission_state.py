@@ -166,8 +166,7 @@ def progress(state: MissionState, report: ControlStatus, now: float) -> MissionS
     if state.phase is P.RETURNING:
         return enter(state, P.CANCELLED, f"returned home, {state.homing}")
     fresh = tuple(name for name in report.unmeasured if name not in state.unmeasured)
-    return _next_goal(
-        msgspec.structs.replace(state, unmeasured=(*state.unmeasured, *fresh)), now)
+    return _next_goal(msgspec.structs.replace(state, unmeasured=(*state.unmeasured, *fresh)), now)
 
 
 def routed(state: MissionState, route: Route) -> MissionState:
@@ -233,9 +232,8 @@ def obey(
             return state, answer
     outcome = _OBEDIENCE[order.action](state, clip(f"{order.by}: {order.reason}"), now)
     after = state if isinstance(outcome, str) else outcome
-    answer = MissionOrderAnswer(
-        order.order, not isinstance(outcome, str),
-        clip(outcome) if isinstance(outcome, str) else "", after.plan)
+    answer = MissionOrderAnswer(order.order, not isinstance(outcome, str),
+                                clip(outcome) if isinstance(outcome, str) else "", after.plan)
     kept = (*state.answers, answer)[-ANSWERS_KEPT:]
     return msgspec.structs.replace(after, answers=kept), answer
 

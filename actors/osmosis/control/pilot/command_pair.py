@@ -74,8 +74,7 @@ class CommandPair:
         self._agreed_since_s = -math.inf
         self._compared_s = -math.inf
 
-    def active(self, command: Command | None, stamp_s: float, incarnation: int, now: float
-               ) -> None:
+    def active(self, command: Command | None, stamp_s: float, incarnation: int, now: float) -> None:
         """Take Osmosis Control's command, or None for a refused one."""
         limits = self._limits
         if self._is_reborn(0, incarnation):

@@ -53,8 +53,7 @@ class LaserPair:
         self._faults = ["", ""]
         self._seen_s = -math.inf
 
-    def take(self, laser: int, sweep: LaserScan, stamp_s: float, now_s: float
-             ) -> LaserView | None:
+    def take(self, laser: int, sweep: LaserScan, stamp_s: float, now_s: float) -> LaserView | None:
         """Take a sweep of one laser; return the new view, or None if the present one stays.
 
         Args:
@@ -98,9 +97,8 @@ def _echoes(sweep: LaserScan, partner: LaserScan | None) -> Array:
 
 
 def _points(sweep: LaserScan, ranges_f32: bytes | None = None) -> Array:
-    return scan_points(
-        sweep.ranges_f32 if ranges_f32 is None else ranges_f32, sweep.angle_min_rad,
-        sweep.angle_increment_rad, sweep.range_max_m)
+    return scan_points(sweep.ranges_f32 if ranges_f32 is None else ranges_f32, sweep.angle_min_rad,
+                       sweep.angle_increment_rad, sweep.range_max_m)
 
 
 def _same_rays(a: LaserScan, b: LaserScan) -> bool:

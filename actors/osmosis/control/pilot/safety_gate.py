@@ -122,8 +122,7 @@ class _Line:
     twist: tuple[float, float] | None = None
     stamp_s: float = -math.inf
     heard_s: float = -math.inf
-    newest: dict[str, tuple[int, int]] = field(
-        default_factory=lambda: Remembered(_SOURCES))
+    newest: dict[str, tuple[int, int]] = field(default_factory=lambda: Remembered(_SOURCES))
     fault: str = ""
 
 
@@ -316,9 +315,8 @@ class SafetyGate:
         if stick or self._standby.twist is None:
             return (None, unusable) if unusable else (line.twist, "")
         other = self._standby
-        return self._pair.choice(
-            (None, unusable) if unusable else (line.twist, ""),
-            None if self._unusable(other, now) else other.twist, now)
+        return self._pair.choice((None, unusable) if unusable else (line.twist, ""),
+                                 None if self._unusable(other, now) else other.twist, now)
 
     def _forbidden(self, mode: PilotMode, now: float) -> str:
         """Why nobody's command may pass, or ""."""

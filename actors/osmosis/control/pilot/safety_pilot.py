@@ -157,7 +157,5 @@ class SafetyPilot(Actor):
 
 
 def _stamped(message: Twist, header: Header) -> Stamped:
-    return Stamped(
-        message.linear_mps, message.angular_radps,
-        header.source, header.incarnation, header.sequence, header.stamp,
-    )
+    return Stamped(message.linear_mps, message.angular_radps, header.source, header.incarnation,
+                   header.sequence, header.stamp)

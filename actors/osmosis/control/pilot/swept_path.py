@@ -97,9 +97,8 @@ def is_free(linear_mps: float, angular_radps: float, points: Array, room: Stoppi
     return not bool(in_the_way.any())
 
 
-def _arc(
-    linear_mps: float, angular_radps: float, path_m: float, room: StoppingRoom
-) -> tuple[Array, Array, Array]:
+def _arc(linear_mps: float, angular_radps: float, path_m: float,
+         room: StoppingRoom) -> tuple[Array, Array, Array]:
     """Poses along the arc in `base_link`; it straightens once the turn could have been braked."""
     turn_rad = math.copysign(room.turn_rad(angular_radps), angular_radps)
     if path_m == 0.0:
@@ -117,9 +116,8 @@ def _arc(
     return x, y, yaw
 
 
-def limited(
-    linear_mps: float, angular_radps: float, points: Array, room: StoppingRoom
-) -> tuple[float, float]:
+def limited(linear_mps: float, angular_radps: float, points: Array,
+            room: StoppingRoom) -> tuple[float, float]:
     """Return the command, slowed down as far as the echoes ask for; zero if nothing is free.
 
     Steps are a twentieth of the commanded speed. Turning is slowed after that, and given up last.

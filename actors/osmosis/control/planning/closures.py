@@ -55,9 +55,8 @@ class Closures:
         return tuple(self._until_s)
 
 
-def without(
-    nodes: Mapping[str, Point], edges: Iterable[Edge], places: Iterable[Point], gap_m: float
-) -> tuple[dict[str, Point], list[Edge]]:
+def without(nodes: Mapping[str, Point], edges: Iterable[Edge], places: Iterable[Point],
+            gap_m: float) -> tuple[dict[str, Point], list[Edge]]:
     """Return the graph without what lies within `gap_m` of the places.
 
     The rests of an edge that is cut end in nodes of their own, named after the edge. No name of an

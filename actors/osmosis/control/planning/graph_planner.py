@@ -177,13 +177,8 @@ class GraphPlanner(Actor):
         if closed:
             open_nodes, open_edges = without(nodes, edges, closed, self._closures.gap_m)
             nodes, edges = open_nodes, tuple(open_edges)
-        return plan_route(
-            nodes,
-            edges,
-            (pose.x_m, pose.y_m),
-            (order.goal.x_m, order.goal.y_m),
-            straight=order.goal.mode is Mode.LIGHT_VERIFICATION,
-        )
+        return plan_route(nodes, edges, (pose.x_m, pose.y_m), (order.goal.x_m, order.goal.y_m),
+                          straight=order.goal.mode is Mode.LIGHT_VERIFICATION)
 
 
 def _route(order: GoalOrder, plan: PlannedRoute, reason: str) -> Route:

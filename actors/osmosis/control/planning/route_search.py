@@ -137,9 +137,8 @@ def _show(point: Point) -> str:
     return f"({point[0]:.1f}, {point[1]:.1f})"
 
 
-def _snap(
-    nodes: Mapping[str, Point], edges: list[Edge], point: Point, node_snap_m: float
-) -> _Snap | None:
+def _snap(nodes: Mapping[str, Point], edges: list[Edge], point: Point,
+          node_snap_m: float) -> _Snap | None:
     """Return the nearest place on the open part of the graph."""
     best: _Snap | None = None
     for a, b in edges:
@@ -166,9 +165,8 @@ def _foot(point: Point, a: Point, b: Point) -> Point:
     return a[0] + share * along[0], a[1] + share * along[1]
 
 
-def _search(
-    nodes: Mapping[str, Point], edges: list[Edge], start: _Snap, goal: _Snap
-) -> list[Point] | None:
+def _search(nodes: Mapping[str, Point], edges: list[Edge], start: _Snap,
+            goal: _Snap) -> list[Point] | None:
     """A* between two snapped points. Temporary nodes are 0 (start) and 1 (goal)."""
     places: dict[str | int, Point] = {0: start.point, 1: goal.point}
     places.update(nodes.items())

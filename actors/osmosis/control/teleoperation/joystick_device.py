@@ -115,9 +115,8 @@ class StickDecoder:
     def stick(self) -> Joystick:
         """Where the stick is now."""
         mapping = self._mapping
-        return Joystick(
-            self._position(mapping.forward_axis, mapping.forward_sign),
-            self._position(mapping.left_axis, mapping.left_sign), self._pressed)
+        return Joystick(self._position(mapping.forward_axis, mapping.forward_sign),
+                        self._position(mapping.left_axis, mapping.left_sign), self._pressed)
 
     def _button(self, number: int, value: int, *, initial: bool) -> None:
         if number == self._mapping.dead_man_button:
