@@ -9,6 +9,7 @@ import math
 from typing import Any, ClassVar
 
 from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.application import Osmosis
@@ -19,16 +20,6 @@ from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
 from rampart.actors.osmosis.control.following.route_control import PERIOD_S, RouteControl
 from rampart.actors.osmosis.control.following.row_inspection import RowInspection
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER
-from rampart.actors.osmosis.messages import (
-    GoalOrder,
-    LaserScan,
-    LightSample,
-    MissionStatus,
-    Odometry,
-    Pose,
-    Route,
-    Twist,
-)
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.manager.spec.tables import NonNegative
 
@@ -63,7 +54,7 @@ class OsmosisControl(Actor):
 
     parameters: Parameters
 
-    command_topic: ClassVar[Topic[Twist]] = topics.COMMAND
+    command_topic: ClassVar[Topic[m.Twist]] = topics.COMMAND
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
         topics.COMMAND, topics.CONTROL_STATUS, topics.LIGHT_MEASURED)
 
@@ -95,49 +86,49 @@ class OsmosisControl(Actor):
             self.core.restore(kept)
 
     @on(topics.MISSION_STATUS)
-    def mission(self, message: MissionStatus, _header: Header) -> None:
+    def mission(self, message: m.MissionStatus, _header: Header) -> None:
         """Hear which lights the Mission Manager has."""
         if self._lights:
             self._lights.hear(message)
 
     @on(topics.POSE)
-    def pose(self, message: Pose, header: Header) -> None:
+    def pose(self, message: m.Pose, header: Header) -> None:
         """Take a pose."""
         self.core.pose(message, header.stamp, self.clock.now())
         self._begin()
 
     @on(topics.SCAN)
-    def scan(self, message: LaserScan, header: Header) -> None:
+    def scan(self, message: m.LaserScan, header: Header) -> None:
         """See."""
         self.core.scan(LOWER, message, header.stamp, self.clock.now())
         self._begin()
 
     @on(topics.UPPER_SCAN)
-    def upper_scan(self, message: LaserScan, header: Header) -> None:
+    def upper_scan(self, message: m.LaserScan, header: Header) -> None:
         """See with the second laser, on a robot that has one."""
         self.core.scan(UPPER, message, header.stamp, self.clock.now())
         self._begin()
 
     @on(topics.LIGHT)
-    def light(self, message: LightSample, header: Header) -> None:
+    def light(self, message: m.LightSample, header: Header) -> None:
         """Take a reading of the light sensor."""
         if self._lights:
             self._lights.sample(header.stamp, message.illuminance_lux)
 
     @on(topics.GOAL)
-    def goal(self, message: GoalOrder, _header: Header) -> None:
+    def goal(self, message: m.GoalOrder, _header: Header) -> None:
         """Take the goal."""
         if self.core.goal(message):
             self._set_out()
 
     @on(topics.ROUTE)
-    def route(self, message: Route, _header: Header) -> None:
+    def route(self, message: m.Route, _header: Header) -> None:
         """Take a route."""
         if self.core.route(message):
             self._set_out()
 
     @on(topics.ODOMETRY)
-    def odometry(self, message: Odometry, header: Header) -> None:
+    def odometry(self, message: m.Odometry, header: Header) -> None:
         """Take the way that the wheels make."""
         self.core.odometry(message, header.stamp, self.clock.now())
 

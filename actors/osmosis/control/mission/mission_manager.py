@@ -9,19 +9,12 @@ import msgspec
 from rampart.actors.bus.bounds import clip
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import ManagerStatus
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.mission import mission_state
 from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE, catch_up
 from rampart.actors.osmosis.control.mission.mission_state import MissionState
-from rampart.actors.osmosis.messages import (
-    ControlStatus,
-    Goal,
-    LightMeasurement,
-    MissionOrder,
-    MissionRequest,
-    Route,
-)
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.parameters import RecoveryNames
 
@@ -61,12 +54,12 @@ class MissionManager(Actor):
         self._lights = frozenset(light.name for light in airport.lights) if airport else None
 
     @on(topics.MISSION_REQUEST)
-    def request(self, message: MissionRequest, _header: Header) -> None:
+    def request(self, message: m.MissionRequest, _header: Header) -> None:
         """Take a mission, unless it was taken before."""
         self._become(mission_state.accept(self.state, message, self.clock.now()))
 
     @on(topics.MISSION_ORDER)
-    def order(self, message: MissionOrder, _header: Header) -> None:
+    def order(self, message: m.MissionOrder, _header: Header) -> None:
         """Obey an order or refuse it, and say so."""
         state, answer = mission_state.obey(self.state, message, self.clock.now())
         self._become(state)
@@ -79,7 +72,7 @@ class MissionManager(Actor):
             self._become(mission_state.hold(self.state, hold_reason(message, held_by)))
 
     @on(topics.CONTROL_STATUS)
-    def progress(self, message: ControlStatus, _header: Header) -> None:
+    def progress(self, message: m.ControlStatus, _header: Header) -> None:
         """Step on when the current goal is reached."""
         self._compare(message.mission_id, message.step)
         if self._lights is not None and not self._lights.issuperset(message.unmeasured):
@@ -88,13 +81,13 @@ class MissionManager(Actor):
         self._become(mission_state.progress(self.state, message, self.clock.now()))
 
     @on(topics.ROUTE)
-    def route(self, message: Route, _header: Header) -> None:
+    def route(self, message: m.Route, _header: Header) -> None:
         """Give up when there is no way."""
         self._compare(message.mission_id, message.step, message.waypoints[-1:])
         self._become(mission_state.routed(self.state, message))
 
     @on(topics.LIGHT_MEASURED)
-    def light(self, message: LightMeasurement, _header: Header) -> None:
+    def light(self, message: m.LightMeasurement, _header: Header) -> None:
         """Keep a light's measurement, if it is one of the airport's."""
         if self._lights is not None and message.light not in self._lights:
             self.report_diagnostic("light", "no light of this airport", message.light)
@@ -158,7 +151,7 @@ class MissionManager(Actor):
             self.repeat_goal()
 
 
-def _leads_to(end: tuple[tuple[float, float], ...], goals: tuple[Goal, ...]) -> bool:
+def _leads_to(end: tuple[tuple[float, float], ...], goals: tuple[m.Goal, ...]) -> bool:
     return any(math.dist(point, (goal.x_m, goal.y_m)) < _SAME_POINT_M
                for point, goal in zip(end, goals, strict=False))
 

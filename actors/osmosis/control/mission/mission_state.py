@@ -18,25 +18,11 @@ from __future__ import annotations
 import msgspec
 
 from rampart.actors.bus.bounds import clip
-from rampart.actors.osmosis.messages import (
-    ControlPhase,
-    ControlStatus,
-    Goal,
-    GoalOrder,
-    LightMeasurement,
-    MissionAction,
-    MissionOrder,
-    MissionOrderAnswer,
-    MissionPhase,
-    MissionRequest,
-    MissionStatus,
-    Mode,
-    Route,
-)
+from rampart.actors.osmosis import messages as m
 
-P = MissionPhase
+P = m.MissionPhase
 
-TRANSITIONS: dict[MissionPhase, frozenset[MissionPhase]] = {
+TRANSITIONS: dict[m.MissionPhase, frozenset[m.MissionPhase]] = {
     P.IDLE: frozenset({P.RUNNING, P.FAILED}),
     P.RUNNING: frozenset({P.PAUSED, P.RETURNING, P.SUCCEEDED, P.FAILED, P.CANCELLED}),
     P.PAUSED: frozenset({P.RUNNING, P.RETURNING, P.FAILED, P.CANCELLED}),
@@ -59,13 +45,13 @@ ACCEPTED_KEPT = 256
 ANSWERS_KEPT = 32
 """An order that is repeated gets its old answer as long as it is among the last so many."""
 
-_NO_GOAL = Goal(0.0, 0.0, Mode.TAXI)
+_NO_GOAL = m.Goal(0.0, 0.0, m.Mode.TAXI)
 
 
 class IllegalTransitionError(ValueError):
     """A phase was to follow another that it cannot follow; the message names both."""
 
-    def __init__(self, mission_id: str, old: MissionPhase, new: MissionPhase) -> None:
+    def __init__(self, mission_id: str, old: m.MissionPhase, new: m.MissionPhase) -> None:
         allowed = ", ".join(sorted(phase.value for phase in TRANSITIONS[old]))
         super().__init__(
             f"mission {mission_id!r}: phase: {old.value} → {new.value} is no transition,"
@@ -101,25 +87,25 @@ class MissionState(msgspec.Struct, frozen=True):
 
     mission_id: str = ""
     name: str = ""
-    phase: MissionPhase = MissionPhase.IDLE
-    goals: tuple[Goal, ...] = ()
+    phase: m.MissionPhase = m.MissionPhase.IDLE
+    goals: tuple[m.Goal, ...] = ()
     step: int = 0
     step_started_s: float = 0.0
     step_times_s: tuple[float, ...] = ()
-    lights: tuple[LightMeasurement, ...] = ()
+    lights: tuple[m.LightMeasurement, ...] = ()
     reason: str = ""
     accepted: tuple[str, ...] = ()
     plan: int = 0
     paused: str = ""
     held: str = ""
-    home: Goal | None = None
+    home: m.Goal | None = None
     homing: str = ""
     skipped: tuple[tuple[int, str], ...] = ()
     unmeasured: tuple[str, ...] = ()
-    answers: tuple[MissionOrderAnswer, ...] = ()
+    answers: tuple[m.MissionOrderAnswer, ...] = ()
 
 
-def enter(state: MissionState, phase: MissionPhase, reason: str = "") -> MissionState:
+def enter(state: MissionState, phase: m.MissionPhase, reason: str = "") -> MissionState:
     """Return the state in a new phase.
 
     Raises:
@@ -130,7 +116,7 @@ def enter(state: MissionState, phase: MissionPhase, reason: str = "") -> Mission
     return msgspec.structs.replace(state, phase=phase, reason=reason)
 
 
-def accept(state: MissionState, request: MissionRequest, now: float) -> MissionState:
+def accept(state: MissionState, request: m.MissionRequest, now: float) -> MissionState:
     """Take a mission; one that is under way is replaced. An id accepted before changes nothing."""
     if request.mission_id in state.accepted:
         return state
@@ -158,10 +144,10 @@ def accept(state: MissionState, request: MissionRequest, now: float) -> MissionS
     ))
 
 
-def progress(state: MissionState, report: ControlStatus, now: float) -> MissionState:
+def progress(state: MissionState, report: m.ControlStatus, now: float) -> MissionState:
     """Step on if Osmosis Control has arrived at the current goal of this mission."""
     current = (report.mission_id, report.step) == (state.mission_id, _step_driven(state))
-    if state.phase not in DRIVING or not current or report.phase is not ControlPhase.ARRIVED:
+    if state.phase not in DRIVING or not current or report.phase is not m.ControlPhase.ARRIVED:
         return state
     if state.phase is P.RETURNING:
         return enter(state, P.CANCELLED, f"returned home, {state.homing}")
@@ -169,7 +155,7 @@ def progress(state: MissionState, report: ControlStatus, now: float) -> MissionS
     return _next_goal(msgspec.structs.replace(state, unmeasured=(*state.unmeasured, *fresh)), now)
 
 
-def routed(state: MissionState, route: Route) -> MissionState:
+def routed(state: MissionState, route: m.Route) -> MissionState:
     """Take note of the way to the current goal; fail the mission if there is none."""
     current = (route.mission_id, route.step) == (state.mission_id, _step_driven(state))
     if state.phase not in DRIVING or not current or not route.active:
@@ -182,13 +168,13 @@ def routed(state: MissionState, route: Route) -> MissionState:
     if state.home is None and state.step == 0:
         # The first waypoint of the first way is where the robot was, or the nearest place to it
         # on the graph: somewhere that a way leads back to.
-        state = msgspec.structs.replace(state, home=Goal(*route.waypoints[0], Mode.TAXI))
+        state = msgspec.structs.replace(state, home=m.Goal(*route.waypoints[0], m.Mode.TAXI))
     if route.reason != state.reason:
         state = msgspec.structs.replace(state, reason=route.reason)
     return state
 
 
-def measured(state: MissionState, light: LightMeasurement) -> MissionState:
+def measured(state: MissionState, light: m.LightMeasurement) -> MissionState:
     """Keep the first measurement of each light.
 
     Also just after success: the last light's message may come after that of the last arrival.
@@ -224,15 +210,15 @@ def hold(state: MissionState, reason: str) -> MissionState:
 
 
 def obey(
-    state: MissionState, order: MissionOrder, now: float
-) -> tuple[MissionState, MissionOrderAnswer]:
+    state: MissionState, order: m.MissionOrder, now: float
+) -> tuple[MissionState, m.MissionOrderAnswer]:
     """Obey an order, or refuse it with a reason; one that was answered before changes nothing."""
     for answer in state.answers:
         if answer.order == order.order:
             return state, answer
     outcome = _OBEDIENCE[order.action](state, clip(f"{order.by}: {order.reason}"), now)
     after = state if isinstance(outcome, str) else outcome
-    answer = MissionOrderAnswer(order.order, not isinstance(outcome, str),
+    answer = m.MissionOrderAnswer(order.order, not isinstance(outcome, str),
                                 clip(outcome) if isinstance(outcome, str) else "", after.plan)
     kept = (*state.answers, answer)[-ANSWERS_KEPT:]
     return msgspec.structs.replace(after, answers=kept), answer
@@ -286,12 +272,12 @@ def _order_home(state: MissionState, why: str, _now: float) -> MissionState | st
 
 
 _OBEDIENCE = {
-    MissionAction.PAUSE: _order_pause,
-    MissionAction.RESUME: _order_resume,
-    MissionAction.REPLAN: _order_replan,
-    MissionAction.SKIP: _order_skip,
-    MissionAction.CANCEL: _order_cancel,
-    MissionAction.HOME: _order_home,
+    m.MissionAction.PAUSE: _order_pause,
+    m.MissionAction.RESUME: _order_resume,
+    m.MissionAction.REPLAN: _order_replan,
+    m.MissionAction.SKIP: _order_skip,
+    m.MissionAction.CANCEL: _order_cancel,
+    m.MissionAction.HOME: _order_home,
 }
 """What each order does: the next state, or why it is refused. Home also ends a pause."""
 
@@ -336,18 +322,18 @@ def _step_driven(state: MissionState) -> int:
     return len(state.goals) if state.homing else state.step
 
 
-def goal_order(state: MissionState) -> GoalOrder:
+def goal_order(state: MissionState) -> m.GoalOrder:
     """Return the current goal for the Graph Planner; inactive unless the robot is to drive."""
     step = _step_driven(state)
     if state.phase not in DRIVING:
-        return GoalOrder(state.mission_id, step, _NO_GOAL, False, state.plan)
+        return m.GoalOrder(state.mission_id, step, _NO_GOAL, False, state.plan)
     goal = state.home if state.homing and state.home else state.goals[state.step]
-    return GoalOrder(state.mission_id, step, goal, True, state.plan)
+    return m.GoalOrder(state.mission_id, step, goal, True, state.plan)
 
 
-def status(state: MissionState) -> MissionStatus:
+def status(state: MissionState) -> m.MissionStatus:
     """Return what the operator sees."""
-    return MissionStatus(
+    return m.MissionStatus(
         mission_id=state.mission_id,
         name=state.name,
         phase=state.phase,

@@ -7,18 +7,11 @@ import math
 from rampart.actors.bus.bounds import clip
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import Holds, ManagerStatus, Reset
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.limits_from_spec import checks_of, gate_of, reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair
 from rampart.actors.osmosis.control.pilot.safety_gate import GateOutput, SafetyGate, Stamped
-from rampart.actors.osmosis.messages import (
-    BaseCommand,
-    LaserScan,
-    PilotMode,
-    PilotOrder,
-    PilotStatus,
-    Twist,
-)
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 
 _PERIOD_S = 0.05
@@ -42,17 +35,17 @@ class SafetyPilot(Actor):
         self._lasers = LaserPair(reach_of(system))
         self._laser_fault = ""
         self._sent_s = -math.inf
-        self._last = GateOutput(0.0, 0.0, PilotMode.AUTO, True, "just started")
+        self._last = GateOutput(0.0, 0.0, m.PilotMode.AUTO, True, "just started")
 
     @on(topics.COMMAND)
-    def command(self, message: Twist, header: Header) -> None:
+    def command(self, message: m.Twist, header: Header) -> None:
         """Offer Osmosis Control's command to the gate and act on the answer at once."""
         refused = self._gate.command(_stamped(message, header), self.clock.now())
         self._note(refused, header)
         self._act()
 
     @on(topics.STANDBY_COMMAND)
-    def standby(self, message: Twist, header: Header) -> None:
+    def standby(self, message: m.Twist, header: Header) -> None:
         """Offer the standby's command; act at once if it drives, else the active one's do."""
         now = self.clock.now()
         self._note(self._gate.standby(_stamped(message, header), now), header)
@@ -60,24 +53,24 @@ class SafetyPilot(Actor):
             self._act()
 
     @on(topics.TELEOP_COMMAND)
-    def joystick(self, message: Twist, header: Header) -> None:
+    def joystick(self, message: m.Twist, header: Header) -> None:
         """Offer the operator's command to the gate and act on the answer at once."""
         refused = self._gate.joystick(_stamped(message, header), self.clock.now())
         self._note(refused, header)
         self._act()
 
     @on(topics.SCAN)
-    def scan(self, message: LaserScan, header: Header) -> None:
+    def scan(self, message: m.LaserScan, header: Header) -> None:
         """Keep what can be seen; if nothing can be believed the robot stops."""
         self._see(LOWER, message, header)
 
     @on(topics.UPPER_SCAN)
-    def upper_scan(self, message: LaserScan, header: Header) -> None:
+    def upper_scan(self, message: m.LaserScan, header: Header) -> None:
         """Keep what the second laser sees, on a robot that has one."""
         self._see(UPPER, message, header)
 
     @on(topics.PILOT_ORDER)
-    def order(self, message: PilotOrder, header: Header) -> None:
+    def order(self, message: m.PilotOrder, header: Header) -> None:
         """Obey a recovery module, and others as well; a change acts at once."""
         before = self._orders_in_force()
         self._gate.order(header.source, message.engaged, message.mode, message.reason,
@@ -94,10 +87,10 @@ class SafetyPilot(Actor):
         if self._gate.reset(message.recovery):
             self._follow(before)
 
-    def _orders_in_force(self) -> tuple[PilotMode, float, tuple[str, ...]]:
+    def _orders_in_force(self) -> tuple[m.PilotMode, float, tuple[str, ...]]:
         return self._gate.mode, self._gate.top_speed_mps, self._gate.unknown
 
-    def _follow(self, before: tuple[PilotMode, float, tuple[str, ...]]) -> None:
+    def _follow(self, before: tuple[m.PilotMode, float, tuple[str, ...]]) -> None:
         if self._orders_in_force()[:2] != before[:2]:
             self._act()
             self._tell()
@@ -126,7 +119,7 @@ class SafetyPilot(Actor):
         if self._gate.unknown:
             self._tell_holds()
 
-    def _see(self, laser: int, message: LaserScan, header: Header) -> None:
+    def _see(self, laser: int, message: m.LaserScan, header: Header) -> None:
         view = self._lasers.take(laser, message, header.stamp, self.clock.now())
         if view is None:
             return
@@ -140,14 +133,14 @@ class SafetyPilot(Actor):
         before, self._last = self._last, self._gate.output(now)
         self._sent_s = now
         self.publish(
-            topics.BASE_COMMAND, BaseCommand(self._last.linear_mps, self._last.angular_radps))
+            topics.BASE_COMMAND, m.BaseCommand(self._last.linear_mps, self._last.angular_radps))
         shown = (before.mode, before.stopped, before.reason)
         if shown != (self._last.mode, self._last.stopped, self._last.reason):
             self._tell()
 
     def _tell(self) -> None:
         last = self._last
-        self.publish(topics.PILOT_STATUS, PilotStatus(
+        self.publish(topics.PILOT_STATUS, m.PilotStatus(
             last.mode, last.stopped, clip(last.reason), self._gate.refused,
             self._gate.top_speed_mps, clip(self._gate.forbidden(self.clock.now()))))
 
@@ -156,6 +149,6 @@ class SafetyPilot(Actor):
             self.report_diagnostic("command refused", refused, header.source)
 
 
-def _stamped(message: Twist, header: Header) -> Stamped:
+def _stamped(message: m.Twist, header: Header) -> Stamped:
     return Stamped(message.linear_mps, message.angular_radps, header.source, header.incarnation,
                    header.sequence, header.stamp)

@@ -29,8 +29,7 @@ def _objection(kept: RouteKept) -> str:
     if not all(math.isfinite(v) for waypoint in kept.route.waypoints for v in waypoint):
         return "a waypoint is not finite"
     order, route = kept.order, kept.route
-    same = (order.mission_id, order.step, order.active) == (
-        route.mission_id, route.step, route.active)
+    same = (order.which, order.active) == (route.which, route.active)
     return "" if same else f"route of step {route.step}, goal of step {order.step}"
 
 
@@ -97,7 +96,7 @@ class GraphPlanner(Actor):
             return
         before, self._order = self._order, message
         if self._blocked is not None and before is not None and message.plan > before.plan \
-                and (message.mission_id, message.step) == (before.mission_id, before.step):
+                and message.which == before.which:
             # Another plan is wanted, and what stands in front of the robot is known.
             self._closures.close((self._blocked.x_m, self._blocked.y_m), self.clock.now())
         self._route = self._blocked = None
@@ -114,8 +113,7 @@ class GraphPlanner(Actor):
         """Plan round what has blocked the robot for long enough."""
         route, now_s = self._route, self.clock.now()
         self._blocked = None
-        if route is None or not route.active or (
-                (message.mission_id, message.step) != (route.mission_id, route.step)):
+        if route is None or not route.active or message.which != route.which:
             return
         for blockage in message.blocked:
             if not math.isfinite(blockage.x_m + blockage.y_m):
