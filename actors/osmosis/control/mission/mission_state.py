@@ -15,11 +15,15 @@ every function takes a state and returns the next one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import msgspec
+from msgspec.structs import replace
 
 from rampart.actors.bus.bounds import clip
 from rampart.actors.osmosis import messages as m
 
+A = m.MissionAction
 P = m.MissionPhase
 
 TRANSITIONS: dict[m.MissionPhase, frozenset[m.MissionPhase]] = {
@@ -51,15 +55,6 @@ _NO_GOAL = m.Goal(0.0, 0.0, m.Mode.TAXI)
 class IllegalTransitionError(ValueError):
     """A phase was to follow another that it cannot follow; the message names both."""
 
-    def __init__(self, mission_id: str, old: m.MissionPhase, new: m.MissionPhase) -> None:
-        allowed = ", ".join(sorted(phase.value for phase in TRANSITIONS[old]))
-        super().__init__(
-            f"mission {mission_id!r}: phase: {old.value} → {new.value} is no transition,"
-            f" after {old.value} may come: {allowed}"
-        )
-        self.old = old
-        self.new = new
-
 
 class MissionState(msgspec.Struct, frozen=True):
     """Everything the Mission Manager must not forget.
@@ -67,7 +62,7 @@ class MissionState(msgspec.Struct, frozen=True):
     Attributes:
         mission_id: the mission under way, or the last one.
         name: its name for people.
-        phase: where in its life it is.
+        phase: where in its course it is.
         goals: in `map`.
         step: index of the current goal; the number of goals once all are reached.
         step_started_s: simulated time at which the current step began.
@@ -112,53 +107,40 @@ def enter(state: MissionState, phase: m.MissionPhase, reason: str = "") -> Missi
         IllegalTransitionError: the phase cannot follow the present one.
     """
     if phase not in TRANSITIONS[state.phase]:
-        raise IllegalTransitionError(state.mission_id, state.phase, phase)
-    return msgspec.structs.replace(state, phase=phase, reason=reason)
+        allowed = ", ".join(sorted(phase.value for phase in TRANSITIONS[state.phase]))
+        raise IllegalTransitionError(
+            f"mission {state.mission_id!r}: phase: {state.phase.value} → {phase.value} is no "
+            f"transition, after {state.phase.value} may come: {allowed}")
+    return replace(state, phase=phase, reason=reason)
 
 
 def accept(state: MissionState, request: m.MissionRequest, now: float) -> MissionState:
     """Take a mission; one that is under way is replaced. An id accepted before changes nothing."""
     if request.mission_id in state.accepted:
         return state
-    started = enter(
-        msgspec.structs.replace(state, phase=P.CANCELLED) if state.phase in ACTIVE else state,
-        P.RUNNING if request.goals else P.FAILED,
-        "" if request.goals else "the mission has no goals",
-    )
-    return _settle(msgspec.structs.replace(
-        started,
-        mission_id=request.mission_id,
-        name=request.name,
-        goals=request.goals,
-        step=0,
-        step_started_s=now,
-        step_times_s=(),
-        lights=(),
-        accepted=(*state.accepted, request.mission_id)[-ACCEPTED_KEPT:],
-        plan=0,
-        paused="",
-        home=None,
-        homing="",
-        skipped=(),
-        unmeasured=(),
-    ))
+    before = replace(state, phase=P.CANCELLED) if state.phase in ACTIVE else state
+    started = enter(before, P.RUNNING) if request.goals else enter(
+        before, P.FAILED, "the mission has no goals")
+    return _settle(MissionState(
+        request.mission_id, request.name, started.phase, request.goals, step_started_s=now,
+        reason=started.reason, accepted=(*state.accepted, request.mission_id)[-ACCEPTED_KEPT:],
+        held=state.held, answers=state.answers))
 
 
 def progress(state: MissionState, report: m.ControlStatus, now: float) -> MissionState:
     """Step on if Osmosis Control has arrived at the current goal of this mission."""
-    current = (report.mission_id, report.step) == (state.mission_id, _step_driven(state))
-    if state.phase not in DRIVING or not current or report.phase is not m.ControlPhase.ARRIVED:
+    current = state.phase in DRIVING and report.which == _driven(state)
+    if not current or report.phase is not m.ControlPhase.ARRIVED:
         return state
     if state.phase is P.RETURNING:
         return enter(state, P.CANCELLED, f"returned home, {state.homing}")
     fresh = tuple(name for name in report.unmeasured if name not in state.unmeasured)
-    return _next_goal(msgspec.structs.replace(state, unmeasured=(*state.unmeasured, *fresh)), now)
+    return _next_goal(replace(state, unmeasured=(*state.unmeasured, *fresh)), now)
 
 
 def routed(state: MissionState, route: m.Route) -> MissionState:
     """Take note of the way to the current goal; fail the mission if there is none."""
-    current = (route.mission_id, route.step) == (state.mission_id, _step_driven(state))
-    if state.phase not in DRIVING or not current or not route.active:
+    if state.phase not in DRIVING or route.which != _driven(state) or not route.active:
         return state
     if not route.waypoints:
         what = "home" if state.phase is P.RETURNING else f"goal {state.step + 1}"
@@ -168,9 +150,9 @@ def routed(state: MissionState, route: m.Route) -> MissionState:
     if state.home is None and state.step == 0:
         # The first waypoint of the first way is where the robot was, or the nearest place to it
         # on the graph: somewhere that a way leads back to.
-        state = msgspec.structs.replace(state, home=m.Goal(*route.waypoints[0], m.Mode.TAXI))
+        state = replace(state, home=m.Goal(*route.waypoints[0], m.Mode.TAXI))
     if route.reason != state.reason:
-        state = msgspec.structs.replace(state, reason=route.reason)
+        state = replace(state, reason=route.reason)
     return state
 
 
@@ -182,31 +164,14 @@ def measured(state: MissionState, light: m.LightMeasurement) -> MissionState:
     known = any(other.light == light.light for other in state.lights)
     if known or state.phase not in ACTIVE | {P.SUCCEEDED}:
         return state
-    return msgspec.structs.replace(state, lights=(*state.lights, light))
-
-
-def pause(state: MissionState, reason: str) -> MissionState:
-    """Hold a running mission; the robot gets no goal until `resume`."""
-    return msgspec.structs.replace(enter(state, P.PAUSED, reason), paused=reason or "paused")
-
-
-def resume(state: MissionState) -> MissionState:
-    """Go on with a paused mission, with the goal it was paused at."""
-    if state.phase is not P.PAUSED:
-        raise IllegalTransitionError(state.mission_id, state.phase, P.RUNNING)
-    return _settle(msgspec.structs.replace(state, paused=""))
-
-
-def cancel(state: MissionState, reason: str) -> MissionState:
-    """Give a mission up on request."""
-    return enter(state, P.CANCELLED, reason)
+    return replace(state, lights=(*state.lights, light))
 
 
 def hold(state: MissionState, reason: str) -> MissionState:
     """Take note of a recovery that holds the robot, or with an empty reason that none does."""
     if reason == state.held:
         return state
-    return _settle(msgspec.structs.replace(state, held=reason))
+    return _settle(replace(state, held=reason))
 
 
 def obey(
@@ -216,75 +181,43 @@ def obey(
     for answer in state.answers:
         if answer.order == order.order:
             return state, answer
-    outcome = _OBEDIENCE[order.action](state, clip(f"{order.by}: {order.reason}"), now)
-    after = state if isinstance(outcome, str) else outcome
-    answer = m.MissionOrderAnswer(order.order, not isinstance(outcome, str),
-                                clip(outcome) if isinstance(outcome, str) else "", after.plan)
-    kept = (*state.answers, answer)[-ANSWERS_KEPT:]
-    return msgspec.structs.replace(after, answers=kept), answer
+    refusal = _refusal(state, order.action)
+    after = state if refusal else _EFFECTS[order.action](
+        state, clip(f"{order.by}: {order.reason}"), now)
+    answer = m.MissionOrderAnswer(order.order, not refusal, clip(refusal), after.plan)
+    return replace(after, answers=(*state.answers, answer)[-ANSWERS_KEPT:]), answer
 
 
-def _order_pause(state: MissionState, why: str, _now: float) -> MissionState | str:
-    if state.phase not in ACTIVE:
-        return _not_under_way(state)
-    if state.paused:
-        return f"it is paused already, {state.paused}"
-    return _settle(msgspec.structs.replace(state, paused=why))
-
-
-def _order_resume(state: MissionState, _why: str, _now: float) -> MissionState | str:
-    if state.phase is not P.PAUSED:
-        return f"it is not paused but {state.phase.value}"
-    if not state.paused:
-        return f"{state.held}; it goes on by itself when the robot is released"
-    return resume(state)
-
-
-def _order_replan(state: MissionState, _why: str, _now: float) -> MissionState | str:
-    if state.phase is P.PAUSED:
-        return "it is paused, and will be planned anew when it goes on"
-    if state.phase not in DRIVING:
-        return _not_under_way(state)
-    return msgspec.structs.replace(state, plan=state.plan + 1)
-
-
-def _order_skip(state: MissionState, why: str, now: float) -> MissionState | str:
-    if state.phase not in ACTIVE:
-        return _not_under_way(state)
-    if state.homing:
-        return "on the way home there is no goal to skip"
-    skipped = (*state.skipped, (state.step, why))
-    return _next_goal(msgspec.structs.replace(state, skipped=skipped), now)
-
-
-def _order_cancel(state: MissionState, why: str, _now: float) -> MissionState | str:
-    return cancel(state, why) if state.phase in ACTIVE else _not_under_way(state)
-
-
-def _order_home(state: MissionState, why: str, _now: float) -> MissionState | str:
-    if state.phase not in ACTIVE:
-        return _not_under_way(state)
-    if state.homing:
-        return f"it is on the way home already, {state.homing}"
-    if state.home is None:
-        return "where the mission began is not known"
-    return _settle(msgspec.structs.replace(state, homing=why, paused=""))
-
-
-_OBEDIENCE = {
-    m.MissionAction.PAUSE: _order_pause,
-    m.MissionAction.RESUME: _order_resume,
-    m.MissionAction.REPLAN: _order_replan,
-    m.MissionAction.SKIP: _order_skip,
-    m.MissionAction.CANCEL: _order_cancel,
-    m.MissionAction.HOME: _order_home,
+_EFFECTS: dict[m.MissionAction, Callable[[MissionState, str, float], MissionState]] = {
+    A.PAUSE: lambda state, why, _now: _settle(replace(state, paused=why)),
+    A.RESUME: lambda state, _why, _now: _settle(replace(state, paused="")),
+    A.REPLAN: lambda state, _why, _now: replace(state, plan=state.plan + 1),
+    A.SKIP: lambda state, why, now: _next_goal(
+        replace(state, skipped=(*state.skipped, (state.step, why))), now),
+    A.CANCEL: lambda state, why, _now: enter(state, P.CANCELLED, why),
+    A.HOME: lambda state, why, _now: _settle(replace(state, homing=why, paused="")),
 }
-"""What each order does: the next state, or why it is refused. Home also ends a pause."""
+"""The next state by each order that is obeyed. Home also ends a pause."""
 
 
-def _not_under_way(state: MissionState) -> str:
-    return f"no mission is under way, the last one is {state.phase.value}" if state.mission_id \
-        else "no mission is under way"
+def _refusal(state: MissionState, action: m.MissionAction) -> str:
+    """Return why an order makes no sense now, or ""."""
+    paused = state.phase is P.PAUSED
+    if action is A.RESUME and not paused:
+        return f"it is not paused but {state.phase.value}"
+    if state.phase not in ACTIVE:
+        last = f", the last one is {state.phase.value}" if state.mission_id else ""
+        return f"no mission is under way{last}"
+    unknown_home = "" if state.home else "where the mission began is not known"
+    return {
+        A.PAUSE: state.paused and f"it is paused already, {state.paused}",
+        A.RESUME: "" if state.paused else
+        f"{state.held}; it goes on by itself when the robot is released",
+        A.REPLAN: "it is paused, and will be planned anew when it goes on" if paused else "",
+        A.SKIP: state.homing and "on the way home there is no goal to skip",
+        A.CANCEL: "",
+        A.HOME: f"it is on the way home already, {state.homing}" if state.homing else unknown_home,
+    }[action]
 
 
 def _settle(state: MissionState) -> MissionState:
@@ -294,58 +227,45 @@ def _settle(state: MissionState) -> MissionState:
     reason = "; ".join(filter(None, (state.held, state.paused)))
     phase = P.PAUSED if reason else P.RETURNING if state.homing else P.RUNNING
     if phase is state.phase:
-        return msgspec.structs.replace(state, reason=reason) if reason != state.reason else state
+        return replace(state, reason=reason) if reason != state.reason else state
     return enter(state, phase, reason or state.homing)
 
 
 def _next_goal(state: MissionState, now: float) -> MissionState:
     """Go on with the next goal, or end the mission after the last one."""
-    state = msgspec.structs.replace(
-        state,
-        step=state.step + 1,
-        step_started_s=now,
+    state = replace(
+        state, step=state.step + 1, step_started_s=now,
         step_times_s=(*state.step_times_s, now - state.step_started_s),
-        reason=state.reason if state.phase is P.PAUSED else "",
-    )
+        reason=state.reason if state.phase is P.PAUSED else "")
     if state.step < len(state.goals):
         return state
     if not state.skipped:
         return enter(state, P.SUCCEEDED)
     left_out = ", ".join(f"goal {index + 1} ({why})" for index, why in state.skipped)
     reached = len(state.goals) - len(state.skipped)
-    return enter(state, P.FAILED, f"{reached} of {len(state.goals)} goals reached, skipped: "
-                                  f"{left_out}")
+    return enter(
+        state, P.FAILED, f"{reached} of {len(state.goals)} goals reached, skipped: {left_out}")
 
 
-def _step_driven(state: MissionState) -> int:
-    """Return the number by which planner and control know what the robot drives to."""
-    return len(state.goals) if state.homing else state.step
+def _driven(state: MissionState) -> tuple[str, int]:
+    """Return mission and step by which planner and control know what the robot drives to."""
+    return state.mission_id, len(state.goals) if state.homing else state.step
 
 
 def goal_order(state: MissionState) -> m.GoalOrder:
     """Return the current goal for the Graph Planner; inactive unless the robot is to drive."""
-    step = _step_driven(state)
     if state.phase not in DRIVING:
-        return m.GoalOrder(state.mission_id, step, _NO_GOAL, False, state.plan)
+        return m.GoalOrder(*_driven(state), _NO_GOAL, False, state.plan)
     goal = state.home if state.homing and state.home else state.goals[state.step]
-    return m.GoalOrder(state.mission_id, step, goal, True, state.plan)
+    return m.GoalOrder(*_driven(state), goal, True, state.plan)
 
 
 def status(state: MissionState) -> m.MissionStatus:
     """Return what the operator sees."""
+    measured_lights = {light.light for light in state.lights}
     return m.MissionStatus(
-        mission_id=state.mission_id,
-        name=state.name,
-        phase=state.phase,
-        step=state.step,
-        goals=state.goals,
-        step_times_s=state.step_times_s,
-        lights=state.lights,
-        reason=clip(state.reason),
+        state.mission_id, state.name, state.phase, state.step, state.goals, state.step_times_s,
+        state.lights, clip(state.reason),
         skipped=tuple(index for index, _ in state.skipped),
-        unmeasured=tuple(
-            name for name in state.unmeasured
-            if not any(light.light == name for light in state.lights)),
-        orders=tuple(action for action, try_out in _OBEDIENCE.items()
-                     if not isinstance(try_out(state, "", 0.0), str)),
-    )
+        unmeasured=tuple(name for name in state.unmeasured if name not in measured_lights),
+        orders=tuple(action for action in A if not _refusal(state, action)))
