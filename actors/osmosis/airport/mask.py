@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import io
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import shapely
@@ -41,8 +41,7 @@ MAX_BOXES = 20_000
 """Rectangles into which the pavement falls; a slanted edge makes one for each row of pixels."""
 
 
-@dataclass(frozen=True, slots=True)
-class MaskScale:
+class MaskScale(msgspec.Struct, frozen=True):
     """Pixel column = columns_per_m * (x - left_m); row = rows_per_m * (top_m - y).
 
     The defaults are the authors': 5.2 * (x + 80) and 4.6 * (80 - y).

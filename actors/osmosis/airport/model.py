@@ -42,8 +42,7 @@ class MissionGoal(_Record, frozen=True):
     mode: GoalMode
 
 
-@dataclass(frozen=True, slots=True)
-class Mission:
+class Mission(msgspec.Struct, frozen=True):
     """An ordered list of goals."""
 
     name: str
@@ -58,8 +57,7 @@ class StartPose(_Record, frozen=True):
     yaw_rad: float
 
 
-@dataclass(frozen=True, slots=True)
-class Light:
+class Light(msgspec.Struct, frozen=True):
     """An inset light; `nominal_cd` is the intensity it should have."""
 
     name: str
@@ -69,8 +67,7 @@ class Light:
     nominal_cd: float
 
 
-@dataclass(frozen=True, slots=True)
-class Surface:
+class Surface(msgspec.Struct, frozen=True):
     """A named piece of pavement: `kind` is runway, taxiway, apron or area."""
 
     name: str
@@ -119,8 +116,7 @@ class ObstaclePreset(_Record, frozen=True):
     gone_after_s: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Attachment:
+class Attachment(msgspec.Struct, frozen=True):
     """The place on the graph nearest to a point: on edge (`a`, `b`); a == b for a lone node."""
 
     x_m: float

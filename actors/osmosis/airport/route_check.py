@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import shapely
@@ -25,8 +25,7 @@ Point = tuple[float, float]
 Points = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class RouteLimits:
+class RouteLimits(msgspec.Struct, frozen=True):
     """What a good route keeps to, in metres.
 
     Args:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import msgspec
@@ -32,8 +31,7 @@ def wrap_angle(angle_rad: float) -> float:
     return math.pi if wrapped == -math.pi else wrapped
 
 
-@dataclass(frozen=True, slots=True)
-class Hull:
+class Hull(msgspec.Struct, frozen=True):
     """The robot's footprint, a rectangle centred on `base_link` (Summit XL: 0.72 m by 0.614 m)."""
 
     length_m: float = 0.72

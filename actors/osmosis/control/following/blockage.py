@@ -8,16 +8,15 @@ takes something to see: one that is held by a recovery on an empty runway is not
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.control.polyline import Array, Point, to_map
 from rampart.actors.osmosis.messages import Blockage
 
 
-@dataclass(frozen=True, slots=True)
-class BlockageLimits:
+class BlockageLimits(msgspec.Struct, frozen=True):
     """When a robot counts as blocked.
 
     Args:

@@ -11,7 +11,6 @@ is already on. If neither side is free within the corridor there is no way, and 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -19,8 +18,7 @@ import numpy as np
 from rampart.actors.osmosis.control.polyline import Array, Hull
 
 
-@dataclass(frozen=True, slots=True)
-class EscapeLimits:
+class EscapeLimits(msgspec.Struct, frozen=True):
     """Room for the escape, in metres.
 
     Args:

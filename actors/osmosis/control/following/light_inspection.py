@@ -17,9 +17,9 @@ import bisect
 import math
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
 from operator import attrgetter
 
+import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.airport.model import Light
@@ -34,8 +34,7 @@ OUT_BELOW = 0.05
 """Ratio below which it is out."""
 
 
-@dataclass(frozen=True, slots=True)
-class InspectionLimits:
+class InspectionLimits(msgspec.Struct, frozen=True):
     """What a measurement needs.
 
     Args:
@@ -63,8 +62,7 @@ class InspectionLimits:
     keep_s: float = 120.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Pose:
+class _Pose(msgspec.Struct, frozen=True):
     stamp_s: float
     x_m: float
     y_m: float

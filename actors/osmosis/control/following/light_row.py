@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from rampart.actors.osmosis.control.following.escape import EscapeLimits
 from rampart.actors.osmosis.control.following.path_follower import (
@@ -42,8 +43,7 @@ _TURNS_RADPS = 0.3
 _BEHIND_RAD = 2.8
 
 
-@dataclass(frozen=True, slots=True)
-class RowLimits:
+class RowLimits(Struct, frozen=True):
     """How a row is followed.
 
     Args:

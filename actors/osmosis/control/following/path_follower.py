@@ -29,8 +29,7 @@ from rampart.actors.osmosis.control.polyline import (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class MotionLimits:
+class MotionLimits(msgspec.Struct, frozen=True):
     """What the robot is asked at most, and how it follows.
 
     Args:

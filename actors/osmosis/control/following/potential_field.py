@@ -13,15 +13,14 @@ side, and stays there. What is left to the field is the last half metre, for whi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.control.polyline import Array, Hull
 
 
-@dataclass(frozen=True, slots=True)
-class FieldGains:
+class FieldGains(msgspec.Struct, frozen=True):
     """Shape of the field.
 
     Args:

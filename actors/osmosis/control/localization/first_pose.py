@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+
+import msgspec
 
 from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck
 from rampart.actors.osmosis.control.localization.position_source import PositionSource
@@ -18,8 +19,7 @@ _ALONE_S = 0.15
 _IMU_SD_RAD = 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class FirstPose:
+class FirstPose(msgspec.Struct, frozen=True):
     """Where to start.
 
     Attributes:

@@ -17,6 +17,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import msgspec
+
 from rampart.actors.bus.plausible import is_possible, is_sane
 from rampart.actors.osmosis.control.polyline import wrap_angle
 
@@ -30,8 +32,7 @@ _FLAT_READINGS = 3
 """The same reading so many times in a row is a stuck device."""
 
 
-@dataclass(frozen=True, slots=True)
-class ParityLimits:
+class ParityLimits(msgspec.Struct, frozen=True):
     """How much integral and rate may differ.
 
     Args:

@@ -24,7 +24,8 @@ Times are simulated seconds, positions and headings are those of `base_link` in 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+
+import msgspec
 
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.bus.plausible import is_sane
@@ -44,8 +45,7 @@ _MAX_AGE_S = 0.3
 """A reading that arrives later is not used: the robot has moved on."""
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
+class Estimate(msgspec.Struct, frozen=True):
     """A pose in `map` and when it was true."""
 
     stamp_s: float

@@ -10,14 +10,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import msgspec
+
 from rampart.actors.osmosis.control.localization.motion_check import Source
 
 _TOO_LONG_S = 1.0
 """After such a silence what was usual says nothing."""
 
 
-@dataclass(frozen=True, slots=True)
-class FilterLimits:
+class FilterLimits(msgspec.Struct, frozen=True):
     """Noise, gates and bounds; docs/localization.md says where the numbers come from.
 
     Args:

@@ -20,7 +20,8 @@ while: the comparison's respawns have then had their chance (`FORGET_S`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+
+import msgspec
 
 Command = tuple[float, float]
 """Linear velocity, m/s, and turn rate, rad/s, of `base_link`."""
@@ -29,8 +30,7 @@ FORGET_S = 5.0
 """So long after the last comparison a doubt is over."""
 
 
-@dataclass(frozen=True, slots=True)
-class PairLimits:
+class PairLimits(msgspec.Struct, frozen=True):
     """When the standby drives, and when the two disagree.
 
     Args:

@@ -15,7 +15,8 @@ or not that far, it shows nothing, and nothing looks like free space.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+
+import msgspec
 
 from rampart.actors.osmosis.messages import LaserScan
 
@@ -23,8 +24,7 @@ NO_REFERENCE_M = -1.0
 """What a device reports that has no reference target."""
 
 
-@dataclass(frozen=True, slots=True)
-class LaserReach:
+class LaserReach(msgspec.Struct, frozen=True):
     """What a sweep covers at least.
 
     Args:
@@ -53,8 +53,7 @@ class LaserReach:
         return ""
 
 
-@dataclass(frozen=True, slots=True)
-class LaserLimits:
+class LaserLimits(msgspec.Struct, frozen=True):
     """What a healthy laser does.
 
     Args:

@@ -42,8 +42,7 @@ _SLOWED = 0.999
 """Below this share of the command the reason says that obstacles slow the robot."""
 
 
-@dataclass(frozen=True, slots=True)
-class Checks:
+class Checks(msgspec.Struct, frozen=True):
     """Which checks are in force; the system spec's layers switch them.
 
     Args:
@@ -56,8 +55,7 @@ class Checks:
     manager: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class GateLimits:
+class GateLimits(msgspec.Struct, frozen=True):
     """Bounds and ages.
 
     Args:
@@ -82,8 +80,8 @@ class GateLimits:
     joystick_timeout_s: float = 0.3
     manager_timeout_s: float = 0.5
     settling_s: float = 0.45
-    room: StoppingRoom = field(default_factory=StoppingRoom)
-    pair: PairLimits = field(default_factory=PairLimits)
+    room: StoppingRoom = StoppingRoom()
+    pair: PairLimits = PairLimits()
 
 
 class Stamped(msgspec.Struct, frozen=True, gc=False):

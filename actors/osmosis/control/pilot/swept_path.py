@@ -10,8 +10,8 @@ turning is safe, so that in front of an obstacle the robot can still turn away.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.control.polyline import Array, Hull
@@ -23,8 +23,7 @@ _CRAWL_MPS = 0.08
 """Slowed down below this the robot stands, else it would twitch with the laser's noise."""
 
 
-@dataclass(frozen=True, slots=True)
-class StoppingRoom:
+class StoppingRoom(msgspec.Struct, frozen=True):
     """Room that has to be free for a speed.
 
     Args:
@@ -40,7 +39,7 @@ class StoppingRoom:
         angular_deceleration_radps2: braking of a turn.
     """
 
-    hull: Hull = field(default_factory=Hull)
+    hull: Hull = Hull()
     top_speed_mps: float = 1.0
     stop_distance_m: float = 0.8
     lateral_distance_m: float = 0.3

@@ -12,15 +12,15 @@ import heapq
 import itertools
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+
+import msgspec
 
 from rampart.actors.osmosis.control.polyline import Point
 
 Edge = tuple[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class SearchLimits:
+class SearchLimits(msgspec.Struct, frozen=True):
     """How far start and goal may be from the graph, in metres.
 
     Args:
@@ -43,8 +43,7 @@ class SearchLimits:
     row_begins_m: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class PlannedRoute:
+class PlannedRoute(msgspec.Struct, frozen=True):
     """Result of a search: waypoints in `map` from start to goal, or none and the reason."""
 
     waypoints: tuple[Point, ...]
@@ -52,8 +51,7 @@ class PlannedRoute:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class _Snap:
+class _Snap(msgspec.Struct, frozen=True):
     """Where a point joins the graph: a place on the edge (a, b); a == b means the node itself."""
 
     point: Point

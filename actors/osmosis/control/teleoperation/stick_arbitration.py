@@ -13,7 +13,8 @@ A joystick on this machine, the operator's page and a terminal may all offer pos
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+
+import msgspec
 
 from rampart.actors.osmosis.messages import Joystick
 
@@ -23,8 +24,7 @@ TIMEOUT_S = 0.3
 _REMEMBERED = 64
 
 
-@dataclass(frozen=True, slots=True)
-class Ruling:
+class Ruling(msgspec.Struct, frozen=True):
     """What follows from an offer, or from the passing of time.
 
     Attributes:
