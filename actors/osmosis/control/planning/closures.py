@@ -11,8 +11,8 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+from rampart.actors.osmosis.airport.model import Point
 from rampart.actors.osmosis.control.planning.route_search import Edge
-from rampart.actors.osmosis.control.polyline import Point
 
 MOST_PLACES = 32
 """That are closed at a time; with one more, the one closed first is tried again."""
