@@ -64,16 +64,12 @@ class Osmosis(Application):
     options: Options
 
     def __init__(self, options: Options) -> None:
-        from rampart.actors.osmosis.airport.formats import (  # noqa: PLC0415 heavy for a tool
-            load_airport,
-            load_mission,
-            load_world,
-        )
+        from rampart.actors.osmosis.airport import formats  # noqa: PLC0415 heavy for a tool
 
         super().__init__(options)
-        self.airport: Airport = load_airport(options.airport)
-        self.world: WorldTruth = load_world(options.airport)
-        self.mission: Mission = load_mission(options.mission, self.airport)
+        self.airport: Airport = formats.load_airport(options.airport)
+        self.world: WorldTruth = formats.load_world(options.airport)
+        self.mission: Mission = formats.load_mission(options.mission, self.airport)
         if options.obstacles > len(self.airport.obstacles):
             raise ValueError(f"obstacles = {options.obstacles}: {self.airport.name} has places for "
                              f"{len(self.airport.obstacles)}")
