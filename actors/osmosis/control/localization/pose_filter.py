@@ -24,8 +24,7 @@ Times are simulated seconds, positions and headings are those of `base_link` in 
 from __future__ import annotations
 
 import math
-
-import msgspec
+from typing import NamedTuple
 
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.bus.plausible import is_sane
@@ -39,19 +38,17 @@ from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, O
 from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits, PositionSource
 from rampart.actors.osmosis.control.polyline import wrap_angle
-from rampart.actors.osmosis.messages import LocalizationStatus
+from rampart.actors.osmosis.messages import GpsFix, LocalizationStatus, Odometry, Pose
 
 _MAX_AGE_S = 0.3
 """A reading that arrives later is not used: the robot has moved on."""
 
 
-class Estimate(msgspec.Struct, frozen=True):
+class Estimate(NamedTuple):
     """A pose in `map` and when it was true."""
 
     stamp_s: float
-    x_m: float
-    y_m: float
-    yaw_rad: float
+    pose: Pose
 
 
 class PoseFilter:
@@ -61,8 +58,7 @@ class PoseFilter:
         limits: noise, gates and bounds.
 
     Attributes:
-        imu: takes an IMU reading: stamp s, yaw rad, rate rad/s, acceleration along x and y m/s2
-            as a pair, and what time it is.
+        imu: takes an IMU reading: stamp s, the reading, and what time it is.
     """
 
     def __init__(self, limits: FilterLimits | None = None) -> None:
@@ -90,7 +86,7 @@ class PoseFilter:
         ekf = self._ekf
         if ekf is None or self._lost(ekf):
             return None
-        return Estimate(self._time_s, ekf.x_m, ekf.y_m, ekf.yaw_rad)
+        return Estimate(self._time_s, Pose(ekf.x_m, ekf.y_m, ekf.yaw_rad))
 
     def status(self, now_s: float) -> LocalizationStatus:
         """Return which sources are in use, which not and why, and how sure the estimate is."""
@@ -111,13 +107,12 @@ class PoseFilter:
 
     # -- wheels and gyro ------------------------------------------------------------------------
 
-    def odometry(self, stamp_s: float, pose: tuple[float, float, float], linear_mps: float,
-                 now_s: float) -> None:
-        """Take an odometry reading: pose (x m, y m, yaw rad) in `odom`, speed in `base_link`."""
+    def odometry(self, stamp_s: float, reading: Odometry, now_s: float) -> None:
+        """Take an odometry reading."""
         if not _timely(stamp_s, now_s):
             return
         wheels = self._wheels
-        step = wheels.take(stamp_s, pose, linear_mps)
+        step = wheels.take(stamp_s, reading)
         if step is None or self._ekf is None:
             return
         dt_s, forward_m, turn_rad = step
@@ -125,7 +120,7 @@ class PoseFilter:
             if abs(forward_m / dt_s - self._speed_mps) > _OTHER_SPEED_MPS:
                 wheels.trust.flaw(wheels.trust.reason, stamp_s)
             return
-        self._speed_mps = linear_mps
+        self._speed_mps = reading.twist.linear_mps
         rest_s = stamp_s - self._time_s
         if rest_s <= 0:
             return
@@ -174,10 +169,9 @@ class PoseFilter:
 
     # -- positions ------------------------------------------------------------------------------
 
-    def absolute_pose(self, stamp_s: float, x_m: float, y_m: float, yaw_rad: float,
-                      now_s: float) -> None:
+    def absolute_pose(self, stamp_s: float, pose: Pose, now_s: float) -> None:
         """Take an absolute pose."""
-        source = self._pose
+        source, (x_m, y_m, yaw_rad) = self._pose, (pose.x_m, pose.y_m, pose.yaw_rad)
         if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s \
                 or not is_sane(x_m, y_m, yaw_rad):
             return
@@ -206,11 +200,10 @@ class PoseFilter:
                 self._speed_mps = (made[0] * math.cos(ekf.yaw_rad)
                                    + made[1] * math.sin(ekf.yaw_rad)) / dt_s
 
-    def gps(self, stamp_s: float, position: tuple[float, float], velocity: tuple[float, float],
-            accuracy_m: float, now_s: float) -> None:
-        """Take a GPS fix, m, with its velocity over ground, m/s, both in `map`."""
-        source = self._gps
-        x_m, y_m = position
+    def gps(self, stamp_s: float, fix: GpsFix, now_s: float) -> None:
+        """Take a GPS fix."""
+        source, x_m, y_m = self._gps, fix.x_m, fix.y_m
+        velocity, accuracy_m = (fix.velocity_x_mps, fix.velocity_y_mps), fix.accuracy_m
         if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s or not accuracy_m >= 0 \
                 or not is_sane(x_m, y_m, accuracy_m) or not math.hypot(*velocity) <= _FASTEST_MPS:
             return

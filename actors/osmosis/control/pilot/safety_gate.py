@@ -17,17 +17,16 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import msgspec
 
-from rampart.actors.bus.envelope import AHEAD_S
+from rampart.actors.bus.envelope import AHEAD_S, Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.ftm.holders import Holders
 from rampart.actors.osmosis.control.pilot.command_pair import CommandPair, PairLimits
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Array
-from rampart.actors.osmosis.messages import PilotMode
+from rampart.actors.osmosis.messages import PilotMode, PilotOrder, Twist
 
 STRICTNESS = (PilotMode.AUTO, PilotMode.TELEOPERATION, PilotMode.STOP)
 """Modes from the most permissive to the strictest; declared here, once."""
@@ -84,17 +83,6 @@ class GateLimits(msgspec.Struct, frozen=True):
     pair: PairLimits = PairLimits()
 
 
-class Stamped(msgspec.Struct, frozen=True, gc=False):
-    """A velocity command with where it comes from: the header of its message."""
-
-    linear_mps: float
-    angular_radps: float
-    source: str
-    incarnation: int
-    sequence: int
-    stamp_s: float
-
-
 class GateOutput(msgspec.Struct, frozen=True, gc=False):
     """What goes to the base. `stopped`: the gate, not the command, keeps the robot standing."""
 
@@ -103,14 +91,6 @@ class GateOutput(msgspec.Struct, frozen=True, gc=False):
     mode: PilotMode
     stopped: bool
     reason: str
-
-
-class _Order(NamedTuple):
-    """What a recovery module has ordered; `top_speed_mps` 0 for no bound."""
-
-    mode: PilotMode
-    reason: str
-    top_speed_mps: float
 
 
 @dataclass(slots=True)
@@ -139,8 +119,8 @@ class SafetyGate:
         self._limits = limits
         self._checks = checks
         self._started_s = started_s
-        self._orders: Holders[_Order] = Holders(
-            recoveries, _Order(PilotMode.STOP, "too many unknown modules order something", 0.0))
+        self._orders: Holders[PilotOrder] = Holders(recoveries, PilotOrder(
+            True, PilotMode.STOP, "too many unknown modules order something"))
         self._auto = _Line()
         self._standby = _Line()
         self._pair = CommandPair(limits.pair)
@@ -151,15 +131,10 @@ class SafetyGate:
         self._scan_fault = ""
         self.refused = 0
 
-    def order(self, recovery: str, engaged: bool, mode: PilotMode, reason: str,
-              top_speed_mps: float = 0.0) -> None:
-        """Take note of a recovery module's order; it is in force until that module ends it.
-
-        `top_speed_mps` bounds the speed meanwhile, whoever drives; 0 or nonsense does not.
-        """
-        if engaged:
-            self._orders.hold(recovery, _Order(
-                mode, reason, top_speed_mps if top_speed_mps > 0 else 0.0))
+    def order(self, recovery: str, order: PilotOrder) -> None:
+        """Take note of a recovery module's order; it is in force until that module ends it."""
+        if order.engaged:
+            self._orders.hold(recovery, order)
         else:
             self._orders.let_go(recovery)
 
@@ -185,17 +160,17 @@ class SafetyGate:
         self._points = points
         self._scan_s = stamp_s
 
-    def command(self, command: Stamped, now: float) -> str:
+    def command(self, command: Twist, header: Header, now: float) -> str:
         """Offer Osmosis Control's command; return why it was refused, or ""."""
-        refused = self._take(self._auto, command, now)
+        refused = self._take(self._auto, command, header, now)
         if self._standby.twist is not None:
-            self._pair.active(*self._offer(self._auto, now), command.incarnation, now)
+            self._pair.active(*self._offer(self._auto, now), header.incarnation, now)
         return refused
 
-    def standby(self, command: Stamped, now: float) -> str:
+    def standby(self, command: Twist, header: Header, now: float) -> str:
         """Offer the command of Osmosis Control's standby; return why it was refused, or ""."""
-        refused = self._take(self._standby, command, now)
-        self._pair.standby(*self._offer(self._standby, now), command.incarnation, now)
+        refused = self._take(self._standby, command, header, now)
+        self._pair.standby(*self._offer(self._standby, now), header.incarnation, now)
         return refused
 
     def standby_drives(self, now: float) -> bool:
@@ -207,32 +182,36 @@ class SafetyGate:
         """Return what a line has to offer to the pair, and from when it is."""
         return None if self._unusable(line, now) else line.twist, line.stamp_s
 
-    def joystick(self, command: Stamped, now: float) -> str:
+    def joystick(self, command: Twist, header: Header, now: float) -> str:
         """Offer Teleoperation's command; return why it was refused, or ""."""
-        return self._take(self._stick, command, now)
+        return self._take(self._stick, command, header, now)
 
-    def _take(self, line: _Line, command: Stamped, now: float) -> str:
-        position = (command.incarnation, command.sequence)
+    def _take(self, line: _Line, command: Twist, header: Header, now: float) -> str:
+        position = (header.incarnation, header.sequence)
         if self._checks.inputs:
-            newest = line.newest.get(command.source)
+            newest = line.newest.get(header.source)
             if newest is not None and position <= newest:
                 # The newer one that was taken before stays valid.
                 self.refused += 1
-                return (f"command {command.source}:{position[0]}/{position[1]} is out of sequence,"
+                return (f"command {header.source}:{position[0]}/{position[1]} is out of sequence,"
                         f" newest is {newest[0]}/{newest[1]}")
-            line.newest[command.source] = position
-        line.fault = self._fault(command, now) or self._reverse_fault(line, command)
+            line.newest[header.source] = position
+        line.fault = self._fault(command, now - header.stamp)
+        backwards = line is not self._stick and command.linear_mps < -_STANDING_MPS
+        if backwards and self._checks.inputs and not line.fault:
+            line.fault = (f"command of {command.linear_mps:.2f} m/s is backwards, "
+                          "where no laser looks")
         if line.fault:
             self.refused += 1
             if self._checks.inputs:
                 line.twist = (0.0, 0.0)
             return line.fault
         line.twist = (command.linear_mps, command.angular_radps)
-        line.stamp_s = command.stamp_s
+        line.stamp_s = header.stamp
         line.heard_s = now
         return ""
 
-    def _fault(self, command: Stamped, now: float) -> str:
+    def _fault(self, command: Twist, age_s: float) -> str:
         linear, angular = command.linear_mps, command.angular_radps
         limits = self._limits
         if not (math.isfinite(linear) and math.isfinite(angular)):
@@ -245,16 +224,10 @@ class SafetyGate:
             if abs(angular) > limits.max_angular_radps * slack:
                 return (f"command of {angular:.2f} rad/s is beyond"
                         f" {limits.max_angular_radps:.2f} rad/s")
-            age_s = now - command.stamp_s
             if not age_s <= limits.command_timeout_s:
                 return f"command is {age_s:.2f} s old, limit {limits.command_timeout_s:.2f} s"
             if age_s < -AHEAD_S:
                 return f"command is stamped {-age_s:.2f} s ahead of now"
-        return ""
-
-    def _reverse_fault(self, line: _Line, command: Stamped) -> str:
-        if self._checks.inputs and line is not self._stick and command.linear_mps < -_STANDING_MPS:
-            return f"command of {command.linear_mps:.2f} m/s is backwards, where no laser looks"
         return ""
 
     @property
@@ -292,9 +265,9 @@ class SafetyGate:
 
     @property
     def top_speed_mps(self) -> float:
-        """The lowest speed that an order in force allows at most; 0 if none bounds it."""
-        return min((order.top_speed_mps for order in self._orders.values() if order.top_speed_mps),
-                   default=0.0)
+        """The lowest speed that an order in force allows at most; 0 or nonsense bounds nothing."""
+        return min((order.top_speed_mps for order in self._orders.values()
+                    if order.top_speed_mps > 0), default=0.0)
 
     def _bounded(self, wanted: tuple[float, float], passing: str
                  ) -> tuple[tuple[float, float], str]:
@@ -338,10 +311,9 @@ class SafetyGate:
         """Why a line's last command may not be executed, or ""."""
         if line.fault and self._checks.inputs:
             return line.fault
-        if self._checks.inputs and line.twist is not None:
-            age_s = now - line.stamp_s
-            if age_s > self._limits.command_timeout_s:
-                return "no fresh command"
+        if self._checks.inputs and line.twist is not None \
+                and now - line.stamp_s > self._limits.command_timeout_s:
+            return "no fresh command"
         return ""
 
     def _why(self, mode: PilotMode) -> str:

@@ -11,7 +11,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.limits_from_spec import checks_of, gate_of, reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair
-from rampart.actors.osmosis.control.pilot.safety_gate import GateOutput, SafetyGate, Stamped
+from rampart.actors.osmosis.control.pilot.safety_gate import GateOutput, SafetyGate
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 
 _PERIOD_S = 0.05
@@ -40,23 +40,21 @@ class SafetyPilot(Actor):
     @on(topics.COMMAND)
     def command(self, message: m.Twist, header: Header) -> None:
         """Offer Osmosis Control's command to the gate and act on the answer at once."""
-        refused = self._gate.command(_stamped(message, header), self.clock.now())
-        self._note(refused, header)
+        self._note(self._gate.command(message, header, self.clock.now()), header)
         self._act()
 
     @on(topics.STANDBY_COMMAND)
     def standby(self, message: m.Twist, header: Header) -> None:
         """Offer the standby's command; act at once if it drives, else the active one's do."""
         now = self.clock.now()
-        self._note(self._gate.standby(_stamped(message, header), now), header)
+        self._note(self._gate.standby(message, header, now), header)
         if self._gate.standby_drives(now):
             self._act()
 
     @on(topics.TELEOP_COMMAND)
     def joystick(self, message: m.Twist, header: Header) -> None:
         """Offer the operator's command to the gate and act on the answer at once."""
-        refused = self._gate.joystick(_stamped(message, header), self.clock.now())
-        self._note(refused, header)
+        self._note(self._gate.joystick(message, header, self.clock.now()), header)
         self._act()
 
     @on(topics.SCAN)
@@ -73,8 +71,7 @@ class SafetyPilot(Actor):
     def order(self, message: m.PilotOrder, header: Header) -> None:
         """Obey a recovery module, and others as well; a change acts at once."""
         before = self._orders_in_force()
-        self._gate.order(header.source, message.engaged, message.mode, message.reason,
-                         message.top_speed_mps)
+        self._gate.order(header.source, message)
         if message.engaged and header.source not in self._recoveries:
             self.report_diagnostic("pilot order", f"given by {header.source!r}, no recovery module "
                                    "of this system; rampart reset ends it", header.source)
@@ -147,8 +144,3 @@ class SafetyPilot(Actor):
     def _note(self, refused: str, header: Header) -> None:
         if refused:
             self.report_diagnostic("command refused", refused, header.source)
-
-
-def _stamped(message: m.Twist, header: Header) -> Stamped:
-    return Stamped(message.linear_mps, message.angular_radps, header.source, header.incarnation,
-                   header.sequence, header.stamp)
