@@ -61,9 +61,9 @@ class RouteCheck:
     def __init__(self, airport: Airport, limits: RouteLimits | None = None) -> None:
         self._allowed = airport.allowed
         self._boundary = airport.allowed.boundary
-        ends = np.array([(*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges])
-        self._from = ends[:, :2] if len(ends) else np.zeros((0, 2))
-        self._along = ends[:, 2:] - ends[:, :2] if len(ends) else np.zeros((0, 2))
+        ends = np.reshape(
+            [(*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges], (-1, 4))
+        self._from, self._along = ends[:, :2], ends[:, 2:] - ends[:, :2]
         self._limits = limits or RouteLimits()
         self._of_shape = lru_cache(maxsize=8)(self._find_in_shape)
 

@@ -207,10 +207,6 @@ class Polyline:
         foot = np.minimum(np.maximum(ahead, 0.0), self._lengths[low:high])
         distance = np.hypot(ahead - foot, left)
         found = np.empty((len(points), 2))
-        if high - low == 1:
-            found[:, 0] = self._arc[low] + foot[:, 0]
-            found[:, 1] = np.where(left[:, 0] < 0.0, -distance[:, 0], distance[:, 0])
-            return found
         best = np.argmin(distance, axis=1)
         row = np.arange(len(points))
         off = distance[row, best]

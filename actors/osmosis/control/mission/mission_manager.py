@@ -51,7 +51,7 @@ class MissionManager(Actor):
         self.state = MissionState()
         self._uncertain_until_s = -math.inf
         airport = Osmosis.of(context).airport
-        self._lights = frozenset(light.name for light in airport.lights) if airport else None
+        self._lights = frozenset(light.name for light in airport.lights)
 
     @on(topics.MISSION_REQUEST)
     def request(self, message: m.MissionRequest, _header: Header) -> None:
@@ -75,9 +75,8 @@ class MissionManager(Actor):
     def progress(self, message: m.ControlStatus, _header: Header) -> None:
         """Step on when the current goal is reached."""
         self._compare(message.mission_id, message.step)
-        if self._lights is not None and not self._lights.issuperset(message.unmeasured):
-            message = msgspec.structs.replace(message, unmeasured=tuple(
-                name for name in message.unmeasured if name in self._lights))
+        message = msgspec.structs.replace(message, unmeasured=tuple(
+            name for name in message.unmeasured if name in self._lights))
         self._become(mission_state.progress(self.state, message, self.clock.now()))
 
     @on(topics.ROUTE)
@@ -89,7 +88,7 @@ class MissionManager(Actor):
     @on(topics.LIGHT_MEASURED)
     def light(self, message: m.LightMeasurement, _header: Header) -> None:
         """Keep a light's measurement, if it is one of the airport's."""
-        if self._lights is not None and message.light not in self._lights:
+        if message.light not in self._lights:
             self.report_diagnostic("light", "no light of this airport", message.light)
             return
         self._become(mission_state.measured(self.state, message))

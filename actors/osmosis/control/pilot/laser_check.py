@@ -23,6 +23,19 @@ from rampart.actors.osmosis.messages import LaserScan
 NO_REFERENCE_M = -1.0
 """What a device reports that has no reference target."""
 
+REFERENCE_M = 0.1
+"""Distance of the reference target."""
+
+TOLERANCE_M = 0.06
+"""A single measurement is farther off than this only if the device is wrong: six standard
+deviations of a healthy one, once in 10^9 sweeps."""
+
+REPEATS = 4
+"""So many equal measurements in a row are no coincidence."""
+
+DISTRUST_S = 1.0
+"""After a wrong measurement the device is not believed for so long."""
+
 
 class LaserReach(msgspec.Struct, frozen=True):
     """What a sweep covers at least.
@@ -53,28 +66,10 @@ class LaserReach(msgspec.Struct, frozen=True):
         return ""
 
 
-class LaserLimits(msgspec.Struct, frozen=True):
-    """What a healthy laser does.
-
-    Args:
-        reference_m: Distance of the reference target.
-        tolerance_m: A single measurement is farther off than this only if the device is wrong:
-            six standard deviations of a healthy one, once in 10^9 sweeps.
-        repeats: So many equal measurements in a row are no coincidence.
-        distrust_s: After a wrong one the device is not believed for so long.
-    """
-
-    reference_m: float = 0.1
-    tolerance_m: float = 0.06
-    repeats: int = 4
-    distrust_s: float = 1.0
-
-
 class LaserCheck:
     """Judges sweep by sweep whether the laser can be believed."""
 
-    def __init__(self, limits: LaserLimits | None = None) -> None:
-        self._limits = limits or LaserLimits()
+    def __init__(self) -> None:
         self._last_m = math.nan
         self._equal = 1
         self._distrusted_until_s = -math.inf
@@ -90,15 +85,12 @@ class LaserCheck:
         """
         if reference_m == NO_REFERENCE_M and math.isnan(self._last_m):
             return ""
-        limits = self._limits
         self._equal = self._equal + 1 if reference_m == self._last_m else 1
         self._last_m = reference_m
-        off_m = reference_m - limits.reference_m
-        if self._equal >= limits.repeats:
-            self._distrust(stamp_s, "the laser repeats itself")
-        elif not abs(off_m) <= limits.tolerance_m:
-            self._distrust(stamp_s, f"the laser's reference is off by {off_m:.2f} m")
+        off_m = reference_m - REFERENCE_M
+        repeats = self._equal >= REPEATS
+        if repeats or not abs(off_m) <= TOLERANCE_M:
+            self._distrusted_until_s = stamp_s + DISTRUST_S
+            self._why = "the laser repeats itself" if repeats else (
+                f"the laser's reference is off by {off_m:.2f} m")
         return self._why if stamp_s < self._distrusted_until_s else ""
-
-    def _distrust(self, stamp_s: float, why: str) -> None:
-        self._distrusted_until_s, self._why = stamp_s + self._limits.distrust_s, why

@@ -112,6 +112,10 @@ class SafetyGate:
         checks: which of them are in force.
         started_s: now.
         recoveries: names of the modules that may give orders; others are obeyed, and named.
+
+    Attributes:
+        orders: what is ordered now, by whom.
+        refused: how many commands were refused.
     """
 
     def __init__(self, limits: GateLimits, checks: Checks, started_s: float,
@@ -119,7 +123,7 @@ class SafetyGate:
         self._limits = limits
         self._checks = checks
         self._started_s = started_s
-        self._orders: Holders[PilotOrder] = Holders(recoveries, PilotOrder(
+        self.orders: Holders[PilotOrder] = Holders(recoveries, PilotOrder(
             True, PilotMode.STOP, "too many unknown modules order something"))
         self._auto = _Line()
         self._standby = _Line()
@@ -134,18 +138,9 @@ class SafetyGate:
     def order(self, recovery: str, order: PilotOrder) -> None:
         """Take note of a recovery module's order; it is in force until that module ends it."""
         if order.engaged:
-            self._orders.hold(recovery, order)
+            self.orders.hold(recovery, order)
         else:
-            self._orders.let_go(recovery)
-
-    def reset(self, name: str) -> bool:
-        """End the order of one that is no recovery module; return whether there was one."""
-        return self._orders.reset(name)
-
-    @property
-    def unknown(self) -> tuple[str, ...]:
-        """Who gives orders and is no recovery module of the system."""
-        return self._orders.unknown
+            self.orders.let_go(recovery)
 
     def manager_alive(self, stamp_s: float) -> None:
         """Take note of the manager's sign of life, given at `stamp_s`."""
@@ -156,9 +151,7 @@ class SafetyGate:
 
         One that must not be believed (`fault` says why) is as good as none.
         """
-        self._scan_fault = fault
-        self._points = points
-        self._scan_s = stamp_s
+        self._points, self._scan_s, self._scan_fault = points, stamp_s, fault
 
     def command(self, command: Twist, header: Header, now: float) -> str:
         """Offer Osmosis Control's command; return why it was refused, or ""."""
@@ -233,9 +226,9 @@ class SafetyGate:
     @property
     def mode(self) -> PilotMode:
         """The strictest engaged order's mode, auto without any."""
-        if not self._orders:
+        if not self.orders:
             return PilotMode.AUTO
-        return max((order.mode for order in self._orders.values()), key=STRICTNESS.index)
+        return max((order.mode for order in self.orders.values()), key=STRICTNESS.index)
 
     def output(self, now: float) -> GateOutput:
         """Return what the base is to do now."""
@@ -266,7 +259,7 @@ class SafetyGate:
     @property
     def top_speed_mps(self) -> float:
         """The lowest speed that an order in force allows at most; 0 or nonsense bounds nothing."""
-        return min((order.top_speed_mps for order in self._orders.values()
+        return min((order.top_speed_mps for order in self.orders.values()
                     if order.top_speed_mps > 0), default=0.0)
 
     def _bounded(self, wanted: tuple[float, float], passing: str
@@ -318,5 +311,5 @@ class SafetyGate:
 
     def _why(self, mode: PilotMode) -> str:
         """The reasons of the orders for a mode."""
-        named = sorted(self._orders.items())
+        named = sorted(self.orders.items())
         return "; ".join(f"{name}: {order.reason}" for name, order in named if order.mode is mode)

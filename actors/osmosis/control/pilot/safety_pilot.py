@@ -81,22 +81,22 @@ class SafetyPilot(Actor):
     def reset(self, message: Reset, _header: Header) -> None:
         """End the order of one that is no recovery module of the system."""
         before = self._orders_in_force()
-        if self._gate.reset(message.recovery):
+        if self._gate.orders.reset(message.recovery):
             self._follow(before)
 
     def _orders_in_force(self) -> tuple[m.PilotMode, float, tuple[str, ...]]:
-        return self._gate.mode, self._gate.top_speed_mps, self._gate.unknown
+        return self._gate.mode, self._gate.top_speed_mps, self._gate.orders.unknown
 
     def _follow(self, before: tuple[m.PilotMode, float, tuple[str, ...]]) -> None:
         if self._orders_in_force()[:2] != before[:2]:
             self._act()
             self._tell()
-        if self._gate.unknown != before[2]:
+        if self._gate.orders.unknown != before[2]:
             self._tell_holds()
 
     def _tell_holds(self) -> None:
         """Tell who orders something and should not."""
-        self.publish(ftm_topics.HOLDS, Holds("pilot", self._gate.unknown))
+        self.publish(ftm_topics.HOLDS, Holds("pilot", self._gate.orders.unknown))
 
     @on(ftm_topics.MANAGER_STATUS)
     def manager(self, _message: ManagerStatus, header: Header) -> None:
@@ -113,7 +113,7 @@ class SafetyPilot(Actor):
     def repeat_status(self) -> None:
         """Repeat the status for whoever joined late."""
         self._tell()
-        if self._gate.unknown:
+        if self._gate.orders.unknown:
             self._tell_holds()
 
     def _see(self, laser: int, message: m.LaserScan, header: Header) -> None:

@@ -129,9 +129,7 @@ def limited(linear_mps: float, angular_radps: float, points: Array,
             break
         if is_free(slower_mps, angular_radps, points, room):
             return slower_mps, angular_radps
-    if is_free(0.0, angular_radps, points, room):
-        return 0.0, angular_radps
-    for share in (0.5, 0.25):
+    for share in (1.0, 0.5, 0.25):
         if is_free(0.0, angular_radps * share, points, room):
             return 0.0, angular_radps * share
     return 0.0, 0.0

@@ -7,6 +7,7 @@ edge, still stands on the graph, and a goal behind it can still be reached from 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -101,7 +102,5 @@ def _between(a: Point, b: Point, share: float) -> Point:
 
 
 def _fresh(stem: str, taken: Mapping[str, Point]) -> str:
-    number = 1
-    while f"{stem}#{number}" in taken:
-        number += 1
-    return f"{stem}#{number}"
+    names = (f"{stem}#{number}" for number in itertools.count(1))
+    return next(name for name in names if name not in taken)

@@ -9,6 +9,7 @@ import msgspec
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.plausible import is_sane
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Point
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.planning.closures import Closures, without
 from rampart.actors.osmosis.control.planning.route_search import PlannedRoute, plan_route
@@ -140,8 +141,7 @@ class GraphPlanner(Actor):
         if order is None:
             return
         if not order.active:
-            self._route = Route(order.mission_id, order.step, order.goal.mode, False, (), "",
-                                order.plan)
+            self._route = _route(order, (), "")
         elif pose is None:
             return
         else:
@@ -151,7 +151,7 @@ class GraphPlanner(Actor):
                 plan = self._search(order, pose)
             if plan.reason:
                 self.report_diagnostic("route search", plan.reason, order.mission_id)
-            self._route = _route(order, plan, plan.reason)
+            self._route = _route(order, plan.waypoints, plan.reason)
         self._tell()
 
     def _plan_round(self, blockage: Blockage, now_s: float) -> None:
@@ -166,19 +166,15 @@ class GraphPlanner(Actor):
             self.report_diagnostic("route search", f"no way round {where}: {plan.reason}",
                                    order.mission_id)
             return
-        self._route = _route(order, plan, f"way round {where}, which is blocked")
+        self._route = _route(order, plan.waypoints, f"way round {where}, which is blocked")
         self._tell()
 
     def _search(self, order: GoalOrder, pose: Pose) -> PlannedRoute:
-        nodes, edges = self._airport.nodes, self._airport.edges
-        closed = self._closures.closed(self.clock.now())
-        if closed:
-            open_nodes, open_edges = without(nodes, edges, closed, self._closures.gap_m)
-            nodes, edges = open_nodes, tuple(open_edges)
+        nodes, edges = without(self._airport.nodes, self._airport.edges,
+                               self._closures.closed(self.clock.now()), self._closures.gap_m)
         return plan_route(nodes, edges, (pose.x_m, pose.y_m), (order.goal.x_m, order.goal.y_m),
                           straight=order.goal.mode is Mode.LIGHT_VERIFICATION)
 
 
-def _route(order: GoalOrder, plan: PlannedRoute, reason: str) -> Route:
-    return Route(order.mission_id, order.step, order.goal.mode, True, plan.waypoints,
-                 clip(reason), order.plan)
+def _route(order: GoalOrder, waypoints: tuple[Point, ...], reason: str) -> Route:
+    return Route(*order.which, order.goal.mode, order.active, waypoints, clip(reason), order.plan)

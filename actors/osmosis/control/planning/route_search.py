@@ -47,7 +47,6 @@ class PlannedRoute(msgspec.Struct, frozen=True):
     """Result of a search: waypoints in `map` from start to goal, or none and the reason."""
 
     waypoints: tuple[Point, ...]
-    length_m: float
     reason: str
 
 
@@ -96,12 +95,11 @@ def plan_route(nodes: Mapping[str, Point], edges: Iterable[Edge], start: Point, 
         if len(waypoints) > 2 and math.dist(*waypoints[:2]) <= limits.row_begins_m:
             del waypoints[0]
         waypoints = _straightened(waypoints, limits.straight_m)
-    length_m = sum(math.dist(a, b) for a, b in itertools.pairwise(waypoints))
-    return PlannedRoute(tuple(waypoints), length_m, "")
+    return PlannedRoute(tuple(waypoints), "")
 
 
 def _none(reason: str) -> PlannedRoute:
-    return PlannedRoute((), math.inf, reason)
+    return PlannedRoute((), reason)
 
 
 def _show(point: Point) -> str:
