@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE
-from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE
+from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints

@@ -20,18 +20,11 @@ from typing import Any
 import shapely
 from shapely.geometry import MultiPoint, MultiPolygon
 
-from rampart.actors.osmosis.airport import limits
+from rampart.actors.osmosis.airport import limits, model
 from rampart.actors.osmosis.airport.errors import AirportError, readable
 from rampart.actors.osmosis.airport.limits import check_count
 from rampart.actors.osmosis.airport.mask import MaskScale, allowed_area
-from rampart.actors.osmosis.airport.model import (
-    Airport,
-    Mission,
-    MissionGoal,
-    Point,
-    StartPose,
-    Surface,
-)
+from rampart.actors.osmosis.airport.model import Airport, Mission, Point
 from rampart.files.reading import read_text, shown
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -70,8 +63,8 @@ def read_airport(graph: Path, scale: MaskScale | None = None) -> Airport:
             raise AirportError(f"{path}: mission name: {mission.name!r}: already used; rename it")
         missions[mission.name] = mission
     return Airport(graph.stem, nodes, edges, allowed,
-                   StartPose(x_m, y_m, math.atan2(to_y - y_m, to_x - x_m)),
-                   (Surface(graph.stem, "area", allowed),), missions=missions)
+                   model.StartPose(x_m, y_m, math.atan2(to_y - y_m, to_x - x_m)),
+                   (model.Surface(graph.stem, "area", allowed),), missions=missions)
 
 
 def images_beside(graph: Path) -> list[Path]:
@@ -138,7 +131,7 @@ def read_mission(path: Path) -> Mission:
     return Mission(path.stem.removeprefix("MISSION_"), tuple(goals))
 
 
-def _goal(line: str, where: str) -> MissionGoal:
+def _goal(line: str, where: str) -> model.MissionGoal:
     found = [_FIELD.fullmatch(part) for part in line.split(",")]
     fields = {match.group(1): match.group(2) for match in found if match}
     if len(found) != 3 or fields.keys() != {"x", "y", "taxi"}:
@@ -146,7 +139,7 @@ def _goal(line: str, where: str) -> MissionGoal:
     if fields["taxi"] not in ("0", "1"):
         raise AirportError(f"{where}: taxi={fields['taxi'][:20]}: 1 is taxi, 0 light verification")
     x_m, y_m = (_number(fields[axis], f"{where}: {axis}") for axis in ("x", "y"))
-    return MissionGoal(x_m, y_m, "taxi" if fields["taxi"] == "1" else "light verification")
+    return model.MissionGoal(x_m, y_m, "taxi" if fields["taxi"] == "1" else "light verification")
 
 
 def _node(entry: Any, where: str) -> tuple[str, Point]:

@@ -15,10 +15,10 @@ from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE
 from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
+from rampart.actors.osmosis.control.following.light_ledger import RowInspection
 from rampart.actors.osmosis.control.following.light_row import RowLimits
 from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
 from rampart.actors.osmosis.control.following.route_control import PERIOD_S, RouteControl
-from rampart.actors.osmosis.control.following.row_inspection import RowInspection
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.manager.spec.tables import NonNegative
@@ -113,7 +113,7 @@ class OsmosisControl(Actor):
     def light(self, message: m.LightSample, header: Header) -> None:
         """Take a reading of the light sensor."""
         if self._lights:
-            self._lights.sample(header.stamp, message.illuminance_lux)
+            self._lights.inspection.sample(header.stamp, message.illuminance_lux)
 
     @on(topics.GOAL)
     def goal(self, message: m.GoalOrder, _header: Header) -> None:

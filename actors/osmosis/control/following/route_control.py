@@ -20,11 +20,10 @@ from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.control.following.blockage import BlockageWatch
 from rampart.actors.osmosis.control.following.control_checkpoint import ControlKept, whole_row
 from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
-from rampart.actors.osmosis.control.following.light_ledger import LightsKept
+from rampart.actors.osmosis.control.following.light_ledger import LightsKept, RowInspection
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
 from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
 from rampart.actors.osmosis.control.following.path_follower import Motion, PathFollower
-from rampart.actors.osmosis.control.following.row_inspection import RowInspection
 from rampart.actors.osmosis.control.limits_from_spec import hull_of, motion_of, reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LaserPair
 from rampart.actors.osmosis.control.polyline import Array, Pose2
@@ -118,7 +117,7 @@ class RouteControl:
             return
         self._pose = place
         if self._lights:
-            self._lights.pose(stamp_s, *place)
+            self._lights.inspection.pose(stamp_s, *place)
         if self._loop:
             self._loop.pose(stamp_s, *place)
 

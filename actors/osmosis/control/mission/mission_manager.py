@@ -13,8 +13,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.mission import mission_state
-from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE, catch_up
-from rampart.actors.osmosis.control.mission.mission_state import MissionState
+from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE, MissionState
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.parameters import RecoveryNames
 
@@ -123,13 +122,13 @@ class MissionManager(Actor):
         """End the uncertainty after a respawn: planner or control know the step as well.
 
         A later step than the checkpoint's is believed only with a way to that step's goal: if the
-        former life died because it gave a wrong goal, the others were told a wrong step.
+        former process died because it gave a wrong goal, the others were told a wrong step.
         """
         if self.clock.now() < self._uncertain_until_s and mission_id == self.state.mission_id:
             if step > self.state.step and not _leads_to(end, self.state.goals[step:step + 1]):
                 return
             self._uncertain_until_s = -math.inf
-            self._become(catch_up(self.state, step, self.clock.now()))
+            self._become(mission_state.catch_up(self.state, step, self.clock.now()))
             self.repeat_status()
             self.repeat_goal()
 

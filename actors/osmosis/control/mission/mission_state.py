@@ -11,10 +11,16 @@ phase are refused with a reason; the table is for mistakes in this program.
 
 The state is one frozen struct that msgspec can serialise, so that a checkpoint is its encoding;
 every function takes a state and returns the next one.
+
+The state is kept before the goal that follows from it is published. So the newest checkpoint is
+never behind what planner and control were told. If it is damaged, the one before it is, by a step;
+to follow that would send the robot back to a goal that it has reached. But only the Mission Manager
+gives steps, so a step that the others are at is one that it once gave (`catch_up`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import msgspec
@@ -22,6 +28,7 @@ from msgspec.structs import replace
 
 from rampart.actors.bus.bounds import clip
 from rampart.actors.osmosis import messages as m
+from rampart.actors.runtime.checkpoint import StateFormat
 
 A = m.MissionAction
 P = m.MissionPhase
@@ -269,3 +276,41 @@ def status(state: MissionState) -> m.MissionStatus:
         skipped=tuple(index for index, _ in state.skipped),
         unmeasured=tuple(name for name in state.unmeasured if name not in measured_lights),
         orders=tuple(action for action in A if not _refusal(state, action)))
+
+# -- checkpoint -----------------------------------------------------------------------------------
+
+
+def catch_up(state: MissionState, step: int, now: float) -> MissionState:
+    """Return the state at the step that planner or control are at, if that is a later goal.
+
+    The first of the steps made up for gets the time until now, the others none: when they ended is
+    not known any more.
+    """
+    missing = step - state.step
+    if state.phase not in ACTIVE or missing <= 0 or step >= len(state.goals):
+        return state
+    times = (max(now - state.step_started_s, 0.0), *(0.0,) * (missing - 1))
+    return replace(
+        state, step=step, step_started_s=now, step_times_s=(*state.step_times_s, *times))
+
+
+def _objection(state: MissionState) -> str:
+    names = [light.light for light in state.lights]
+    numbers = [v for goal in state.goals for v in (goal.x_m, goal.y_m)]
+    wrong = {
+        f"step {state.step} of {len(state.goals)} goals":
+            not 0 <= state.step <= len(state.goals),
+        f"{state.phase.value} after the last goal":
+            state.phase in ACTIVE and state.step == len(state.goals),
+        f"{len(state.step_times_s)} step times at step {state.step}":
+            len(state.step_times_s) != state.step,
+        f"{state.phase.value} without a mission":
+            state.phase is not P.IDLE and not state.mission_id,
+        "a light is in it twice": len(set(names)) < len(names),
+        "a number is not finite":
+            not all(map(math.isfinite, (*numbers, state.step_started_s))),
+    }
+    return "; ".join(text for text, holds in wrong.items() if holds)
+
+
+MISSION_STATE = StateFormat(MissionState, version=1, objection=_objection)
