@@ -79,7 +79,7 @@ class LaserScan(Message, frozen=True):
     """One sweep of the 2D laser in `base_link`; a range of `range_max_m` means no echo.
 
     `reference_m` is the range to the target in the laser's housing, measured once a sweep, for
-    `rampart.actors.osmosis.control.pilot.laser_check`; exactly -1 for a device without one.
+    `rampart.actors.osmosis.control.pilot.laser_pair`; exactly -1 for a device without one.
     """
 
     angle_min_rad: float

@@ -6,7 +6,7 @@ What a spec does not say (gains, look-ahead distances) keeps the default of its 
 from __future__ import annotations
 
 from rampart.actors.osmosis.control.following.path_follower import MotionLimits
-from rampart.actors.osmosis.control.pilot.laser_check import LaserReach
+from rampart.actors.osmosis.control.pilot.laser_pair import LaserReach
 from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom
 from rampart.actors.osmosis.control.polyline import Hull

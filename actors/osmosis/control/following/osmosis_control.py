@@ -13,12 +13,15 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE
 from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
 from rampart.actors.osmosis.control.following.light_ledger import RowInspection
 from rampart.actors.osmosis.control.following.light_row import RowLimits
 from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
-from rampart.actors.osmosis.control.following.route_control import PERIOD_S, RouteControl
+from rampart.actors.osmosis.control.following.route_control import (
+    CONTROL_STATE,
+    PERIOD_S,
+    RouteControl,
+)
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.manager.spec.tables import NonNegative

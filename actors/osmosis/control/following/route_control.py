@@ -3,6 +3,10 @@
 The core of Osmosis Control and of its standby. It takes messages and the time, and gives commands,
 measurements and the status; no bus, no clock. What a system wants beyond the paper's is a part that
 it is given or not: a check of routes, dead reckoning, a loop on the turn rate, the lights.
+
+What is kept of it: the lights, which must not be forgotten, and the route with the progress along
+it. The Graph Planner repeats the route; but it tells a route that is resumed from another one, and
+where the row of lights began that a new route may join in the middle.
 """
 
 from __future__ import annotations
@@ -18,7 +22,6 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.control.following.blockage import BlockageWatch
-from rampart.actors.osmosis.control.following.control_checkpoint import ControlKept, whole_row
 from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
 from rampart.actors.osmosis.control.following.light_ledger import LightsKept, RowInspection
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
@@ -26,7 +29,8 @@ from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
 from rampart.actors.osmosis.control.following.path_follower import Motion, PathFollower
 from rampart.actors.osmosis.control.limits_from_spec import hull_of, motion_of, reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LaserPair
-from rampart.actors.osmosis.control.polyline import Array, Pose2
+from rampart.actors.osmosis.control.polyline import Array, Point, Polyline, Pose2
+from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.manager.spec.schema import SystemSpec
 
 PERIOD_S = 0.05
@@ -35,6 +39,55 @@ _ASIDE_M = 0.1
 """A step of the way aside by this much is told at once, where a standby has to know."""
 _ACTIVE_SILENT_S = 0.6
 """After so long without a status, three periods, the standby is the one in the loop."""
+JOIN_M = 0.5
+"""A row is prolonged to where it began if that lies within this distance of its straight line."""
+
+
+class ControlKept(msgspec.Struct, frozen=True):
+    """State of Osmosis Control.
+
+    Attributes:
+        lights: of the mission.
+        route: the one being followed.
+        progress_m: arc length along it; None before the first step.
+        row_start: first waypoint of the first route to the present goal, in `map`.
+    """
+
+    lights: LightsKept = LightsKept()
+    route: m.Route | None = None
+    progress_m: float | None = None
+    row_start: tuple[float, float] | None = None
+
+
+def _objection(kept: ControlKept) -> str:
+    names = [light.light for light in kept.lights.measured]
+    if len(set(names)) < len(names):
+        return "a light is measured twice"
+    waypoints = kept.route.waypoints if kept.route else ()
+    numbers = [*(v for point in waypoints for v in point), *(kept.row_start or ()),
+               kept.progress_m or 0.0, *(light.ratio for light in kept.lights.measured)]
+    if not all(map(math.isfinite, numbers)):
+        return "a number is not finite"
+    if kept.route and kept.lights.mission_id != kept.route.mission_id:
+        return (f"lights of mission {kept.lights.mission_id!r}, "
+                f"route of {kept.route.mission_id!r}")
+    return ""
+
+
+CONTROL_STATE = StateFormat(ControlKept, version=1, objection=_objection)
+
+
+def whole_row(row_start: Point | None, waypoints: tuple[Point, ...]) -> tuple[Point, ...]:
+    """Return a row from where it began, if the route joins it further on; else the route."""
+    if row_start is None or len(waypoints) < 2:
+        return waypoints
+    line = Polyline(waypoints)
+    foot = line.project(*row_start)
+    (x_m, y_m), heading = waypoints[0], line.heading_at(0.0)
+    behind_m = math.cos(heading) * (x_m - row_start[0]) + math.sin(heading) * (y_m - row_start[1])
+    aside_m = math.cos(heading) * (y_m - row_start[1]) - math.sin(heading) * (x_m - row_start[0])
+    joins = foot.s_m < 1e-6 and behind_m > 0.0 and abs(aside_m) <= JOIN_M
+    return (row_start, *waypoints) if joins else waypoints
 
 
 class RouteControl:

@@ -28,15 +28,16 @@ from typing import NamedTuple
 
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.bus.plausible import is_sane
-from rampart.actors.osmosis.control.localization.first_pose import (
+from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck, Trust
+from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
+from rampart.actors.osmosis.control.localization.position_source import (
     COURSE_FROM_MPS,
     GPS_VELOCITY_SD_MPS,
     SIDESLIP_RAD,
+    FilterLimits,
+    PositionSource,
     find_first,
 )
-from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck, Trust
-from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
-from rampart.actors.osmosis.control.localization.position_source import FilterLimits, PositionSource
 from rampart.actors.osmosis.control.polyline import wrap_angle
 from rampart.actors.osmosis.messages import GpsFix, LocalizationStatus, Odometry, Pose
 
