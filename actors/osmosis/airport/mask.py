@@ -107,11 +107,8 @@ def _without_lone_pixels(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_
     """Majority vote of each pixel with its eight neighbours (a median filter)."""
     padded = np.pad(allowed, 1, mode="edge").astype(np.int8)
     rows, columns = allowed.shape
-    votes = np.zeros(allowed.shape, dtype=np.int8)
-    for i in range(3):
-        for j in range(3):
-            votes += padded[i : i + rows, j : j + columns]
-    return votes >= 5
+    votes = sum(padded[i:i + rows, j:j + columns] for i in range(3) for j in range(3))
+    return np.asarray(votes) >= 5
 
 
 def _boxes(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64] | None:
@@ -120,14 +117,13 @@ def _boxes(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64] | None:
     Returns:
         First column, first row, last column, last row, each one array; None if there are too many.
     """
-    steps = np.diff(np.pad(allowed, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    # A last row of none closes what is open there.
+    steps = np.diff(np.pad(allowed, ((0, 1), (1, 1))).astype(np.int8), axis=1)
     boxes: list[tuple[float, float, float, float]] = []
     open_runs: dict[tuple[int, int], int] = {}
-    for row in range(len(allowed) + 1):
-        runs: set[tuple[int, int]] = set()
-        if row < len(allowed):
-            begins, ends = np.flatnonzero(steps[row] == 1), np.flatnonzero(steps[row] == -1)
-            runs = set(zip(begins.tolist(), ends.tolist(), strict=True))
+    for row, step in enumerate(steps):
+        begins, ends = np.flatnonzero(step == 1), np.flatnonzero(step == -1)
+        runs = set(zip(begins.tolist(), ends.tolist(), strict=True))
         for run in [run for run in open_runs if run not in runs]:
             boxes.append((run[0], open_runs.pop(run), run[1], row))
         for run in runs:

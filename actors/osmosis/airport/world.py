@@ -20,7 +20,5 @@ class WorldTruth(msgspec.Struct, frozen=True):
 
     def intensity_cd(self, airport: Airport) -> dict[str, float]:
         """Return the real intensity of every light by name, cd."""
-        return {
-            light.name: light.nominal_cd * self.light_factors.get(light.name, 1.0)
-            for light in airport.lights
-        }
+        return {light.name: light.nominal_cd * self.light_factors.get(light.name, 1.0)
+                for light in airport.lights}

@@ -114,6 +114,11 @@ class Polyline:
     Args:
         points: at least one point; repeated points are merged.
 
+    Attributes:
+        points: those that are left.
+        end: the last of them.
+        length_m: of the whole polyline.
+
     Raises:
         ValueError: no points.
     """
@@ -126,6 +131,7 @@ class Polyline:
             if math.dist(point, kept[-1]) > 1e-9:
                 kept.append(point)
         self.points: tuple[Point, ...] = tuple(kept)
+        self.end = kept[-1]
         if len(kept) == 1:  # a segment of no extent keeps every formula below valid
             kept = [kept[0], (kept[0][0] + 1e-9, kept[0][1])]
         vertices = np.array(kept, dtype=float)
@@ -136,20 +142,11 @@ class Polyline:
         self._arc = np.concatenate(((0.0,), np.cumsum(self._lengths)))
         # The same as plain numbers: for one point at a time they are ten times as fast.
         self._arc_m: list[float] = self._arc.tolist()
+        self.length_m = self._arc_m[-1]
         self._segments: list[tuple[float, float, float, float, float]] = [
             (*start, *direction, length) for start, direction, length in zip(
                 self._starts.tolist(), self._directions.tolist(), self._lengths.tolist(),
                 strict=True)]
-
-    @property
-    def length_m(self) -> float:
-        """Length of the whole polyline."""
-        return self._arc_m[-1]
-
-    @property
-    def end(self) -> Point:
-        """The last point."""
-        return self.points[-1]
 
     def point_at(self, s_m: float) -> Point:
         """Return the point at an arc length; beyond the ends the outer segments go on straight."""

@@ -28,10 +28,7 @@ from msgspec.structs import replace
 
 from rampart.actors.osmosis.airport.model import Light
 from rampart.actors.osmosis.airport.photometry import SENSOR_FORWARD_M
-from rampart.actors.osmosis.control.following.light_inspection import (
-    InspectionLimits,
-    LightInspection,
-)
+from rampart.actors.osmosis.control.following import light_inspection
 from rampart.actors.osmosis.control.following.light_row import LightRow
 from rampart.actors.osmosis.control.polyline import Point, Polyline
 from rampart.actors.osmosis.messages import LightMeasurement, MissionStatus, Mode, Route
@@ -78,7 +75,7 @@ class LightLedger:
 
     def __init__(self, lights: Sequence[Light]) -> None:
         self._lights = tuple(lights)
-        self._limits = InspectionLimits()
+        self._limits = light_inspection.InspectionLimits()
         self._places = np.array([(li.x_m, li.y_m) for li in self._lights]).reshape(-1, 2)
         self._names = frozenset(light.name for light in self._lights)
         self._sent_s: dict[str, float] = {}
@@ -190,7 +187,7 @@ class RowInspection:
     def __init__(self, lights: tuple[Light, ...], *, goes_back: bool) -> None:
         self._lights = lights
         self._goes_back = goes_back
-        self.inspection = LightInspection(lights)
+        self.inspection = light_inspection.LightInspection(lights)
         self._mission_id: str | None = None
         self._goal: tuple[str, int, Mode] | None = None
         self._due: dict[str, None] = {}
@@ -209,7 +206,8 @@ class RowInspection:
         if route.mission_id != self._mission_id:
             self._mission_id = route.mission_id
             self.ledger.begin(route.mission_id)
-            self.inspection = LightInspection(self._lights, judged=self.ledger.judged)
+            self.inspection = light_inspection.LightInspection(
+                self._lights, judged=self.ledger.judged)
         goal = (*route.which, route.mode)
         if goal != self._goal:
             self._goal, self._due = goal, {}

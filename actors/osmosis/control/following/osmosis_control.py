@@ -65,7 +65,6 @@ class OsmosisControl(Actor):
         super().__init__(context)
         system, airport = context.run.system, Osmosis.of(context).airport
         parameters = self.parameters
-        self._bridges = parameters.bridge_m > 0
         self._lights = RowInspection(airport.lights, goes_back=system.layers.checkpoints) \
             if topics.LIGHT_MEASURED in self.outputs else None
         self.core = RouteControl(
@@ -73,14 +72,13 @@ class OsmosisControl(Actor):
             RowLimits(pass_after_s=parameters.pass_after_s or math.inf),
             lights=self._lights,
             check=RouteCheck(airport) if parameters.check_route else None,
-            bridge=DeadReckoning(parameters.bridge_m) if self._bridges else None,
-            loop=MotionLoop(system.robot.top_turn_rate_radps)
-            if parameters.yaw_loop else None,
+            bridge=DeadReckoning(parameters.bridge_m) if parameters.bridge_m else None,
+            loop=MotionLoop(system.robot.top_turn_rate_radps) if parameters.yaw_loop else None,
             has_standby=parameters.has_standby)
 
     def listens(self, topic: Topic[Any]) -> bool:
         """Whether it hears a topic: the base publishes odometry only if somebody does."""
-        return self._bridges or topic is not topics.ODOMETRY
+        return self.parameters.bridge_m > 0 or topic is not topics.ODOMETRY
 
     def on_start(self) -> None:
         """Find out what was measured; the robot goes on when the route is there."""

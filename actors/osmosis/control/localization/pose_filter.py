@@ -28,16 +28,10 @@ from typing import NamedTuple
 
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.bus.plausible import is_sane
+from rampart.actors.osmosis.control.localization import position_source as positions
 from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck, Trust
 from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
-from rampart.actors.osmosis.control.localization.position_source import (
-    COURSE_FROM_MPS,
-    GPS_VELOCITY_SD_MPS,
-    SIDESLIP_RAD,
-    FilterLimits,
-    PositionSource,
-    find_first,
-)
+from rampart.actors.osmosis.control.localization.position_source import FilterLimits, PositionSource
 from rampart.actors.osmosis.control.polyline import wrap_angle
 from rampart.actors.osmosis.messages import GpsFix, LocalizationStatus, Odometry, Pose
 
@@ -162,12 +156,6 @@ class PoseFilter:
         else:
             self._bridged_m += max(abs(forward_m), _CREEP_MPS * dt_s)
 
-    def _catch_up(self, ekf: PlanarEkf, stamp_s: float) -> None:
-        """Without wheels, go on with the last known speed up to a reading."""
-        dt_s = stamp_s - self._time_s
-        if dt_s > 0 and not self._wheels.usable(stamp_s):
-            self._move(ekf, stamp_s, self._speed_mps * dt_s, None)
-
     # -- positions ------------------------------------------------------------------------------
 
     def absolute_pose(self, stamp_s: float, pose: Pose, now_s: float) -> None:
@@ -176,14 +164,11 @@ class PoseFilter:
         if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s \
                 or not is_sane(x_m, y_m, yaw_rad):
             return
-        then_s, was = source.stamp_s, source.reading
+        then_s, was, limits, ekf = source.stamp_s, source.reading, self.limits, self._ekf
         source.stamp_s, source.reading = stamp_s, (x_m, y_m, yaw_rad)
-        ekf = self._ekf
         if ekf is None:
             self._try_to_start(now_s)
             return
-        limits = self.limits
-        self._catch_up(ekf, stamp_s)
         x_m, y_m = self._bring_up(ekf, source, stamp_s - then_s)
         yaw_rad += self._gyro.rate_radps * (self._time_s - stamp_s) if self._gyro.usable(
             stamp_s) else 0.0
@@ -208,16 +193,13 @@ class PoseFilter:
         if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s or not accuracy_m >= 0 \
                 or not is_sane(x_m, y_m, accuracy_m) or not math.hypot(*velocity) <= _FASTEST_MPS:
             return
-        then_s = source.stamp_s
+        then_s, limits, ekf = source.stamp_s, self.limits, self._ekf
         same = (x_m, y_m, 0.0) == source.reading and velocity == source.velocity
         source.repeats = source.repeats + 1 if same else 0
         source.stamp_s, source.reading, source.velocity = stamp_s, (x_m, y_m, 0.0), velocity
-        ekf = self._ekf
         if ekf is None:
             self._try_to_start(now_s)
             return
-        limits = self.limits
-        self._catch_up(ekf, stamp_s)
         x_m, y_m = self._bring_up(ekf, source, stamp_s - then_s)
         if source.repeats >= _GPS_REPEATS:
             source.trust.flaw("repeats the same fix", stamp_s)
@@ -235,16 +217,22 @@ class PoseFilter:
         if not self._wheels.usable(stamp_s):
             self._speed_mps = along
         turning = abs(self._gyro.rate_radps) > _STRAIGHT_RADPS or not self._gyro.usable(stamp_s)
-        if abs(along) < COURSE_FROM_MPS or turning or self._pose.usable(stamp_s):
+        if abs(along) < positions.COURSE_FROM_MPS or turning or self._pose.usable(stamp_s):
             return
         sign = math.copysign(1.0, along)
         course = math.atan2(sign * velocity[1], sign * velocity[0])
-        variance = (GPS_VELOCITY_SD_MPS / along) ** 2 + SIDESLIP_RAD**2
+        variance = (positions.GPS_VELOCITY_SD_MPS / along) ** 2 + positions.SIDESLIP_RAD**2
         if ekf.heading_nis(course, variance) <= self.limits.gate:
             ekf.update_heading(course, variance)
 
     def _bring_up(self, ekf: PlanarEkf, source: PositionSource, dt_s: float) -> tuple[float, float]:
-        """Move a reading on to the filter's time, note its offset from the track, return it."""
+        """Move a reading on to the filter's time, note its offset from the track, return it.
+
+        Without wheels the filter goes on with the last known speed up to the reading.
+        """
+        rest_s = source.stamp_s - self._time_s
+        if rest_s > 0 and not self._wheels.usable(source.stamp_s):
+            self._move(ekf, source.stamp_s, self._speed_mps * rest_s, None)
         on_m = self._speed_mps * (self._time_s - source.stamp_s)
         x_m = source.reading[0] + on_m * math.cos(ekf.yaw_rad)
         y_m = source.reading[1] + on_m * math.sin(ekf.yaw_rad)
@@ -360,7 +348,7 @@ class PoseFilter:
     def _try_to_start(self, now_s: float) -> None:
         pose, gps, limits = self._pose, self._gps, self.limits
         self._first_s = now_s if self._first_s is None else self._first_s
-        first = find_first(pose, gps, self._wheels, self._gyro, now_s=now_s,
+        first = positions.find_first(pose, gps, self._wheels, self._gyro, now_s=now_s,
                            waited_s=now_s - self._first_s)
         if first is None:
             return

@@ -38,9 +38,7 @@ TRANSITIONS: dict[m.MissionPhase, frozenset[m.MissionPhase]] = {
     P.RUNNING: frozenset({P.PAUSED, P.RETURNING, P.SUCCEEDED, P.FAILED, P.CANCELLED}),
     P.PAUSED: frozenset({P.RUNNING, P.RETURNING, P.FAILED, P.CANCELLED}),
     P.RETURNING: frozenset({P.PAUSED, P.FAILED, P.CANCELLED}),
-    P.SUCCEEDED: frozenset({P.RUNNING, P.FAILED}),
-    P.FAILED: frozenset({P.RUNNING, P.FAILED}),
-    P.CANCELLED: frozenset({P.RUNNING, P.FAILED}),
+    **dict.fromkeys((P.SUCCEEDED, P.FAILED, P.CANCELLED), frozenset({P.RUNNING, P.FAILED})),
 }
 """Phase → phases that may follow. A new mission may fail at once: it has no goals."""
 

@@ -173,7 +173,7 @@ class SafetyGate:
 
     def _offer(self, line: _Line, now: float) -> tuple[tuple[float, float] | None, float]:
         """Return what a line has to offer to the pair, and from when it is."""
-        return None if self._unusable(line, now) else line.twist, line.stamp_s
+        return self._usable(line, now)[0], line.stamp_s
 
     def joystick(self, command: Twist, header: Header, now: float) -> str:
         """Offer Teleoperation's command; return why it was refused, or ""."""
@@ -233,7 +233,7 @@ class SafetyGate:
     def output(self, now: float) -> GateOutput:
         """Return what the base is to do now."""
         mode = self.mode
-        reason = self._forbidden(mode, now)
+        reason = self.forbidden(now)
         if reason:
             return GateOutput(0.0, 0.0, mode, True, reason)
         stick = now - self._stick.heard_s <= self._limits.joystick_timeout_s
@@ -251,10 +251,6 @@ class SafetyGate:
         if abs(linear) < abs(wanted[0]) * _SLOWED or stopped:
             reason = "obstacle: stopped" if linear == 0.0 else "obstacle: slowed down"
         return GateOutput(linear, angular, mode, stopped, reason)
-
-    def forbidden(self, now: float) -> str:
-        """Return why nobody may drive now, not even by the joystick, or ""."""
-        return self._forbidden(self.mode, now)
 
     @property
     def top_speed_mps(self) -> float:
@@ -274,19 +270,16 @@ class SafetyGate:
 
     def _wanted(self, stick: bool, now: float) -> tuple[tuple[float, float] | None, str]:
         """Return the command to execute and what is special about it, or None and why not."""
-        line = self._stick if stick else self._auto
-        unusable = self._unusable(line, now)
+        active = self._usable(self._stick if stick else self._auto, now)
         if stick or self._standby.twist is None:
-            return (None, unusable) if unusable else (line.twist, "")
-        other = self._standby
-        return self._pair.choice((None, unusable) if unusable else (line.twist, ""),
-                                 None if self._unusable(other, now) else other.twist, now)
+            return active
+        return self._pair.choice(active, self._usable(self._standby, now)[0], now)
 
-    def _forbidden(self, mode: PilotMode, now: float) -> str:
-        """Why nobody's command may pass, or ""."""
+    def forbidden(self, now: float) -> str:
+        """Return why nothing may drive now, not even the joystick, or ""."""
         limits = self._limits
-        if mode is PilotMode.STOP:
-            return self._why(mode) or "ordered to stop"
+        if self.mode is PilotMode.STOP:
+            return self._why(PilotMode.STOP) or "ordered to stop"
         if self._checks.manager:
             silence_s = now - self._manager_heard_s
             if silence_s > limits.manager_timeout_s:
@@ -300,14 +293,14 @@ class SafetyGate:
                 return "no fresh laser scan"  # nor is one with a stamp from the future, or none
         return ""
 
-    def _unusable(self, line: _Line, now: float) -> str:
-        """Why a line's last command may not be executed, or ""."""
-        if line.fault and self._checks.inputs:
-            return line.fault
-        if self._checks.inputs and line.twist is not None \
-                and now - line.stamp_s > self._limits.command_timeout_s:
-            return "no fresh command"
-        return ""
+    def _usable(self, line: _Line, now: float) -> tuple[tuple[float, float] | None, str]:
+        """Return a line's last command; None with the reason if it may not be executed."""
+        if self._checks.inputs and line.fault:
+            return None, line.fault
+        late = now - line.stamp_s > self._limits.command_timeout_s
+        if self._checks.inputs and line.twist is not None and late:
+            return None, "no fresh command"
+        return line.twist, ""
 
     def _why(self, mode: PilotMode) -> str:
         """The reasons of the orders for a mode."""

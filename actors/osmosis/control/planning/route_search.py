@@ -68,9 +68,6 @@ def plan_route(nodes: Mapping[str, Point], edges: Iterable[Edge], start: Point, 
     if not all(map(math.isfinite, (*start, *goal))):
         return _none(f"start {_show(start)} or goal {_show(goal)} is not a finite point")
     usable = sorted({(min(edge), max(edge)) for edge in edges if edge[0] != edge[1]})
-    unknown = [name for edge in usable for name in edge if name not in nodes]
-    if unknown:
-        return _none(f"the graph's edges name the node {unknown[0]!r}, which does not exist")
     joined: list[Attachment] = []
     reaches = ((start, "start", limits.start_reach_m), (goal, "goal", limits.goal_reach_m))
     for point, what, reach_m in reaches:

@@ -71,8 +71,6 @@ def test_the_reason_says_what_is_missing():
     island = plan_route({**SQUARE, "X": (50.0, 0.0), "Y": (60.0, 0.0)}, [*RING, ("X", "Y")],
                         (0.0, 0.0), (55.0, 0.0))
     assert island.reason == "no way in the graph from (0.0, 0.0) to (55.0, 0.0)"
-    unknown = plan_route(SQUARE, [*RING, ("A", "Q")], (0.0, 0.0), (20.0, 0.0))
-    assert "'Q'" in unknown.reason
     assert plan_route({}, [], (0.0, 0.0), (1.0, 0.0)).reason == "the graph has no edge that is open"
     assert "finite" in plan_route(SQUARE, RING, (math.nan, 0.0), (1.0, 0.0)).reason
 
