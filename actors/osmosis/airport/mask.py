@@ -56,8 +56,7 @@ class MaskScale(msgspec.Struct, frozen=True):
         if not (self.columns_per_m > 0 and self.rows_per_m > 0):
             raise AirportError(
                 f"mask scale: pixels per metre: ({self.columns_per_m:g}, {self.rows_per_m:g}): "
-                "both must be positive"
-            )
+                "both must be positive")
 
 
 def allowed_area(path: Path, scale: MaskScale) -> Any:

@@ -276,6 +276,11 @@ def foot(point: Point, a: Point, b: Point) -> Point:
     return a[0] + share * along[0], a[1] + share * along[1]
 
 
+def show(point: Point) -> str:
+    """Return a point as text for messages."""
+    return f"({point[0]:.1f}, {point[1]:.1f})"
+
+
 def rectangle(x_m: float, y_m: float, yaw_rad: float, length_m: float, width_m: float) -> Any:
     """Return a rectangle about (x, y), `length_m` along its own x axis, as a shapely polygon."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)

@@ -94,8 +94,6 @@ def _rays(count: int, angle_min_rad: float, angle_increment_rad: float) -> Array
 
 def to_map(points: Array, x_m: float, y_m: float, yaw_rad: float) -> Array:
     """Move points from `base_link` at the given pose into `map`."""
-    if not len(points):
-        return points
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.asarray(points @ np.array(((cos, sin), (-sin, cos))) + (x_m, y_m))
 
@@ -143,10 +141,8 @@ class Polyline:
         # The same as plain numbers: for one point at a time they are ten times as fast.
         self._arc_m: list[float] = self._arc.tolist()
         self.length_m = self._arc_m[-1]
-        self._segments: list[tuple[float, float, float, float, float]] = [
-            (*start, *direction, length) for start, direction, length in zip(
-                self._starts.tolist(), self._directions.tolist(), self._lengths.tolist(),
-                strict=True)]
+        self._segments: list[list[float]] = np.column_stack(
+            (self._starts, self._directions, self._lengths)).tolist()
 
     def point_at(self, s_m: float) -> Point:
         """Return the point at an arc length; beyond the ends the outer segments go on straight."""
@@ -194,8 +190,6 @@ class Polyline:
             s_from_m: start of the stretch of route looked at.
             s_to_m: end of that stretch; it is cut to the route.
         """
-        if not len(points):
-            return NO_POINTS
         low, high = self._stretch(s_from_m, s_to_m)
         along_x, along_y = self._directions[low:high].T
         x, y = (points[:, None, :] - self._starts[low:high]).transpose(2, 0, 1)

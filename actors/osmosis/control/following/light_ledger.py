@@ -30,7 +30,7 @@ from rampart.actors.osmosis.airport.model import Light
 from rampart.actors.osmosis.airport.photometry import SENSOR_FORWARD_M
 from rampart.actors.osmosis.control.following import light_inspection
 from rampart.actors.osmosis.control.following.light_row import LightRow
-from rampart.actors.osmosis.control.polyline import Point, Polyline
+from rampart.actors.osmosis.control.polyline import Polyline
 from rampart.actors.osmosis.messages import LightMeasurement, MissionStatus, Mode, Route
 
 _OVER_M = 0.5
@@ -212,8 +212,11 @@ class RowInspection:
         if goal != self._goal:
             self._goal, self._due = goal, {}
         if route.mode is Mode.LIGHT_VERIFICATION and route.waypoints:
+            line = Polyline(route.waypoints)
+            feet = {light.name: line.project(light.x_m, light.y_m) for light in self._lights}
             self._due |= dict.fromkeys(
-                light.name for light in lights_along(self._lights, route.waypoints))
+                name for name, foot in feet.items()
+                if 0.0 < foot.s_m < line.length_m and abs(foot.n_m) <= _OVER_M)
         if row is not None:
             self._row = self.ledger.on_row(row.line)
 
@@ -254,11 +257,3 @@ class RowInspection:
     def missed(self) -> tuple[str, ...]:
         """The lights along all ways to this goal that were not measured."""
         return tuple(name for name in self._due if name not in self.inspection.judged)
-
-
-def lights_along(lights: tuple[Light, ...], waypoints: tuple[Point, ...]) -> tuple[Light, ...]:
-    """Return the lights that a robot passes over which follows the waypoints."""
-    line = Polyline(waypoints)
-    feet = [(light, line.project(light.x_m, light.y_m)) for light in lights]
-    return tuple(light for light, foot in feet
-                 if 0.0 < foot.s_m < line.length_m and abs(foot.n_m) <= _OVER_M)

@@ -168,7 +168,8 @@ class LightRow(Follower):
         if self._free_for_s < limits.clear_s:
             allowed = min(allowed, self._ramp.last[0])  # an echo that comes and goes is there
         waiting = allowed == 0.0
-        bearing = self._bearing(x_m, y_m, yaw_rad, foot.s_m)
+        x_to, y_to = line.point_at(foot.s_m + limits.lookahead_m)
+        bearing = wrap_angle(math.atan2(y_to - y_m, x_to - x_m) - yaw_rad)
         if abs(bearing) > _BEHIND_RAD:  # either way round is as short: do not waver between them
             turning = self._ramp.last[1]
             bearing = math.copysign(bearing, turning if abs(turning) > _TURNS_RADPS else 1.0)
@@ -213,10 +214,6 @@ class LightRow(Follower):
             self._passing = None
             self._free_for_s = math.inf if back else 0.0
         return motion
-
-    def _bearing(self, x_m: float, y_m: float, yaw_rad: float, s_m: float) -> float:
-        x_to, y_to = self.line.point_at(s_m + self._limits.lookahead_m)
-        return wrap_angle(math.atan2(y_to - y_m, x_to - x_m) - yaw_rad)
 
     def _free(self, x_m: float, y_m: float, yaw_rad: float, points: Array, s_m: float) -> float:
         """Free distance ahead of the hull in the lane along the row; infinite if all is free."""

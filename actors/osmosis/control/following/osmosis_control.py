@@ -82,8 +82,7 @@ class OsmosisControl(Actor):
 
     def on_start(self) -> None:
         """Find out what was measured; the robot goes on when the route is there."""
-        kept = self.kept(CONTROL_STATE)
-        if kept is not None:
+        if (kept := self.kept(CONTROL_STATE)) is not None:
             self.core.restore(kept)
 
     @on(topics.MISSION_STATUS)
@@ -144,8 +143,7 @@ class OsmosisControl(Actor):
     @every(0.5)
     def _remember(self) -> None:
         """Keep what a successor needs; before what follows from it is sent."""
-        kept = self.core.kept
-        if kept is not None:
+        if (kept := self.core.kept) is not None:
             self.keep(CONTROL_STATE, kept)
 
     @every(PERIOD_S)

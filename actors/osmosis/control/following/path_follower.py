@@ -10,7 +10,6 @@ against it (heading error, curves, obstacles, the goal), and changes within acce
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -85,8 +84,7 @@ STANDSTILL = (0.0, 0.0)
 """The command of a robot that stands."""
 
 
-@dataclass(slots=True)
-class Ramp:
+class Ramp(msgspec.Struct):
     """Acceleration limits on a command: remembers the last one."""
 
     limits: MotionLimits

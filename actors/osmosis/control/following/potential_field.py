@@ -42,8 +42,6 @@ class FieldGains(msgspec.Struct, frozen=True):
 
 def clusters(points: Array, gap_m: float = 0.5) -> list[Array]:
     """Split echoes, in the order of the sweep, into obstacles wherever neighbours are apart."""
-    if len(points) == 0:
-        return []
     steps = np.hypot(*np.diff(points, axis=0).T)
     return np.split(points, np.flatnonzero(steps > gap_m) + 1)
 

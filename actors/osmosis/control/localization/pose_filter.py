@@ -120,7 +120,7 @@ class PoseFilter:
         if rest_s <= 0:
             return
         if rest_s > dt_s + wheels.fresh_s:  # what was in between nobody has seen
-            self._ekf.doubt_position(_TOP_SPEED_MPS * (rest_s - dt_s))
+            self._ekf.doubt(_TOP_SPEED_MPS * (rest_s - dt_s))
             self._bridged_m += _TOP_SPEED_MPS * (rest_s - dt_s)
         # After a while without wheels the filter may be part of the way along this step.
         share = rest_s / dt_s if rest_s < dt_s else 1.0
@@ -283,8 +283,7 @@ class PoseFilter:
         source.trust.flaw(f"moves otherwise than the others, {apart_m:.1f} m", stamp_s)
         # It has been taken in until now; what was farther off than this failed the gate.
         doubt_m = min(apart_m, self.limits.contradiction_m / 2)
-        ekf.doubt_position(doubt_m)
-        ekf.doubt_heading(doubt_m / 10)
+        ekf.doubt(doubt_m, doubt_m / 10)
 
     def _judge(self, ekf: PlanarEkf, source: PositionSource, other: PositionSource, fits: bool
                ) -> bool:
@@ -325,8 +324,7 @@ class PoseFilter:
         else:
             self._wheels.trust.flaw("does not fit the positions", stamp_s)
         x_m, y_m = (o + t for o, t in zip(pose.offset, self._track, strict=True))
-        ekf.doubt_position(1.0)
-        ekf.doubt_heading(1.0)
+        ekf.doubt(1.0, 1.0)
         ekf.update_position(x_m, y_m, self.limits.absolute_sd_m**2)
         ekf.update_heading(pose.reading[2], self.limits.absolute_sd_rad**2)
         self._apart = (0.0, 0.0)

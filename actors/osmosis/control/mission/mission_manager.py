@@ -49,8 +49,7 @@ class MissionManager(Actor):
         super().__init__(context)
         self.state = MissionState()
         self._uncertain_until_s = -math.inf
-        airport = Osmosis.of(context).airport
-        self._lights = frozenset(light.name for light in airport.lights)
+        self._lights = frozenset(light.name for light in Osmosis.of(context).airport.lights)
 
     @on(topics.MISSION_REQUEST)
     def request(self, message: m.MissionRequest, _header: Header) -> None:
@@ -98,8 +97,7 @@ class MissionManager(Actor):
         A state from a checkpoint may be an older one. So status and goal are held back until
         planner or control have said which step they are at, or have had the time to.
         """
-        state = self.kept(MISSION_STATE)
-        if state is not None:
+        if (state := self.kept(MISSION_STATE)) is not None:
             self.state = state
             if state.phase in mission_state.ACTIVE:
                 self._uncertain_until_s = self.clock.now() + UNCERTAIN_S
@@ -125,7 +123,10 @@ class MissionManager(Actor):
         former process died because it gave a wrong goal, the others were told a wrong step.
         """
         if self.clock.now() < self._uncertain_until_s and mission_id == self.state.mission_id:
-            if step > self.state.step and not _leads_to(end, self.state.goals[step:step + 1]):
+            goals = self.state.goals[step:step + 1]
+            if step > self.state.step and not any(
+                    math.dist(point, (goal.x_m, goal.y_m)) < _SAME_POINT_M
+                    for point, goal in zip(end, goals, strict=False)):
                 return
             self._uncertain_until_s = -math.inf
             self._become(mission_state.catch_up(self.state, step, self.clock.now()))
@@ -147,11 +148,6 @@ class MissionManager(Actor):
         order = mission_state.goal_order(state)
         if order != mission_state.goal_order(before):
             self.repeat_goal()
-
-
-def _leads_to(end: tuple[tuple[float, float], ...], goals: tuple[m.Goal, ...]) -> bool:
-    return any(math.dist(point, (goal.x_m, goal.y_m)) < _SAME_POINT_M
-               for point, goal in zip(end, goals, strict=False))
 
 
 def hold_reason(status: ManagerStatus, holding: tuple[str, ...]) -> str:

@@ -166,8 +166,8 @@ def measured(state: MissionState, light: m.LightMeasurement) -> MissionState:
 
     Also just after success: the last light's message may come after that of the last arrival.
     """
-    known = any(other.light == light.light for other in state.lights)
-    if known or state.phase not in ACTIVE | {P.SUCCEEDED}:
+    known = {other.light for other in state.lights}
+    if light.light in known or state.phase not in ACTIVE | {P.SUCCEEDED}:
         return state
     return replace(state, lights=(*state.lights, light))
 
@@ -294,19 +294,15 @@ def catch_up(state: MissionState, step: int, now: float) -> MissionState:
 
 def _objection(state: MissionState) -> str:
     names = [light.light for light in state.lights]
-    numbers = [v for goal in state.goals for v in (goal.x_m, goal.y_m)]
+    numbers = [state.step_started_s, *(v for goal in state.goals for v in (goal.x_m, goal.y_m))]
+    goals, times, phase = len(state.goals), len(state.step_times_s), state.phase
     wrong = {
-        f"step {state.step} of {len(state.goals)} goals":
-            not 0 <= state.step <= len(state.goals),
-        f"{state.phase.value} after the last goal":
-            state.phase in ACTIVE and state.step == len(state.goals),
-        f"{len(state.step_times_s)} step times at step {state.step}":
-            len(state.step_times_s) != state.step,
-        f"{state.phase.value} without a mission":
-            state.phase is not P.IDLE and not state.mission_id,
+        f"step {state.step} of {goals} goals": not 0 <= state.step <= goals,
+        f"{phase.value} after the last goal": phase in ACTIVE and state.step == goals,
+        f"{times} step times at step {state.step}": times != state.step,
+        f"{phase.value} without a mission": phase is not P.IDLE and not state.mission_id,
         "a light is in it twice": len(set(names)) < len(names),
-        "a number is not finite":
-            not all(map(math.isfinite, (*numbers, state.step_started_s))),
+        "a number is not finite": not all(map(math.isfinite, numbers)),
     }
     return "; ".join(text for text, holds in wrong.items() if holds)
 

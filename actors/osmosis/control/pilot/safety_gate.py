@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, field
 
 import msgspec
 
@@ -93,14 +92,14 @@ class GateOutput(msgspec.Struct, frozen=True, gc=False):
     reason: str
 
 
-@dataclass(slots=True)
-class _Line:
+class _Line(msgspec.Struct):
     """State of one command source: auto, its standby, or joystick."""
 
     twist: tuple[float, float] | None = None
     stamp_s: float = -math.inf
     heard_s: float = -math.inf
-    newest: dict[str, tuple[int, int]] = field(default_factory=lambda: Remembered(_SOURCES))
+    newest: dict[str, tuple[int, int]] = msgspec.field(
+        default_factory=lambda: Remembered(_SOURCES))
     fault: str = ""
 
 

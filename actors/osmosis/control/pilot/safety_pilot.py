@@ -34,6 +34,7 @@ class SafetyPilot(Actor):
             gate_of(system), checks_of(system), context.clock.now(), self._recoveries)
         self._lasers = LaserPair(reach_of(system))
         self._laser_fault = ""
+        self._ordered, self._unknown = (self._gate.mode, 0.0), self._gate.orders.unknown
         self._sent_s = -math.inf
         self._last = GateOutput(0.0, 0.0, m.PilotMode.AUTO, True, "just started")
 
@@ -70,28 +71,26 @@ class SafetyPilot(Actor):
     @on(topics.PILOT_ORDER)
     def order(self, message: m.PilotOrder, header: Header) -> None:
         """Obey a recovery module, and others as well; a change acts at once."""
-        before = self._orders_in_force()
         self._gate.order(header.source, message)
         if message.engaged and header.source not in self._recoveries:
             self.report_diagnostic("pilot order", f"given by {header.source!r}, no recovery module "
                                    "of this system; rampart reset ends it", header.source)
-        self._follow(before)
+        self._follow()
 
     @on(ftm_topics.RESET)
     def reset(self, message: Reset, _header: Header) -> None:
         """End the order of one that is no recovery module of the system."""
-        before = self._orders_in_force()
         if self._gate.orders.reset(message.recovery):
-            self._follow(before)
+            self._follow()
 
-    def _orders_in_force(self) -> tuple[m.PilotMode, float, tuple[str, ...]]:
-        return self._gate.mode, self._gate.top_speed_mps, self._gate.orders.unknown
-
-    def _follow(self, before: tuple[m.PilotMode, float, tuple[str, ...]]) -> None:
-        if self._orders_in_force()[:2] != before[:2]:
+    def _follow(self) -> None:
+        """Act on orders that are others than before."""
+        gate, ordered, unknown = self._gate, self._ordered, self._unknown
+        self._ordered, self._unknown = (gate.mode, gate.top_speed_mps), gate.orders.unknown
+        if self._ordered != ordered:
             self._act()
             self._tell()
-        if self._gate.orders.unknown != before[2]:
+        if self._unknown != unknown:
             self._tell_holds()
 
     def _tell_holds(self) -> None:

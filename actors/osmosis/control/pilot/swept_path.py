@@ -77,8 +77,6 @@ def is_free(linear_mps: float, angular_radps: float, points: Array, room: Stoppi
         points: laser echoes in `base_link`, shape (n, 2).
         room: what has to be free.
     """
-    if not len(points):
-        return True
     if abs(linear_mps) < 1e-6:
         linear_mps = 0.0
     margin_m = room.beside_m(linear_mps)

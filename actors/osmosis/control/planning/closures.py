@@ -10,7 +10,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+
+import msgspec
 
 from rampart.actors.osmosis.airport.model import Point
 from rampart.actors.osmosis.control.planning.route_search import Edge
@@ -22,8 +23,7 @@ _LEAST_STUB_M = 0.05
 """A shorter rest of an edge is none."""
 
 
-@dataclass(slots=True)
-class Closures:
+class Closures(msgspec.Struct):
     """The places that are blocked, each until it is tried again.
 
     Args:
@@ -33,7 +33,7 @@ class Closures:
 
     gap_m: float = 1.0
     lasts_s: float = 60.0
-    _until_s: dict[Point, float] = field(default_factory=dict)
+    _until_s: dict[Point, float] = {}
 
     def close(self, place: Point, now_s: float) -> None:
         """Close the graph round a place in `map`; one near it that was closed before is renewed."""

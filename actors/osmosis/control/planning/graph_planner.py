@@ -9,7 +9,7 @@ import msgspec
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.plausible import is_sane
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.airport.model import Point
+from rampart.actors.osmosis.airport.model import Point, show
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.planning.closures import Closures, without
 from rampart.actors.osmosis.control.planning.route_search import PlannedRoute, plan_route
@@ -160,7 +160,7 @@ class GraphPlanner(Actor):
             return
         self._closures.close(place, now_s)
         plan = self._search(order, pose)
-        where = f"({place[0]:.1f}, {place[1]:.1f})"
+        where = show(place)
         if not plan.waypoints:
             self._closures.reopen()
             self.report_diagnostic("route search", f"no way round {where}: {plan.reason}",

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 
 import msgspec
 
-from rampart.actors.osmosis.airport.model import Attachment, Point, foot
+from rampart.actors.osmosis.airport.model import Attachment, Point, foot, show
 
 Edge = tuple[str, str]
 
@@ -66,21 +66,21 @@ def plan_route(nodes: Mapping[str, Point], edges: Iterable[Edge], start: Point, 
     """
     limits = limits or SearchLimits()
     if not all(map(math.isfinite, (*start, *goal))):
-        return _none(f"start {_show(start)} or goal {_show(goal)} is not a finite point")
+        return PlannedRoute((), f"start {show(start)} or goal {show(goal)} is not a finite point")
     usable = sorted({(min(edge), max(edge)) for edge in edges if edge[0] != edge[1]})
     joined: list[Attachment] = []
     reaches = ((start, "start", limits.start_reach_m), (goal, "goal", limits.goal_reach_m))
     for point, what, reach_m in reaches:
         snap = _snap(nodes, usable, point, limits.node_snap_m)
         if snap is None:
-            return _none("the graph has no edge that is open")
+            return PlannedRoute((), "the graph has no edge that is open")
         if snap.distance_m > reach_m:
-            return _none(f"{what} {_show(point)} is {snap.distance_m:.1f} m from the graph, "
-                         f"at most {reach_m:.1f} m is allowed")
+            return PlannedRoute((), f"{what} {show(point)} is {snap.distance_m:.1f} m from the "
+                                    f"graph, at most {reach_m:.1f} m is allowed")
         joined.append(snap)
     path = _search(nodes, usable, joined[0], joined[1])
     if path is None:
-        return _none(f"no way in the graph from {_show(start)} to {_show(goal)}")
+        return PlannedRoute((), f"no way in the graph from {show(start)} to {show(goal)}")
     if joined[1].distance_m <= limits.cut_m:
         path[-1] = goal
     else:
@@ -93,14 +93,6 @@ def plan_route(nodes: Mapping[str, Point], edges: Iterable[Edge], start: Point, 
             del waypoints[0]
         waypoints = _straightened(waypoints, limits.straight_m)
     return PlannedRoute(tuple(waypoints), "")
-
-
-def _none(reason: str) -> PlannedRoute:
-    return PlannedRoute((), reason)
-
-
-def _show(point: Point) -> str:
-    return f"({point[0]:.1f}, {point[1]:.1f})"
 
 
 def _snap(nodes: Mapping[str, Point], edges: list[Edge], point: Point,
