@@ -17,10 +17,9 @@ from pathlib import Path
 
 import msgspec
 
-from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE, ControlKept
 from rampart.actors.osmosis.control.following.light_ledger import LightsKept
-from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE
-from rampart.actors.osmosis.control.mission.mission_state import MissionState
+from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE, ControlKept
+from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE, MissionState
 from rampart.actors.osmosis.messages import (
     Goal,
     LightMeasurement,

@@ -16,11 +16,12 @@ exception, of a request, of names joined) is shortened with `clip` where the mes
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
 Meta = msgspec.Meta
+T = TypeVar("T")
 
 NAME_CHARS = 256
 """Longest name of a node, module, topic, light or order; a file name has as many at most."""
@@ -43,9 +44,11 @@ MOST = 10_000
 Name = Annotated[str, Meta(max_length=NAME_CHARS)]
 Text = Annotated[str, Meta(max_length=TEXT_CHARS)]
 Document = Annotated[str, Meta(max_length=DOCUMENT_CHARS)]
-Names = Annotated[tuple[Name, ...], Meta(max_length=MANY)]
-Texts = Annotated[tuple[Text, ...], Meta(max_length=MANY)]
-Explained = Annotated[tuple[tuple[Name, Text], ...], Meta(max_length=MANY)]
+Many = Annotated[tuple[T, ...], Meta(max_length=MANY)]
+Most = Annotated[tuple[T, ...], Meta(max_length=MOST)]
+Names = Many[Name]
+Texts = Many[Text]
+Explained = Many[tuple[Name, Text]]
 """Names, each with what there is to say of it."""
 
 Count = Annotated[int, Meta(ge=0, le=2**53)]

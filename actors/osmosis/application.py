@@ -29,7 +29,6 @@ class Osmosis(Application):
         airport: where the robot drives, as the controller believes it to be.
         mission: what it does there.
         world: what differs in the world from the controller's map.
-        joystick: device to drive with, "auto" for the first; "" for what the spec says.
     """
 
     class Options(Application.Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -64,24 +63,15 @@ class Osmosis(Application):
     options: Options
 
     def __init__(self, options: Options) -> None:
-        from rampart.actors.osmosis.airport.formats import (  # noqa: PLC0415 heavy for a tool
-            load_airport,
-            load_mission,
-            load_world,
-        )
+        from rampart.actors.osmosis.airport import formats  # noqa: PLC0415 heavy for a tool
 
         super().__init__(options)
-        self.airport: Airport = load_airport(options.airport)
-        self.world: WorldTruth = load_world(options.airport)
-        self.mission: Mission = load_mission(options.mission, self.airport)
+        self.airport: Airport = formats.load_airport(options.airport)
+        self.world: WorldTruth = formats.load_world(options.airport)
+        self.mission: Mission = formats.load_mission(options.mission, self.airport)
         if options.obstacles > len(self.airport.obstacles):
             raise ValueError(f"obstacles = {options.obstacles}: {self.airport.name} has places for "
                              f"{len(self.airport.obstacles)}")
-
-    @property
-    def joystick(self) -> str:
-        """Device to drive with, "auto" for the first; "" for what the spec says."""
-        return self.options.joystick
 
     @classmethod
     def on_map(cls, airport: Airport, mission: Mission | None = None,
@@ -139,7 +129,7 @@ class Osmosis(Application):
         Raises:
             ValueError: no node reads it, it is neither a device nor a FIFO, or nobody drives.
         """
-        name = self.joystick
+        name = self.options.joystick
         if not name:
             return ""
         if virtual:

@@ -1,12 +1,12 @@
 """The messages of Osmosis: SI units, REP-103 axes, REP-105 frames.
 
-Header data (source, incarnation, sequence, stamp) is not in these structs: the bus puts it
-round them (see `rampart.actors.bus.envelope`). Angles are in (-pi, pi], x forward, y left, yaw
-counter-clockwise. A field named `*_f32` is a little-endian float32 array as bytes.
+The bus puts the header (source, incarnation, sequence, stamp) round these structs
+(`rampart.actors.bus.envelope`). Angles are in (-pi, pi], x forward, y left, yaw counter-clockwise.
+A field named `*_f32` is a little-endian float32 array as bytes.
 
-Every field but a measurement or a command is bounded, by the types of `rampart.actors.bus.bounds`:
-a payload beyond the bounds never reaches an actor. Those that are plain `float` may be anything,
-NaN and infinity included: to judge them is the business of whoever reads them.
+Every field but a measurement or a command is bounded by its type (`rampart.actors.bus.bounds`): a
+payload beyond the bounds never reaches an actor. A plain `float` may be anything, NaN and infinity
+included; its reader judges it.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from typing import Annotated
 import msgspec
 
 from rampart.actors.bus.bounds import (
-    MANY,
-    MOST,
     Count,
     Duration,
     Explained,
     Floats32,
     Lasting,
+    Many,
+    Most,
     Name,
     Names,
     Seconds,
@@ -78,9 +78,8 @@ class GpsFix(Message, frozen=True):
 class LaserScan(Message, frozen=True):
     """One sweep of the 2D laser in `base_link`; a range of `range_max_m` means no echo.
 
-    `reference_m` is the range to the target in the laser's housing, measured once a sweep, by which
-    it can be checked (`rampart.actors.osmosis.control.pilot.laser_check`); exactly -1 for a device
-    without one.
+    `reference_m` is the range to the target in the laser's housing, measured once a sweep, for
+    `rampart.actors.osmosis.control.pilot.laser_pair`; exactly -1 for a device without one.
     """
 
     angle_min_rad: float
@@ -96,18 +95,12 @@ class LightSample(Message, frozen=True):
     illuminance_lux: float
 
 
-class BaseCommand(Message, frozen=True):
+class BaseCommand(Twist, frozen=True):
     """Velocity for the base. The base stops by itself when these cease (dead man)."""
-
-    linear_mps: float
-    angular_radps: float
 
 
 class BrakeCommand(Message, frozen=True):
-    """Low-level brake. Engaged, it blocks the wheels whatever the velocity command says.
-
-    Several may hold it; it is released when the last of them has let go.
-    """
+    """Low-level brake: blocks the wheels until the last of those that hold it has let go."""
 
     engaged: bool
     reason: Text
@@ -138,15 +131,12 @@ class Goal(Message, frozen=True):
     mode: Mode
 
 
-Goals = Annotated[tuple[Goal, ...], msgspec.Meta(max_length=MANY)]
-
-
 class MissionRequest(Message, frozen=True):
     """A mission for the Mission Manager. The same `mission_id` twice is one mission."""
 
     mission_id: Name
     name: Name
-    goals: Goals
+    goals: Many[Goal]
 
 
 class MissionPhase(StrEnum):
@@ -178,10 +168,6 @@ class LightMeasurement(Message, frozen=True):
     verdict: LightVerdict
 
 
-_Lights = Annotated[tuple[LightMeasurement, ...], msgspec.Meta(max_length=MOST)]
-_LightNames = Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST)]
-
-
 class MissionAction(StrEnum):
     """What can be asked of a mission under way."""
 
@@ -194,10 +180,7 @@ class MissionAction(StrEnum):
 
 
 class MissionOrder(Message, frozen=True):
-    """Asks the Mission Manager for something; the same `order` twice is one order.
-
-    `by` is who asks, `reason` why: both are kept with what comes of it.
-    """
+    """Asks the Mission Manager for something, by whom and why; the same `order` twice is one."""
 
     order: Name
     action: MissionAction
@@ -214,59 +197,58 @@ class MissionOrderAnswer(Message, frozen=True):
     plan: Count = 0
 
 
-_StepTimes = Annotated[tuple[Seconds, ...], msgspec.Meta(max_length=MANY)]
-_Steps = Annotated[tuple[Count, ...], msgspec.Meta(max_length=MANY)]
-_Actions = Annotated[tuple[MissionAction, ...], msgspec.Meta(max_length=16)]
-
-
 class MissionStatus(Message, frozen=True):
     """Where the mission is. `step` is the index of the current goal; lights measured so far.
 
-    `skipped` holds the indices of goals that were left out on request, `unmeasured` names the
-    lights that the robot passed without being able to measure them. `orders` are those that would
-    be obeyed now.
+    `skipped` holds the indices of goals left out on request, `unmeasured` the lights that the robot
+    passed and could not measure, `orders` those that would be obeyed now.
     """
 
     mission_id: Name
     name: Name
     phase: MissionPhase
     step: Count
-    goals: Goals
-    step_times_s: _StepTimes
-    lights: _Lights
+    goals: Many[Goal]
+    step_times_s: Many[Seconds]
+    lights: Most[LightMeasurement]
     reason: Text
-    skipped: _Steps = ()
-    unmeasured: _LightNames = ()
-    orders: _Actions = ()
+    skipped: Many[Count] = ()
+    unmeasured: Most[Name] = ()
+    orders: Annotated[tuple[MissionAction, ...], msgspec.Meta(max_length=16)] = ()
 
 
-class GoalOrder(Message, frozen=True):
-    """The Mission Manager's current goal for the Graph Planner; `active` False means none.
-
-    On the way home `step` is the number of goals. `plan` grows with each wish for another plan.
-    """
+class OfStep(Message, frozen=True):
+    """What belongs to one step of a mission."""
 
     mission_id: Name
     step: Count
+
+    @property
+    def which(self) -> tuple[str, int]:
+        """The mission, and the step of it."""
+        return self.mission_id, self.step
+
+
+class GoalOrder(OfStep, frozen=True):
+    """The Mission Manager's current goal for the Graph Planner; `active` False means none.
+
+    On the way home `step` is the number of goals. `plan` grows with each request for another plan.
+    """
+
     goal: Goal
     active: bool
     plan: Count = 0
 
 
-_Waypoints = Annotated[tuple[tuple[float, float], ...], msgspec.Meta(max_length=MOST)]
-
-
-class Route(Message, frozen=True):
+class Route(OfStep, frozen=True):
     """Way to a goal: waypoints in `map`, first is the start; empty with a `reason` if none.
 
-    `plan` is that of the goal it was made for. Of a way round something blocked the reason says so.
+    `plan` is that of the goal it was made for. The reason of a way round something says so.
     """
 
-    mission_id: Name
-    step: Count
     mode: Mode
     active: bool
-    waypoints: _Waypoints
+    waypoints: Most[tuple[float, float]]
     reason: Text
     plan: Count = 0
 
@@ -289,30 +271,23 @@ class Blockage(Message, frozen=True):
     since_s: Seconds
 
 
-_Blockages = Annotated[tuple[Blockage, ...], msgspec.Meta(max_length=MANY)]
-
-
-class ControlStatus(Message, frozen=True):
+class ControlStatus(OfStep, frozen=True):
     """Progress along the route of (mission, step).
 
     `blocked` holds at most one blockage, the one in front of the robot now. `reason` says why a
     route was refused. `unmeasured` names, on arrival, lights that were passed unmeasured.
 
-    What a standby has to do as well: `back_to` holds the point in `map` to which the robot goes
-    back, if it does, `passing` says that it leaves the row to drive round something, `aside_m` how
-    far to the left of the route it means to be, and `turn_added_radps` what its yaw loop has
-    learnt.
+    The standby does the same: it goes back to the point `back_to`, drives round something while
+    `passing`, `aside_m` to the left of the route, and adds what the yaw loop has learnt.
     """
 
-    mission_id: Name
-    step: Count
     phase: ControlPhase
     waypoint: Count
     distance_to_go_m: float
-    blocked: _Blockages = ()
+    blocked: Many[Blockage] = ()
     reason: Text = ""
-    unmeasured: _LightNames = ()
-    back_to: _Waypoints = ()
+    unmeasured: Most[Name] = ()
+    back_to: Most[tuple[float, float]] = ()
     passing: bool = False
     aside_m: float = 0.0
     turn_added_radps: float = 0.0
@@ -321,8 +296,7 @@ class ControlStatus(Message, frozen=True):
 class LocalizationStatus(Message, frozen=True):
     """What the pose rests on: sources in use, and those that are not, each with the reason.
 
-    Standard deviations are infinite before there is a pose. `bridged_m` is the way made since two
-    independent sources last agreed on the position.
+    `bridged_m`: the way since two sources last agreed on the position. Deviations may be infinite.
     """
 
     in_use: Names
@@ -338,7 +312,6 @@ class Joystick(Message, frozen=True):
     forward: float
     left: float
     dead_man: bool
-# ---- safety pilot ----------------------------------------------------------------------------
 
 
 class PilotMode(StrEnum):
@@ -364,8 +337,7 @@ class PilotOrder(Message, frozen=True):
 class PilotStatus(Message, frozen=True):
     """What the Safety Pilot does and why: `reason` is empty while commands pass unchanged.
 
-    `top_speed_mps` is the lowest bound that was ordered, 0 for none. `forbids` says why nobody may
-    drive now, not even by the joystick; "" if somebody may.
+    `top_speed_mps` is the lowest bound ordered, or 0; `forbids` why not even the joystick drives.
     """
 
     mode: PilotMode
@@ -399,9 +371,6 @@ class ObstacleCommand(Message, frozen=True):
     radius_m: float
 
 
-_Obstacles = Annotated[tuple[ObstacleCommand, ...], msgspec.Meta(max_length=MANY)]
-
-
 class ActuatorFaultKind(StrEnum):
     """What can fail about the base's actuators."""
 
@@ -415,8 +384,7 @@ class ActuatorFault(Message, frozen=True):
 
     `wheel`: front left, front right, rear left or rear right; a brake failure ignores it.
     `strength` from 0 to 1: what is left of a weak wheel's torque and speed, or of the braking
-    torque with a brake failure, whose wheels do not lock; 1 loses nothing. A stuck wheel ignores
-    it. `InjectionReport.affected` counts the 10 ms ticks in which the fault changed something.
+    torque. `InjectionReport.affected` counts the 10 ms ticks in which the fault changed something.
     """
 
     injection: Name
@@ -429,4 +397,4 @@ class ActuatorFault(Message, frozen=True):
 class ObstacleList(Message, frozen=True):
     """The obstacles that are there now, for the map on the operator's page."""
 
-    obstacles: _Obstacles
+    obstacles: Many[ObstacleCommand]

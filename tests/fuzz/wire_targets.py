@@ -10,8 +10,8 @@ from rampart.actors.bus.envelope import UNREADABLE, ArrivalGuard, Header, encode
 from rampart.actors.bus.recorder_connection import frame, parse_frame
 from rampart.actors.operator.requests import RequestError, RequestReader
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE
-from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE
+from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
+from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
 from rampart.actors.osmosis.control.planning.graph_planner import ROUTE_STATE
 from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     EVENT,

@@ -25,8 +25,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE
-from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE
+from rampart.actors.osmosis.control.following.route_control import CONTROL_STATE
+from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints

@@ -13,16 +13,19 @@ import msgspec
 import pytest
 
 from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis.control.following.control_checkpoint import (
+from rampart.actors.osmosis.control.following.light_ledger import LightsKept
+from rampart.actors.osmosis.control.following.light_row import LightRow
+from rampart.actors.osmosis.control.following.path_follower import PathFollower
+from rampart.actors.osmosis.control.following.route_control import (
     CONTROL_STATE,
     ControlKept,
     whole_row,
 )
-from rampart.actors.osmosis.control.following.light_ledger import LightsKept
-from rampart.actors.osmosis.control.following.light_row import LightRow
-from rampart.actors.osmosis.control.following.path_follower import PathFollower
-from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE, catch_up
-from rampart.actors.osmosis.control.mission.mission_state import MissionState
+from rampart.actors.osmosis.control.mission.mission_state import (
+    MISSION_STATE,
+    MissionState,
+    catch_up,
+)
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Polyline
 from rampart.actors.runtime.checkpoint import Loaded, MemoryCheckpoints, Record, StateError
 from rampart.manager.arbitration.arbiter import build_arbiter

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -11,7 +10,7 @@ import shapely
 
 from rampart.actors.osmosis.airport.errors import Problem
 from rampart.actors.osmosis.airport.limits import MAX_GOALS_BY_EDGES, sides
-from rampart.actors.osmosis.airport.model import GOAL_MODES, GRAPH_REACH_M, Airport, Mission
+from rampart.actors.osmosis.airport.model import GRAPH_REACH_M, Airport, Mission, repeated
 
 MIN_EDGE_CLEARANCE_M = 0.5
 """An edge nearer than this to the prohibited area cannot be driven (half the robot's width)."""
@@ -34,20 +33,15 @@ def problems(airport: Airport) -> Iterator[Problem]:
 def _graph(airport: Airport) -> Iterator[Problem]:
     if not airport.nodes:
         yield Problem("nodes", "empty", "a graph needs at least one node")
-    for name, at in airport.nodes.items():
-        if not all(math.isfinite(v) for v in at):
-            yield Problem(f"nodes.{name}", f"{at}", "coordinates must be finite numbers of metres")
     for i, (a, b) in enumerate(airport.edges):
         for name in (a, b):
             if name not in airport.nodes:
                 yield Problem(f"edges[{i}]", repr(name), "unknown node; name one from nodes")
         if a == b:
             yield Problem(f"edges[{i}]", f"{a!r} to {b!r}", "an edge joins two different nodes")
-    pairs = Counter(frozenset(edge) for edge in airport.edges if edge[0] != edge[1])
-    for pair, times in pairs.items():
-        if times > 1:
-            yield Problem("edges", " to ".join(sorted(pair)), "edge given twice; once is enough",
-                          tolerable=True)
+    for pair in repeated(frozenset(edge) for edge in airport.edges if edge[0] != edge[1]):
+        yield Problem("edges", " to ".join(sorted(pair)), "edge given twice; once is enough",
+                      tolerable=True)
 
 
 def _search(goals: int, where: str, airport: Airport) -> Iterator[Problem]:
@@ -61,9 +55,6 @@ def _ground(airport: Airport) -> Iterator[Problem]:
         yield Problem("surface", "empty", "the airport needs pavement to drive on")
         return
     start = airport.start
-    if not all(math.isfinite(v) for v in (start.x_m, start.y_m, start.yaw_rad)):
-        yield Problem("start", f"{start}", "the start pose must be finite")
-        return
     if airport.prohibited_distance_m(start.x_m, start.y_m) <= 0:
         yield Problem("start", f"({start.x_m:g}, {start.y_m:g})",
                       "in the prohibited area; put it on the pavement", tolerable=True)
@@ -105,10 +96,8 @@ def _off_pavement(airport: Airport, points: Sequence[tuple[float, float]]) -> li
 
 
 def _lights(airport: Airport) -> Iterator[Problem]:
-    names = Counter(light.name for light in airport.lights)
-    for name, times in names.items():
-        if times > 1:
-            yield Problem("row", repr(name), "two lights of this name; names must be unique")
+    for name in repeated(light.name for light in airport.lights):
+        yield Problem("row", repr(name), "two lights of this name; names must be unique")
     off = _off_pavement(airport, [(light.x_m, light.y_m) for light in airport.lights])
     for light, is_off in zip(airport.lights, off, strict=True):
         if not light.nominal_cd > 0:
@@ -120,10 +109,8 @@ def _lights(airport: Airport) -> Iterator[Problem]:
 
 
 def _obstacles(airport: Airport) -> Iterator[Problem]:
-    names = Counter(preset.name for preset in airport.obstacles)
-    for name, times in names.items():
-        if times > 1:
-            yield Problem("obstacle", repr(name), "two obstacles of this name; must be unique")
+    for name in repeated(preset.name for preset in airport.obstacles):
+        yield Problem("obstacle", repr(name), "two obstacles of this name; must be unique")
     for preset in airport.obstacles:
         where = f"obstacle.{preset.name}"
         if not 0.05 <= preset.radius_m <= 5.0:
@@ -148,11 +135,6 @@ def mission_problems(mission: Mission, airport: Airport) -> Iterator[Problem]:
     for i, goal in enumerate(mission.goals):
         at = f"({goal.x_m:g}, {goal.y_m:g})"
         spot = f"{where}.goals[{i}]"
-        if goal.mode not in GOAL_MODES:
-            yield Problem(f"{spot}.mode", repr(goal.mode), f"must be one of {GOAL_MODES}")
-        if not (math.isfinite(goal.x_m) and math.isfinite(goal.y_m)):
-            yield Problem(spot, at, "coordinates must be finite numbers of metres")
-            continue
         nearest = airport.nearest_on_graph(goal.x_m, goal.y_m)
         if nearest.distance_m > GRAPH_REACH_M:
             yield Problem(spot, at, f"{nearest.distance_m:.1f} m from the graph; a mission point "

@@ -59,8 +59,7 @@ def draw(airport: Airport, tolerance_m: float = 0.02) -> AirportDrawing:
         nodes={name: (float(x), float(y)) for name, (x, y) in airport.nodes.items()},
         edges=tuple((*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges),
         lights=airport.lights,
-        start=(airport.start.x_m, airport.start.y_m),
-    )
+        start=(airport.start.x_m, airport.start.y_m))
 
 
 def svg_path(shape: Any, tolerance_m: float = 0.02) -> str:

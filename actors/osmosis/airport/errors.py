@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+
+import msgspec
 
 from rampart.files.reading import FileError, plain_line
 
@@ -17,8 +18,7 @@ class AirportError(ValueError):
         super().__init__(plain_line(line))
 
 
-@dataclass(frozen=True, slots=True)
-class Problem:
+class Problem(msgspec.Struct, frozen=True):
     """One finding about an airport.
 
     Args:

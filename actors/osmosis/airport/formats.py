@@ -83,20 +83,15 @@ def files_of(source: Path) -> list[Path]:
     """
     if source.suffix != ".graph":
         return [source]
-    images = [p for p in source.parent.iterdir() if p.suffix.lower() in foreign.IMAGE_SUFFIXES]
-    own = [p for p in images if p.stem.startswith(source.stem)]  # as `graph_format` chooses
-    return [source, *sorted([*(own or images), *source.parent.glob("*.miss")])]
+    return [source, *sorted([*foreign.images_beside(source), *source.parent.glob("*.miss")])]
 
 
 def _load(name_or_path: str | Path, scale: MaskScale | None) -> tuple[Airport, WorldTruth]:
     with readable(name_or_path, "give a file that exists"):
         path = _find(name_or_path)
-        if path.suffix == ".toml":
-            airport, truth = toml_format.read_airport(path)
-            own = True
-        else:
-            airport, truth = foreign.read_airport(path, scale), WorldTruth()
-            own = False
+        own = path.suffix == ".toml"
+        airport, truth = toml_format.read_airport(path) if own else (
+            foreign.read_airport(path, scale), WorldTruth())
     warnings = []
     for problem in problems(airport):
         if own or not problem.tolerable:

@@ -20,16 +20,11 @@ from typing import Any
 import shapely
 from shapely.geometry import MultiPoint, MultiPolygon
 
+from rampart.actors.osmosis.airport import limits, model
 from rampart.actors.osmosis.airport.errors import AirportError, readable
-from rampart.actors.osmosis.airport.limits import (
-    MAX_COUNTS,
-    MAX_GOALS,
-    MAX_NAME,
-    MAX_NUMBER,
-    check_count,
-)
+from rampart.actors.osmosis.airport.limits import check_count
 from rampart.actors.osmosis.airport.mask import MaskScale, allowed_area
-from rampart.actors.osmosis.airport.model import Airport, Mission, MissionGoal, StartPose, Surface
+from rampart.actors.osmosis.airport.model import Airport, Mission, Point
 from rampart.files.reading import read_text, shown
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -50,39 +45,42 @@ def read_airport(graph: Path, scale: MaskScale | None = None) -> Airport:
         AirportError: a file is missing or malformed.
     """
     nodes, edges = read_graph(graph)
-    image = _image_beside(graph)
-    allowed = _reached_by(nodes, allowed_area(image, scale or MaskScale()))
-    first, second = _first_edge(nodes, edges)
+    images = images_beside(graph)
+    if len(images) != 1:
+        listed = ", ".join(p.name for p in images) or "none"
+        raise AirportError(
+            f"{graph}: area image: {listed}: need exactly one, {graph.stem}_area.jpg or .png")
+    allowed = _reached_by(nodes, allowed_area(images[0], scale or MaskScale()))
+    first = next(iter(nodes))
+    second = next((b if a == first else a for a, b in edges if first in (a, b)), first)
     (x_m, y_m), (to_x, to_y) = nodes[first], nodes[second]
     missions: dict[str, Mission] = {}
     files = sorted(graph.parent.glob("*.miss"))
-    check_count(str(graph.parent), "*.miss", len(files), MAX_COUNTS["missions"])
+    check_count(str(graph.parent), "*.miss", len(files), limits.MAX_COUNTS["missions"])
     for path in files:
         mission = read_mission(path)
         if mission.name in missions:
             raise AirportError(f"{path}: mission name: {mission.name!r}: already used; rename it")
         missions[mission.name] = mission
-    return Airport(
-        name=graph.stem,
-        nodes=nodes,
-        edges=edges,
-        allowed=allowed,
-        start=StartPose(x_m, y_m, math.atan2(to_y - y_m, to_x - x_m)),
-        surfaces=(Surface(graph.stem, "area", allowed),),
-        missions=missions,
-    )
+    return Airport(graph.stem, nodes, edges, allowed,
+                   model.StartPose(x_m, y_m, math.atan2(to_y - y_m, to_x - x_m)),
+                   (model.Surface(graph.stem, "area", allowed),), missions=missions)
 
 
-def _reached_by(nodes: dict[str, tuple[float, float]], area: Any) -> Any:
+def images_beside(graph: Path) -> list[Path]:
+    """Return the images that may be a graph's area: those named after it, else all beside it."""
+    images = sorted(p for p in graph.parent.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+    return [p for p in images if p.stem.startswith(graph.stem)] or images
+
+
+def _reached_by(nodes: dict[str, Point], area: Any) -> Any:
     """Drop stray pavement that holds no node, such as marks at the image's rim."""
     at = MultiPoint(list(nodes.values()))
     parts = [part for part in shapely.get_parts(area) if part.intersects(at)]
     return MultiPolygon(parts) if parts else area
 
 
-def read_graph(
-    path: Path,
-) -> tuple[dict[str, tuple[float, float]], tuple[tuple[str, str], ...]]:
+def read_graph(path: Path) -> tuple[dict[str, Point], tuple[tuple[str, str], ...]]:
     """Read nodes and edges of a `.graph` file.
 
     Raises:
@@ -93,12 +91,11 @@ def read_graph(
     except (ValueError, RecursionError) as error:  # a number of thousands of digits; nesting
         raise AirportError(f"{path}: not JSON: {error}: see the format's sample") from None
     if not isinstance(table, dict) or not all(
-        isinstance(table.get(key), list) for key in ("nodes", "edges")
-    ):
+            isinstance(table.get(key), list) for key in ("nodes", "edges")):
         raise AirportError(f"{path}: file: {shown(table)}: needs the lists nodes and edges")
     for key in ("nodes", "edges"):
-        check_count(str(path), key, len(table[key]), MAX_COUNTS[key])
-    nodes: dict[str, tuple[float, float]] = {}
+        check_count(str(path), key, len(table[key]), limits.MAX_COUNTS[key])
+    nodes: dict[str, Point] = {}
     for i, entry in enumerate(table["nodes"]):
         name, at = _node(entry, f"{path}: nodes[{i}]")
         if name in nodes:
@@ -107,7 +104,7 @@ def read_graph(
     edges = []
     for i, entry in enumerate(table["edges"]):
         if not (isinstance(entry, list) and len(entry) == 2
-                and all(isinstance(end, str) for end in entry)):  # fmt: skip
+                and all(isinstance(end, str) for end in entry)):
             raise AirportError(f'{path}: edges[{i}]: {shown(entry)}: must be ["N1", "N2"]')
         for end in entry:
             if end not in nodes:
@@ -128,13 +125,13 @@ def read_mission(path: Path) -> Mission:
     for number, line in enumerate(_text(path).splitlines(), start=1):
         if line.strip():
             goals.append(_goal(line, f"{path}: line {number}"))
-            check_count(str(path), "goals", len(goals), MAX_GOALS)
+            check_count(str(path), "goals", len(goals), limits.MAX_GOALS)
     if not goals:
         raise AirportError(f"{path}: goals: empty: give lines such as x=20,y=-57,taxi=1")
     return Mission(path.stem.removeprefix("MISSION_"), tuple(goals))
 
 
-def _goal(line: str, where: str) -> MissionGoal:
+def _goal(line: str, where: str) -> model.MissionGoal:
     found = [_FIELD.fullmatch(part) for part in line.split(",")]
     fields = {match.group(1): match.group(2) for match in found if match}
     if len(found) != 3 or fields.keys() != {"x", "y", "taxi"}:
@@ -142,20 +139,17 @@ def _goal(line: str, where: str) -> MissionGoal:
     if fields["taxi"] not in ("0", "1"):
         raise AirportError(f"{where}: taxi={fields['taxi'][:20]}: 1 is taxi, 0 light verification")
     x_m, y_m = (_number(fields[axis], f"{where}: {axis}") for axis in ("x", "y"))
-    return MissionGoal(x_m, y_m, "taxi" if fields["taxi"] == "1" else "light verification")
+    return model.MissionGoal(x_m, y_m, "taxi" if fields["taxi"] == "1" else "light verification")
 
 
-def _node(entry: Any, where: str) -> tuple[str, tuple[float, float]]:
+def _node(entry: Any, where: str) -> tuple[str, Point]:
     if not (isinstance(entry, dict) and isinstance(entry.get("id"), str)):
         raise AirportError(f'{where}: {shown(entry)}: must be {{"id": "N1", "x": 0, "y": 0}}')
     name = entry["id"]
-    if not name.isprintable() or len(name) > MAX_NAME:
-        raise AirportError(f"{where}.id: {shown(name)}: must be a name of at most {MAX_NAME} "
-                           "printable characters")
-    return name, (
-        _number(entry.get("x"), f"{where}.x"),
-        _number(entry.get("y"), f"{where}.y"),
-    )
+    if not name.isprintable() or len(name) > limits.MAX_NAME:
+        raise AirportError(f"{where}.id: {shown(name)}: must be a name of at most "
+                           f"{limits.MAX_NAME} printable characters")
+    return name, (_number(entry.get("x"), f"{where}.x"), _number(entry.get("y"), f"{where}.y"))
 
 
 def _number(value: Any, where: str) -> float:
@@ -167,30 +161,10 @@ def _number(value: Any, where: str) -> float:
         number = math.nan
     if not math.isfinite(number):
         raise AirportError(f"{where}: {shown(value)}: must be a finite number of metres")
-    if abs(number) > MAX_NUMBER:
-        raise AirportError(f"{where}: {shown(value)}: must be within {MAX_NUMBER:,.0f} m of 0")
-    return number
-
-
-def _first_edge(
-    nodes: dict[str, tuple[float, float]], edges: tuple[tuple[str, str], ...]
-) -> tuple[str, str]:
-    first = next(iter(nodes))
-    for a, b in edges:
-        if first in (a, b):
-            return first, b if a == first else a
-    return first, first
-
-
-def _image_beside(graph: Path) -> Path:
-    images = sorted(p for p in graph.parent.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
-    own = [p for p in images if p.stem.startswith(graph.stem)] or images
-    if len(own) != 1:
-        listed = ", ".join(p.name for p in own) or "none"
+    if abs(number) > limits.MAX_NUMBER:
         raise AirportError(
-            f"{graph}: area image: {listed}: need exactly one, {graph.stem}_area.jpg or .png"
-        )
-    return own[0]
+            f"{where}: {shown(value)}: must be within {limits.MAX_NUMBER:,.0f} m of 0")
+    return number
 
 
 def _text(path: Path) -> str:

@@ -23,10 +23,8 @@ MAX_NUMBER = 1e6
 MAX_NAME = 200
 """Characters of a name."""
 
-MAX_COUNTS = {
-    "surface": 1000, "prohibited": 1000, "building": 1000, "row": 1000, "obstacle": 1000,
-    "missions": 1000, "nodes": 5000, "edges": 10_000,
-}
+MAX_COUNTS = {"surface": 1000, "prohibited": 1000, "building": 1000, "row": 1000, "obstacle": 1000,
+              "missions": 1000, "nodes": 5000, "edges": 10_000}
 """Of the tables and lists of an airport's file."""
 
 MAX_LIGHTS = 100_000

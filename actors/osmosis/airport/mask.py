@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import io
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import shapely
@@ -41,8 +41,7 @@ MAX_BOXES = 20_000
 """Rectangles into which the pavement falls; a slanted edge makes one for each row of pixels."""
 
 
-@dataclass(frozen=True, slots=True)
-class MaskScale:
+class MaskScale(msgspec.Struct, frozen=True):
     """Pixel column = columns_per_m * (x - left_m); row = rows_per_m * (top_m - y).
 
     The defaults are the authors': 5.2 * (x + 80) and 4.6 * (80 - y).
@@ -57,8 +56,7 @@ class MaskScale:
         if not (self.columns_per_m > 0 and self.rows_per_m > 0):
             raise AirportError(
                 f"mask scale: pixels per metre: ({self.columns_per_m:g}, {self.rows_per_m:g}): "
-                "both must be positive"
-            )
+                "both must be positive")
 
 
 def allowed_area(path: Path, scale: MaskScale) -> Any:
@@ -108,11 +106,8 @@ def _without_lone_pixels(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_
     """Majority vote of each pixel with its eight neighbours (a median filter)."""
     padded = np.pad(allowed, 1, mode="edge").astype(np.int8)
     rows, columns = allowed.shape
-    votes = np.zeros(allowed.shape, dtype=np.int8)
-    for i in range(3):
-        for j in range(3):
-            votes += padded[i : i + rows, j : j + columns]
-    return votes >= 5
+    votes = sum(padded[i:i + rows, j:j + columns] for i in range(3) for j in range(3))
+    return np.asarray(votes) >= 5
 
 
 def _boxes(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64] | None:
@@ -121,14 +116,13 @@ def _boxes(allowed: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64] | None:
     Returns:
         First column, first row, last column, last row, each one array; None if there are too many.
     """
-    steps = np.diff(np.pad(allowed, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    # A last row of none closes what is open there.
+    steps = np.diff(np.pad(allowed, ((0, 1), (1, 1))).astype(np.int8), axis=1)
     boxes: list[tuple[float, float, float, float]] = []
     open_runs: dict[tuple[int, int], int] = {}
-    for row in range(len(allowed) + 1):
-        runs: set[tuple[int, int]] = set()
-        if row < len(allowed):
-            begins, ends = np.flatnonzero(steps[row] == 1), np.flatnonzero(steps[row] == -1)
-            runs = set(zip(begins.tolist(), ends.tolist(), strict=True))
+    for row, step in enumerate(steps):
+        begins, ends = np.flatnonzero(step == 1), np.flatnonzero(step == -1)
+        runs = set(zip(begins.tolist(), ends.tolist(), strict=True))
         for run in [run for run in open_runs if run not in runs]:
             boxes.append((run[0], open_runs.pop(run), run[1], row))
         for run in runs:

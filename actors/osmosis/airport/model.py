@@ -8,10 +8,11 @@ rest of the world is prohibited (paper, section V: the robot must not leave the 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -20,7 +21,10 @@ import shapely
 from shapely.geometry import box
 
 from rampart.actors.osmosis.airport.errors import AirportError
+from rampart.actors.osmosis.airport.limits import MAX_NAME
 
+Name = Annotated[str, msgspec.Meta(max_length=MAX_NAME)]
+Point = tuple[float, float]
 GoalMode = Literal["taxi", "light verification"]
 GOAL_MODES: tuple[GoalMode, ...] = ("taxi", "light verification")
 ObstacleShape = Literal["cylinder", "box"]
@@ -28,13 +32,14 @@ GRAPH_REACH_M = 3.0
 """A point farther than this from the graph cannot be a mission point."""
 SIMPLIFICATION_M = 0.02
 """Accuracy of curved edges of the pavement: the fewer points, the faster the checks."""
+H = TypeVar("H", bound=Hashable)
 
 
-class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of what airport files hold as it is; a misspelt key is an error, not silence."""
 
 
-class MissionGoal(_Record, frozen=True):
+class MissionGoal(Record, frozen=True):
     """One mission point and the mode in which it is reached (paper, section III)."""
 
     x_m: float
@@ -42,15 +47,14 @@ class MissionGoal(_Record, frozen=True):
     mode: GoalMode
 
 
-@dataclass(frozen=True, slots=True)
-class Mission:
+class Mission(Record, frozen=True):
     """An ordered list of goals."""
 
-    name: str
+    name: Name
     goals: tuple[MissionGoal, ...]
 
 
-class StartPose(_Record, frozen=True):
+class StartPose(Record, frozen=True):
     """Where the robot stands at the start."""
 
     x_m: float
@@ -58,8 +62,7 @@ class StartPose(_Record, frozen=True):
     yaw_rad: float
 
 
-@dataclass(frozen=True, slots=True)
-class Light:
+class Light(msgspec.Struct, frozen=True):
     """An inset light; `nominal_cd` is the intensity it should have."""
 
     name: str
@@ -69,8 +72,7 @@ class Light:
     nominal_cd: float
 
 
-@dataclass(frozen=True, slots=True)
-class Surface:
+class Surface(msgspec.Struct, frozen=True):
     """A named piece of pavement: `kind` is runway, taxiway, apron or area."""
 
     name: str
@@ -78,7 +80,7 @@ class Surface:
     polygon: Any
 
 
-class Building(_Record, frozen=True):
+class Building(Record, frozen=True):
     """A box on the ground: `length_m` along its own x axis, which is turned by `yaw_rad`."""
 
     name: str
@@ -95,7 +97,7 @@ class Building(_Record, frozen=True):
         return rectangle(self.x_m, self.y_m, self.yaw_rad, self.length_m, self.width_m)
 
 
-class ObstaclePreset(_Record, frozen=True):
+class ObstaclePreset(Record, frozen=True):
     """An obstacle that can be put in the robot's way.
 
     Args:
@@ -119,12 +121,10 @@ class ObstaclePreset(_Record, frozen=True):
     gone_after_s: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Attachment:
+class Attachment(msgspec.Struct, frozen=True):
     """The place on the graph nearest to a point: on edge (`a`, `b`); a == b for a lone node."""
 
-    x_m: float
-    y_m: float
+    point: Point
     distance_m: float
     a: str
     b: str
@@ -150,7 +150,7 @@ class Airport:
     """
 
     name: str
-    nodes: Mapping[str, tuple[float, float]]
+    nodes: Mapping[str, Point]
     edges: tuple[tuple[str, str], ...]
     allowed: Any
     start: StartPose
@@ -177,42 +177,27 @@ class Airport:
             table[b].append((a, length_m))
         return {name: tuple(found) for name, found in table.items()}
 
-    def nearest_node(self, x_m: float, y_m: float) -> tuple[str, float]:
-        """Return the node nearest to a point, and its distance, m."""
-        return min(
-            ((name, math.dist(at, (x_m, y_m))) for name, at in self.nodes.items()),
-            key=lambda found: found[1],
-        )
-
     def nearest_on_graph(self, x_m: float, y_m: float) -> Attachment:
         """Return the place on an edge, or lone node, nearest to a point."""
-        name, distance_m = self.nearest_node(x_m, y_m)
-        best = Attachment(*self.nodes[name], distance_m, name, name)
+        at, nodes = (x_m, y_m), self.nodes
+        name = min(nodes, key=lambda node: math.dist(nodes[node], at))
+        best = Attachment(nodes[name], math.dist(nodes[name], at), name, name)
         for a, b in self.edges:
-            (ax, ay), (bx, by) = self.nodes[a], self.nodes[b]
-            dx, dy = bx - ax, by - ay
-            square = dx * dx + dy * dy
-            share = ((x_m - ax) * dx + (y_m - ay) * dy) / square if square else 0.0
-            share = min(1.0, max(0.0, share))
-            px, py = ax + share * dx, ay + share * dy
-            off_m = math.dist((px, py), (x_m, y_m))
+            point = foot(at, nodes[a], nodes[b])
+            off_m = math.dist(point, at)
             if off_m < best.distance_m - 1e-9:
-                best = Attachment(px, py, off_m, a, b)
+                best = Attachment(point, off_m, a, b)
         return best
 
     @cached_property
     def within_reach(self) -> frozenset[str]:
         """All nodes that can be reached from the start pose."""
-        return self.component(self.nearest_on_graph(self.start.x_m, self.start.y_m).a)
-
-    def component(self, node: str) -> frozenset[str]:
-        """Return all nodes that can be reached from `node`, itself included."""
-        reached, todo = {node}, [node]
+        todo = [self.nearest_on_graph(self.start.x_m, self.start.y_m).a]
+        reached = set(todo)
         while todo:
-            for other, _ in self.neighbours[todo.pop()]:
-                if other not in reached:
-                    reached.add(other)
-                    todo.append(other)
+            beyond = {other for other, _ in self.neighbours[todo.pop()]} - reached
+            reached |= beyond
+            todo += beyond
         return frozenset(reached)
 
     # -- ground ---------------------------------------------------------------------------------
@@ -224,9 +209,7 @@ class Airport:
         """
         return float(self.prohibited_distances_m(((x_m, y_m),))[0])
 
-    def prohibited_distances_m(
-        self, points: npt.ArrayLike
-    ) -> npt.NDArray[np.float64]:
+    def prohibited_distances_m(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Return `prohibited_distance_m` for several points at once."""
         at = np.asarray(points, dtype=float)
         ax, ay, dx, dy, square = self._boundary
@@ -236,8 +219,7 @@ class Airport:
         py -= share * dy
         distances = np.sqrt((px * px + py * py).min(axis=1))
         inside = shapely.contains_xy(self.allowed, at[:, 0], at[:, 1])
-        signed: npt.NDArray[np.float64] = np.where(inside, distances, -distances)
-        return signed
+        return np.asarray(np.where(inside, distances, -distances))
 
     @cached_property
     def _boundary(self) -> tuple[npt.NDArray[np.float64], ...]:
@@ -271,26 +253,40 @@ class Airport:
         Raises:
             AirportError: the airport has no such mission.
         """
-        try:
-            return self.missions[name]
-        except KeyError:
+        if name not in self.missions:
             known = ", ".join(self.missions) or "none"
             raise AirportError(
-                f"{self.name}: missions: {name!r}: no such mission, there are: {known}"
-            ) from None
+                f"{self.name}: missions: {name!r}: no such mission, there are: {known}")
+        return self.missions[name]
+
+
+def repeated(names: Iterable[H]) -> list[H]:
+    """Return what is given more than once."""
+    return [name for name, times in Counter(names).items() if times > 1]
+
+
+def foot(point: Point, a: Point, b: Point) -> Point:
+    """Return the place on the way from a to b that is nearest to a point."""
+    along = (b[0] - a[0], b[1] - a[1])
+    square = along[0] ** 2 + along[1] ** 2
+    if square == 0.0:
+        return a
+    share = ((point[0] - a[0]) * along[0] + (point[1] - a[1]) * along[1]) / square
+    share = min(max(share, 0.0), 1.0)
+    return a[0] + share * along[0], a[1] + share * along[1]
+
+
+def show(point: Point) -> str:
+    """Return a point as text for messages."""
+    return f"({point[0]:.1f}, {point[1]:.1f})"
 
 
 def rectangle(x_m: float, y_m: float, yaw_rad: float, length_m: float, width_m: float) -> Any:
     """Return a rectangle about (x, y), `length_m` along its own x axis, as a shapely polygon."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     half = ((length_m / 2, width_m / 2), (-length_m / 2, width_m / 2),
-            (-length_m / 2, -width_m / 2), (length_m / 2, -width_m / 2))  # fmt: skip
+            (-length_m / 2, -width_m / 2), (length_m / 2, -width_m / 2))
     return shapely.polygons([(x_m + u * cos - v * sin, y_m + u * sin + v * cos) for u, v in half])
-
-
-def union(polygons: Iterable[Any]) -> Any:
-    """Merge polygons."""
-    return shapely.unary_union(list(polygons))
 
 
 def rounded(area: Any, fillet_radius_m: float) -> Any:

@@ -27,10 +27,7 @@ SENSOR_HEIGHT_M = 0.35
 
 def sensor_position(x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
     """Return the sensor's place in `map` for a pose of `base_link` in `map`."""
-    return (
-        x_m + SENSOR_FORWARD_M * math.cos(yaw_rad),
-        y_m + SENSOR_FORWARD_M * math.sin(yaw_rad),
-    )
+    return (x_m + SENSOR_FORWARD_M * math.cos(yaw_rad), y_m + SENSOR_FORWARD_M * math.sin(yaw_rad))
 
 
 def illuminance_per_candela(distance_m: float | NDArray[np.float64]) -> NDArray[np.float64]:

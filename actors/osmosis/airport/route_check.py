@@ -11,22 +11,20 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import shapely
 
 from rampart.actors.bus.plausible import is_sane
-from rampart.actors.osmosis.airport.model import Airport
+from rampart.actors.osmosis.airport.model import Airport, Point, show
 
-Point = tuple[float, float]
 Points = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class RouteLimits:
+class RouteLimits(msgspec.Struct, frozen=True):
     """What a good route keeps to, in metres.
 
     Args:
@@ -62,15 +60,13 @@ class RouteCheck:
     def __init__(self, airport: Airport, limits: RouteLimits | None = None) -> None:
         self._allowed = airport.allowed
         self._boundary = airport.allowed.boundary
-        ends = np.array([(*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges])
-        self._from = ends[:, :2] if len(ends) else np.zeros((0, 2))
-        self._along = ends[:, 2:] - ends[:, :2] if len(ends) else np.zeros((0, 2))
+        ends = np.reshape(
+            [(*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges], (-1, 4))
+        self._from, self._along = ends[:, :2], ends[:, 2:] - ends[:, :2]
         self._limits = limits or RouteLimits()
         self._of_shape = lru_cache(maxsize=8)(self._find_in_shape)
 
-    def fault(
-        self, waypoints: tuple[Point, ...], robot: Point | None, goal: Point | None
-    ) -> str:
+    def fault(self, waypoints: tuple[Point, ...], robot: Point | None, goal: Point | None) -> str:
         """Return what is wrong with a route, or "".
 
         Args:
@@ -84,13 +80,13 @@ class RouteCheck:
             return "a waypoint is not finite, or farther away than anything can be"
         limits = self._limits
         if goal is not None and not math.dist(waypoints[-1], goal) <= limits.end_m:
-            return (f"the route ends at {_show(waypoints[-1])},"
-                    f" {math.dist(waypoints[-1], goal):.1f} m from the goal {_show(goal)}")
+            return (f"the route ends at {show(waypoints[-1])},"
+                    f" {math.dist(waypoints[-1], goal):.1f} m from the goal {show(goal)}")
         if robot is not None:
             way = shapely.linestrings(waypoints if len(waypoints) > 1 else waypoints * 2)
             off_m = float(shapely.distance(way, shapely.points(robot)))
             if not off_m <= limits.start_m:
-                return f"the robot at {_show(robot)} is {off_m:.1f} m from the route"
+                return f"the robot at {show(robot)} is {off_m:.1f} m from the route"
         return self._of_shape(waypoints)
 
     def _find_in_shape(self, waypoints: tuple[Point, ...]) -> str:
@@ -99,7 +95,7 @@ class RouteCheck:
             fault = self._ground(a, b) or self._off_graph(
                 a, b, first=number == 1, last=number == len(legs))
             if fault:
-                return f"leg {number} from {_show(a)} to {_show(b)} {fault}"
+                return f"leg {number} from {show(a)} to {show(b)} {fault}"
         return ""
 
     def _ground(self, a: Point, b: Point) -> str:
@@ -145,7 +141,3 @@ class RouteCheck:
         at = np.clip(np.einsum("nei,ei->ne", relative, self._along) / square, 0.0, 1.0)
         off = relative - at[:, :, None] * self._along[None, :, :]
         return np.asarray(np.sqrt((off**2).sum(axis=2)).min(axis=1))
-
-
-def _show(point: Point) -> str:
-    return f"({point[0]:.1f}, {point[1]:.1f})"

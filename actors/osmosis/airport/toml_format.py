@@ -4,68 +4,32 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import msgspec
 import shapely
 from shapely.geometry import LineString, Polygon
 from shapely.validation import explain_validity
 
+from rampart.actors.osmosis.airport import limits, model
 from rampart.actors.osmosis.airport.errors import AirportError, Problem, readable
-from rampart.actors.osmosis.airport.limits import (
-    MAX_COUNTS,
-    MAX_CROSSINGS,
-    MAX_GOALS,
-    MAX_LIGHTS,
-    MAX_NAME,
-    MAX_NEAR_IN_FILLET,
-    MAX_NEAR_IN_STRIPS,
-    MAX_NUMBER,
-    MAX_POINTS,
-    check_count,
-    check_nearness,
-)
-from rampart.actors.osmosis.airport.model import (
-    GOAL_MODES,
-    Airport,
-    Building,
-    Light,
-    Mission,
-    MissionGoal,
-    ObstaclePreset,
-    ObstacleShape,
-    StartPose,
-    Surface,
-    rounded,
-    union,
-)
+from rampart.actors.osmosis.airport.limits import check_count, check_nearness
+from rampart.actors.osmosis.airport.model import Name, Point, Record
 from rampart.actors.osmosis.airport.world import WorldTruth
 from rampart.files import toml
 from rampart.files.reading import read_text, shown
 
-Name = Annotated[str, msgspec.Meta(max_length=MAX_NAME)]
-Point = tuple[float, float]
 SurfaceKind = Literal["runway", "taxiway", "apron", "area"]
-_CHOICES = {
-    "mode": GOAL_MODES,
-    "kind": get_args(SurfaceKind),
-    "shape": get_args(ObstacleShape),
-}
+_CHOICES = {"mode": model.GOAL_MODES, "kind": get_args(SurfaceKind),
+            "shape": get_args(model.ObstacleShape)}
 _KEY = re.compile(r"\[[^]]*\]|[^.[]+")
 _UNKNOWN = re.compile(r"Object contains unknown field `(.*)`")
-_TYPE_NAMES = {
-    str: "str", int: "int", float: "float", bool: "bool", list: "array", dict: "object"
-}  # fmt: skip
+_TYPE_NAMES = {str: "str", int: "int", float: "float", bool: "bool", list: "array", dict: "object"}
 
 
-class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of the file's tables: a misspelt key is an error, not silence."""
-
-
-class _Surface(_Table, frozen=True):
+class _Surface(Record, frozen=True):
     name: Name
     kind: SurfaceKind
     polygon: list[Point] | None = None
@@ -73,12 +37,12 @@ class _Surface(_Table, frozen=True):
     half_width_m: float | None = None
 
 
-class _Area(_Table, frozen=True):
+class _Area(Record, frozen=True):
     name: Name
     polygon: list[Point]
 
 
-class _Row(_Table, frozen=True):
+class _Row(Record, frozen=True):
     name: Name
     nominal_cd: float
     first: Point | None = None
@@ -87,52 +51,45 @@ class _Row(_Table, frozen=True):
     positions: list[Point] | None = None
 
 
-class _Mission(_Table, frozen=True):
-    goals: list[MissionGoal]
+class _Mission(Record, frozen=True):
+    goals: tuple[model.MissionGoal, ...]
 
 
-class _World(_Table, frozen=True):
+class _World(Record, frozen=True):
     light_factors: dict[str, float] = {}
 
 
-class _File(_Table, frozen=True):
+class _File(Record, frozen=True):
     name: Name
-    start: StartPose
+    start: model.StartPose
     nodes: dict[str, Point]
-    edges: list[tuple[str, str]]
+    edges: tuple[tuple[str, str], ...]
     surface: list[_Surface]
     fillet_radius_m: float = 0.0
     prohibited: list[_Area] = []
-    building: list[Building] = []
+    building: tuple[model.Building, ...] = ()
     row: list[_Row] = []
     missions: dict[str, _Mission] = {}
-    obstacle: list[ObstaclePreset] = []
+    obstacle: tuple[model.ObstaclePreset, ...] = ()
     world: _World = _World()
 
 
-class _MissionFile(_Table, frozen=True):
-    name: Name
-    goals: list[MissionGoal]
-
-
-def read_airport(path: Path) -> tuple[Airport, WorldTruth]:
+def read_airport(path: Path) -> tuple[model.Airport, WorldTruth]:
     """Read an airport and the truth about its lights; geometry is checked by the caller.
 
     Raises:
         AirportError: unreadable, not TOML, a wrong field, or a shape that is none.
     """
-    file = _convert(path, _File)
-    name = str(path)
+    file, name = _convert(path, _File), str(path)
     _count(file, name)
     surfaces = _surfaces(file.surface, name)
-    prohibited = [
-        _polygon(area.polygon, f"prohibited[{i}].polygon", name)
-        for i, area in enumerate(file.prohibited)
-    ]
+    prohibited = [_polygon(area.polygon, f"prohibited[{i}].polygon", name)
+                  for i, area in enumerate(file.prohibited)]
     if file.fillet_radius_m < 0:
         raise _error(name, "fillet_radius_m", file.fillet_radius_m, "must not be negative")
     for table in ("surface", "prohibited", "building", "row"):
-        _unique(name, table, [part.name for part in getattr(file, table)])
+        for twice in model.repeated(part.name for part in getattr(file, table)):
+            raise _error(name, table, repr(twice), "name given twice; names must be unique")
     for building in file.building:
         if min(building.length_m, building.width_m, building.height_m) <= 0:
             raise _error(name, f"building.{building.name}", "size", "sides must be positive")
@@ -140,40 +97,29 @@ def read_airport(path: Path) -> tuple[Airport, WorldTruth]:
     solid = [building.polygon for building in file.building]
     pavement = [part.polygon for part in surfaces]
     check_nearness(name, "surface, prohibited and building", [*pavement, *prohibited, *solid], 0.0,
-                   MAX_CROSSINGS)
-    allowed = union(pavement)
+                   limits.MAX_CROSSINGS)
+    allowed = shapely.unary_union(pavement)
     if file.fillet_radius_m > 0:
         check_nearness(name, "fillet_radius_m", [allowed], 2 * file.fillet_radius_m,
-                       MAX_NEAR_IN_FILLET)
-    allowed = rounded(allowed, file.fillet_radius_m)
+                       limits.MAX_NEAR_IN_FILLET)
+    allowed = model.rounded(allowed, file.fillet_radius_m)
     allowed = allowed.difference(shapely.unary_union([*prohibited, *solid]))
     lights = tuple(light for i, row in enumerate(file.row) for light in _lights(row, i, name))
-    airport = Airport(
-        name=file.name,
-        nodes=file.nodes,
-        edges=tuple(file.edges),
-        allowed=allowed,
-        start=file.start,
-        surfaces=surfaces,
-        buildings=tuple(file.building),
-        lights=lights,
-        missions={
-            key: Mission(key, tuple(mission.goals)) for key, mission in file.missions.items()
-        },
-        obstacles=tuple(file.obstacle),
-    )
+    missions = {key: model.Mission(key, mission.goals) for key, mission in file.missions.items()}
+    airport = model.Airport(file.name, file.nodes, file.edges, allowed, file.start, surfaces,
+                            file.building, lights, missions, file.obstacle)
     return airport, _truth(file.world, airport, name)
 
 
-def read_mission(path: Path) -> Mission:
+def read_mission(path: Path) -> model.Mission:
     """Read a mission file: `name` and `goals` as in an airport file.
 
     Raises:
         AirportError: as `read_airport`.
     """
-    file = _convert(path, _MissionFile)
-    check_count(str(path), "goals", len(file.goals), MAX_GOALS)
-    return Mission(file.name, tuple(file.goals))
+    mission: model.Mission = _convert(path, model.Mission)
+    check_count(str(path), "goals", len(mission.goals), limits.MAX_GOALS)
+    return mission
 
 
 def _convert(path: Path, kind: Any) -> Any:
@@ -206,10 +152,8 @@ def _locate(table: Any, path: str, message: str) -> tuple[str, str]:
     """
     found = list(_resolve(table, "", _KEY.findall(path))) or [(path, table)]
     fitting = [
-        (where, value)
-        for where, value in found
-        if f"{value!r}" in message or f"got `{_TYPE_NAMES.get(type(value), '')}`" in message
-    ]
+        (where, value) for where, value in found
+        if f"{value!r}" in message or f"got `{_TYPE_NAMES.get(type(value), '')}`" in message]
     where, value = (fitting or found)[0]
     return where.lstrip(".") or "file", shown(value)
 
@@ -234,9 +178,9 @@ def _check_numbers(value: Any, path: str, file: str) -> None:
     """Refuse NaN and infinities anywhere, TOML can write both, and what no airport measures."""
     if isinstance(value, float) and not math.isfinite(value):
         raise _error(file, path.lstrip("."), value, "must be a finite number")
-    if isinstance(value, (int, float)) and abs(value) > MAX_NUMBER:
+    if isinstance(value, (int, float)) and abs(value) > limits.MAX_NUMBER:
         raise _error(file, path.lstrip("."), shown(value),
-                     f"must be between -{MAX_NUMBER:g} and {MAX_NUMBER:g}")
+                     f"must be between -{limits.MAX_NUMBER:g} and {limits.MAX_NUMBER:g}")
     if isinstance(value, dict):
         for key, part in value.items():
             _check_numbers(part, f"{path}.{key}", file)
@@ -247,43 +191,37 @@ def _check_numbers(value: Any, path: str, file: str) -> None:
 
 def _count(file: _File, name: str) -> None:
     """Refuse more of anything than there may be, before anything is built of it."""
-    for table, most in MAX_COUNTS.items():
+    for table, most in limits.MAX_COUNTS.items():
         check_count(name, table, len(getattr(file, table)), most)
     check_count(name, "goals of all missions",
-                sum(len(mission.goals) for mission in file.missions.values()), MAX_GOALS)
+                sum(len(mission.goals) for mission in file.missions.values()), limits.MAX_GOALS)
     check_count(name, "lights of all rows", sum(
-        max(row.count or 0, len(row.positions or ())) for row in file.row), MAX_LIGHTS)
+        max(row.count or 0, len(row.positions or ())) for row in file.row), limits.MAX_LIGHTS)
     points = [*(part.polygon or part.centre_line or () for part in file.surface),
               *(area.polygon for area in file.prohibited)]
-    check_count(name, "points of all outlines", sum(map(len, points)), MAX_POINTS)
+    check_count(name, "points of all outlines", sum(map(len, points)), limits.MAX_POINTS)
 
 
-def _surfaces(parts: list[_Surface], file: str) -> tuple[Surface, ...]:
+def _surfaces(parts: list[_Surface], file: str) -> tuple[model.Surface, ...]:
     near, surfaces = 0, []
     for i, part in enumerate(parts):
-        if len(part.centre_line or ()) > 1 and part.half_width_m is not None:
-            near += check_nearness(
-                file, f"surface[{i}].centre_line", [LineString(part.centre_line)],
-                2 * part.half_width_m, MAX_NEAR_IN_STRIPS - near)
-        surfaces.append(_surface(part, i, file))
+        where, half_m = f"surface[{i}]", part.half_width_m
+        if (part.polygon is None) == (part.centre_line is None):
+            raise _error(file, where, part.name, "give either polygon or centre_line, not both")
+        if part.polygon is not None:
+            shape = _polygon(part.polygon, f"{where}.polygon", file)
+        elif part.centre_line is None or len(part.centre_line) < 2:
+            raise _error(file, f"{where}.centre_line", shown(part.centre_line),
+                         "needs two points or more")
+        elif half_m is None or half_m <= 0:
+            raise _error(file, f"{where}.half_width_m", half_m, "must be positive")
+        else:
+            line = LineString(part.centre_line)
+            near += check_nearness(file, f"{where}.centre_line", [line], 2 * half_m,
+                                   limits.MAX_NEAR_IN_STRIPS - near)
+            shape = line.buffer(half_m, cap_style="flat" if part.kind == "runway" else "round")
+        surfaces.append(model.Surface(part.name, part.kind, shape))
     return tuple(surfaces)
-
-
-def _surface(part: _Surface, i: int, file: str) -> Surface:
-    where = f"surface[{i}]"
-    if (part.polygon is None) == (part.centre_line is None):
-        raise _error(file, where, part.name, "give either polygon or centre_line, not both")
-    if part.polygon is not None:
-        shape = _polygon(part.polygon, f"{where}.polygon", file)
-        return Surface(part.name, part.kind, shape)
-    if part.centre_line is None or len(part.centre_line) < 2:
-        raise _error(file, f"{where}.centre_line", shown(part.centre_line),
-                     "needs two points or more")
-    if part.half_width_m is None or part.half_width_m <= 0:
-        raise _error(file, f"{where}.half_width_m", part.half_width_m, "must be positive")
-    cap = "flat" if part.kind == "runway" else "round"
-    strip = LineString(part.centre_line).buffer(part.half_width_m, cap_style=cap)
-    return Surface(part.name, part.kind, strip)
 
 
 def _polygon(points: list[Point], where: str, file: str) -> Any:
@@ -295,7 +233,7 @@ def _polygon(points: list[Point], where: str, file: str) -> Any:
     return shape
 
 
-def _lights(row: _Row, i: int, file: str) -> list[Light]:
+def _lights(row: _Row, i: int, file: str) -> list[model.Light]:
     where = f"row[{i}]"
     spaced = row.first is not None and row.last is not None and row.count is not None
     if spaced == (row.positions is not None):
@@ -306,13 +244,11 @@ def _lights(row: _Row, i: int, file: str) -> list[Light]:
             raise _error(file, f"{where}.count", row.count, "a row needs two lights or more")
         (ax, ay), (bx, by), gaps = row.first, row.last, row.count - 1
         points = [(ax + (bx - ax) * k / gaps, ay + (by - ay) * k / gaps) for k in range(row.count)]
-    return [
-        Light(f"{row.name}{k:02d}", row.name, x_m, y_m, row.nominal_cd)
-        for k, (x_m, y_m) in enumerate(points, start=1)
-    ]
+    return [model.Light(f"{row.name}{k:02d}", row.name, x_m, y_m, row.nominal_cd)
+            for k, (x_m, y_m) in enumerate(points, start=1)]
 
 
-def _truth(world: _World, airport: Airport, file: str) -> WorldTruth:
+def _truth(world: _World, airport: model.Airport, file: str) -> WorldTruth:
     known = {light.name for light in airport.lights}
     for name, factor in world.light_factors.items():
         where = f"world.light_factors.{name}"
@@ -320,13 +256,7 @@ def _truth(world: _World, airport: Airport, file: str) -> WorldTruth:
             raise _error(file, where, repr(name), "unknown light; name one of a row, e.g. A01")
         if not 0 <= factor <= 2:
             raise _error(file, where, factor, "a share of the nominal intensity, 0 to 2")
-    return WorldTruth(dict(world.light_factors))
-
-
-def _unique(file: str, where: str, names: list[str]) -> None:
-    for name, times in Counter(names).items():
-        if times > 1:
-            raise _error(file, where, repr(name), "name given twice; names must be unique")
+    return WorldTruth(world.light_factors)
 
 
 def _error(file: str, where: str, value: object, remedy: str) -> AirportError:

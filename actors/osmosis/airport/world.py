@@ -7,20 +7,18 @@ Controllers see nominal values (`Airport.lights`); what a light really gives is 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+
+import msgspec
 
 from rampart.actors.osmosis.airport.model import Airport
 
 
-@dataclass(frozen=True, slots=True)
-class WorldTruth:
+class WorldTruth(msgspec.Struct, frozen=True):
     """Real intensity of each light as a share of its nominal one; lights not named have 1."""
 
-    light_factors: Mapping[str, float] = field(default_factory=dict)
+    light_factors: Mapping[str, float] = {}
 
     def intensity_cd(self, airport: Airport) -> dict[str, float]:
         """Return the real intensity of every light by name, cd."""
-        return {
-            light.name: light.nominal_cd * self.light_factors.get(light.name, 1.0)
-            for light in airport.lights
-        }
+        return {light.name: light.nominal_cd * self.light_factors.get(light.name, 1.0)
+                for light in airport.lights}

@@ -6,7 +6,7 @@ What a spec does not say (gains, look-ahead distances) keeps the default of its 
 from __future__ import annotations
 
 from rampart.actors.osmosis.control.following.path_follower import MotionLimits
-from rampart.actors.osmosis.control.pilot.laser_check import LaserReach
+from rampart.actors.osmosis.control.pilot.laser_pair import LaserReach
 from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom
 from rampart.actors.osmosis.control.polyline import Hull
@@ -25,32 +25,21 @@ def motion_of(system: SystemSpec) -> MotionLimits:
     """Return what Osmosis Control asks of the robot at most."""
     robot = system.robot
     return MotionLimits(
-        max_linear_mps=robot.top_speed_mps,
-        max_angular_radps=robot.top_turn_rate_radps,
+        robot.top_speed_mps, robot.top_turn_rate_radps,
         acceleration_mps2=min(COMFORT_MPS2, robot.acceleration_mps2),
-        deceleration_mps2=min(COMFORT_MPS2, robot.braking_mps2),
-    )
+        deceleration_mps2=min(COMFORT_MPS2, robot.braking_mps2))
 
 
 def gate_of(system: SystemSpec) -> GateLimits:
     """Return the bounds and ages that the Safety Pilot enforces."""
     robot, timing = system.robot, system.timing
     room = StoppingRoom(
-        hull=hull_of(system),
-        top_speed_mps=robot.top_speed_mps,
-        stop_distance_m=robot.stop_distance_m,
-        lateral_distance_m=robot.lateral_distance_m,
-        deceleration_mps2=robot.braking_mps2,
-        reaction_s=timing.control_period_s + timing.actuation_s,
-    )
+        hull_of(system), robot.top_speed_mps, robot.stop_distance_m, robot.lateral_distance_m,
+        robot.braking_mps2, reaction_s=timing.control_period_s + timing.actuation_s)
     return GateLimits(
-        max_linear_mps=robot.top_speed_mps,
-        max_angular_radps=robot.top_turn_rate_radps,
-        command_timeout_s=timing.command_timeout_s,
-        scan_timeout_s=timing.scan_timeout_s,
-        manager_timeout_s=timing.manager_timeout_s,
-        room=room,
-    )
+        robot.top_speed_mps, robot.top_turn_rate_radps, room=room,
+        command_timeout_s=timing.command_timeout_s, scan_timeout_s=timing.scan_timeout_s,
+        manager_timeout_s=timing.manager_timeout_s)
 
 
 def reach_of(system: SystemSpec) -> LaserReach:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import msgspec
@@ -32,8 +31,7 @@ def wrap_angle(angle_rad: float) -> float:
     return math.pi if wrapped == -math.pi else wrapped
 
 
-@dataclass(frozen=True, slots=True)
-class Hull:
+class Hull(msgspec.Struct, frozen=True):
     """The robot's footprint, a rectangle centred on `base_link` (Summit XL: 0.72 m by 0.614 m)."""
 
     length_m: float = 0.72
@@ -67,9 +65,8 @@ class Hull:
 
 
 @lru_cache(maxsize=4)
-def scan_points(
-    ranges_f32: bytes, angle_min_rad: float, angle_increment_rad: float, range_max_m: float
-) -> Array:
+def scan_points(ranges_f32: bytes, angle_min_rad: float, angle_increment_rad: float,
+                range_max_m: float) -> Array:
     """Return the echoes of a laser sweep as points in `base_link`, shape (n, 2).
 
     A range that is not finite, not positive or at `range_max_m` is no echo. A payload that is
@@ -97,8 +94,6 @@ def _rays(count: int, angle_min_rad: float, angle_increment_rad: float) -> Array
 
 def to_map(points: Array, x_m: float, y_m: float, yaw_rad: float) -> Array:
     """Move points from `base_link` at the given pose into `map`."""
-    if not len(points):
-        return points
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.asarray(points @ np.array(((cos, sin), (-sin, cos))) + (x_m, y_m))
 
@@ -117,6 +112,11 @@ class Polyline:
     Args:
         points: at least one point; repeated points are merged.
 
+    Attributes:
+        points: those that are left.
+        end: the last of them.
+        length_m: of the whole polyline.
+
     Raises:
         ValueError: no points.
     """
@@ -129,6 +129,7 @@ class Polyline:
             if math.dist(point, kept[-1]) > 1e-9:
                 kept.append(point)
         self.points: tuple[Point, ...] = tuple(kept)
+        self.end = kept[-1]
         if len(kept) == 1:  # a segment of no extent keeps every formula below valid
             kept = [kept[0], (kept[0][0] + 1e-9, kept[0][1])]
         vertices = np.array(kept, dtype=float)
@@ -139,20 +140,9 @@ class Polyline:
         self._arc = np.concatenate(((0.0,), np.cumsum(self._lengths)))
         # The same as plain numbers: for one point at a time they are ten times as fast.
         self._arc_m: list[float] = self._arc.tolist()
-        self._segments: list[tuple[float, float, float, float, float]] = [
-            (*start, *direction, length) for start, direction, length in zip(
-                self._starts.tolist(), self._directions.tolist(), self._lengths.tolist(),
-                strict=True)]
-
-    @property
-    def length_m(self) -> float:
-        """Length of the whole polyline."""
-        return self._arc_m[-1]
-
-    @property
-    def end(self) -> Point:
-        """The last point."""
-        return self.points[-1]
+        self.length_m = self._arc_m[-1]
+        self._segments: list[list[float]] = np.column_stack(
+            (self._starts, self._directions, self._lengths)).tolist()
 
     def point_at(self, s_m: float) -> Point:
         """Return the point at an arc length; beyond the ends the outer segments go on straight."""
@@ -200,8 +190,6 @@ class Polyline:
             s_from_m: start of the stretch of route looked at.
             s_to_m: end of that stretch; it is cut to the route.
         """
-        if not len(points):
-            return NO_POINTS
         low, high = self._stretch(s_from_m, s_to_m)
         along_x, along_y = self._directions[low:high].T
         x, y = (points[:, None, :] - self._starts[low:high]).transpose(2, 0, 1)
@@ -210,10 +198,6 @@ class Polyline:
         foot = np.minimum(np.maximum(ahead, 0.0), self._lengths[low:high])
         distance = np.hypot(ahead - foot, left)
         found = np.empty((len(points), 2))
-        if high - low == 1:
-            found[:, 0] = self._arc[low] + foot[:, 0]
-            found[:, 1] = np.where(left[:, 0] < 0.0, -distance[:, 0], distance[:, 0])
-            return found
         best = np.argmin(distance, axis=1)
         row = np.arange(len(points))
         off = distance[row, best]

@@ -188,14 +188,14 @@ def test_an_order_of_a_recovery_module_is_not_ended_by_a_reset_and_not_muted_by_
 def test_orders_of_a_crowd_are_bounded_and_the_strictest_holds():
     gate = SafetyGate(GateLimits(), Checks(), 0.0, ["RM2"])
     for number in range(10_000):
-        gate.order(f"s{number}", True, PilotMode.AUTO, "", 0.1)
-    assert len(gate.unknown) == UNKNOWN + 1
+        gate.order(f"s{number}", m.PilotOrder(True, PilotMode.AUTO, "", 0.1))
+    assert len(gate.orders.unknown) == UNKNOWN + 1
     assert gate.mode is PilotMode.STOP
-    for name in gate.unknown:
-        assert gate.reset(name)
-    assert (gate.mode, gate.top_speed_mps, gate.unknown) == (PilotMode.AUTO, 0.0, ())
-    gate.order("RM2", True, PilotMode.STOP, "")
-    assert not gate.reset("RM2")
+    for name in gate.orders.unknown:
+        assert gate.orders.reset(name)
+    assert (gate.mode, gate.top_speed_mps, gate.orders.unknown) == (PilotMode.AUTO, 0.0, ())
+    gate.order("RM2", m.PilotOrder(True, PilotMode.STOP, ""))
+    assert not gate.orders.reset("RM2")
 
 
 # -- the parts ----------------------------------------------------------------------------------

@@ -8,16 +8,15 @@ takes something to see: one that is held by a recovery on an empty runway is not
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
-from rampart.actors.osmosis.control.polyline import Array, Point, to_map
+from rampart.actors.osmosis.control.polyline import Array, Point, Pose2, to_map
 from rampart.actors.osmosis.messages import Blockage
 
 
-@dataclass(frozen=True, slots=True)
-class BlockageLimits:
+class BlockageLimits(msgspec.Struct, frozen=True):
     """When a robot counts as blocked.
 
     Args:
@@ -42,17 +41,15 @@ class BlockageWatch:
 
     def __init__(self, limits: BlockageLimits | None = None) -> None:
         self._limits = limits or BlockageLimits()
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew, for another route."""
         self._best_m = math.inf
         self._since_s: float | None = None
         self._place: Point | None = None
 
-    def restart(self) -> None:
-        """Begin anew, for another route."""
-        self._best_m, self._since_s, self._place = math.inf, None, None
-
-    def update(
-        self, to_go_m: float, pose: tuple[float, float, float], points: Array, now_s: float
-    ) -> Blockage | None:
+    def update(self, to_go_m: float, pose: Pose2, points: Array, now_s: float) -> Blockage | None:
         """Return what blocks the robot, or None.
 
         Args:
@@ -73,12 +70,8 @@ class BlockageWatch:
         return Blockage(*self._place, self._since_s)
 
 
-def nearest_ahead(
-    points: Array, pose: tuple[float, float, float], limits: BlockageLimits
-) -> Point | None:
+def nearest_ahead(points: Array, pose: Pose2, limits: BlockageLimits) -> Point | None:
     """Return the nearest echo ahead of the robot as a point in `map`, or None."""
-    if not len(points):
-        return None
     distance_m = np.hypot(points[:, 0], points[:, 1])
     ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) <= limits.half_angle_rad
     near = np.flatnonzero(ahead & (distance_m <= limits.reach_m))

@@ -52,14 +52,10 @@ class DeadReckoning:
 
     def odometry(self, stamp_s: float, pose: Pose2, now_s: float) -> None:
         """Take a pose in `odom`."""
-        way = self._way
-        if not is_possible(stamp_s, now_s) or not is_sane(*pose):
-            return
-        if not way:
-            way.append((stamp_s, pose, 0.0))
-        elif stamp_s > way[-1][0]:
-            _, (x_m, y_m, _), made_m = way[-1]
-            way.append((stamp_s, pose, made_m + math.hypot(pose[0] - x_m, pose[1] - y_m)))
+        last_s, last, made_m = self._way[-1] if self._way else (-math.inf, pose, 0.0)
+        if stamp_s > last_s and is_possible(stamp_s, now_s) and is_sane(*pose):
+            made_m += math.hypot(pose[0] - last[0], pose[1] - last[1])
+            self._way.append((stamp_s, pose, made_m))
 
     def estimate(self, now_s: float) -> Pose2 | None:
         """Return the pose in `map`, bridged if need be; None if it is not known any more."""
@@ -68,11 +64,10 @@ class DeadReckoning:
         way = self._way
         if not way or now_s - way[-1][0] > _ODOMETRY_FRESH_S:
             return None
-        start = self._start or self._find_start()
-        if start is None:
+        self._start = self._start or self._find_start()
+        if self._start is None:
             return None
-        self._start = start
-        _, (x0_m, y0_m, yaw0), made0_m = start
+        _, (x0_m, y0_m, yaw0), made0_m = self._start
         _, (x_m, y_m, yaw), made_m = way[-1]
         if made_m - made0_m > self.bridge_m:
             return None

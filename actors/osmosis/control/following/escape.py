@@ -11,7 +11,6 @@ is already on. If neither side is free within the corridor there is no way, and 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -19,8 +18,7 @@ import numpy as np
 from rampart.actors.osmosis.control.polyline import Array, Hull
 
 
-@dataclass(frozen=True, slots=True)
-class EscapeLimits:
+class EscapeLimits(msgspec.Struct, frozen=True):
     """Room for the escape, in metres.
 
     Args:
@@ -105,8 +103,7 @@ class Escape:
         ahead = echoes[:, 0] - s_m
         width = self._limits.max_deviation_m + self._hull.half_width_m + self._limits.clearance_m
         far_m = self._limits.range_m + self._limits.depth_m
-        keep = (ahead > -behind_m) & (ahead < far_m) & (np.abs(echoes[:, 1]) < width)
-        kept = echoes[keep]
+        kept = echoes[(ahead > -behind_m) & (ahead < far_m) & (np.abs(echoes[:, 1]) < width)]
         return np.asarray(kept[np.argsort(kept[:, 0], kind="stable")])
 
     def _with_bodies(self, near: Array, s_m: float, n_m: float) -> Array:
@@ -143,10 +140,8 @@ class Escape:
             self._until_m = -math.inf
             return 0.0, True
         ends = np.flatnonzero(np.diff(near[:, 0]) > self._limits.group_m) + 1
-        upto = next(
-            int(end) for end in (*ends, len(near)) if not self._is_free(near[:end], 0.0, keep_off_m)
-        )
-        group = near[:upto]
+        groups = (near[:end] for end in (*ends, len(near)))
+        group = next(part for part in groups if not self._is_free(part, 0.0, keep_off_m))
         first_m = float(group[np.abs(group[:, 1]) < keep_off_m, 0].min())
         if first_m > self._until_m + self._limits.group_m / 2:
             self.side = 0  # the obstacle that the side was chosen for is passed

@@ -17,9 +17,9 @@ import bisect
 import math
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
-from operator import attrgetter
+from operator import itemgetter
 
+import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.airport.model import Light
@@ -34,8 +34,7 @@ OUT_BELOW = 0.05
 """Ratio below which it is out."""
 
 
-@dataclass(frozen=True, slots=True)
-class InspectionLimits:
+class InspectionLimits(msgspec.Struct, frozen=True):
     """What a measurement needs.
 
     Args:
@@ -63,15 +62,7 @@ class InspectionLimits:
     keep_s: float = 120.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Pose:
-    stamp_s: float
-    x_m: float
-    y_m: float
-    yaw_rad: float
-
-
-_stamp_s = attrgetter("stamp_s")
+_stamp_s = itemgetter(0)
 
 
 def verdict(ratio: float) -> LightVerdict:
@@ -90,25 +81,21 @@ class LightInspection:
         judged: names of lights that have their measurement already.
     """
 
-    def __init__(
-        self,
-        lights: Iterable[Light],
-        limits: InspectionLimits | None = None,
-        judged: Iterable[str] = (),
-    ) -> None:
+    def __init__(self, lights: Iterable[Light], limits: InspectionLimits | None = None,
+                 judged: Iterable[str] = ()) -> None:
         self._lights = tuple(lights)
         self._limits = limits or InspectionLimits()
         self._places = np.array([(li.x_m, li.y_m) for li in self._lights]).reshape(-1, 2)
         self._x_m, self._y_m = np.ascontiguousarray(self._places.T)
         self.judged: set[str] = set(judged)
-        self._poses: deque[_Pose] = deque(maxlen=60)
+        self._poses: deque[tuple[float, float, float, float]] = deque(maxlen=60)
         self._waiting: deque[tuple[float, float]] = deque(maxlen=60)
         self._samples: dict[int, list[tuple[float, float, float, float]]] = {}
 
     def pose(self, stamp_s: float, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Take a pose of `base_link` in `map` and when it was true; older ones are ignored."""
-        if not self._poses or stamp_s > self._poses[-1].stamp_s:
-            self._poses.append(_Pose(stamp_s, x_m, y_m, yaw_rad))
+        if not self._poses or stamp_s > self._poses[-1][0]:
+            self._poses.append((stamp_s, x_m, y_m, yaw_rad))
 
     def sample(self, stamp_s: float, illuminance_lux: float) -> None:
         """Take a reading of the light sensor and when it was measured."""
@@ -123,10 +110,10 @@ class LightInspection:
                 by the full distance.
         """
         self._place_samples()
-        found = []
-        here = self._sensor_now()
-        if here is None:
-            return []
+        found: list[LightMeasurement] = []
+        if not self._poses:
+            return found
+        here = sensor_position(*self._poses[-1][1:])
         for index in list(self._samples):
             light = self._lights[index]
             distance_m = math.dist(here, (light.x_m, light.y_m))
@@ -141,22 +128,15 @@ class LightInspection:
             found.append(LightMeasurement(light.name, intensity_cd, ratio, verdict(ratio)))
         return found
 
-    def _sensor_now(self) -> Point | None:
-        if not self._poses:
-            return None
-        last = self._poses[-1]
-        return sensor_position(last.x_m, last.y_m, last.yaw_rad)
-
     def _place_samples(self) -> None:
         """Give each sample whose time is between two poses its place, and to the lights near."""
-        while self._waiting and self._poses and self._waiting[0][0] <= self._poses[-1].stamp_s:
+        while self._waiting and self._poses and self._waiting[0][0] <= self._poses[-1][0]:
             stamp_s, lux = self._waiting.popleft()
             place = self._sensor_at(stamp_s)
             if place is None or not self._lights:
                 continue
-            near = np.hypot(self._x_m - place[0], self._y_m - place[1]) <= (
-                self._limits.fit_radius_m)
-            for index in near.nonzero()[0] if np.count_nonzero(near) else ():
+            off_m = np.hypot(self._x_m - place[0], self._y_m - place[1])
+            for index in np.flatnonzero(off_m <= self._limits.fit_radius_m):
                 samples = self._samples.setdefault(int(index), [])
                 if samples and stamp_s - samples[0][0] > self._limits.keep_s:
                     samples.clear()
@@ -166,22 +146,16 @@ class LightInspection:
         after = bisect.bisect_left(self._poses, stamp_s, key=_stamp_s)
         if after >= len(self._poses):
             return None
-        b = self._poses[after]
-        if b.stamp_s == stamp_s:
-            return sensor_position(b.x_m, b.y_m, b.yaw_rad)
-        if after == 0:
+        b_s, bx, by, b_yaw = self._poses[after]
+        if b_s == stamp_s:
+            return sensor_position(bx, by, b_yaw)
+        a_s, ax, ay, a_yaw = self._poses[after - 1]
+        if after == 0 or b_s - a_s > self._limits.pose_gap_s:
             return None
-        a = self._poses[after - 1]
-        span_s = b.stamp_s - a.stamp_s
-        if span_s > self._limits.pose_gap_s:
-            return None
-        share = (stamp_s - a.stamp_s) / span_s
-        turn = math.remainder(b.yaw_rad - a.yaw_rad, math.tau)
-        return sensor_position(
-            a.x_m + share * (b.x_m - a.x_m),
-            a.y_m + share * (b.y_m - a.y_m),
-            a.yaw_rad + share * turn,
-        )
+        share = (stamp_s - a_s) / (b_s - a_s)
+        turn = math.remainder(b_yaw - a_yaw, math.tau)
+        return sensor_position(ax + share * (bx - ax), ay + share * (by - ay),
+                               a_yaw + share * turn)
 
     def _fit(self, index: int, samples: list[tuple[float, float, float, float]]) -> float | None:
         """Return the intensity in candela by least squares, or None if samples are missing."""
@@ -197,11 +171,8 @@ class LightInspection:
         order = np.argsort(ahead)
         near = np.abs(ahead) < limits.span_m
         gaps = np.diff(ahead[order])
-        if ahead.min() > -limits.span_m or ahead.max() < limits.span_m:
-            return None
-        if not near.any() or float(aside[near].min()) > limits.aside_m:
-            return None
-        if float(gaps.max()) > limits.largest_gap_m:
+        if ahead.min() > -limits.span_m or ahead.max() < limits.span_m or not near.any() \
+                or aside[near].min() > limits.aside_m or gaps.max() > limits.largest_gap_m:
             return None
         others = np.hypot(*(self._places - self._places[index]).T) <= limits.neighbour_m
         others[index] = False

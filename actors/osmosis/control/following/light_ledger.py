@@ -24,12 +24,17 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from rampart.actors.osmosis.airport.model import Light
 from rampart.actors.osmosis.airport.photometry import SENSOR_FORWARD_M
-from rampart.actors.osmosis.control.following.light_inspection import InspectionLimits
+from rampart.actors.osmosis.control.following import light_inspection
+from rampart.actors.osmosis.control.following.light_row import LightRow
 from rampart.actors.osmosis.control.polyline import Polyline
-from rampart.actors.osmosis.messages import LightMeasurement, MissionStatus
+from rampart.actors.osmosis.messages import LightMeasurement, MissionStatus, Mode, Route
+
+_OVER_M = 0.5
+"""A light this near to the row's line is one of the row."""
 
 RESEND_S = 0.5
 """A measurement that the Mission Manager does not show is sent again after so long."""
@@ -66,12 +71,11 @@ class LightLedger:
 
     Args:
         lights: of the airport.
-        limits: those of the inspection.
     """
 
-    def __init__(self, lights: Sequence[Light], limits: InspectionLimits | None = None) -> None:
+    def __init__(self, lights: Sequence[Light]) -> None:
         self._lights = tuple(lights)
-        self._limits = limits or InspectionLimits()
+        self._limits = light_inspection.InspectionLimits()
         self._places = np.array([(li.x_m, li.y_m) for li in self._lights]).reshape(-1, 2)
         self._names = frozenset(light.name for light in self._lights)
         self._sent_s: dict[str, float] = {}
@@ -100,8 +104,7 @@ class LightLedger:
         """Take a measurement that is about to be sent; return whether the light had none."""
         if found.light in self.judged:
             return False
-        self.kept = msgspec.structs.replace(
-            self.kept, measured=(*self.kept.measured, found), blind=False)
+        self.kept = replace(self.kept, measured=(*self.kept.measured, found), blind=False)
         self._sent_s[found.light] = now
         return True
 
@@ -122,8 +125,6 @@ class LightLedger:
 
     def on_row(self, line: Polyline) -> tuple[tuple[float, str], ...]:
         """Return the lights that a row passes over, each with its arc length, in order."""
-        if not len(self._places):
-            return ()
         feet = line.coordinates(self._places, 0.0, line.length_m)
         return tuple(sorted(
             (float(s), light.name) for (s, n), light in zip(feet, self._lights, strict=True)
@@ -135,7 +136,7 @@ class LightLedger:
         out = tuple(name for at_m, name in row if abs(at_m - sensor_m) <= self._limits.fit_radius_m
                     and name not in self.judged and name not in self.kept.given_up)
         if out:
-            self.kept = msgspec.structs.replace(self.kept, given_up=(*self.kept.given_up, *out))
+            self.kept = replace(self.kept, given_up=(*self.kept.given_up, *out))
 
     def is_complete(self, row: Iterable[tuple[float, str]]) -> bool:
         """Whether every light of a row is measured, or given up."""
@@ -160,7 +161,7 @@ class LightLedger:
             if at_m > passed_m or name in judged or name in self.kept.given_up:
                 continue
             if self.kept.blind or name == self._gone_back_for:
-                self.kept = msgspec.structs.replace(
+                self.kept = replace(
                     self.kept, given_up=(*self.kept.given_up, name), blind=True)
                 continue
             self._gone_back_for = name
@@ -168,3 +169,91 @@ class LightLedger:
             to_s_m = at_m - limits.fit_radius_m - SENSOR_FORWARD_M - ROOM_M
             return Detour(name, max(to_s_m, 0.0))
         return None
+
+
+class RowInspection:
+    """Holds inspection and ledger to the row that is driven; one mission at a time.
+
+    Args:
+        lights: of the airport.
+        goes_back: whether the robot drives back for a light that it has missed.
+
+    Attributes:
+        inspection: measures.
+        ledger: who knows of which measurement.
+        is_incomplete: the row's end is reached and a light of it is neither measured nor given up.
+    """
+
+    def __init__(self, lights: tuple[Light, ...], *, goes_back: bool) -> None:
+        self._lights = lights
+        self._goes_back = goes_back
+        self.inspection = light_inspection.LightInspection(lights)
+        self._mission_id: str | None = None
+        self._goal: tuple[str, int, Mode] | None = None
+        self._due: dict[str, None] = {}
+        self._row: tuple[tuple[float, str], ...] = ()
+        self.ledger = LightLedger(lights)
+        self.is_incomplete = False
+
+    def hear(self, status: MissionStatus) -> None:
+        """Take note of which lights the Mission Manager has, to go back for none of them."""
+        if self._goes_back:
+            self.ledger.hear(status)
+            self.inspection.judged |= self.ledger.judged
+
+    def begin(self, route: Route, row: LightRow | None) -> None:
+        """Take note of another route, and of the row along it that is driven now, if one is."""
+        if route.mission_id != self._mission_id:
+            self._mission_id = route.mission_id
+            self.ledger.begin(route.mission_id)
+            self.inspection = light_inspection.LightInspection(
+                self._lights, judged=self.ledger.judged)
+        goal = (*route.which, route.mode)
+        if goal != self._goal:
+            self._goal, self._due = goal, {}
+        if route.mode is Mode.LIGHT_VERIFICATION and route.waypoints:
+            line = Polyline(route.waypoints)
+            feet = {light.name: line.project(light.x_m, light.y_m) for light in self._lights}
+            self._due |= dict.fromkeys(
+                name for name, foot in feet.items()
+                if 0.0 < foot.s_m < line.length_m and abs(foot.n_m) <= _OVER_M)
+        if row is not None:
+            self._row = self.ledger.on_row(row.line)
+
+    def measure(self, now_s: float, *, arrived: bool) -> list[LightMeasurement]:
+        """Return the new measurements; once each, to be kept before they are sent."""
+        return [found for found in self.inspection.take(ended=arrived)
+                if self.ledger.add(found, now_s)]
+
+    def look_back(self, row: LightRow, *, arrived: bool) -> str:
+        """Send the robot back for a light that it passed without a measurement.
+
+        Args:
+            row: what it follows.
+            arrived: it is at the row's end, and about to leave it.
+
+        Returns:
+            The light's name if it turns round now, or "".
+        """
+        self.is_incomplete = False
+        s_m = row.progress_m
+        if not self._goes_back or s_m is None or row.back_to is not None:
+            return ""
+        if row.is_off_course:
+            self.ledger.leave_out(self._row, s_m)
+            return ""
+        detour = self.ledger.detour(self._row, s_m, ended=arrived)
+        if detour is not None:
+            row.go_back(detour.to_s_m)
+        # Without a word from the Mission Manager it is not known whether a light is missing.
+        self.is_incomplete = arrived and not self.ledger.is_complete(self._row)
+        return detour.light if detour is not None else ""
+
+    def to_send_again(self, now_s: float) -> list[LightMeasurement]:
+        """Return what the Mission Manager should have and does not show."""
+        return self.ledger.to_send_again(now_s) if self._goes_back else []
+
+    @property
+    def missed(self) -> tuple[str, ...]:
+        """The lights along all ways to this goal that were not measured."""
+        return tuple(name for name in self._due if name not in self.inspection.judged)

@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from rampart.actors.osmosis.control.following.escape import EscapeLimits
 from rampart.actors.osmosis.control.following.path_follower import (
@@ -26,12 +27,12 @@ from rampart.actors.osmosis.control.following.path_follower import (
     Motion,
     MotionLimits,
     PathFollower,
-    braking_speed,
 )
 from rampart.actors.osmosis.control.polyline import (
     Array,
     Hull,
     Point,
+    Pose2,
     Projection,
     to_map,
     wrap_angle,
@@ -42,8 +43,7 @@ _TURNS_RADPS = 0.3
 _BEHIND_RAD = 2.8
 
 
-@dataclass(frozen=True, slots=True)
-class RowLimits:
+class RowLimits(Struct, frozen=True):
     """How a row is followed.
 
     Args:
@@ -89,16 +89,10 @@ class LightRow(Follower):
         near_s_m: arc length at which the robot was last known to be, for one that resumes.
     """
 
-    def __init__(
-        self,
-        waypoints: tuple[Point, ...],
-        hull: Hull | None = None,
-        motion: MotionLimits | None = None,
-        limits: RowLimits | None = None,
-        edge_m: Callable[[float, float], float] | None = None,
-        *,
-        near_s_m: float | None = None,
-    ) -> None:
+    def __init__(self, waypoints: tuple[Point, ...], hull: Hull | None = None,
+                 motion: MotionLimits | None = None, limits: RowLimits | None = None,
+                 edge_m: Callable[[float, float], float] | None = None, *,
+                 near_s_m: float | None = None) -> None:
         super().__init__(waypoints, hull, motion, near_s_m)
         self._limits = limits or RowLimits()
         self._free_for_s = math.inf
@@ -162,27 +156,26 @@ class LightRow(Follower):
                 return Motion(back.linear_mps, back.angular_radps, False, back.waiting,
                               foot.segment, to_go_m)
             self._back = None
-        if self._arrived or (
-                to_go_m <= limits.overrun_m and abs(foot.n_m) <= limits.goal_reach_m):
+        if self._arrived or (to_go_m <= limits.overrun_m and abs(foot.n_m) <= limits.goal_reach_m):
             return self._arrive()
         if self._passing is not None:
             return self._pass(self._passing, (x_m, y_m, yaw_rad), foot, points, dt_s)
 
-        braking = self._motion.deceleration_mps2
         cruise = min(limits.speed_mps, self._motion.max_linear_mps)
         free_m = self._free(x_m, y_m, yaw_rad, points, foot.s_m)
-        allowed = braking_speed(free_m - limits.stop_distance_m, braking)
+        allowed = self._motion.braking_speed(free_m - limits.stop_distance_m)
         self._free_for_s = self._free_for_s + dt_s if allowed >= cruise else 0.0
         if self._free_for_s < limits.clear_s:
             allowed = min(allowed, self._ramp.last[0])  # an echo that comes and goes is there
         waiting = allowed == 0.0
-        bearing = self._bearing(x_m, y_m, yaw_rad, foot.s_m)
+        x_to, y_to = line.point_at(foot.s_m + limits.lookahead_m)
+        bearing = wrap_angle(math.atan2(y_to - y_m, x_to - x_m) - yaw_rad)
         if abs(bearing) > _BEHIND_RAD:  # either way round is as short: do not waver between them
             turning = self._ramp.last[1]
             bearing = math.copysign(bearing, turning if abs(turning) > _TURNS_RADPS else 1.0)
         speed = 0.0
         if abs(bearing) < self._motion.turn_in_place_rad:
-            approach = max(braking_speed(to_go_m, braking), 0.15)
+            approach = max(self._motion.braking_speed(to_go_m), 0.15)
             speed = min(cruise * math.cos(bearing) ** 2, approach, allowed)
         turn = 0.0 if waiting else self._motion.heading_gain_per_s * bearing
         linear, angular = self._ramp.towards(speed, turn, dt_s)
@@ -207,10 +200,8 @@ class LightRow(Follower):
                 self.line.points, self._hull, self._motion,
                 escape=replace(usual, max_deviation_m=min(usual.max_deviation_m, room_m)))
 
-    def _pass(
-        self, follower: PathFollower, pose: tuple[float, float, float], foot: Projection,
-        points: Array, dt_s: float,
-    ) -> Motion:
+    def _pass(self, follower: PathFollower, pose: Pose2, foot: Projection, points: Array,
+              dt_s: float) -> Motion:
         """Drive round, and hand back when on the row again with nothing in the way."""
         motion = follower.step(*pose, points, dt_s)
         self._ramp.last = (motion.linear_mps, motion.angular_radps)
@@ -224,23 +215,11 @@ class LightRow(Follower):
             self._free_for_s = math.inf if back else 0.0
         return motion
 
-    def _bearing(self, x_m: float, y_m: float, yaw_rad: float, s_m: float) -> float:
-        x_to, y_to = self.line.point_at(s_m + self._limits.lookahead_m)
-        return wrap_angle(math.atan2(y_to - y_m, x_to - x_m) - yaw_rad)
-
-    def _free(
-        self, x_m: float, y_m: float, yaw_rad: float, points: Array, s_m: float
-    ) -> float:
+    def _free(self, x_m: float, y_m: float, yaw_rad: float, points: Array, s_m: float) -> float:
         """Free distance ahead of the hull in the lane along the row; infinite if all is free."""
-        if len(points) == 0:
-            return math.inf
         reach_m = 2.0 * self._limits.stop_distance_m + 4.0
-        echoes = self.line.coordinates(
-            to_map(points, x_m, y_m, yaw_rad), s_m - 1.0, s_m + reach_m
-        )
+        echoes = self.line.coordinates(to_map(points, x_m, y_m, yaw_rad), s_m - 1.0, s_m + reach_m)
         half_m = self._hull.half_width_m + self._limits.lane_margin_m
         lane = (np.abs(echoes[:, 1]) < half_m) & (echoes[:, 0] > s_m)
         ahead = echoes[lane, 0]
-        if not len(ahead):
-            return math.inf
-        return float(ahead.min()) - s_m - self._hull.half_length_m
+        return float(ahead.min()) - s_m - self._hull.half_length_m if len(ahead) else math.inf

@@ -22,11 +22,11 @@ gains little and wears its tyres; the mission takes longer instead.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class LoopLimits:
+class LoopLimits(msgspec.Struct, frozen=True):
     """How the loop behaves.
 
     Args:

@@ -9,26 +9,20 @@ import math
 from typing import Any, ClassVar
 
 from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.control.following.control_checkpoint import CONTROL_STATE
 from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
+from rampart.actors.osmosis.control.following.light_ledger import RowInspection
 from rampart.actors.osmosis.control.following.light_row import RowLimits
 from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
-from rampart.actors.osmosis.control.following.route_control import PERIOD_S, RouteControl
-from rampart.actors.osmosis.control.following.row_inspection import RowInspection
-from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER
-from rampart.actors.osmosis.messages import (
-    GoalOrder,
-    LaserScan,
-    LightSample,
-    MissionStatus,
-    Odometry,
-    Pose,
-    Route,
-    Twist,
+from rampart.actors.osmosis.control.following.route_control import (
+    CONTROL_STATE,
+    PERIOD_S,
+    RouteControl,
 )
+from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.manager.spec.tables import NonNegative
 
@@ -63,7 +57,7 @@ class OsmosisControl(Actor):
 
     parameters: Parameters
 
-    command_topic: ClassVar[Topic[Twist]] = topics.COMMAND
+    command_topic: ClassVar[Topic[m.Twist]] = topics.COMMAND
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
         topics.COMMAND, topics.CONTROL_STATUS, topics.LIGHT_MEASURED)
 
@@ -71,7 +65,6 @@ class OsmosisControl(Actor):
         super().__init__(context)
         system, airport = context.run.system, Osmosis.of(context).airport
         parameters = self.parameters
-        self._bridges = parameters.bridge_m > 0
         self._lights = RowInspection(airport.lights, goes_back=system.layers.checkpoints) \
             if topics.LIGHT_MEASURED in self.outputs else None
         self.core = RouteControl(
@@ -79,65 +72,63 @@ class OsmosisControl(Actor):
             RowLimits(pass_after_s=parameters.pass_after_s or math.inf),
             lights=self._lights,
             check=RouteCheck(airport) if parameters.check_route else None,
-            bridge=DeadReckoning(parameters.bridge_m) if self._bridges else None,
-            loop=MotionLoop(system.robot.top_turn_rate_radps)
-            if parameters.yaw_loop else None,
+            bridge=DeadReckoning(parameters.bridge_m) if parameters.bridge_m else None,
+            loop=MotionLoop(system.robot.top_turn_rate_radps) if parameters.yaw_loop else None,
             has_standby=parameters.has_standby)
 
     def listens(self, topic: Topic[Any]) -> bool:
         """Whether it hears a topic: the base publishes odometry only if somebody does."""
-        return self._bridges or topic is not topics.ODOMETRY
+        return self.parameters.bridge_m > 0 or topic is not topics.ODOMETRY
 
     def on_start(self) -> None:
         """Find out what was measured; the robot goes on when the route is there."""
-        kept = self.kept(CONTROL_STATE)
-        if kept is not None:
+        if (kept := self.kept(CONTROL_STATE)) is not None:
             self.core.restore(kept)
 
     @on(topics.MISSION_STATUS)
-    def mission(self, message: MissionStatus, _header: Header) -> None:
+    def mission(self, message: m.MissionStatus, _header: Header) -> None:
         """Hear which lights the Mission Manager has."""
         if self._lights:
             self._lights.hear(message)
 
     @on(topics.POSE)
-    def pose(self, message: Pose, header: Header) -> None:
+    def pose(self, message: m.Pose, header: Header) -> None:
         """Take a pose."""
         self.core.pose(message, header.stamp, self.clock.now())
         self._begin()
 
     @on(topics.SCAN)
-    def scan(self, message: LaserScan, header: Header) -> None:
+    def scan(self, message: m.LaserScan, header: Header) -> None:
         """See."""
         self.core.scan(LOWER, message, header.stamp, self.clock.now())
         self._begin()
 
     @on(topics.UPPER_SCAN)
-    def upper_scan(self, message: LaserScan, header: Header) -> None:
+    def upper_scan(self, message: m.LaserScan, header: Header) -> None:
         """See with the second laser, on a robot that has one."""
         self.core.scan(UPPER, message, header.stamp, self.clock.now())
         self._begin()
 
     @on(topics.LIGHT)
-    def light(self, message: LightSample, header: Header) -> None:
+    def light(self, message: m.LightSample, header: Header) -> None:
         """Take a reading of the light sensor."""
         if self._lights:
-            self._lights.sample(header.stamp, message.illuminance_lux)
+            self._lights.inspection.sample(header.stamp, message.illuminance_lux)
 
     @on(topics.GOAL)
-    def goal(self, message: GoalOrder, _header: Header) -> None:
+    def goal(self, message: m.GoalOrder, _header: Header) -> None:
         """Take the goal."""
         if self.core.goal(message):
             self._set_out()
 
     @on(topics.ROUTE)
-    def route(self, message: Route, _header: Header) -> None:
+    def route(self, message: m.Route, _header: Header) -> None:
         """Take a route."""
         if self.core.route(message):
             self._set_out()
 
     @on(topics.ODOMETRY)
-    def odometry(self, message: Odometry, header: Header) -> None:
+    def odometry(self, message: m.Odometry, header: Header) -> None:
         """Take the way that the wheels make."""
         self.core.odometry(message, header.stamp, self.clock.now())
 
@@ -152,8 +143,7 @@ class OsmosisControl(Actor):
     @every(0.5)
     def _remember(self) -> None:
         """Keep what a successor needs; before what follows from it is sent."""
-        kept = self.core.kept
-        if kept is not None:
+        if (kept := self.core.kept) is not None:
             self.keep(CONTROL_STATE, kept)
 
     @every(PERIOD_S)

@@ -10,7 +10,6 @@ against it (heading error, curves, obstacles, the goal), and changes within acce
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -29,8 +28,7 @@ from rampart.actors.osmosis.control.polyline import (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class MotionLimits:
+class MotionLimits(msgspec.Struct, frozen=True):
     """What the robot is asked at most, and how it follows.
 
     Args:
@@ -60,6 +58,10 @@ class MotionLimits:
     abeam_m: float = 1.1
     obstacle_stop_m: float = 0.3
 
+    def braking_speed(self, distance_m: float) -> float:
+        """Speed from which the robot stops within a distance; 0 for none left."""
+        return math.sqrt(2.0 * self.deceleration_mps2 * max(distance_m, 0.0))
+
 
 class Motion(msgspec.Struct, frozen=True, gc=False):
     """Result of one control step: the command, and how far the robot is.
@@ -82,8 +84,7 @@ STANDSTILL = (0.0, 0.0)
 """The command of a robot that stands."""
 
 
-@dataclass(slots=True)
-class Ramp:
+class Ramp(msgspec.Struct):
     """Acceleration limits on a command: remembers the last one."""
 
     limits: MotionLimits
@@ -106,11 +107,6 @@ def free_ahead(points: Array, hull: Hull, margin_m: float) -> float:
     lane = (np.abs(points[:, 1]) < hull.half_width_m + margin_m) & (points[:, 0] > 0.0)
     ahead = points[lane, 0]
     return float(ahead.min()) - hull.half_length_m if len(ahead) else math.inf
-
-
-def braking_speed(distance_m: float, deceleration_mps2: float) -> float:
-    """Speed from which the robot stops within a distance; 0 for none left."""
-    return math.sqrt(2.0 * deceleration_mps2 * max(distance_m, 0.0))
 
 
 class Follower:
@@ -170,16 +166,9 @@ class PathFollower(Follower):
         near_s_m: arc length at which the robot was last known to be, for one that resumes.
     """
 
-    def __init__(
-        self,
-        waypoints: tuple[Point, ...],
-        hull: Hull | None = None,
-        limits: MotionLimits | None = None,
-        gains: FieldGains | None = None,
-        escape: EscapeLimits | None = None,
-        *,
-        near_s_m: float | None = None,
-    ) -> None:
+    def __init__(self, waypoints: tuple[Point, ...], hull: Hull | None = None,
+                 limits: MotionLimits | None = None, gains: FieldGains | None = None,
+                 escape: EscapeLimits | None = None, *, near_s_m: float | None = None) -> None:
         super().__init__(waypoints, hull, limits, near_s_m)
         self._gains = gains or FieldGains()
         self._room = escape or EscapeLimits()
@@ -195,9 +184,7 @@ class PathFollower(Follower):
         if self._escape.side == 0:
             self._escape.offset_m = aside_m
 
-    def step(
-        self, x_m: float, y_m: float, yaw_rad: float, points: Array, dt_s: float
-    ) -> Motion:
+    def step(self, x_m: float, y_m: float, yaw_rad: float, points: Array, dt_s: float) -> Motion:
         """Return the command for now.
 
         Args:
@@ -216,9 +203,7 @@ class PathFollower(Follower):
         if self._arrived or passed or (last_leg and direct_m <= limits.arrival_radius_m):
             return self._arrive()
 
-        echoes = line.coordinates(
-            to_map(points, x_m, y_m, yaw_rad), foot.s_m - 2.0, foot.s_m + 5.0
-        )
+        echoes = line.coordinates(to_map(points, x_m, y_m, yaw_rad), foot.s_m - 2.0, foot.s_m + 5.0)
         way = self._escape.update(echoes, foot.s_m, foot.n_m)
         bearing = self._bearing((x_m, y_m, yaw_rad), foot, way, points)
         speed = self._speed(bearing, foot.s_m, direct_m, points) if way.possible else 0.0
@@ -269,22 +254,17 @@ class PathFollower(Follower):
         limits = self._motion
         if abs(bearing) > limits.turn_in_place_rad:
             return 0.0
-        top, braking = limits.max_linear_mps, limits.deceleration_mps2
-        curve = abs(wrap_angle(
-            self.line.heading_at(min(s_m + 1.2 * limits.lookahead_m, self.line.length_m))
-            - self.line.heading_at(s_m)
-        ))
+        top, line = limits.max_linear_mps, self.line
+        ahead_m = min(s_m + 1.2 * limits.lookahead_m, line.length_m)
+        curve = abs(wrap_angle(line.heading_at(ahead_m) - line.heading_at(s_m)))
         speeds = [
             top * math.cos(bearing) ** 2,
             top * max(math.cos(min(curve, math.pi) / 2) ** 2, 0.35),
-            max(braking_speed(direct_m - limits.arrival_radius_m / 2, braking), 0.2),
-        ]
-        if not len(points):
-            return min(speeds)
+            max(limits.braking_speed(direct_m - limits.arrival_radius_m / 2), 0.2)]
         ahead = points[points[:, 0] > -self._hull.half_length_m]
         if len(ahead):
             nearest_m = float(self._hull.distance(ahead).min())
             free_m = free_ahead(points, self._hull, 0.08)
             speeds.append(max(0.35, 0.35 + 0.8 * (nearest_m - 0.2)))
-            speeds.append(braking_speed(free_m - limits.obstacle_stop_m, braking))
+            speeds.append(limits.braking_speed(free_m - limits.obstacle_stop_m))
         return min(speeds)

@@ -13,15 +13,17 @@ side, and stays there. What is left to the field is the last half metre, for whi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.control.polyline import Array, Hull
 
+_NEAR_M = 0.1
+"""Nearer than this to the target the attraction fades."""
 
-@dataclass(frozen=True, slots=True)
-class FieldGains:
+
+class FieldGains(msgspec.Struct, frozen=True):
     """Shape of the field.
 
     Args:
@@ -40,16 +42,8 @@ class FieldGains:
 
 def clusters(points: Array, gap_m: float = 0.5) -> list[Array]:
     """Split echoes, in the order of the sweep, into obstacles wherever neighbours are apart."""
-    if len(points) == 0:
-        return []
     steps = np.hypot(*np.diff(points, axis=0).T)
     return np.split(points, np.flatnonzero(steps > gap_m) + 1)
-
-
-def attraction(target_x_m: float, target_y_m: float, near_m: float = 0.1) -> tuple[float, float]:
-    """Unit vector to the target, shrinking linearly within `near_m` (paper's conic-quadratic)."""
-    scale = max(math.hypot(target_x_m, target_y_m), near_m)
-    return target_x_m / scale, target_y_m / scale
 
 
 def repulsion(points: Array, hull: Hull, gains: FieldGains) -> tuple[float, float]:
@@ -78,9 +72,8 @@ def repulsion(points: Array, hull: Hull, gains: FieldGains) -> tuple[float, floa
     return push_x, push_y
 
 
-def field(
-    target_x_m: float, target_y_m: float, points: Array, hull: Hull, gains: FieldGains
-) -> tuple[float, float]:
+def field(target_x_m: float, target_y_m: float, points: Array, hull: Hull,
+          gains: FieldGains) -> tuple[float, float]:
     """Return the field's vector at the robot, in `base_link`; its direction is where to go.
 
     Args:
@@ -90,7 +83,9 @@ def field(
         hull: footprint of the robot.
         gains: shape of the field.
     """
-    pull_x, pull_y = attraction(target_x_m, target_y_m)
+    # A unit vector to the target, shrinking linearly near it (paper's conic-quadratic).
+    scale = max(math.hypot(target_x_m, target_y_m), _NEAR_M)
+    pull_x, pull_y = target_x_m / scale, target_y_m / scale
     push_x, push_y = repulsion(points, hull, gains)
     pull = math.hypot(pull_x, pull_y)
     if pull < 1e-9:

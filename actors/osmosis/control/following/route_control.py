@@ -3,6 +3,10 @@
 The core of Osmosis Control and of its standby. It takes messages and the time, and gives commands,
 measurements and the status; no bus, no clock. What a system wants beyond the paper's is a part that
 it is given or not: a check of routes, dead reckoning, a loop on the turn rate, the lights.
+
+What is kept of it: the lights, which must not be forgotten, and the route with the progress along
+it. The Graph Planner repeats the route; but it tells a route that is resumed from another one, and
+where the row of lights began that a new route may join in the middle.
 """
 
 from __future__ import annotations
@@ -14,32 +18,19 @@ import msgspec
 
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.plausible import is_sane
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.control.following.blockage import BlockageWatch
-from rampart.actors.osmosis.control.following.control_checkpoint import ControlKept, whole_row
 from rampart.actors.osmosis.control.following.dead_reckoning import DeadReckoning
-from rampart.actors.osmosis.control.following.light_ledger import LightsKept
+from rampart.actors.osmosis.control.following.light_ledger import LightsKept, RowInspection
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
 from rampart.actors.osmosis.control.following.motion_loop import MotionLoop
 from rampart.actors.osmosis.control.following.path_follower import Motion, PathFollower
-from rampart.actors.osmosis.control.following.row_inspection import RowInspection
 from rampart.actors.osmosis.control.limits_from_spec import hull_of, motion_of, reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LaserPair
-from rampart.actors.osmosis.control.polyline import Array, Pose2
-from rampart.actors.osmosis.messages import (
-    Blockage,
-    ControlPhase,
-    ControlStatus,
-    GoalOrder,
-    LaserScan,
-    LightMeasurement,
-    Mode,
-    Odometry,
-    Pose,
-    Route,
-    Twist,
-)
+from rampart.actors.osmosis.control.polyline import Array, Point, Polyline, Pose2
+from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.manager.spec.schema import SystemSpec
 
 PERIOD_S = 0.05
@@ -48,6 +39,55 @@ _ASIDE_M = 0.1
 """A step of the way aside by this much is told at once, where a standby has to know."""
 _ACTIVE_SILENT_S = 0.6
 """After so long without a status, three periods, the standby is the one in the loop."""
+JOIN_M = 0.5
+"""A row is prolonged to where it began if that lies within this distance of its straight line."""
+
+
+class ControlKept(msgspec.Struct, frozen=True):
+    """State of Osmosis Control.
+
+    Attributes:
+        lights: of the mission.
+        route: the one being followed.
+        progress_m: arc length along it; None before the first step.
+        row_start: first waypoint of the first route to the present goal, in `map`.
+    """
+
+    lights: LightsKept = LightsKept()
+    route: m.Route | None = None
+    progress_m: float | None = None
+    row_start: tuple[float, float] | None = None
+
+
+def _objection(kept: ControlKept) -> str:
+    names = [light.light for light in kept.lights.measured]
+    if len(set(names)) < len(names):
+        return "a light is measured twice"
+    waypoints = kept.route.waypoints if kept.route else ()
+    numbers = [*(v for point in waypoints for v in point), *(kept.row_start or ()),
+               kept.progress_m or 0.0, *(light.ratio for light in kept.lights.measured)]
+    if not all(map(math.isfinite, numbers)):
+        return "a number is not finite"
+    if kept.route and kept.lights.mission_id != kept.route.mission_id:
+        return (f"lights of mission {kept.lights.mission_id!r}, "
+                f"route of {kept.route.mission_id!r}")
+    return ""
+
+
+CONTROL_STATE = StateFormat(ControlKept, version=1, objection=_objection)
+
+
+def whole_row(row_start: Point | None, waypoints: tuple[Point, ...]) -> tuple[Point, ...]:
+    """Return a row from where it began, if the route joins it further on; else the route."""
+    if row_start is None or len(waypoints) < 2:
+        return waypoints
+    line = Polyline(waypoints)
+    foot = line.project(*row_start)
+    (x_m, y_m), heading = waypoints[0], line.heading_at(0.0)
+    behind_m = math.cos(heading) * (x_m - row_start[0]) + math.sin(heading) * (y_m - row_start[1])
+    aside_m = math.cos(heading) * (y_m - row_start[1]) - math.sin(heading) * (x_m - row_start[0])
+    joins = foot.s_m < 1e-6 and behind_m > 0.0 and abs(aside_m) <= JOIN_M
+    return (row_start, *waypoints) if joins else waypoints
 
 
 class RouteControl:
@@ -88,18 +128,18 @@ class RouteControl:
         self._watch = BlockageWatch()
         self._pose: Pose2 | None = None
         self._points: Array | None = None
-        self._goal: GoalOrder | None = None
-        self._route: Route | None = None
-        self._refused: Route | None = None
+        self._goal: m.GoalOrder | None = None
+        self._route: m.Route | None = None
+        self._refused: m.Route | None = None
         self._why_refused = ""
         self._follower: PathFollower | LightRow | None = None
         self._motion: Motion | None = None
-        self._blocked: Blockage | None = None
+        self._blocked: m.Blockage | None = None
         self._row_start: tuple[float, float] | None = None
         self._last = ControlKept()
         self._stepped_s = now_s
         self._begun = False
-        self.status = ControlStatus("", 0, ControlPhase.IDLE, 0, 0.0)
+        self.status = m.ControlStatus("", 0, m.ControlPhase.IDLE, 0, 0.0)
 
     # -- what survives a restart ----------------------------------------------------------------
 
@@ -121,7 +161,7 @@ class RouteControl:
 
     # -- what it hears --------------------------------------------------------------------------
 
-    def pose(self, pose: Pose, stamp_s: float, now_s: float) -> None:
+    def pose(self, pose: m.Pose, stamp_s: float, now_s: float) -> None:
         """Take a pose in `map`."""
         place = (pose.x_m, pose.y_m, pose.yaw_rad)
         if self._bridge:
@@ -130,23 +170,23 @@ class RouteControl:
             return
         self._pose = place
         if self._lights:
-            self._lights.pose(stamp_s, *place)
+            self._lights.inspection.pose(stamp_s, *place)
         if self._loop:
             self._loop.pose(stamp_s, *place)
 
-    def odometry(self, odometry: Odometry, stamp_s: float, now_s: float) -> None:
+    def odometry(self, odometry: m.Odometry, stamp_s: float, now_s: float) -> None:
         """Take the way that the wheels make."""
         pose = odometry.pose
         if self._bridge:
             self._bridge.odometry(stamp_s, (pose.x_m, pose.y_m, pose.yaw_rad), now_s)
 
-    def scan(self, laser: int, sweep: LaserScan, stamp_s: float, now_s: float) -> None:
+    def scan(self, laser: int, sweep: m.LaserScan, stamp_s: float, now_s: float) -> None:
         """Take a sweep of one laser."""
         view = self._lasers.take(laser, sweep, stamp_s, now_s)
         if view is not None and not view.fault:  # the Safety Pilot stops who sees nothing
             self._points = view.points
 
-    def goal(self, order: GoalOrder) -> bool:
+    def goal(self, order: m.GoalOrder) -> bool:
         """Take the goal, to check the route's end by; a route refused for it is looked at again.
 
         Returns:
@@ -157,7 +197,7 @@ class RouteControl:
         self._goal = order
         return self._refused is not None and self.route(self._refused)
 
-    def route(self, route: Route) -> bool:
+    def route(self, route: m.Route) -> bool:
         """Take a route; the follower finds its place on it by itself.
 
         Returns:
@@ -194,38 +234,36 @@ class RouteControl:
         self._last = ControlKept()
         return True
 
-    def _follower_of(self, route: Route) -> PathFollower | LightRow | None:
+    def _follower_of(self, route: m.Route) -> PathFollower | LightRow | None:
         if not route.active or not route.waypoints:
             return None
         resumed_at_m = self._last.progress_m if route == self._last.route else None
-        if route.mode is Mode.TAXI:
+        if route.mode is m.Mode.TAXI:
             return PathFollower(route.waypoints, self._hull, self._limits, near_s_m=resumed_at_m)
         waypoints = whole_row(self._row_start, route.waypoints) if self._resumes \
             else route.waypoints
         return LightRow(waypoints, self._hull, self._limits, self._row,
                         self._airport.prohibited_distance_m, near_s_m=resumed_at_m)
 
-    def _fault_of(self, route: Route) -> str:
+    def _fault_of(self, route: m.Route) -> str:
         """Return why a route must not be followed, or ""."""
         if self._check is None or not route.active or not route.waypoints:
             return ""
         pose, order = self._pose, self._goal
-        known = order is not None and order.active and (
-            (order.mission_id, order.step) == (route.mission_id, route.step))
-        return self._check.fault(
-            route.waypoints, pose[:2] if pose else None,
-            (order.goal.x_m, order.goal.y_m) if known and order else None)
+        known = order is not None and order.active and order.which == route.which
+        return self._check.fault(route.waypoints, pose[:2] if pose else None,
+                                 (order.goal.x_m, order.goal.y_m) if known and order else None)
 
-    def adopt(self, active: ControlStatus, stamp_s: float) -> None:
+    def adopt(self, active: m.ControlStatus, stamp_s: float) -> None:
         """Do as the active one does, by its status of `stamp_s`."""
         if self._loop and math.isfinite(active.turn_added_radps):
             self._loop.adopt(active.turn_added_radps, stamp_s + _ACTIVE_SILENT_S)
         route, follower = self._route, self._follower
-        if route is None or (route.mission_id, route.step) != (active.mission_id, active.step):
+        if route is None or route.which != active.which:
             return
         if isinstance(follower, LightRow):
             follower.adopt(active.back_to[0] if active.back_to else None, passing=active.passing)
-        elif isinstance(follower, PathFollower) and active.phase is ControlPhase.FOLLOWING:
+        elif isinstance(follower, PathFollower) and active.phase is m.ControlPhase.FOLLOWING:
             follower.adopt_aside(active.aside_m)
 
     # -- what comes of it -----------------------------------------------------------------------
@@ -238,17 +276,17 @@ class RouteControl:
         self._begun = True
         return True
 
-    def step(self, now_s: float) -> Twist:
+    def step(self, now_s: float) -> m.Twist:
         """Return the command for now: zero without a route, because silence is a failure."""
         dt_s = min(max(now_s - self._stepped_s, PERIOD_S / 5), PERIOD_S * 4)
         self._stepped_s = now_s
         self._motion = motion = self._follow(dt_s, now_s)
         if motion is None:
-            return Twist(0.0, 0.0)
+            return m.Twist(0.0, 0.0)
         turn_radps = motion.angular_radps
         if self._loop:
             turn_radps = self._loop.turn(motion.linear_mps, turn_radps, dt_s)
-        return Twist(motion.linear_mps, turn_radps)
+        return m.Twist(motion.linear_mps, turn_radps)
 
     def _follow(self, dt_s: float, now_s: float) -> Motion | None:
         follower, points = self._follower, self._points
@@ -262,7 +300,7 @@ class RouteControl:
             motion.distance_to_go_m, pose, points, now_s)
         return motion
 
-    def measure(self, now_s: float) -> list[LightMeasurement]:
+    def measure(self, now_s: float) -> list[m.LightMeasurement]:
         """Return the measurements of the last step, to be kept before they are sent.
 
         They are sent before the arrival is, so that none comes too late.
@@ -292,20 +330,20 @@ class RouteControl:
             self._tell("light inspection", "passed without a measurement, going back", light)
         return lights.is_incomplete
 
-    def _status(self, *, is_incomplete: bool) -> ControlStatus:
+    def _status(self, *, is_incomplete: bool) -> m.ControlStatus:
         motion, follower, route = self._motion, self._follower, self._route
-        mission_id, step = (route.mission_id, route.step) if route else ("", 0)
+        mission_id, step = route.which if route else ("", 0)
         if motion is None:
-            phase = ControlPhase.WAITING if follower else (
-                ControlPhase.REFUSED if self._why_refused else ControlPhase.IDLE)
-            return ControlStatus(mission_id, step, phase, 0, 0.0, reason=self._why_refused)
+            phase = m.ControlPhase.WAITING if follower else (
+                m.ControlPhase.REFUSED if self._why_refused else m.ControlPhase.IDLE)
+            return m.ControlStatus(mission_id, step, phase, 0, 0.0, reason=self._why_refused)
         row = follower if isinstance(follower, LightRow) else None
-        phase = ControlPhase.FOLLOWING
+        phase = m.ControlPhase.FOLLOWING
         if motion.waiting or is_incomplete:
-            phase = ControlPhase.WAITING
+            phase = m.ControlPhase.WAITING
         elif motion.arrived:
-            phase = ControlPhase.ARRIVED
-        return ControlStatus(
+            phase = m.ControlPhase.ARRIVED
+        return m.ControlStatus(
             mission_id, step, phase, motion.waypoint, motion.distance_to_go_m,
             (self._blocked,) if self._blocked else (), self._why_refused,
             self._lights.missed if self._lights and motion.arrived else (),
@@ -315,9 +353,9 @@ class RouteControl:
             round(self._loop.added_radps, 4) if self._loop else 0.0)
 
 
-def _same_goal(one: Route, other: Route) -> bool:
-    return (one.mission_id, one.step, one.mode) == (other.mission_id, other.step, other.mode)
+def _same_goal(one: m.Route, other: m.Route) -> bool:
+    return (one.which, one.mode) == (other.which, other.mode)
 
 
-def _news(status: ControlStatus) -> tuple[object, ...]:
-    return status.mission_id, status.step, status.phase, status.back_to, status.passing
+def _news(status: m.ControlStatus) -> tuple[object, ...]:
+    return status.which, status.phase, status.back_to, status.passing

@@ -1,8 +1,8 @@
 """Localization by fusion: odometry, IMU, GPS and the absolute pose, any one of which may fail.
 
 In the place of `rampart.actors.osmosis.control.localization.localization`, the paper's, if a
-system's spec says so. It keeps nothing that a restart would lose: a new life starts from the first
-absolute pose and fix.
+system's spec says so. It keeps nothing that a restart would lose: a new process starts from the
+first absolute pose and fix.
 """
 
 from __future__ import annotations
@@ -45,29 +45,23 @@ class FusedLocalization(Actor):
     @on(topics.IMU)
     def imu(self, message: Imu, header: Header) -> None:
         """Take a reading of the gyro."""
-        self._filter.imu(header.stamp, message.yaw_rad, message.yaw_rate_radps,
-                         (message.accel_x_mps2, message.accel_y_mps2), self.clock.now())
+        self._filter.imu(header.stamp, message, self.clock.now())
 
     @on(topics.ODOMETRY)
     def odometry(self, message: Odometry, header: Header) -> None:
         """Take a reading of the wheels."""
-        pose = message.pose
-        self._filter.odometry(header.stamp, (pose.x_m, pose.y_m, pose.yaw_rad),
-                              message.twist.linear_mps, self.clock.now())
+        self._filter.odometry(header.stamp, message, self.clock.now())
 
     @on(topics.ABSOLUTE_POSE)
     def absolute_pose(self, message: Pose, header: Header) -> None:
         """Take an absolute pose."""
-        self._filter.absolute_pose(header.stamp, message.x_m, message.y_m, message.yaw_rad,
-                                   self.clock.now())
+        self._filter.absolute_pose(header.stamp, message, self.clock.now())
         self._tell_first()
 
     @on(topics.GPS)
     def gps(self, message: GpsFix, header: Header) -> None:
         """Take a fix."""
-        self._filter.gps(header.stamp, (message.x_m, message.y_m),
-                         (message.velocity_x_mps, message.velocity_y_mps),
-                         message.accuracy_m, self.clock.now())
+        self._filter.gps(header.stamp, message, self.clock.now())
         self._tell_first()
 
     @every(_PERIOD_S)
@@ -76,8 +70,7 @@ class FusedLocalization(Actor):
         estimate = self._filter.estimate()
         if estimate is not None and estimate.stamp_s > self._told_s:
             self._told_s = estimate.stamp_s
-            self.publish(topics.POSE, Pose(estimate.x_m, estimate.y_m, estimate.yaw_rad),
-                         stamp=estimate.stamp_s)
+            self.publish(topics.POSE, estimate.pose, stamp=estimate.stamp_s)
 
     @every(0.2)
     def repeat(self) -> None:

@@ -17,8 +17,7 @@ from rampart.actors.runtime.actor import Actor, Context, Header, on
 def is_newer(pose: Pose, stamp_s: float, last_stamp_s: float, now_s: float) -> bool:
     """Whether a measurement is usable and later than the last one passed on."""
     return stamp_s > last_stamp_s and is_possible(stamp_s, now_s) and all(
-        math.isfinite(value) for value in (pose.x_m, pose.y_m, pose.yaw_rad)
-    )
+        map(math.isfinite, (pose.x_m, pose.y_m, pose.yaw_rad)))
 
 
 class Localization(Actor):

@@ -17,8 +17,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import msgspec
+
 from rampart.actors.bus.plausible import is_possible, is_sane
 from rampart.actors.osmosis.control.polyline import wrap_angle
+from rampart.actors.osmosis.messages import Imu, Odometry
 
 BACK_AFTER_S = 1.0
 """How long a device must have been without a flaw to be believed again."""
@@ -30,8 +33,7 @@ _FLAT_READINGS = 3
 """The same reading so many times in a row is a stuck device."""
 
 
-@dataclass(frozen=True, slots=True)
-class ParityLimits:
+class ParityLimits(msgspec.Struct, frozen=True):
     """How much integral and rate may differ.
 
     Args:
@@ -124,24 +126,19 @@ class OdometryCheck(Source):
         self._pose = (0.0, 0.0, 0.0)
         self._sum = (0.0, 0.0)
 
-    def take(self, stamp_s: float, pose: tuple[float, float, float], linear_mps: float
-             ) -> tuple[float, float, float] | None:
+    def take(self, stamp_s: float, reading: Odometry) -> tuple[float, float, float] | None:
         """Take a message; return (duration s, way forward m, turn rad) since the last one.
-
-        Args:
-            stamp_s: when it was measured.
-            pose: x m, y m, yaw rad in `odom`.
-            linear_mps: speed.
 
         Returns:
             None for the first message, one after a gap, an old one, one that is no number, and
             one with a flaw; `trust` may deny more.
         """
+        pose = x_m, y_m, yaw_rad = reading.pose.x_m, reading.pose.y_m, reading.pose.yaw_rad
+        linear_mps = reading.twist.linear_mps
         if not stamp_s > self.stamp_s or not is_sane(*pose, linear_mps):
             return None
         then_s, was = self.stamp_s, self._pose
         self.stamp_s, self._pose, self.speed_mps = stamp_s, pose, linear_mps
-        x_m, y_m, yaw_rad = pose
         dt_s = stamp_s - then_s
         if dt_s > LONGEST_STEP_S:
             return None
@@ -181,9 +178,10 @@ class ImuCheck(Source):
         self._sum = 0.0
         self._flat = 0
 
-    def take(self, stamp_s: float, yaw_rad: float, rate_radps: float,
-             acceleration: tuple[float, float], now_s: float) -> None:
-        """Take a message; the acceleration is along x and y, m/s2."""
+    def take(self, stamp_s: float, reading: Imu, now_s: float) -> None:
+        """Take a message."""
+        yaw_rad, rate_radps = reading.yaw_rad, reading.yaw_rate_radps
+        acceleration = reading.accel_x_mps2, reading.accel_y_mps2
         if not stamp_s > self.stamp_s or not is_possible(stamp_s, now_s) \
                 or not is_sane(yaw_rad, rate_radps, *acceleration):
             return

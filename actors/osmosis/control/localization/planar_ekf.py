@@ -123,11 +123,8 @@ class PlanarEkf:
         self._yw = yw * variance_rad2 / total
         self._ww = ww * variance_rad2 / total
 
-    def doubt_position(self, sd_m: float) -> None:
-        """Add to the uncertainty of the position: what was taken in was wrong by so much."""
+    def doubt(self, sd_m: float, sd_rad: float = 0.0) -> None:
+        """Add to the uncertainty: what was taken in was wrong by so much."""
         self._xx += sd_m * sd_m
         self._yy += sd_m * sd_m
-
-    def doubt_heading(self, sd_rad: float) -> None:
-        """Add to the uncertainty of the heading."""
         self._ww += sd_rad * sd_rad

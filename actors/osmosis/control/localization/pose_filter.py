@@ -24,34 +24,26 @@ Times are simulated seconds, positions and headings are those of `base_link` in 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.bus.plausible import is_sane
-from rampart.actors.osmosis.control.localization.first_pose import (
-    COURSE_FROM_MPS,
-    GPS_VELOCITY_SD_MPS,
-    SIDESLIP_RAD,
-    find_first,
-)
+from rampart.actors.osmosis.control.localization import position_source as positions
 from rampart.actors.osmosis.control.localization.motion_check import ImuCheck, OdometryCheck, Trust
 from rampart.actors.osmosis.control.localization.planar_ekf import PlanarEkf
 from rampart.actors.osmosis.control.localization.position_source import FilterLimits, PositionSource
 from rampart.actors.osmosis.control.polyline import wrap_angle
-from rampart.actors.osmosis.messages import LocalizationStatus
+from rampart.actors.osmosis.messages import GpsFix, LocalizationStatus, Odometry, Pose
 
 _MAX_AGE_S = 0.3
 """A reading that arrives later is not used: the robot has moved on."""
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
+class Estimate(NamedTuple):
     """A pose in `map` and when it was true."""
 
     stamp_s: float
-    x_m: float
-    y_m: float
-    yaw_rad: float
+    pose: Pose
 
 
 class PoseFilter:
@@ -61,8 +53,7 @@ class PoseFilter:
         limits: noise, gates and bounds.
 
     Attributes:
-        imu: takes an IMU reading: stamp s, yaw rad, rate rad/s, acceleration along x and y m/s2
-            as a pair, and what time it is.
+        imu: takes an IMU reading: stamp s, the reading, and what time it is.
     """
 
     def __init__(self, limits: FilterLimits | None = None) -> None:
@@ -90,7 +81,7 @@ class PoseFilter:
         ekf = self._ekf
         if ekf is None or self._lost(ekf):
             return None
-        return Estimate(self._time_s, ekf.x_m, ekf.y_m, ekf.yaw_rad)
+        return Estimate(self._time_s, Pose(ekf.x_m, ekf.y_m, ekf.yaw_rad))
 
     def status(self, now_s: float) -> LocalizationStatus:
         """Return which sources are in use, which not and why, and how sure the estimate is."""
@@ -111,13 +102,12 @@ class PoseFilter:
 
     # -- wheels and gyro ------------------------------------------------------------------------
 
-    def odometry(self, stamp_s: float, pose: tuple[float, float, float], linear_mps: float,
-                 now_s: float) -> None:
-        """Take an odometry reading: pose (x m, y m, yaw rad) in `odom`, speed in `base_link`."""
+    def odometry(self, stamp_s: float, reading: Odometry, now_s: float) -> None:
+        """Take an odometry reading."""
         if not _timely(stamp_s, now_s):
             return
         wheels = self._wheels
-        step = wheels.take(stamp_s, pose, linear_mps)
+        step = wheels.take(stamp_s, reading)
         if step is None or self._ekf is None:
             return
         dt_s, forward_m, turn_rad = step
@@ -125,12 +115,12 @@ class PoseFilter:
             if abs(forward_m / dt_s - self._speed_mps) > _OTHER_SPEED_MPS:
                 wheels.trust.flaw(wheels.trust.reason, stamp_s)
             return
-        self._speed_mps = linear_mps
+        self._speed_mps = reading.twist.linear_mps
         rest_s = stamp_s - self._time_s
         if rest_s <= 0:
             return
         if rest_s > dt_s + wheels.fresh_s:  # what was in between nobody has seen
-            self._ekf.doubt_position(_TOP_SPEED_MPS * (rest_s - dt_s))
+            self._ekf.doubt(_TOP_SPEED_MPS * (rest_s - dt_s))
             self._bridged_m += _TOP_SPEED_MPS * (rest_s - dt_s)
         # After a while without wheels the filter may be part of the way along this step.
         share = rest_s / dt_s if rest_s < dt_s else 1.0
@@ -166,29 +156,19 @@ class PoseFilter:
         else:
             self._bridged_m += max(abs(forward_m), _CREEP_MPS * dt_s)
 
-    def _catch_up(self, ekf: PlanarEkf, stamp_s: float) -> None:
-        """Without wheels, go on with the last known speed up to a reading."""
-        dt_s = stamp_s - self._time_s
-        if dt_s > 0 and not self._wheels.usable(stamp_s):
-            self._move(ekf, stamp_s, self._speed_mps * dt_s, None)
-
     # -- positions ------------------------------------------------------------------------------
 
-    def absolute_pose(self, stamp_s: float, x_m: float, y_m: float, yaw_rad: float,
-                      now_s: float) -> None:
+    def absolute_pose(self, stamp_s: float, pose: Pose, now_s: float) -> None:
         """Take an absolute pose."""
-        source = self._pose
+        source, (x_m, y_m, yaw_rad) = self._pose, (pose.x_m, pose.y_m, pose.yaw_rad)
         if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s \
                 or not is_sane(x_m, y_m, yaw_rad):
             return
-        then_s, was = source.stamp_s, source.reading
+        then_s, was, limits, ekf = source.stamp_s, source.reading, self.limits, self._ekf
         source.stamp_s, source.reading = stamp_s, (x_m, y_m, yaw_rad)
-        ekf = self._ekf
         if ekf is None:
             self._try_to_start(now_s)
             return
-        limits = self.limits
-        self._catch_up(ekf, stamp_s)
         x_m, y_m = self._bring_up(ekf, source, stamp_s - then_s)
         yaw_rad += self._gyro.rate_radps * (self._time_s - stamp_s) if self._gyro.usable(
             stamp_s) else 0.0
@@ -206,24 +186,20 @@ class PoseFilter:
                 self._speed_mps = (made[0] * math.cos(ekf.yaw_rad)
                                    + made[1] * math.sin(ekf.yaw_rad)) / dt_s
 
-    def gps(self, stamp_s: float, position: tuple[float, float], velocity: tuple[float, float],
-            accuracy_m: float, now_s: float) -> None:
-        """Take a GPS fix, m, with its velocity over ground, m/s, both in `map`."""
-        source = self._gps
-        x_m, y_m = position
+    def gps(self, stamp_s: float, fix: GpsFix, now_s: float) -> None:
+        """Take a GPS fix."""
+        source, x_m, y_m = self._gps, fix.x_m, fix.y_m
+        velocity, accuracy_m = (fix.velocity_x_mps, fix.velocity_y_mps), fix.accuracy_m
         if not _timely(stamp_s, now_s) or not stamp_s > source.stamp_s or not accuracy_m >= 0 \
                 or not is_sane(x_m, y_m, accuracy_m) or not math.hypot(*velocity) <= _FASTEST_MPS:
             return
-        then_s = source.stamp_s
+        then_s, limits, ekf = source.stamp_s, self.limits, self._ekf
         same = (x_m, y_m, 0.0) == source.reading and velocity == source.velocity
         source.repeats = source.repeats + 1 if same else 0
         source.stamp_s, source.reading, source.velocity = stamp_s, (x_m, y_m, 0.0), velocity
-        ekf = self._ekf
         if ekf is None:
             self._try_to_start(now_s)
             return
-        limits = self.limits
-        self._catch_up(ekf, stamp_s)
         x_m, y_m = self._bring_up(ekf, source, stamp_s - then_s)
         if source.repeats >= _GPS_REPEATS:
             source.trust.flaw("repeats the same fix", stamp_s)
@@ -235,30 +211,34 @@ class PoseFilter:
             ekf.update_position(x_m, y_m, variance)
             self._take_velocity(ekf, velocity, stamp_s)
 
-    def _take_velocity(self, ekf: PlanarEkf, velocity: tuple[float, float], stamp_s: float
-                       ) -> None:
+    def _take_velocity(self, ekf: PlanarEkf, velocity: tuple[float, float], stamp_s: float) -> None:
         """Take the speed if the wheels are out, and the course if the absolute pose is."""
         along = velocity[0] * math.cos(ekf.yaw_rad) + velocity[1] * math.sin(ekf.yaw_rad)
         if not self._wheels.usable(stamp_s):
             self._speed_mps = along
         turning = abs(self._gyro.rate_radps) > _STRAIGHT_RADPS or not self._gyro.usable(stamp_s)
-        if abs(along) < COURSE_FROM_MPS or turning or self._pose.usable(stamp_s):
+        if abs(along) < positions.COURSE_FROM_MPS or turning or self._pose.usable(stamp_s):
             return
         sign = math.copysign(1.0, along)
         course = math.atan2(sign * velocity[1], sign * velocity[0])
-        variance = (GPS_VELOCITY_SD_MPS / along) ** 2 + SIDESLIP_RAD**2
+        variance = (positions.GPS_VELOCITY_SD_MPS / along) ** 2 + positions.SIDESLIP_RAD**2
         if ekf.heading_nis(course, variance) <= self.limits.gate:
             ekf.update_heading(course, variance)
 
     def _bring_up(self, ekf: PlanarEkf, source: PositionSource, dt_s: float) -> tuple[float, float]:
-        """Move a reading on to the filter's time, note its offset from the track, return it."""
+        """Move a reading on to the filter's time, note its offset from the track, return it.
+
+        Without wheels the filter goes on with the last known speed up to the reading.
+        """
+        rest_s = source.stamp_s - self._time_s
+        if rest_s > 0 and not self._wheels.usable(source.stamp_s):
+            self._move(ekf, source.stamp_s, self._speed_mps * rest_s, None)
         on_m = self._speed_mps * (self._time_s - source.stamp_s)
         x_m = source.reading[0] + on_m * math.cos(ekf.yaw_rad)
         y_m = source.reading[1] + on_m * math.sin(ekf.yaw_rad)
         # While it is not clear who is wrong, and later of who is, nothing is taken for usual.
         sure = self._pose.trust.reason or self._gps.trust.reason
-        doubted = source.trust.reason if sure else (
-            math.hypot(*self._apart) > self.limits.apart_m)
+        doubted = source.trust.reason if sure else (math.hypot(*self._apart) > self.limits.apart_m)
         source.see((x_m - self._track[0], y_m - self._track[1]), dt_s,
                    math.inf if doubted else self.limits.witness_s)
         return x_m, y_m
@@ -303,8 +283,7 @@ class PoseFilter:
         source.trust.flaw(f"moves otherwise than the others, {apart_m:.1f} m", stamp_s)
         # It has been taken in until now; what was farther off than this failed the gate.
         doubt_m = min(apart_m, self.limits.contradiction_m / 2)
-        ekf.doubt_position(doubt_m)
-        ekf.doubt_heading(doubt_m / 10)
+        ekf.doubt(doubt_m, doubt_m / 10)
 
     def _judge(self, ekf: PlanarEkf, source: PositionSource, other: PositionSource, fits: bool
                ) -> bool:
@@ -345,8 +324,7 @@ class PoseFilter:
         else:
             self._wheels.trust.flaw("does not fit the positions", stamp_s)
         x_m, y_m = (o + t for o, t in zip(pose.offset, self._track, strict=True))
-        ekf.doubt_position(1.0)
-        ekf.doubt_heading(1.0)
+        ekf.doubt(1.0, 1.0)
         ekf.update_position(x_m, y_m, self.limits.absolute_sd_m**2)
         ekf.update_heading(pose.reading[2], self.limits.absolute_sd_rad**2)
         self._apart = (0.0, 0.0)
@@ -368,7 +346,7 @@ class PoseFilter:
     def _try_to_start(self, now_s: float) -> None:
         pose, gps, limits = self._pose, self._gps, self.limits
         self._first_s = now_s if self._first_s is None else self._first_s
-        first = find_first(pose, gps, self._wheels, self._gyro, now_s=now_s,
+        first = positions.find_first(pose, gps, self._wheels, self._gyro, now_s=now_s,
                            waited_s=now_s - self._first_s)
         if first is None:
             return

@@ -9,19 +9,11 @@ import msgspec
 from rampart.actors.bus.bounds import clip
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import ManagerStatus
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.mission import mission_state
-from rampart.actors.osmosis.control.mission.mission_checkpoint import MISSION_STATE, catch_up
-from rampart.actors.osmosis.control.mission.mission_state import MissionState
-from rampart.actors.osmosis.messages import (
-    ControlStatus,
-    Goal,
-    LightMeasurement,
-    MissionOrder,
-    MissionRequest,
-    Route,
-)
+from rampart.actors.osmosis.control.mission.mission_state import MISSION_STATE, MissionState
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.parameters import RecoveryNames
 
@@ -57,16 +49,15 @@ class MissionManager(Actor):
         super().__init__(context)
         self.state = MissionState()
         self._uncertain_until_s = -math.inf
-        airport = Osmosis.of(context).airport
-        self._lights = frozenset(light.name for light in airport.lights) if airport else None
+        self._lights = frozenset(light.name for light in Osmosis.of(context).airport.lights)
 
     @on(topics.MISSION_REQUEST)
-    def request(self, message: MissionRequest, _header: Header) -> None:
+    def request(self, message: m.MissionRequest, _header: Header) -> None:
         """Take a mission, unless it was taken before."""
         self._become(mission_state.accept(self.state, message, self.clock.now()))
 
     @on(topics.MISSION_ORDER)
-    def order(self, message: MissionOrder, _header: Header) -> None:
+    def order(self, message: m.MissionOrder, _header: Header) -> None:
         """Obey an order or refuse it, and say so."""
         state, answer = mission_state.obey(self.state, message, self.clock.now())
         self._become(state)
@@ -79,24 +70,23 @@ class MissionManager(Actor):
             self._become(mission_state.hold(self.state, hold_reason(message, held_by)))
 
     @on(topics.CONTROL_STATUS)
-    def progress(self, message: ControlStatus, _header: Header) -> None:
+    def progress(self, message: m.ControlStatus, _header: Header) -> None:
         """Step on when the current goal is reached."""
         self._compare(message.mission_id, message.step)
-        if self._lights is not None and not self._lights.issuperset(message.unmeasured):
-            message = msgspec.structs.replace(message, unmeasured=tuple(
-                name for name in message.unmeasured if name in self._lights))
+        message = msgspec.structs.replace(message, unmeasured=tuple(
+            name for name in message.unmeasured if name in self._lights))
         self._become(mission_state.progress(self.state, message, self.clock.now()))
 
     @on(topics.ROUTE)
-    def route(self, message: Route, _header: Header) -> None:
+    def route(self, message: m.Route, _header: Header) -> None:
         """Give up when there is no way."""
         self._compare(message.mission_id, message.step, message.waypoints[-1:])
         self._become(mission_state.routed(self.state, message))
 
     @on(topics.LIGHT_MEASURED)
-    def light(self, message: LightMeasurement, _header: Header) -> None:
+    def light(self, message: m.LightMeasurement, _header: Header) -> None:
         """Keep a light's measurement, if it is one of the airport's."""
-        if self._lights is not None and message.light not in self._lights:
+        if message.light not in self._lights:
             self.report_diagnostic("light", "no light of this airport", message.light)
             return
         self._become(mission_state.measured(self.state, message))
@@ -107,8 +97,7 @@ class MissionManager(Actor):
         A state from a checkpoint may be an older one. So status and goal are held back until
         planner or control have said which step they are at, or have had the time to.
         """
-        state = self.kept(MISSION_STATE)
-        if state is not None:
+        if (state := self.kept(MISSION_STATE)) is not None:
             self.state = state
             if state.phase in mission_state.ACTIVE:
                 self._uncertain_until_s = self.clock.now() + UNCERTAIN_S
@@ -126,19 +115,21 @@ class MissionManager(Actor):
         """Keep the state, if that failed when it was new."""
         self.keep(MISSION_STATE, self.state)
 
-    def _compare(
-        self, mission_id: str, step: int, end: tuple[tuple[float, float], ...] = ()
-    ) -> None:
+    def _compare(self, mission_id: str, step: int,
+                 end: tuple[tuple[float, float], ...] = ()) -> None:
         """End the uncertainty after a respawn: planner or control know the step as well.
 
         A later step than the checkpoint's is believed only with a way to that step's goal: if the
-        former life died because it gave a wrong goal, the others were told a wrong step.
+        former process died because it gave a wrong goal, the others were told a wrong step.
         """
         if self.clock.now() < self._uncertain_until_s and mission_id == self.state.mission_id:
-            if step > self.state.step and not _leads_to(end, self.state.goals[step:step + 1]):
+            goals = self.state.goals[step:step + 1]
+            if step > self.state.step and not any(
+                    math.dist(point, (goal.x_m, goal.y_m)) < _SAME_POINT_M
+                    for point, goal in zip(end, goals, strict=False)):
                 return
             self._uncertain_until_s = -math.inf
-            self._become(catch_up(self.state, step, self.clock.now()))
+            self._become(mission_state.catch_up(self.state, step, self.clock.now()))
             self.repeat_status()
             self.repeat_goal()
 
@@ -157,11 +148,6 @@ class MissionManager(Actor):
         order = mission_state.goal_order(state)
         if order != mission_state.goal_order(before):
             self.repeat_goal()
-
-
-def _leads_to(end: tuple[tuple[float, float], ...], goals: tuple[Goal, ...]) -> bool:
-    return any(math.dist(point, (goal.x_m, goal.y_m)) < _SAME_POINT_M
-               for point, goal in zip(end, goals, strict=False))
 
 
 def hold_reason(status: ManagerStatus, holding: tuple[str, ...]) -> str:

@@ -11,39 +11,34 @@ phase are refused with a reason; the table is for mistakes in this program.
 
 The state is one frozen struct that msgspec can serialise, so that a checkpoint is its encoding;
 every function takes a state and returns the next one.
+
+The state is kept before the goal that follows from it is published. So the newest checkpoint is
+never behind what planner and control were told. If it is damaged, the one before it is, by a step;
+to follow that would send the robot back to a goal that it has reached. But only the Mission Manager
+gives steps, so a step that the others are at is one that it once gave (`catch_up`).
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+
 import msgspec
+from msgspec.structs import replace
 
 from rampart.actors.bus.bounds import clip
-from rampart.actors.osmosis.messages import (
-    ControlPhase,
-    ControlStatus,
-    Goal,
-    GoalOrder,
-    LightMeasurement,
-    MissionAction,
-    MissionOrder,
-    MissionOrderAnswer,
-    MissionPhase,
-    MissionRequest,
-    MissionStatus,
-    Mode,
-    Route,
-)
+from rampart.actors.osmosis import messages as m
+from rampart.actors.runtime.checkpoint import StateFormat
 
-P = MissionPhase
+A = m.MissionAction
+P = m.MissionPhase
 
-TRANSITIONS: dict[MissionPhase, frozenset[MissionPhase]] = {
+TRANSITIONS: dict[m.MissionPhase, frozenset[m.MissionPhase]] = {
     P.IDLE: frozenset({P.RUNNING, P.FAILED}),
     P.RUNNING: frozenset({P.PAUSED, P.RETURNING, P.SUCCEEDED, P.FAILED, P.CANCELLED}),
     P.PAUSED: frozenset({P.RUNNING, P.RETURNING, P.FAILED, P.CANCELLED}),
     P.RETURNING: frozenset({P.PAUSED, P.FAILED, P.CANCELLED}),
-    P.SUCCEEDED: frozenset({P.RUNNING, P.FAILED}),
-    P.FAILED: frozenset({P.RUNNING, P.FAILED}),
-    P.CANCELLED: frozenset({P.RUNNING, P.FAILED}),
+    **dict.fromkeys((P.SUCCEEDED, P.FAILED, P.CANCELLED), frozenset({P.RUNNING, P.FAILED})),
 }
 """Phase → phases that may follow. A new mission may fail at once: it has no goals."""
 
@@ -59,20 +54,11 @@ ACCEPTED_KEPT = 256
 ANSWERS_KEPT = 32
 """An order that is repeated gets its old answer as long as it is among the last so many."""
 
-_NO_GOAL = Goal(0.0, 0.0, Mode.TAXI)
+_NO_GOAL = m.Goal(0.0, 0.0, m.Mode.TAXI)
 
 
 class IllegalTransitionError(ValueError):
     """A phase was to follow another that it cannot follow; the message names both."""
-
-    def __init__(self, mission_id: str, old: MissionPhase, new: MissionPhase) -> None:
-        allowed = ", ".join(sorted(phase.value for phase in TRANSITIONS[old]))
-        super().__init__(
-            f"mission {mission_id!r}: phase: {old.value} → {new.value} is no transition,"
-            f" after {old.value} may come: {allowed}"
-        )
-        self.old = old
-        self.new = new
 
 
 class MissionState(msgspec.Struct, frozen=True):
@@ -81,7 +67,7 @@ class MissionState(msgspec.Struct, frozen=True):
     Attributes:
         mission_id: the mission under way, or the last one.
         name: its name for people.
-        phase: where in its life it is.
+        phase: where in its course it is.
         goals: in `map`.
         step: index of the current goal; the number of goals once all are reached.
         step_started_s: simulated time at which the current step began.
@@ -101,79 +87,65 @@ class MissionState(msgspec.Struct, frozen=True):
 
     mission_id: str = ""
     name: str = ""
-    phase: MissionPhase = MissionPhase.IDLE
-    goals: tuple[Goal, ...] = ()
+    phase: m.MissionPhase = m.MissionPhase.IDLE
+    goals: tuple[m.Goal, ...] = ()
     step: int = 0
     step_started_s: float = 0.0
     step_times_s: tuple[float, ...] = ()
-    lights: tuple[LightMeasurement, ...] = ()
+    lights: tuple[m.LightMeasurement, ...] = ()
     reason: str = ""
     accepted: tuple[str, ...] = ()
     plan: int = 0
     paused: str = ""
     held: str = ""
-    home: Goal | None = None
+    home: m.Goal | None = None
     homing: str = ""
     skipped: tuple[tuple[int, str], ...] = ()
     unmeasured: tuple[str, ...] = ()
-    answers: tuple[MissionOrderAnswer, ...] = ()
+    answers: tuple[m.MissionOrderAnswer, ...] = ()
 
 
-def enter(state: MissionState, phase: MissionPhase, reason: str = "") -> MissionState:
+def enter(state: MissionState, phase: m.MissionPhase, reason: str = "") -> MissionState:
     """Return the state in a new phase.
 
     Raises:
         IllegalTransitionError: the phase cannot follow the present one.
     """
     if phase not in TRANSITIONS[state.phase]:
-        raise IllegalTransitionError(state.mission_id, state.phase, phase)
-    return msgspec.structs.replace(state, phase=phase, reason=reason)
+        allowed = ", ".join(sorted(phase.value for phase in TRANSITIONS[state.phase]))
+        raise IllegalTransitionError(
+            f"mission {state.mission_id!r}: phase: {state.phase.value} → {phase.value} is no "
+            f"transition, after {state.phase.value} may come: {allowed}")
+    return replace(state, phase=phase, reason=reason)
 
 
-def accept(state: MissionState, request: MissionRequest, now: float) -> MissionState:
+def accept(state: MissionState, request: m.MissionRequest, now: float) -> MissionState:
     """Take a mission; one that is under way is replaced. An id accepted before changes nothing."""
     if request.mission_id in state.accepted:
         return state
-    started = enter(
-        msgspec.structs.replace(state, phase=P.CANCELLED) if state.phase in ACTIVE else state,
-        P.RUNNING if request.goals else P.FAILED,
-        "" if request.goals else "the mission has no goals",
-    )
-    return _settle(msgspec.structs.replace(
-        started,
-        mission_id=request.mission_id,
-        name=request.name,
-        goals=request.goals,
-        step=0,
-        step_started_s=now,
-        step_times_s=(),
-        lights=(),
-        accepted=(*state.accepted, request.mission_id)[-ACCEPTED_KEPT:],
-        plan=0,
-        paused="",
-        home=None,
-        homing="",
-        skipped=(),
-        unmeasured=(),
-    ))
+    before = replace(state, phase=P.CANCELLED) if state.phase in ACTIVE else state
+    started = enter(before, P.RUNNING) if request.goals else enter(
+        before, P.FAILED, "the mission has no goals")
+    return _settle(MissionState(
+        request.mission_id, request.name, started.phase, request.goals, step_started_s=now,
+        reason=started.reason, accepted=(*state.accepted, request.mission_id)[-ACCEPTED_KEPT:],
+        held=state.held, answers=state.answers))
 
 
-def progress(state: MissionState, report: ControlStatus, now: float) -> MissionState:
+def progress(state: MissionState, report: m.ControlStatus, now: float) -> MissionState:
     """Step on if Osmosis Control has arrived at the current goal of this mission."""
-    current = (report.mission_id, report.step) == (state.mission_id, _step_driven(state))
-    if state.phase not in DRIVING or not current or report.phase is not ControlPhase.ARRIVED:
+    current = state.phase in DRIVING and report.which == _driven(state)
+    if not current or report.phase is not m.ControlPhase.ARRIVED:
         return state
     if state.phase is P.RETURNING:
         return enter(state, P.CANCELLED, f"returned home, {state.homing}")
     fresh = tuple(name for name in report.unmeasured if name not in state.unmeasured)
-    return _next_goal(
-        msgspec.structs.replace(state, unmeasured=(*state.unmeasured, *fresh)), now)
+    return _next_goal(replace(state, unmeasured=(*state.unmeasured, *fresh)), now)
 
 
-def routed(state: MissionState, route: Route) -> MissionState:
+def routed(state: MissionState, route: m.Route) -> MissionState:
     """Take note of the way to the current goal; fail the mission if there is none."""
-    current = (route.mission_id, route.step) == (state.mission_id, _step_driven(state))
-    if state.phase not in DRIVING or not current or not route.active:
+    if state.phase not in DRIVING or route.which != _driven(state) or not route.active:
         return state
     if not route.waypoints:
         what = "home" if state.phase is P.RETURNING else f"goal {state.step + 1}"
@@ -183,124 +155,74 @@ def routed(state: MissionState, route: Route) -> MissionState:
     if state.home is None and state.step == 0:
         # The first waypoint of the first way is where the robot was, or the nearest place to it
         # on the graph: somewhere that a way leads back to.
-        state = msgspec.structs.replace(state, home=Goal(*route.waypoints[0], Mode.TAXI))
+        state = replace(state, home=m.Goal(*route.waypoints[0], m.Mode.TAXI))
     if route.reason != state.reason:
-        state = msgspec.structs.replace(state, reason=route.reason)
+        state = replace(state, reason=route.reason)
     return state
 
 
-def measured(state: MissionState, light: LightMeasurement) -> MissionState:
+def measured(state: MissionState, light: m.LightMeasurement) -> MissionState:
     """Keep the first measurement of each light.
 
     Also just after success: the last light's message may come after that of the last arrival.
     """
-    known = any(other.light == light.light for other in state.lights)
-    if known or state.phase not in ACTIVE | {P.SUCCEEDED}:
+    known = {other.light for other in state.lights}
+    if light.light in known or state.phase not in ACTIVE | {P.SUCCEEDED}:
         return state
-    return msgspec.structs.replace(state, lights=(*state.lights, light))
-
-
-def pause(state: MissionState, reason: str) -> MissionState:
-    """Hold a running mission; the robot gets no goal until `resume`."""
-    return msgspec.structs.replace(enter(state, P.PAUSED, reason), paused=reason or "paused")
-
-
-def resume(state: MissionState) -> MissionState:
-    """Go on with a paused mission, with the goal it was paused at."""
-    if state.phase is not P.PAUSED:
-        raise IllegalTransitionError(state.mission_id, state.phase, P.RUNNING)
-    return _settle(msgspec.structs.replace(state, paused=""))
-
-
-def cancel(state: MissionState, reason: str) -> MissionState:
-    """Give a mission up on request."""
-    return enter(state, P.CANCELLED, reason)
+    return replace(state, lights=(*state.lights, light))
 
 
 def hold(state: MissionState, reason: str) -> MissionState:
     """Take note of a recovery that holds the robot, or with an empty reason that none does."""
     if reason == state.held:
         return state
-    return _settle(msgspec.structs.replace(state, held=reason))
+    return _settle(replace(state, held=reason))
 
 
 def obey(
-    state: MissionState, order: MissionOrder, now: float
-) -> tuple[MissionState, MissionOrderAnswer]:
+    state: MissionState, order: m.MissionOrder, now: float
+) -> tuple[MissionState, m.MissionOrderAnswer]:
     """Obey an order, or refuse it with a reason; one that was answered before changes nothing."""
     for answer in state.answers:
         if answer.order == order.order:
             return state, answer
-    outcome = _OBEDIENCE[order.action](state, clip(f"{order.by}: {order.reason}"), now)
-    after = state if isinstance(outcome, str) else outcome
-    answer = MissionOrderAnswer(
-        order.order, not isinstance(outcome, str),
-        clip(outcome) if isinstance(outcome, str) else "", after.plan)
-    kept = (*state.answers, answer)[-ANSWERS_KEPT:]
-    return msgspec.structs.replace(after, answers=kept), answer
+    refusal = _refusal(state, order.action)
+    after = state if refusal else _EFFECTS[order.action](
+        state, clip(f"{order.by}: {order.reason}"), now)
+    answer = m.MissionOrderAnswer(order.order, not refusal, clip(refusal), after.plan)
+    return replace(after, answers=(*state.answers, answer)[-ANSWERS_KEPT:]), answer
 
 
-def _order_pause(state: MissionState, why: str, _now: float) -> MissionState | str:
-    if state.phase not in ACTIVE:
-        return _not_under_way(state)
-    if state.paused:
-        return f"it is paused already, {state.paused}"
-    return _settle(msgspec.structs.replace(state, paused=why))
-
-
-def _order_resume(state: MissionState, _why: str, _now: float) -> MissionState | str:
-    if state.phase is not P.PAUSED:
-        return f"it is not paused but {state.phase.value}"
-    if not state.paused:
-        return f"{state.held}; it goes on by itself when the robot is released"
-    return resume(state)
-
-
-def _order_replan(state: MissionState, _why: str, _now: float) -> MissionState | str:
-    if state.phase is P.PAUSED:
-        return "it is paused, and will be planned anew when it goes on"
-    if state.phase not in DRIVING:
-        return _not_under_way(state)
-    return msgspec.structs.replace(state, plan=state.plan + 1)
-
-
-def _order_skip(state: MissionState, why: str, now: float) -> MissionState | str:
-    if state.phase not in ACTIVE:
-        return _not_under_way(state)
-    if state.homing:
-        return "on the way home there is no goal to skip"
-    skipped = (*state.skipped, (state.step, why))
-    return _next_goal(msgspec.structs.replace(state, skipped=skipped), now)
-
-
-def _order_cancel(state: MissionState, why: str, _now: float) -> MissionState | str:
-    return cancel(state, why) if state.phase in ACTIVE else _not_under_way(state)
-
-
-def _order_home(state: MissionState, why: str, _now: float) -> MissionState | str:
-    if state.phase not in ACTIVE:
-        return _not_under_way(state)
-    if state.homing:
-        return f"it is on the way home already, {state.homing}"
-    if state.home is None:
-        return "where the mission began is not known"
-    return _settle(msgspec.structs.replace(state, homing=why, paused=""))
-
-
-_OBEDIENCE = {
-    MissionAction.PAUSE: _order_pause,
-    MissionAction.RESUME: _order_resume,
-    MissionAction.REPLAN: _order_replan,
-    MissionAction.SKIP: _order_skip,
-    MissionAction.CANCEL: _order_cancel,
-    MissionAction.HOME: _order_home,
+_EFFECTS: dict[m.MissionAction, Callable[[MissionState, str, float], MissionState]] = {
+    A.PAUSE: lambda state, why, _now: _settle(replace(state, paused=why)),
+    A.RESUME: lambda state, _why, _now: _settle(replace(state, paused="")),
+    A.REPLAN: lambda state, _why, _now: replace(state, plan=state.plan + 1),
+    A.SKIP: lambda state, why, now: _next_goal(
+        replace(state, skipped=(*state.skipped, (state.step, why))), now),
+    A.CANCEL: lambda state, why, _now: enter(state, P.CANCELLED, why),
+    A.HOME: lambda state, why, _now: _settle(replace(state, homing=why, paused="")),
 }
-"""What each order does: the next state, or why it is refused. Home also ends a pause."""
+"""The next state by each order that is obeyed. Home also ends a pause."""
 
 
-def _not_under_way(state: MissionState) -> str:
-    return f"no mission is under way, the last one is {state.phase.value}" if state.mission_id \
-        else "no mission is under way"
+def _refusal(state: MissionState, action: m.MissionAction) -> str:
+    """Return why an order makes no sense now, or ""."""
+    paused = state.phase is P.PAUSED
+    if action is A.RESUME and not paused:
+        return f"it is not paused but {state.phase.value}"
+    if state.phase not in ACTIVE:
+        last = f", the last one is {state.phase.value}" if state.mission_id else ""
+        return f"no mission is under way{last}"
+    unknown_home = "" if state.home else "where the mission began is not known"
+    return {
+        A.PAUSE: state.paused and f"it is paused already, {state.paused}",
+        A.RESUME: "" if state.paused else
+        f"{state.held}; it goes on by itself when the robot is released",
+        A.REPLAN: "it is paused, and will be planned anew when it goes on" if paused else "",
+        A.SKIP: state.homing and "on the way home there is no goal to skip",
+        A.CANCEL: "",
+        A.HOME: f"it is on the way home already, {state.homing}" if state.homing else unknown_home,
+    }[action]
 
 
 def _settle(state: MissionState) -> MissionState:
@@ -310,58 +232,79 @@ def _settle(state: MissionState) -> MissionState:
     reason = "; ".join(filter(None, (state.held, state.paused)))
     phase = P.PAUSED if reason else P.RETURNING if state.homing else P.RUNNING
     if phase is state.phase:
-        return msgspec.structs.replace(state, reason=reason) if reason != state.reason else state
+        return replace(state, reason=reason) if reason != state.reason else state
     return enter(state, phase, reason or state.homing)
 
 
 def _next_goal(state: MissionState, now: float) -> MissionState:
     """Go on with the next goal, or end the mission after the last one."""
-    state = msgspec.structs.replace(
-        state,
-        step=state.step + 1,
-        step_started_s=now,
+    state = replace(
+        state, step=state.step + 1, step_started_s=now,
         step_times_s=(*state.step_times_s, now - state.step_started_s),
-        reason=state.reason if state.phase is P.PAUSED else "",
-    )
+        reason=state.reason if state.phase is P.PAUSED else "")
     if state.step < len(state.goals):
         return state
     if not state.skipped:
         return enter(state, P.SUCCEEDED)
     left_out = ", ".join(f"goal {index + 1} ({why})" for index, why in state.skipped)
     reached = len(state.goals) - len(state.skipped)
-    return enter(state, P.FAILED, f"{reached} of {len(state.goals)} goals reached, skipped: "
-                                  f"{left_out}")
+    return enter(
+        state, P.FAILED, f"{reached} of {len(state.goals)} goals reached, skipped: {left_out}")
 
 
-def _step_driven(state: MissionState) -> int:
-    """Return the number by which planner and control know what the robot drives to."""
-    return len(state.goals) if state.homing else state.step
+def _driven(state: MissionState) -> tuple[str, int]:
+    """Return mission and step by which planner and control know what the robot drives to."""
+    return state.mission_id, len(state.goals) if state.homing else state.step
 
 
-def goal_order(state: MissionState) -> GoalOrder:
+def goal_order(state: MissionState) -> m.GoalOrder:
     """Return the current goal for the Graph Planner; inactive unless the robot is to drive."""
-    step = _step_driven(state)
     if state.phase not in DRIVING:
-        return GoalOrder(state.mission_id, step, _NO_GOAL, False, state.plan)
+        return m.GoalOrder(*_driven(state), _NO_GOAL, False, state.plan)
     goal = state.home if state.homing and state.home else state.goals[state.step]
-    return GoalOrder(state.mission_id, step, goal, True, state.plan)
+    return m.GoalOrder(*_driven(state), goal, True, state.plan)
 
 
-def status(state: MissionState) -> MissionStatus:
+def status(state: MissionState) -> m.MissionStatus:
     """Return what the operator sees."""
-    return MissionStatus(
-        mission_id=state.mission_id,
-        name=state.name,
-        phase=state.phase,
-        step=state.step,
-        goals=state.goals,
-        step_times_s=state.step_times_s,
-        lights=state.lights,
-        reason=clip(state.reason),
+    measured_lights = {light.light for light in state.lights}
+    return m.MissionStatus(
+        state.mission_id, state.name, state.phase, state.step, state.goals, state.step_times_s,
+        state.lights, clip(state.reason),
         skipped=tuple(index for index, _ in state.skipped),
-        unmeasured=tuple(
-            name for name in state.unmeasured
-            if not any(light.light == name for light in state.lights)),
-        orders=tuple(action for action, try_out in _OBEDIENCE.items()
-                     if not isinstance(try_out(state, "", 0.0), str)),
-    )
+        unmeasured=tuple(name for name in state.unmeasured if name not in measured_lights),
+        orders=tuple(action for action in A if not _refusal(state, action)))
+
+# -- checkpoint -----------------------------------------------------------------------------------
+
+
+def catch_up(state: MissionState, step: int, now: float) -> MissionState:
+    """Return the state at the step that planner or control are at, if that is a later goal.
+
+    The first of the steps made up for gets the time until now, the others none: when they ended is
+    not known any more.
+    """
+    missing = step - state.step
+    if state.phase not in ACTIVE or missing <= 0 or step >= len(state.goals):
+        return state
+    times = (max(now - state.step_started_s, 0.0), *(0.0,) * (missing - 1))
+    return replace(
+        state, step=step, step_started_s=now, step_times_s=(*state.step_times_s, *times))
+
+
+def _objection(state: MissionState) -> str:
+    names = [light.light for light in state.lights]
+    numbers = [state.step_started_s, *(v for goal in state.goals for v in (goal.x_m, goal.y_m))]
+    goals, times, phase = len(state.goals), len(state.step_times_s), state.phase
+    wrong = {
+        f"step {state.step} of {goals} goals": not 0 <= state.step <= goals,
+        f"{phase.value} after the last goal": phase in ACTIVE and state.step == goals,
+        f"{times} step times at step {state.step}": times != state.step,
+        f"{phase.value} without a mission": phase is not P.IDLE and not state.mission_id,
+        "a light is in it twice": len(set(names)) < len(names),
+        "a number is not finite": not all(map(math.isfinite, numbers)),
+    }
+    return "; ".join(text for text, holds in wrong.items() if holds)
+
+
+MISSION_STATE = StateFormat(MissionState, version=1, objection=_objection)

@@ -20,7 +20,8 @@ while: the comparison's respawns have then had their chance (`FORGET_S`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+
+import msgspec
 
 Command = tuple[float, float]
 """Linear velocity, m/s, and turn rate, rad/s, of `base_link`."""
@@ -29,8 +30,7 @@ FORGET_S = 5.0
 """So long after the last comparison a doubt is over."""
 
 
-@dataclass(frozen=True, slots=True)
-class PairLimits:
+class PairLimits(msgspec.Struct, frozen=True):
     """When the standby drives, and when the two disagree.
 
     Args:
@@ -74,8 +74,7 @@ class CommandPair:
         self._agreed_since_s = -math.inf
         self._compared_s = -math.inf
 
-    def active(self, command: Command | None, stamp_s: float, incarnation: int, now: float
-               ) -> None:
+    def active(self, command: Command | None, stamp_s: float, incarnation: int, now: float) -> None:
         """Take Osmosis Control's command, or None for a refused one."""
         limits = self._limits
         if self._is_reborn(0, incarnation):

@@ -16,18 +16,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import msgspec
 
-from rampart.actors.bus.envelope import AHEAD_S
+from rampart.actors.bus.envelope import AHEAD_S, Header
 from rampart.actors.bus.limits import Remembered
 from rampart.actors.ftm.holders import Holders
 from rampart.actors.osmosis.control.pilot.command_pair import CommandPair, PairLimits
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, limited
 from rampart.actors.osmosis.control.polyline import NO_POINTS, Array
-from rampart.actors.osmosis.messages import PilotMode
+from rampart.actors.osmosis.messages import PilotMode, PilotOrder, Twist
 
 STRICTNESS = (PilotMode.AUTO, PilotMode.TELEOPERATION, PilotMode.STOP)
 """Modes from the most permissive to the strictest; declared here, once."""
@@ -42,8 +40,7 @@ _SLOWED = 0.999
 """Below this share of the command the reason says that obstacles slow the robot."""
 
 
-@dataclass(frozen=True, slots=True)
-class Checks:
+class Checks(msgspec.Struct, frozen=True):
     """Which checks are in force; the system spec's layers switch them.
 
     Args:
@@ -56,8 +53,7 @@ class Checks:
     manager: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class GateLimits:
+class GateLimits(msgspec.Struct, frozen=True):
     """Bounds and ages.
 
     Args:
@@ -82,19 +78,8 @@ class GateLimits:
     joystick_timeout_s: float = 0.3
     manager_timeout_s: float = 0.5
     settling_s: float = 0.45
-    room: StoppingRoom = field(default_factory=StoppingRoom)
-    pair: PairLimits = field(default_factory=PairLimits)
-
-
-class Stamped(msgspec.Struct, frozen=True, gc=False):
-    """A velocity command with where it comes from: the header of its message."""
-
-    linear_mps: float
-    angular_radps: float
-    source: str
-    incarnation: int
-    sequence: int
-    stamp_s: float
+    room: StoppingRoom = StoppingRoom()
+    pair: PairLimits = PairLimits()
 
 
 class GateOutput(msgspec.Struct, frozen=True, gc=False):
@@ -107,22 +92,13 @@ class GateOutput(msgspec.Struct, frozen=True, gc=False):
     reason: str
 
 
-class _Order(NamedTuple):
-    """What a recovery module has ordered; `top_speed_mps` 0 for no bound."""
-
-    mode: PilotMode
-    reason: str
-    top_speed_mps: float
-
-
-@dataclass(slots=True)
-class _Line:
+class _Line(msgspec.Struct):
     """State of one command source: auto, its standby, or joystick."""
 
     twist: tuple[float, float] | None = None
     stamp_s: float = -math.inf
     heard_s: float = -math.inf
-    newest: dict[str, tuple[int, int]] = field(
+    newest: dict[str, tuple[int, int]] = msgspec.field(
         default_factory=lambda: Remembered(_SOURCES))
     fault: str = ""
 
@@ -135,6 +111,10 @@ class SafetyGate:
         checks: which of them are in force.
         started_s: now.
         recoveries: names of the modules that may give orders; others are obeyed, and named.
+
+    Attributes:
+        orders: what is ordered now, by whom.
+        refused: how many commands were refused.
     """
 
     def __init__(self, limits: GateLimits, checks: Checks, started_s: float,
@@ -142,8 +122,8 @@ class SafetyGate:
         self._limits = limits
         self._checks = checks
         self._started_s = started_s
-        self._orders: Holders[_Order] = Holders(
-            recoveries, _Order(PilotMode.STOP, "too many unknown modules order something", 0.0))
+        self.orders: Holders[PilotOrder] = Holders(recoveries, PilotOrder(
+            True, PilotMode.STOP, "too many unknown modules order something"))
         self._auto = _Line()
         self._standby = _Line()
         self._pair = CommandPair(limits.pair)
@@ -154,26 +134,12 @@ class SafetyGate:
         self._scan_fault = ""
         self.refused = 0
 
-    def order(self, recovery: str, engaged: bool, mode: PilotMode, reason: str,
-              top_speed_mps: float = 0.0) -> None:
-        """Take note of a recovery module's order; it is in force until that module ends it.
-
-        `top_speed_mps` bounds the speed meanwhile, whoever drives; 0 or nonsense does not.
-        """
-        if engaged:
-            self._orders.hold(recovery, _Order(
-                mode, reason, top_speed_mps if top_speed_mps > 0 else 0.0))
+    def order(self, recovery: str, order: PilotOrder) -> None:
+        """Take note of a recovery module's order; it is in force until that module ends it."""
+        if order.engaged:
+            self.orders.hold(recovery, order)
         else:
-            self._orders.let_go(recovery)
-
-    def reset(self, name: str) -> bool:
-        """End the order of one that is no recovery module; return whether there was one."""
-        return self._orders.reset(name)
-
-    @property
-    def unknown(self) -> tuple[str, ...]:
-        """Who gives orders and is no recovery module of the system."""
-        return self._orders.unknown
+            self.orders.let_go(recovery)
 
     def manager_alive(self, stamp_s: float) -> None:
         """Take note of the manager's sign of life, given at `stamp_s`."""
@@ -184,21 +150,19 @@ class SafetyGate:
 
         One that must not be believed (`fault` says why) is as good as none.
         """
-        self._scan_fault = fault
-        self._points = points
-        self._scan_s = stamp_s
+        self._points, self._scan_s, self._scan_fault = points, stamp_s, fault
 
-    def command(self, command: Stamped, now: float) -> str:
+    def command(self, command: Twist, header: Header, now: float) -> str:
         """Offer Osmosis Control's command; return why it was refused, or ""."""
-        refused = self._take(self._auto, command, now)
+        refused = self._take(self._auto, command, header, now)
         if self._standby.twist is not None:
-            self._pair.active(*self._offer(self._auto, now), command.incarnation, now)
+            self._pair.active(*self._offer(self._auto, now), header.incarnation, now)
         return refused
 
-    def standby(self, command: Stamped, now: float) -> str:
+    def standby(self, command: Twist, header: Header, now: float) -> str:
         """Offer the command of Osmosis Control's standby; return why it was refused, or ""."""
-        refused = self._take(self._standby, command, now)
-        self._pair.standby(*self._offer(self._standby, now), command.incarnation, now)
+        refused = self._take(self._standby, command, header, now)
+        self._pair.standby(*self._offer(self._standby, now), header.incarnation, now)
         return refused
 
     def standby_drives(self, now: float) -> bool:
@@ -208,34 +172,38 @@ class SafetyGate:
 
     def _offer(self, line: _Line, now: float) -> tuple[tuple[float, float] | None, float]:
         """Return what a line has to offer to the pair, and from when it is."""
-        return None if self._unusable(line, now) else line.twist, line.stamp_s
+        return self._usable(line, now)[0], line.stamp_s
 
-    def joystick(self, command: Stamped, now: float) -> str:
+    def joystick(self, command: Twist, header: Header, now: float) -> str:
         """Offer Teleoperation's command; return why it was refused, or ""."""
-        return self._take(self._stick, command, now)
+        return self._take(self._stick, command, header, now)
 
-    def _take(self, line: _Line, command: Stamped, now: float) -> str:
-        position = (command.incarnation, command.sequence)
+    def _take(self, line: _Line, command: Twist, header: Header, now: float) -> str:
+        position = (header.incarnation, header.sequence)
         if self._checks.inputs:
-            newest = line.newest.get(command.source)
+            newest = line.newest.get(header.source)
             if newest is not None and position <= newest:
                 # The newer one that was taken before stays valid.
                 self.refused += 1
-                return (f"command {command.source}:{position[0]}/{position[1]} is out of sequence,"
+                return (f"command {header.source}:{position[0]}/{position[1]} is out of sequence,"
                         f" newest is {newest[0]}/{newest[1]}")
-            line.newest[command.source] = position
-        line.fault = self._fault(command, now) or self._reverse_fault(line, command)
+            line.newest[header.source] = position
+        line.fault = self._fault(command, now - header.stamp)
+        backwards = line is not self._stick and command.linear_mps < -_STANDING_MPS
+        if backwards and self._checks.inputs and not line.fault:
+            line.fault = (f"command of {command.linear_mps:.2f} m/s is backwards, "
+                          "where no laser looks")
         if line.fault:
             self.refused += 1
             if self._checks.inputs:
                 line.twist = (0.0, 0.0)
             return line.fault
         line.twist = (command.linear_mps, command.angular_radps)
-        line.stamp_s = command.stamp_s
+        line.stamp_s = header.stamp
         line.heard_s = now
         return ""
 
-    def _fault(self, command: Stamped, now: float) -> str:
+    def _fault(self, command: Twist, age_s: float) -> str:
         linear, angular = command.linear_mps, command.angular_radps
         limits = self._limits
         if not (math.isfinite(linear) and math.isfinite(angular)):
@@ -248,29 +216,23 @@ class SafetyGate:
             if abs(angular) > limits.max_angular_radps * slack:
                 return (f"command of {angular:.2f} rad/s is beyond"
                         f" {limits.max_angular_radps:.2f} rad/s")
-            age_s = now - command.stamp_s
             if not age_s <= limits.command_timeout_s:
                 return f"command is {age_s:.2f} s old, limit {limits.command_timeout_s:.2f} s"
             if age_s < -AHEAD_S:
                 return f"command is stamped {-age_s:.2f} s ahead of now"
         return ""
 
-    def _reverse_fault(self, line: _Line, command: Stamped) -> str:
-        if self._checks.inputs and line is not self._stick and command.linear_mps < -_STANDING_MPS:
-            return f"command of {command.linear_mps:.2f} m/s is backwards, where no laser looks"
-        return ""
-
     @property
     def mode(self) -> PilotMode:
         """The strictest engaged order's mode, auto without any."""
-        if not self._orders:
+        if not self.orders:
             return PilotMode.AUTO
-        return max((order.mode for order in self._orders.values()), key=STRICTNESS.index)
+        return max((order.mode for order in self.orders.values()), key=STRICTNESS.index)
 
     def output(self, now: float) -> GateOutput:
         """Return what the base is to do now."""
         mode = self.mode
-        reason = self._forbidden(mode, now)
+        reason = self.forbidden(now)
         if reason:
             return GateOutput(0.0, 0.0, mode, True, reason)
         stick = now - self._stick.heard_s <= self._limits.joystick_timeout_s
@@ -289,15 +251,11 @@ class SafetyGate:
             reason = "obstacle: stopped" if linear == 0.0 else "obstacle: slowed down"
         return GateOutput(linear, angular, mode, stopped, reason)
 
-    def forbidden(self, now: float) -> str:
-        """Return why nobody may drive now, not even by the joystick, or ""."""
-        return self._forbidden(self.mode, now)
-
     @property
     def top_speed_mps(self) -> float:
-        """The lowest speed that an order in force allows at most; 0 if none bounds it."""
-        return min((order.top_speed_mps for order in self._orders.values() if order.top_speed_mps),
-                   default=0.0)
+        """The lowest speed that an order in force allows at most; 0 or nonsense bounds nothing."""
+        return min((order.top_speed_mps for order in self.orders.values()
+                    if order.top_speed_mps > 0), default=0.0)
 
     def _bounded(self, wanted: tuple[float, float], passing: str
                  ) -> tuple[tuple[float, float], str]:
@@ -311,20 +269,16 @@ class SafetyGate:
 
     def _wanted(self, stick: bool, now: float) -> tuple[tuple[float, float] | None, str]:
         """Return the command to execute and what is special about it, or None and why not."""
-        line = self._stick if stick else self._auto
-        unusable = self._unusable(line, now)
+        active = self._usable(self._stick if stick else self._auto, now)
         if stick or self._standby.twist is None:
-            return (None, unusable) if unusable else (line.twist, "")
-        other = self._standby
-        return self._pair.choice(
-            (None, unusable) if unusable else (line.twist, ""),
-            None if self._unusable(other, now) else other.twist, now)
+            return active
+        return self._pair.choice(active, self._usable(self._standby, now)[0], now)
 
-    def _forbidden(self, mode: PilotMode, now: float) -> str:
-        """Why nobody's command may pass, or ""."""
+    def forbidden(self, now: float) -> str:
+        """Return why nothing may drive now, not even the joystick, or ""."""
         limits = self._limits
-        if mode is PilotMode.STOP:
-            return self._why(mode) or "ordered to stop"
+        if self.mode is PilotMode.STOP:
+            return self._why(PilotMode.STOP) or "ordered to stop"
         if self._checks.manager:
             silence_s = now - self._manager_heard_s
             if silence_s > limits.manager_timeout_s:
@@ -338,17 +292,16 @@ class SafetyGate:
                 return "no fresh laser scan"  # nor is one with a stamp from the future, or none
         return ""
 
-    def _unusable(self, line: _Line, now: float) -> str:
-        """Why a line's last command may not be executed, or ""."""
-        if line.fault and self._checks.inputs:
-            return line.fault
-        if self._checks.inputs and line.twist is not None:
-            age_s = now - line.stamp_s
-            if age_s > self._limits.command_timeout_s:
-                return "no fresh command"
-        return ""
+    def _usable(self, line: _Line, now: float) -> tuple[tuple[float, float] | None, str]:
+        """Return a line's last command; None with the reason if it may not be executed."""
+        if self._checks.inputs and line.fault:
+            return None, line.fault
+        late = now - line.stamp_s > self._limits.command_timeout_s
+        if self._checks.inputs and line.twist is not None and late:
+            return None, "no fresh command"
+        return line.twist, ""
 
     def _why(self, mode: PilotMode) -> str:
         """The reasons of the orders for a mode."""
-        named = sorted(self._orders.items())
+        named = sorted(self.orders.items())
         return "; ".join(f"{name}: {order.reason}" for name, order in named if order.mode is mode)

@@ -7,18 +7,11 @@ import math
 from rampart.actors.bus.bounds import clip
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import Holds, ManagerStatus, Reset
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.limits_from_spec import checks_of, gate_of, reach_of
 from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair
-from rampart.actors.osmosis.control.pilot.safety_gate import GateOutput, SafetyGate, Stamped
-from rampart.actors.osmosis.messages import (
-    BaseCommand,
-    LaserScan,
-    PilotMode,
-    PilotOrder,
-    PilotStatus,
-    Twist,
-)
+from rampart.actors.osmosis.control.pilot.safety_gate import GateOutput, SafetyGate
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 
 _PERIOD_S = 0.05
@@ -41,72 +34,68 @@ class SafetyPilot(Actor):
             gate_of(system), checks_of(system), context.clock.now(), self._recoveries)
         self._lasers = LaserPair(reach_of(system))
         self._laser_fault = ""
+        self._ordered, self._unknown = (self._gate.mode, 0.0), self._gate.orders.unknown
         self._sent_s = -math.inf
-        self._last = GateOutput(0.0, 0.0, PilotMode.AUTO, True, "just started")
+        self._last = GateOutput(0.0, 0.0, m.PilotMode.AUTO, True, "just started")
 
     @on(topics.COMMAND)
-    def command(self, message: Twist, header: Header) -> None:
+    def command(self, message: m.Twist, header: Header) -> None:
         """Offer Osmosis Control's command to the gate and act on the answer at once."""
-        refused = self._gate.command(_stamped(message, header), self.clock.now())
-        self._note(refused, header)
+        self._note(self._gate.command(message, header, self.clock.now()), header)
         self._act()
 
     @on(topics.STANDBY_COMMAND)
-    def standby(self, message: Twist, header: Header) -> None:
+    def standby(self, message: m.Twist, header: Header) -> None:
         """Offer the standby's command; act at once if it drives, else the active one's do."""
         now = self.clock.now()
-        self._note(self._gate.standby(_stamped(message, header), now), header)
+        self._note(self._gate.standby(message, header, now), header)
         if self._gate.standby_drives(now):
             self._act()
 
     @on(topics.TELEOP_COMMAND)
-    def joystick(self, message: Twist, header: Header) -> None:
+    def joystick(self, message: m.Twist, header: Header) -> None:
         """Offer the operator's command to the gate and act on the answer at once."""
-        refused = self._gate.joystick(_stamped(message, header), self.clock.now())
-        self._note(refused, header)
+        self._note(self._gate.joystick(message, header, self.clock.now()), header)
         self._act()
 
     @on(topics.SCAN)
-    def scan(self, message: LaserScan, header: Header) -> None:
+    def scan(self, message: m.LaserScan, header: Header) -> None:
         """Keep what can be seen; if nothing can be believed the robot stops."""
         self._see(LOWER, message, header)
 
     @on(topics.UPPER_SCAN)
-    def upper_scan(self, message: LaserScan, header: Header) -> None:
+    def upper_scan(self, message: m.LaserScan, header: Header) -> None:
         """Keep what the second laser sees, on a robot that has one."""
         self._see(UPPER, message, header)
 
     @on(topics.PILOT_ORDER)
-    def order(self, message: PilotOrder, header: Header) -> None:
+    def order(self, message: m.PilotOrder, header: Header) -> None:
         """Obey a recovery module, and others as well; a change acts at once."""
-        before = self._orders_in_force()
-        self._gate.order(header.source, message.engaged, message.mode, message.reason,
-                         message.top_speed_mps)
+        self._gate.order(header.source, message)
         if message.engaged and header.source not in self._recoveries:
             self.report_diagnostic("pilot order", f"given by {header.source!r}, no recovery module "
                                    "of this system; rampart reset ends it", header.source)
-        self._follow(before)
+        self._follow()
 
     @on(ftm_topics.RESET)
     def reset(self, message: Reset, _header: Header) -> None:
         """End the order of one that is no recovery module of the system."""
-        before = self._orders_in_force()
-        if self._gate.reset(message.recovery):
-            self._follow(before)
+        if self._gate.orders.reset(message.recovery):
+            self._follow()
 
-    def _orders_in_force(self) -> tuple[PilotMode, float, tuple[str, ...]]:
-        return self._gate.mode, self._gate.top_speed_mps, self._gate.unknown
-
-    def _follow(self, before: tuple[PilotMode, float, tuple[str, ...]]) -> None:
-        if self._orders_in_force()[:2] != before[:2]:
+    def _follow(self) -> None:
+        """Act on orders that are others than before."""
+        gate, ordered, unknown = self._gate, self._ordered, self._unknown
+        self._ordered, self._unknown = (gate.mode, gate.top_speed_mps), gate.orders.unknown
+        if self._ordered != ordered:
             self._act()
             self._tell()
-        if self._gate.unknown != before[2]:
+        if self._unknown != unknown:
             self._tell_holds()
 
     def _tell_holds(self) -> None:
         """Tell who orders something and should not."""
-        self.publish(ftm_topics.HOLDS, Holds("pilot", self._gate.unknown))
+        self.publish(ftm_topics.HOLDS, Holds("pilot", self._gate.orders.unknown))
 
     @on(ftm_topics.MANAGER_STATUS)
     def manager(self, _message: ManagerStatus, header: Header) -> None:
@@ -123,10 +112,10 @@ class SafetyPilot(Actor):
     def repeat_status(self) -> None:
         """Repeat the status for whoever joined late."""
         self._tell()
-        if self._gate.unknown:
+        if self._gate.orders.unknown:
             self._tell_holds()
 
-    def _see(self, laser: int, message: LaserScan, header: Header) -> None:
+    def _see(self, laser: int, message: m.LaserScan, header: Header) -> None:
         view = self._lasers.take(laser, message, header.stamp, self.clock.now())
         if view is None:
             return
@@ -140,24 +129,17 @@ class SafetyPilot(Actor):
         before, self._last = self._last, self._gate.output(now)
         self._sent_s = now
         self.publish(
-            topics.BASE_COMMAND, BaseCommand(self._last.linear_mps, self._last.angular_radps))
+            topics.BASE_COMMAND, m.BaseCommand(self._last.linear_mps, self._last.angular_radps))
         shown = (before.mode, before.stopped, before.reason)
         if shown != (self._last.mode, self._last.stopped, self._last.reason):
             self._tell()
 
     def _tell(self) -> None:
         last = self._last
-        self.publish(topics.PILOT_STATUS, PilotStatus(
+        self.publish(topics.PILOT_STATUS, m.PilotStatus(
             last.mode, last.stopped, clip(last.reason), self._gate.refused,
             self._gate.top_speed_mps, clip(self._gate.forbidden(self.clock.now()))))
 
     def _note(self, refused: str, header: Header) -> None:
         if refused:
             self.report_diagnostic("command refused", refused, header.source)
-
-
-def _stamped(message: Twist, header: Header) -> Stamped:
-    return Stamped(
-        message.linear_mps, message.angular_radps,
-        header.source, header.incarnation, header.sequence, header.stamp,
-    )

@@ -10,8 +10,8 @@ turning is safe, so that in front of an obstacle the robot can still turn away.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 
 from rampart.actors.osmosis.control.polyline import Array, Hull
@@ -23,8 +23,7 @@ _CRAWL_MPS = 0.08
 """Slowed down below this the robot stands, else it would twitch with the laser's noise."""
 
 
-@dataclass(frozen=True, slots=True)
-class StoppingRoom:
+class StoppingRoom(msgspec.Struct, frozen=True):
     """Room that has to be free for a speed.
 
     Args:
@@ -40,7 +39,7 @@ class StoppingRoom:
         angular_deceleration_radps2: braking of a turn.
     """
 
-    hull: Hull = field(default_factory=Hull)
+    hull: Hull = Hull()
     top_speed_mps: float = 1.0
     stop_distance_m: float = 0.8
     lateral_distance_m: float = 0.3
@@ -78,8 +77,6 @@ def is_free(linear_mps: float, angular_radps: float, points: Array, room: Stoppi
         points: laser echoes in `base_link`, shape (n, 2).
         room: what has to be free.
     """
-    if not len(points):
-        return True
     if abs(linear_mps) < 1e-6:
         linear_mps = 0.0
     margin_m = room.beside_m(linear_mps)
@@ -97,9 +94,8 @@ def is_free(linear_mps: float, angular_radps: float, points: Array, room: Stoppi
     return not bool(in_the_way.any())
 
 
-def _arc(
-    linear_mps: float, angular_radps: float, path_m: float, room: StoppingRoom
-) -> tuple[Array, Array, Array]:
+def _arc(linear_mps: float, angular_radps: float, path_m: float,
+         room: StoppingRoom) -> tuple[Array, Array, Array]:
     """Poses along the arc in `base_link`; it straightens once the turn could have been braked."""
     turn_rad = math.copysign(room.turn_rad(angular_radps), angular_radps)
     if path_m == 0.0:
@@ -117,9 +113,8 @@ def _arc(
     return x, y, yaw
 
 
-def limited(
-    linear_mps: float, angular_radps: float, points: Array, room: StoppingRoom
-) -> tuple[float, float]:
+def limited(linear_mps: float, angular_radps: float, points: Array,
+            room: StoppingRoom) -> tuple[float, float]:
     """Return the command, slowed down as far as the echoes ask for; zero if nothing is free.
 
     Steps are a twentieth of the commanded speed. Turning is slowed after that, and given up last.
@@ -132,9 +127,7 @@ def limited(
             break
         if is_free(slower_mps, angular_radps, points, room):
             return slower_mps, angular_radps
-    if is_free(0.0, angular_radps, points, room):
-        return 0.0, angular_radps
-    for share in (0.5, 0.25):
+    for share in (1.0, 0.5, 0.25):
         if is_free(0.0, angular_radps * share, points, room):
             return 0.0, angular_radps * share
     return 0.0, 0.0

@@ -7,12 +7,14 @@ edge, still stands on the graph, and a goal behind it can still be reached from 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 
+import msgspec
+
+from rampart.actors.osmosis.airport.model import Point
 from rampart.actors.osmosis.control.planning.route_search import Edge
-from rampart.actors.osmosis.control.polyline import Point
 
 MOST_PLACES = 32
 """That are closed at a time; with one more, the one closed first is tried again."""
@@ -21,8 +23,7 @@ _LEAST_STUB_M = 0.05
 """A shorter rest of an edge is none."""
 
 
-@dataclass(slots=True)
-class Closures:
+class Closures(msgspec.Struct):
     """The places that are blocked, each until it is tried again.
 
     Args:
@@ -32,7 +33,7 @@ class Closures:
 
     gap_m: float = 1.0
     lasts_s: float = 60.0
-    _until_s: dict[Point, float] = field(default_factory=dict)
+    _until_s: dict[Point, float] = {}
 
     def close(self, place: Point, now_s: float) -> None:
         """Close the graph round a place in `map`; one near it that was closed before is renewed."""
@@ -55,9 +56,8 @@ class Closures:
         return tuple(self._until_s)
 
 
-def without(
-    nodes: Mapping[str, Point], edges: Iterable[Edge], places: Iterable[Point], gap_m: float
-) -> tuple[dict[str, Point], list[Edge]]:
+def without(nodes: Mapping[str, Point], edges: Iterable[Edge], places: Iterable[Point],
+            gap_m: float) -> tuple[dict[str, Point], list[Edge]]:
     """Return the graph without what lies within `gap_m` of the places.
 
     The rests of an edge that is cut end in nodes of their own, named after the edge. No name of an
@@ -102,7 +102,5 @@ def _between(a: Point, b: Point, share: float) -> Point:
 
 
 def _fresh(stem: str, taken: Mapping[str, Point]) -> str:
-    number = 1
-    while f"{stem}#{number}" in taken:
-        number += 1
-    return f"{stem}#{number}"
+    names = (f"{stem}#{number}" for number in itertools.count(1))
+    return next(name for name in names if name not in taken)

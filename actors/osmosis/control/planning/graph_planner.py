@@ -9,6 +9,7 @@ import msgspec
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.plausible import is_sane
 from rampart.actors.osmosis import topics
+from rampart.actors.osmosis.airport.model import Point, show
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.control.planning.closures import Closures, without
 from rampart.actors.osmosis.control.planning.route_search import PlannedRoute, plan_route
@@ -29,8 +30,7 @@ def _objection(kept: RouteKept) -> str:
     if not all(math.isfinite(v) for waypoint in kept.route.waypoints for v in waypoint):
         return "a waypoint is not finite"
     order, route = kept.order, kept.route
-    same = (order.mission_id, order.step, order.active) == (
-        route.mission_id, route.step, route.active)
+    same = (order.which, order.active) == (route.which, route.active)
     return "" if same else f"route of step {route.step}, goal of step {order.step}"
 
 
@@ -97,7 +97,7 @@ class GraphPlanner(Actor):
             return
         before, self._order = self._order, message
         if self._blocked is not None and before is not None and message.plan > before.plan \
-                and (message.mission_id, message.step) == (before.mission_id, before.step):
+                and message.which == before.which:
             # Another plan is wanted, and what stands in front of the robot is known.
             self._closures.close((self._blocked.x_m, self._blocked.y_m), self.clock.now())
         self._route = self._blocked = None
@@ -114,8 +114,7 @@ class GraphPlanner(Actor):
         """Plan round what has blocked the robot for long enough."""
         route, now_s = self._route, self.clock.now()
         self._blocked = None
-        if route is None or not route.active or (
-                (message.mission_id, message.step) != (route.mission_id, route.step)):
+        if route is None or not route.active or message.which != route.which:
             return
         for blockage in message.blocked:
             if not math.isfinite(blockage.x_m + blockage.y_m):
@@ -142,8 +141,7 @@ class GraphPlanner(Actor):
         if order is None:
             return
         if not order.active:
-            self._route = Route(order.mission_id, order.step, order.goal.mode, False, (), "",
-                                order.plan)
+            self._route = _route(order, (), "")
         elif pose is None:
             return
         else:
@@ -153,7 +151,7 @@ class GraphPlanner(Actor):
                 plan = self._search(order, pose)
             if plan.reason:
                 self.report_diagnostic("route search", plan.reason, order.mission_id)
-            self._route = _route(order, plan, plan.reason)
+            self._route = _route(order, plan.waypoints, plan.reason)
         self._tell()
 
     def _plan_round(self, blockage: Blockage, now_s: float) -> None:
@@ -162,30 +160,21 @@ class GraphPlanner(Actor):
             return
         self._closures.close(place, now_s)
         plan = self._search(order, pose)
-        where = f"({place[0]:.1f}, {place[1]:.1f})"
+        where = show(place)
         if not plan.waypoints:
             self._closures.reopen()
             self.report_diagnostic("route search", f"no way round {where}: {plan.reason}",
                                    order.mission_id)
             return
-        self._route = _route(order, plan, f"way round {where}, which is blocked")
+        self._route = _route(order, plan.waypoints, f"way round {where}, which is blocked")
         self._tell()
 
     def _search(self, order: GoalOrder, pose: Pose) -> PlannedRoute:
-        nodes, edges = self._airport.nodes, self._airport.edges
-        closed = self._closures.closed(self.clock.now())
-        if closed:
-            open_nodes, open_edges = without(nodes, edges, closed, self._closures.gap_m)
-            nodes, edges = open_nodes, tuple(open_edges)
-        return plan_route(
-            nodes,
-            edges,
-            (pose.x_m, pose.y_m),
-            (order.goal.x_m, order.goal.y_m),
-            straight=order.goal.mode is Mode.LIGHT_VERIFICATION,
-        )
+        nodes, edges = without(self._airport.nodes, self._airport.edges,
+                               self._closures.closed(self.clock.now()), self._closures.gap_m)
+        return plan_route(nodes, edges, (pose.x_m, pose.y_m), (order.goal.x_m, order.goal.y_m),
+                          straight=order.goal.mode is Mode.LIGHT_VERIFICATION)
 
 
-def _route(order: GoalOrder, plan: PlannedRoute, reason: str) -> Route:
-    return Route(order.mission_id, order.step, order.goal.mode, True, plan.waypoints,
-                 clip(reason), order.plan)
+def _route(order: GoalOrder, waypoints: tuple[Point, ...], reason: str) -> Route:
+    return Route(*order.which, order.goal.mode, order.active, waypoints, clip(reason), order.plan)

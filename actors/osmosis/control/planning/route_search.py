@@ -12,15 +12,15 @@ import heapq
 import itertools
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 
-from rampart.actors.osmosis.control.polyline import Point
+import msgspec
+
+from rampart.actors.osmosis.airport.model import Attachment, Point, foot, show
 
 Edge = tuple[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class SearchLimits:
+class SearchLimits(msgspec.Struct, frozen=True):
     """How far start and goal may be from the graph, in metres.
 
     Args:
@@ -43,40 +43,15 @@ class SearchLimits:
     row_begins_m: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class PlannedRoute:
+class PlannedRoute(msgspec.Struct, frozen=True):
     """Result of a search: waypoints in `map` from start to goal, or none and the reason."""
 
     waypoints: tuple[Point, ...]
-    length_m: float
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class _Snap:
-    """Where a point joins the graph: a place on the edge (a, b); a == b means the node itself."""
-
-    point: Point
-    distance_m: float
-    a: str
-    b: str
-
-
-def edge_key(a: str, b: str) -> Edge:
-    """Return the name of an undirected edge, the same from both ends."""
-    return (a, b) if a <= b else (b, a)
-
-
-def plan_route(
-    nodes: Mapping[str, Point],
-    edges: Iterable[Edge],
-    start: Point,
-    goal: Point,
-    *,
-    straight: bool = False,
-    blocked: frozenset[Edge] = frozenset(),
-    limits: SearchLimits | None = None,
-) -> PlannedRoute:
+def plan_route(nodes: Mapping[str, Point], edges: Iterable[Edge], start: Point, goal: Point, *,
+               straight: bool = False, limits: SearchLimits | None = None) -> PlannedRoute:
     """Return a shortest route over the graph.
 
     Args:
@@ -87,33 +62,25 @@ def plan_route(
         straight: light verification: inner waypoints of a straight row are left out, and the row
             begins at its node, if that is near, and not where the robot is: from there the line
             would be at a slant and lead past beside the first light.
-        blocked: edges not to be used, in either order of their ends.
         limits: snapping distances.
     """
     limits = limits or SearchLimits()
     if not all(map(math.isfinite, (*start, *goal))):
-        return _none(f"start {_show(start)} or goal {_show(goal)} is not a finite point")
-    closed = {edge_key(*edge) for edge in blocked}
-    usable = sorted({edge_key(a, b) for a, b in edges if a != b} - closed)
-    unknown = [name for edge in usable for name in edge if name not in nodes]
-    if unknown:
-        return _none(f"the graph's edges name the node {unknown[0]!r}, which does not exist")
-    joined: list[_Snap] = []
+        return PlannedRoute((), f"start {show(start)} or goal {show(goal)} is not a finite point")
+    usable = sorted({(min(edge), max(edge)) for edge in edges if edge[0] != edge[1]})
+    joined: list[Attachment] = []
     reaches = ((start, "start", limits.start_reach_m), (goal, "goal", limits.goal_reach_m))
     for point, what, reach_m in reaches:
         snap = _snap(nodes, usable, point, limits.node_snap_m)
         if snap is None:
-            return _none("the graph has no edge that is open")
+            return PlannedRoute((), "the graph has no edge that is open")
         if snap.distance_m > reach_m:
-            return _none(
-                f"{what} {_show(point)} is {snap.distance_m:.1f} m from the graph,"
-                f" at most {reach_m:.1f} m is allowed"
-            )
+            return PlannedRoute((), f"{what} {show(point)} is {snap.distance_m:.1f} m from the "
+                                    f"graph, at most {reach_m:.1f} m is allowed")
         joined.append(snap)
     path = _search(nodes, usable, joined[0], joined[1])
     if path is None:
-        where = f" with {len(closed)} edges blocked" if closed else ""
-        return _none(f"no way in the graph from {_show(start)} to {_show(goal)}{where}")
+        return PlannedRoute((), f"no way in the graph from {show(start)} to {show(goal)}")
     if joined[1].distance_m <= limits.cut_m:
         path[-1] = goal
     else:
@@ -125,50 +92,29 @@ def plan_route(
         if len(waypoints) > 2 and math.dist(*waypoints[:2]) <= limits.row_begins_m:
             del waypoints[0]
         waypoints = _straightened(waypoints, limits.straight_m)
-    length_m = sum(math.dist(a, b) for a, b in itertools.pairwise(waypoints))
-    return PlannedRoute(tuple(waypoints), length_m, "")
+    return PlannedRoute(tuple(waypoints), "")
 
 
-def _none(reason: str) -> PlannedRoute:
-    return PlannedRoute((), math.inf, reason)
-
-
-def _show(point: Point) -> str:
-    return f"({point[0]:.1f}, {point[1]:.1f})"
-
-
-def _snap(
-    nodes: Mapping[str, Point], edges: list[Edge], point: Point, node_snap_m: float
-) -> _Snap | None:
+def _snap(nodes: Mapping[str, Point], edges: list[Edge], point: Point,
+          node_snap_m: float) -> Attachment | None:
     """Return the nearest place on the open part of the graph."""
-    best: _Snap | None = None
+    best: Attachment | None = None
     for a, b in edges:
-        foot = _foot(point, nodes[a], nodes[b])
-        distance_m = math.dist(point, foot)
+        place = foot(point, nodes[a], nodes[b])
+        distance_m = math.dist(point, place)
         if best is None or distance_m < best.distance_m:
-            best = _Snap(foot, distance_m, a, b)
+            best = Attachment(place, distance_m, a, b)
     if best is None:
         return None
     for name in sorted({name for edge in edges for name in edge}):
         distance_m = math.dist(point, nodes[name])
         if distance_m <= best.distance_m + (node_snap_m if best.a != best.b else 0.0):
-            best = _Snap(nodes[name], distance_m, name, name)
+            best = Attachment(nodes[name], distance_m, name, name)
     return best
 
 
-def _foot(point: Point, a: Point, b: Point) -> Point:
-    along = (b[0] - a[0], b[1] - a[1])
-    square = along[0] ** 2 + along[1] ** 2
-    if square == 0.0:
-        return a
-    share = ((point[0] - a[0]) * along[0] + (point[1] - a[1]) * along[1]) / square
-    share = min(max(share, 0.0), 1.0)
-    return a[0] + share * along[0], a[1] + share * along[1]
-
-
-def _search(
-    nodes: Mapping[str, Point], edges: list[Edge], start: _Snap, goal: _Snap
-) -> list[Point] | None:
+def _search(nodes: Mapping[str, Point], edges: list[Edge], start: Attachment,
+            goal: Attachment) -> list[Point] | None:
     """A* between two snapped points. Temporary nodes are 0 (start) and 1 (goal)."""
     places: dict[str | int, Point] = {0: start.point, 1: goal.point}
     places.update(nodes.items())
@@ -189,7 +135,7 @@ def _search(
     cost: dict[str | int, float] = {0: 0.0}
     came: dict[str | int, str | int] = {}
     done: set[str | int] = set()
-    tie = 0
+    ties = itertools.count(1)
     queue: list[tuple[float, int, str | int]] = [(math.dist(start.point, goal.point), 0, 0)]
     while queue:
         _, _, place = heapq.heappop(queue)
@@ -207,9 +153,8 @@ def _search(
             if total < cost.get(beyond, math.inf):
                 cost[beyond] = total
                 came[beyond] = place
-                tie += 1
                 guess = total + math.dist(places[beyond], goal.point)
-                heapq.heappush(queue, (guess, tie, beyond))
+                heapq.heappush(queue, (guess, next(ties), beyond))
     return None
 
 
@@ -224,6 +169,6 @@ def _without_repeats(path: list[Point]) -> list[Point]:
 def _straightened(path: list[Point], straight_m: float) -> list[Point]:
     """Return the ends alone if the row between them is straight, else the path as it is."""
     first, last = path[0], path[-1]
-    if all(math.dist(point, _foot(point, first, last)) <= straight_m for point in path[1:-1]):
+    if all(math.dist(point, foot(point, first, last)) <= straight_m for point in path[1:-1]):
         return [first, last] if len(path) > 1 else path
     return path

@@ -34,10 +34,8 @@ AUTO = "auto"
 EVENT = struct.Struct("=IhBB")
 """`struct js_event`: time in ms, value, type, number of the button or axis."""
 
-BUTTON = 0x01
-AXIS = 0x02
-INITIAL = 0x80
-"""Mark of a record that tells a state and not a change."""
+BUTTON, AXIS, INITIAL = 0x01, 0x02, 0x80
+"""Types of records; the last is the mark of one that tells a state and not a change."""
 
 FULL_SCALE = 32767
 _DEVICES = Path("/dev/input")
@@ -103,7 +101,8 @@ class StickDecoder:
         self._rest = data[whole:]
         for _time_ms, value, kind, number in EVENT.iter_unpack(data[:whole]):
             if kind & ~INITIAL == BUTTON:
-                self._button(number, value, initial=bool(kind & INITIAL))
+                if number == self._mapping.dead_man_button:
+                    self._pressed = bool(value) and (self._pressed or not kind & INITIAL)
             elif kind & ~INITIAL == AXIS:
                 if number in self._axes:
                     self._axes[number] = value
@@ -115,13 +114,8 @@ class StickDecoder:
     def stick(self) -> Joystick:
         """Where the stick is now."""
         mapping = self._mapping
-        return Joystick(
-            self._position(mapping.forward_axis, mapping.forward_sign),
-            self._position(mapping.left_axis, mapping.left_sign), self._pressed)
-
-    def _button(self, number: int, value: int, *, initial: bool) -> None:
-        if number == self._mapping.dead_man_button:
-            self._pressed = bool(value) and (self._pressed or not initial)
+        return Joystick(self._position(mapping.forward_axis, mapping.forward_sign),
+                        self._position(mapping.left_axis, mapping.left_sign), self._pressed)
 
     def _position(self, axis: int, sign: int) -> float:
         share = min(abs(self._axes[axis]) / FULL_SCALE, 1.0)

@@ -13,7 +13,8 @@ A joystick on this machine, the operator's page and a terminal may all offer pos
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+
+import msgspec
 
 from rampart.actors.osmosis.messages import Joystick
 
@@ -23,8 +24,7 @@ TIMEOUT_S = 0.3
 _REMEMBERED = 64
 
 
-@dataclass(frozen=True, slots=True)
-class Ruling:
+class Ruling(msgspec.Struct, frozen=True):
     """What follows from an offer, or from the passing of time.
 
     Attributes:
@@ -41,15 +41,10 @@ class Ruling:
 
 
 class StickArbiter:
-    """Follows one source at a time.
+    """Follows one source at a time."""
 
-    Args:
-        timeout_s: see `TIMEOUT_S`.
-    """
-
-    def __init__(self, timeout_s: float = TIMEOUT_S) -> None:
+    def __init__(self) -> None:
         self.holder = ""
-        self._timeout_s = timeout_s
         self._heard_s = -math.inf
         self._barred: dict[str, bool] = {}
         """Sources that have to let go first, and whether they know; the newest are remembered."""
@@ -71,7 +66,7 @@ class StickArbiter:
                 return lost
             self.holder = ""
             return Ruling(released=True)
-        if not now_s - stamp_s <= self._timeout_s:  # so is a stamp that is no number
+        if not now_s - stamp_s <= TIMEOUT_S:  # so is a stamp that is no number
             return Ruling(None, lost.released, "its position came too late", source)
         if not self.holder and source not in self._barred:
             self.holder = source
@@ -86,11 +81,11 @@ class StickArbiter:
 
     def expire(self, now_s: float) -> Ruling:
         """Take the stick from a source that has not been heard for too long."""
-        if not self.holder or now_s - self._heard_s <= self._timeout_s:
+        if not self.holder or now_s - self._heard_s <= TIMEOUT_S:
             return Ruling()
         source, self.holder = self.holder, ""
         self._bar(source, told=False)
-        return Ruling(None, True, f"not heard for {self._timeout_s:g} s: counts as let go", source)
+        return Ruling(None, True, f"not heard for {TIMEOUT_S:g} s: counts as let go", source)
 
     def _bar(self, source: str, *, told: bool) -> None:
         self._barred.pop(source, None)

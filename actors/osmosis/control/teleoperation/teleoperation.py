@@ -15,11 +15,7 @@ from rampart.actors.osmosis.control.teleoperation.joystick_device import (
     JoystickDevice,
     StickMapping,
 )
-from rampart.actors.osmosis.control.teleoperation.stick_arbitration import (
-    TIMEOUT_S,
-    Ruling,
-    StickArbiter,
-)
+from rampart.actors.osmosis.control.teleoperation.stick_arbitration import Ruling, StickArbiter
 from rampart.actors.osmosis.messages import Joystick, Twist
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.timer import Timer
@@ -76,23 +72,20 @@ class Teleoperation(Actor):
         self._linear_mps = robot.top_speed_mps if own.linear_mps is None else own.linear_mps
         self._angular_radps = (
             robot.top_turn_rate_radps if own.angular_radps is None else own.angular_radps)
-        self._arbiter = StickArbiter(TIMEOUT_S)
+        self._arbiter = StickArbiter()
         self._look: Timer | None = None
-        self._device: JoystickDevice | None = None
+        self._named = Osmosis.of(context).options.joystick or own.device
+        self._device = JoystickDevice(self._named, own, self._moved, self._gone)
         self._missing = ""
 
     def on_start(self) -> None:
         """Open the joystick, if there is to be one."""
-        name = Osmosis.of(self.context).joystick or self.parameters.device
-        if not name or self.context.run.plan.virtual:
-            return
-        self._device = JoystickDevice(name, self.parameters, self._moved, self._gone)
-        self._plug()
+        if self._named and not self.context.run.plan.virtual:
+            self._plug()
 
     def on_stop(self) -> None:
         """Let the joystick go."""
-        if self._device is not None:
-            self._device.close()
+        self._device.close()
 
     @on(topics.JOYSTICK)
     def joystick(self, message: Joystick, header: Header) -> None:
@@ -105,8 +98,7 @@ class Teleoperation(Actor):
 
     def _attend(self) -> None:
         """Look again soon while somebody has the stick, or holds a device in vain."""
-        held = self._device is not None and self._device.stick.dead_man
-        if (held or self._arbiter.holder) and self._look is None:
+        if (self._device.stick.dead_man or self._arbiter.holder) and self._look is None:
             self._look = self.call_later(_LOOK_S, self._again)
 
     def _obey(self, ruling: Ruling, stamp_s: float) -> None:
@@ -122,8 +114,7 @@ class Teleoperation(Actor):
     def _again(self) -> None:
         """Repeat a device that is held, and notice who has fallen silent."""
         self._look = None
-        device = self._device
-        if device is not None and device.stick.dead_man:
+        if self._device.stick.dead_man:
             self._moved()
         else:
             now_s = self.clock.now()
@@ -133,26 +124,18 @@ class Teleoperation(Actor):
     # -- the device -----------------------------------------------------------------------------
 
     def _plug(self) -> None:
-        device = self._device
-        if device is None:
-            return
-        missing = device.open()
+        missing = self._device.open()
         if missing and missing != self._missing:
-            self.report_diagnostic("joystick", f"waiting for it: {missing}", device.path)
+            self.report_diagnostic("joystick", f"waiting for it: {missing}", self._device.path)
         self._missing = missing
         if missing:
             self.call_later(_REPLUG_S, self._plug)
 
     def _moved(self) -> None:
-        device = self._device
-        if device is not None:
-            self._offer(device.path, device.stick, self.clock.now())
+        self._offer(self._device.path, self._device.stick, self.clock.now())
 
     def _gone(self, why: str) -> None:
-        device = self._device
-        if device is None:
-            return
-        self._offer(device.path, device.stick, self.clock.now())  # closed, it has let go
-        self.report_diagnostic("joystick", f"vanished: {why}", device.path)
+        self._moved()  # closed, it has let go
+        self.report_diagnostic("joystick", f"vanished: {why}", self._device.path)
         self._missing = why
         self.call_later(_REPLUG_S, self._plug)

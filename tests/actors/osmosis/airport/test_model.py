@@ -78,7 +78,7 @@ def test_the_prohibited_polygon_and_the_allowed_area_share_no_ground():
 
 def test_the_nearest_place_on_the_graph_may_be_in_the_middle_of_an_edge():
     found = airport().nearest_on_graph(10, 4)
-    assert ({found.a, found.b}, found.x_m, found.y_m) == ({"SW", "SE"}, 10, 3)
+    assert ({found.a, found.b}, found.point) == ({"SW", "SE"}, (10, 3))
     assert found.distance_m == pytest.approx(1)
 
 
@@ -96,13 +96,11 @@ GOAL_FAR = Mission("M", (MissionGoal(10, 10, "taxi"),))
         ({"edges": (("SW", "XX"),)}, "edges[0]: unknown node"),
         ({"edges": (("SW", "SW"),)}, "edges[0]: an edge joins two different nodes"),
         ({"edges": (*EDGES, ("SE", "SW"))}, "edges: edge given twice"),
-        ({"nodes": {**NODES, "SW": (math.nan, 0)}}, "nodes.SW: coordinates must be finite"),
         ({"nodes": {**NODES, "NW": (10.0, 10.0)}}, "nodes.NW: in the prohibited area"),
         ({"edges": (*EDGES, ("SW", "NE"))}, "edges[3]: passes through the prohibited area"),
         ({"nodes": {**NODES, "SE": (17.0, 0.2), "SW": (3.0, 0.2)}, "start": StartPose(3, 2, 0)},
          "edges[0]: nearer to the prohibited area than"),
         ({"start": StartPose(10, 10, 0)}, "start: in the prohibited area"),
-        ({"start": StartPose(3, 3, math.inf)}, "start: the start pose must be finite"),
         ({"start": StartPose(3, 10, 0), "nodes": {"NE": (17.0, 17.0)}, "edges": ()},
          "start: 15.7 m from the graph"),
         ({"lights": (Light("L1", "L", 10, 10, 200),)}, "row.L1: off the pavement"),
@@ -127,8 +125,6 @@ def test_each_fault_of_an_airport_is_found_and_named(changes, expected):
     [
         ((), "missions.M: a mission needs at least one goal"),
         ((MissionGoal(3, 25, "taxi"),), "missions.M.goals[0]: 8.0 m from the graph"),
-        ((MissionGoal(3, 3, "fly"),), "missions.M.goals[0].mode: must be one of"),
-        ((MissionGoal(math.nan, 3, "taxi"),), "missions.M.goals[0]: coordinates must be finite"),
         ((MissionGoal(7, 5, "taxi"), MissionGoal(6.4, 6.0, "taxi")),
          "missions.M.goals[1]: in the prohibited area"),
     ],

@@ -37,10 +37,15 @@ def shortest_m(a: str, b: str, without: frozenset[str] = frozenset()) -> float:
     return math.inf
 
 
+def nearest_node(place) -> tuple[str, float]:
+    off_m = {name: math.dist(at, (place.x_m, place.y_m)) for name, at in AIRPORT.nodes.items()}
+    return min(off_m.items(), key=lambda found: found[1])
+
+
 def route_m(mission: str) -> float:
-    at, total_m = AIRPORT.nearest_node(AIRPORT.start.x_m, AIRPORT.start.y_m)[0], 0.0
+    at, total_m = nearest_node(AIRPORT.start)[0], 0.0
     for goal in AIRPORT.missions[mission].goals:
-        node, off_m = AIRPORT.nearest_node(goal.x_m, goal.y_m)
+        node, off_m = nearest_node(goal)
         total_m += shortest_m(at, node) + off_m
         at = node
     return total_m

@@ -8,6 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rampart.actors.bus.envelope import Header
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.following.light_row import LightRow, RowLimits
 from rampart.actors.osmosis.control.following.motion_loop import LoopLimits, MotionLoop
@@ -15,7 +17,7 @@ from rampart.actors.osmosis.control.following.osmosis_control import OsmosisCont
 from rampart.actors.osmosis.control.following.path_follower import PathFollower
 from rampart.actors.osmosis.control.following.standby_control import StandbyControl
 from rampart.actors.osmosis.control.pilot.command_pair import FORGET_S, CommandPair, PairLimits
-from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate, Stamped
+from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate
 from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.osmosis.messages import PilotMode
 from rampart.actors.recovery.respawn import Ask, RespawnCore, accused
@@ -36,8 +38,8 @@ class Bench:
     def send(self, source, command, age_s=0.0):
         self.sequence += 1
         take = self.gate.command if source == "osmosis_control" else self.gate.standby
-        return take(Stamped(*command, source, self.lives[source], self.sequence,
-                            self.now - age_s), self.now)
+        header = Header(source, self.lives[source], self.sequence, self.now - age_s)
+        return take(m.Twist(*command), header, self.now)
 
     def tick(self, active=None, standby=None, ticks=1, age_s=0.0):
         """Let periods pass; None is silence."""
@@ -126,9 +128,9 @@ def test_when_both_are_silent_the_robot_stops():
 
 def test_orders_and_the_stick_stand_above_both():
     bench = Bench().tick(None, (0.7, 0.0), ticks=20)
-    bench.gate.joystick(Stamped(-0.2, 0.0, "teleoperation", 1, 1, bench.now), bench.now)
+    bench.gate.joystick(m.Twist(-0.2, 0.0), Header("teleoperation", 1, 1, bench.now), bench.now)
     assert bench.out == (-0.2, 0.0)
-    bench.gate.order("RM2", True, PilotMode.STOP, "because")
+    bench.gate.order("RM2", m.PilotOrder(True, PilotMode.STOP, "because"))
     assert bench.out == (0.0, 0.0)
 
 
@@ -197,19 +199,19 @@ def test_without_a_standby_the_pair_has_no_say(fresh):
 
 def test_the_lowest_ordered_bound_holds_until_its_order_ends_and_keeps_the_turn_rate():
     bench = Bench().tick((0.9, 0.4), ticks=3)
-    bench.gate.order("RM7", True, PilotMode.AUTO, "weak wheel", 0.5)
-    bench.gate.order("RM8", True, PilotMode.AUTO, "worse", 0.3)
+    bench.gate.order("RM7", m.PilotOrder(True, PilotMode.AUTO, "weak wheel", 0.5))
+    bench.gate.order("RM8", m.PilotOrder(True, PilotMode.AUTO, "worse", 0.3))
     assert bench.out == (0.3, 0.4)
-    bench.gate.order("RM8", False, PilotMode.AUTO, "")
+    bench.gate.order("RM8", m.PilotOrder(False, PilotMode.AUTO, ""))
     assert (bench.out, bench.reason) == ((0.5, 0.4), "speed bounded by order")
-    bench.gate.order("RM7", False, PilotMode.AUTO, "")
+    bench.gate.order("RM7", m.PilotOrder(False, PilotMode.AUTO, ""))
     assert (bench.out, bench.gate.top_speed_mps) == ((0.9, 0.4), 0.0)
 
 
 @pytest.mark.parametrize("nonsense", [0.0, -1.0, math.nan])
 def test_a_bound_that_makes_no_sense_bounds_nothing(nonsense):
     bench = Bench().tick((0.9, 0.4), ticks=3)
-    bench.gate.order("RM7", True, PilotMode.AUTO, "", nonsense)
+    bench.gate.order("RM7", m.PilotOrder(True, PilotMode.AUTO, "", nonsense))
     assert bench.out == (0.9, 0.4)
 
 

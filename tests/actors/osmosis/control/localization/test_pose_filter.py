@@ -52,19 +52,9 @@ class Outcome:
 
 
 def feed(pose_filter: PoseFilter, reading: Reading, now_s: float) -> None:
-    body, stamp_s = reading.body, reading.stamp_s
-    if reading.topic is topics.IMU:
-        pose_filter.imu(stamp_s, body.yaw_rad, body.yaw_rate_radps,
-                        (body.accel_x_mps2, body.accel_y_mps2), now_s)
-    elif reading.topic is topics.ODOMETRY:
-        pose = body.pose
-        pose_filter.odometry(stamp_s, (pose.x_m, pose.y_m, pose.yaw_rad), body.twist.linear_mps,
-                             now_s)
-    elif reading.topic is topics.GPS:
-        pose_filter.gps(stamp_s, (body.x_m, body.y_m),
-                        (body.velocity_x_mps, body.velocity_y_mps), body.accuracy_m, now_s)
-    else:
-        pose_filter.absolute_pose(stamp_s, body.x_m, body.y_m, body.yaw_rad, now_s)
+    take = {topics.IMU: pose_filter.imu, topics.ODOMETRY: pose_filter.odometry,
+            topics.GPS: pose_filter.gps, topics.ABSOLUTE_POSE: pose_filter.absolute_pose}
+    take[reading.topic](reading.stamp_s, reading.body, now_s)
 
 
 def run(*faults, start_s=0.0, seed=1, limits=None, judge_to_s=FOR_EVER):
@@ -97,9 +87,10 @@ def compare(pose_filter: PoseFilter, truth: Truth, now_s: float, outcome: Outcom
         return
     outcome.told += 1
     x_m, y_m, yaw_rad = truth.at(estimate.stamp_s)
-    outcome.worst_m = max(outcome.worst_m, math.hypot(estimate.x_m - x_m, estimate.y_m - y_m))
+    found = estimate.pose
+    outcome.worst_m = max(outcome.worst_m, math.hypot(found.x_m - x_m, found.y_m - y_m))
     outcome.worst_rad = max(
-        outcome.worst_rad, abs(math.remainder(estimate.yaw_rad - yaw_rad, math.tau)))
+        outcome.worst_rad, abs(math.remainder(found.yaw_rad - yaw_rad, math.tau)))
 
 
 # ---- without a fault -----------------------------------------------------------------------------
@@ -151,14 +142,14 @@ def test_a_fresh_life_that_hears_only_what_is_late_already_says_nothing_until_th
     pose_filter = PoseFilter()
     for step in range(20):  # as on a machine that is busy with starting everybody
         now_s = 0.05 * step
-        pose_filter.absolute_pose(now_s - 0.25, 1.0, 2.0, 0.5, now_s)
+        pose_filter.absolute_pose(now_s - 0.25, m.Pose(1.0, 2.0, 0.5), now_s)
         assert pose_filter.estimate() is None
     for step in range(20, 30):
         now_s = 0.05 * step
-        pose_filter.absolute_pose(now_s, 1.0, 2.0, 0.5, now_s)
+        pose_filter.absolute_pose(now_s, m.Pose(1.0, 2.0, 0.5), now_s)
         estimate = pose_filter.estimate()
         if estimate is not None:
-            assert (estimate.x_m, estimate.y_m) == pytest.approx((1.0, 2.0), abs=0.01)
+            assert (estimate.pose.x_m, estimate.pose.y_m) == pytest.approx((1.0, 2.0), abs=0.01)
     assert estimate is not None
 
 
@@ -336,7 +327,8 @@ def test_the_filter_is_the_textbook_one(moves):
 def test_odometry_is_checked_against_itself(linear_mps, twist_mps, reason):
     check = OdometryCheck()
     for i in range(100):
-        check.take(0.02 * i, (linear_mps * 0.02 * i, 0.0, 0.0), twist_mps)
+        check.take(0.02 * i, m.Odometry(
+            m.Pose(linear_mps * 0.02 * i, 0.0, 0.0), m.Twist(twist_mps, 0.0)))
     assert check.trust.reason == reason
 
 
@@ -349,7 +341,7 @@ def test_odometry_is_checked_against_itself(linear_mps, twist_mps, reason):
 def test_the_imu_is_checked_against_itself(rate_radps, said_radps, noise, reason):
     check = ImuCheck()
     for i in range(300):
-        check.take(0.01 * i, rate_radps * 0.01 * i, said_radps, (noise * 0.05 * (i % 2), 0.0),
+        check.take(0.01 * i, m.Imu(rate_radps * 0.01 * i, said_radps, noise * 0.05 * (i % 2), 0.0),
                    0.01 * i)
     assert check.trust.reason == reason
 
@@ -364,12 +356,13 @@ def test_what_is_no_number_or_beyond_all_measure_is_not_used(bad):
             feed(pose_filter, item, now_s)
             feed(other, item, now_s)
             later_s = item.stamp_s + 1e-4
-            pose_filter.imu(later_s, bad, 0.0, (0.0, 0.0), now_s)
-            pose_filter.odometry(later_s, (0.0, bad, 0.0), 0.0, now_s)
-            pose_filter.gps(later_s, (bad, 0.0), (0.0, 0.0), 0.02, now_s)
-            pose_filter.gps(later_s, (0.0, 0.0), (0.0, 0.0), -1.0, now_s)
-            pose_filter.gps(later_s, (0.0, 0.0), (0.0, bad), 0.02, now_s)
-            pose_filter.absolute_pose(later_s, 0.0, 0.0, bad, now_s)
+            pose_filter.imu(later_s, m.Imu(bad, 0.0, 0.0, 0.0), now_s)
+            pose_filter.odometry(
+                later_s, m.Odometry(m.Pose(0.0, bad, 0.0), m.Twist(0.0, 0.0)), now_s)
+            pose_filter.gps(later_s, m.GpsFix(bad, 0.0, 0.0, 0.0, 0.02), now_s)
+            pose_filter.gps(later_s, m.GpsFix(0.0, 0.0, 0.0, 0.0, -1.0), now_s)
+            pose_filter.gps(later_s, m.GpsFix(0.0, 0.0, 0.0, bad, 0.02), now_s)
+            pose_filter.absolute_pose(later_s, m.Pose(0.0, 0.0, bad), now_s)
     assert pose_filter.estimate() == other.estimate()
     assert pose_filter.status(4.0) == other.status(4.0)
 

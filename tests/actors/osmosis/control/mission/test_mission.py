@@ -66,7 +66,7 @@ def test_a_repeated_arrival_steps_on_once():
 def test_the_same_id_is_one_mission_even_when_it_is_over():
     state = running()
     assert ms.accept(state, REQUEST, 11.0) is state
-    over = ms.cancel(state, "enough")
+    over = ms.enter(state, MissionPhase.CANCELLED, "enough")
     assert ms.accept(over, REQUEST, 12.0) is over
 
 
@@ -102,10 +102,10 @@ def test_a_light_keeps_its_first_measurement():
 
 def test_a_paused_mission_gives_no_goal_and_resumes_at_the_same_one():
     state = ms.progress(running(), arrived(0), 11.0)
-    paused = ms.pause(state, "the operator drives")
+    paused, _ = ms.obey(state, order(A.PAUSE), 11.5)
     assert not ms.goal_order(paused).active
     assert ms.progress(paused, arrived(1), 12.0) is paused
-    assert ms.goal_order(ms.resume(paused)) == ms.goal_order(state)
+    assert ms.goal_order(ms.obey(paused, order(A.RESUME, 2), 12.5)[0]) == ms.goal_order(state)
 
 
 @pytest.mark.parametrize(("old", "new"), list(itertools.product(MissionPhase, repeat=2)))
@@ -119,8 +119,9 @@ def test_a_phase_is_entered_by_the_table_or_not_at_all(old, new):
 
 
 def test_resuming_what_is_not_paused_is_refused():
-    with pytest.raises(IllegalTransitionError, match="running → running"):
-        ms.resume(running())
+    state, answer = ms.obey(running(), order(A.RESUME), 11.0)
+    assert (answer.accepted, answer.reason) == (False, "it is not paused but running")
+    assert state.phase is MissionPhase.RUNNING
 
 
 def test_the_state_survives_serialisation():
@@ -147,15 +148,16 @@ def obeyed(state, action, number=1, now=15.0):
 def situations():
     """The mission in each situation in which an order may find it."""
     begun = ms.routed(running(), ROUTE)
+    paused = obeyed(begun, A.PAUSE, 98)
     return {
         "none": MissionState(),
         "running": begun,
         "running, nowhere known": running(),
-        "paused": ms.pause(begun, "operator: lunch"),
+        "paused": paused,
         "held": ms.hold(begun, "held by RM2"),
-        "held and paused": ms.hold(ms.pause(begun, "operator: lunch"), "held by RM2"),
+        "held and paused": ms.hold(paused, "held by RM2"),
         "returning": obeyed(begun, A.HOME, 99),
-        "cancelled": ms.cancel(begun, "enough"),
+        "cancelled": ms.enter(begun, MissionPhase.CANCELLED, "enough"),
     }
 
 

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.pilot.laser_check import LaserCheck
+from rampart.actors.osmosis.control.pilot.laser_pair import LaserCheck
 from rampart.sim.campaign.job import Job, run_job
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.faults.topic_faults import topic_fault

@@ -15,8 +15,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.control.pilot.laser_check import LaserReach
-from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair
+from rampart.actors.osmosis.control.pilot.laser_pair import LOWER, UPPER, LaserPair, LaserReach
 from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
 from rampart.actors.osmosis.messages import LaserScan
 from rampart.actors.runtime.actor import Actor, Context, Header, on

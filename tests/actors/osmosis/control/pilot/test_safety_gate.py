@@ -5,7 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate, Stamped
+from rampart.actors.bus.envelope import Header
+from rampart.actors.osmosis import messages as m
+from rampart.actors.osmosis.control.pilot.safety_gate import Checks, GateLimits, SafetyGate
 from rampart.actors.osmosis.control.pilot.swept_path import StoppingRoom, is_free, limited
 from rampart.actors.osmosis.control.polyline import NO_POINTS
 from rampart.actors.osmosis.messages import PilotMode
@@ -37,8 +39,9 @@ class Bench:
     def send(self, linear, angular=0.0, *, age=0.0, sequence=None, incarnation=1, stick=False):
         self.sequence = self.sequence + 1 if sequence is None else sequence
         take = self.gate.joystick if stick else self.gate.command
-        return take(Stamped(linear, angular, "teleoperation" if stick else "osmosis_control",
-                            incarnation, self.sequence, self.now - age), self.now)
+        source = "teleoperation" if stick else "osmosis_control"
+        return take(m.Twist(linear, angular),
+                    Header(source, incarnation, self.sequence, self.now - age), self.now)
 
     def out(self):
         output = self.gate.output(self.now)
@@ -73,7 +76,7 @@ def test_a_good_command_passes_unchanged_and_without_a_reason():
 def test_the_strictest_engaged_order_wins(engaged, mode):
     bench = Bench()
     for index, wanted in enumerate(engaged):
-        bench.gate.order(f"RM{index}", True, wanted, "")
+        bench.gate.order(f"RM{index}", m.PilotOrder(True, wanted, ""))
     assert bench.gate.mode is mode
 
 
@@ -89,7 +92,7 @@ def test_the_strictest_engaged_order_wins(engaged, mode):
 @pytest.mark.parametrize("checks", [Checks(), BASELINE], ids=["checked", "baseline"])
 def test_who_drives(mode, auto, stick, expected, checks):
     bench = Bench(checks)
-    bench.gate.order("RM2", mode is not PilotMode.AUTO, mode, "because")
+    bench.gate.order("RM2", m.PilotOrder(mode is not PilotMode.AUTO, mode, "because"))
     if auto is not None:
         bench.send(auto)
     if stick is not None:
@@ -100,11 +103,11 @@ def test_who_drives(mode, auto, stick, expected, checks):
 def test_an_order_ends_only_by_the_word_of_who_gave_it():
     bench = Bench()
     bench.send(0.5)
-    bench.gate.order("RM2", True, PilotMode.STOP, "stale command")
-    bench.gate.order("RM5", False, PilotMode.TELEOPERATION, "")
+    bench.gate.order("RM2", m.PilotOrder(True, PilotMode.STOP, "stale command"))
+    bench.gate.order("RM5", m.PilotOrder(False, PilotMode.TELEOPERATION, ""))
     assert bench.out() == (0.0, 0.0)
     assert bench.reason() == "RM2: stale command"
-    bench.gate.order("RM2", False, PilotMode.STOP, "")
+    bench.gate.order("RM2", m.PilotOrder(False, PilotMode.STOP, ""))
     assert bench.out() == (0.5, 0.0)
 
 
@@ -204,11 +207,11 @@ def test_a_gate_just_started_waits_for_the_orders_it_may_have_missed():
     gate = SafetyGate(LIMITS, Checks(), 10.0)
     gate.manager_alive(10.1)
     gate.scan(NO_POINTS, 10.1)
-    gate.command(Stamped(0.5, 0.0, "osmosis_control", 1, 1, 10.1), 10.1)
+    gate.command(m.Twist(0.5, 0.0), Header("osmosis_control", 1, 1, 10.1), 10.1)
     assert gate.output(10.1).linear_mps == 0.0
-    gate.order("RM2", True, PilotMode.STOP, "")
+    gate.order("RM2", m.PilotOrder(True, PilotMode.STOP, ""))
     assert gate.output(10.5).linear_mps == 0.0
-    gate.order("RM2", False, PilotMode.STOP, "")
+    gate.order("RM2", m.PilotOrder(False, PilotMode.STOP, ""))
     assert gate.output(10.5).linear_mps == 0.5
 
 
@@ -220,7 +223,7 @@ def test_old_news_of_the_manager_is_no_sign_of_life():
         if tick % 7 == 0:
             gate.manager_alive(1.0)  # it was overtaken
         gate.scan(NO_POINTS, now)
-        gate.command(Stamped(0.5, 0.0, "osmosis_control", 1, tick, now), now)
+        gate.command(m.Twist(0.5, 0.0), Header("osmosis_control", 1, tick, now), now)
         assert (gate.output(now).linear_mps > 0) == (
             LIMITS.settling_s <= now <= 5.0 + LIMITS.manager_timeout_s)
 
