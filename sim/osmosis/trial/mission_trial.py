@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -17,7 +16,6 @@ from rampart.actors.runtime.clock import Clock
 from rampart.sim.faults.scenario import FaultOutcome
 from rampart.sim.osmosis.trial.console import MissionConsole
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
-from rampart.sim.osmosis.trial.judge import Judge, JudgeSink
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
 from rampart.sim.osmosis.trial.report import render
 from rampart.sim.osmosis.trial.run_end import RunEnd
@@ -33,6 +31,7 @@ _SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not 
 class MissionTrial(Trial):
     """One mission on one airport; it is over when nothing progresses for `limit_s`."""
 
+    recorder: MissionRecorder
     judges = True
     injector = OsmosisInjector
     tells = MissionConsole
@@ -47,7 +46,6 @@ class MissionTrial(Trial):
         self.goals = len(known.mission.goals)
         self.title = f"{self.name} on {known.airport.name}"
         self.about = f"mission {self.name} ({self.goals} goals) on {known.airport.name}"
-        self.judge = Judge(known.mission.goals)
         self._end = RunEnd(_PATIENCE_S if limit_s is None else limit_s, run.plan.waits)
         self.recorder = MissionRecorder(run.plan, self.strategy, known.airport, known.mission)
 
@@ -62,7 +60,7 @@ class MissionTrial(Trial):
             elif isinstance(message, GroundTruth):
                 self._end.truth(message.twist, clock.now())
 
-        return [to_end, JudgeSink(self.judge), *super().sinks(clock)]
+        return [to_end, *super().sinks(clock)]
 
     def excuse(self, stall_s: float) -> None:
         """Do not count simulated seconds in which the launcher heard nothing, being stopped."""
@@ -75,13 +73,12 @@ class MissionTrial(Trial):
     def conclude(self, now_s: float, why: str, faults: tuple[FaultOutcome, ...] = ()
                  ) -> MissionRecord:
         """Return the record of the run with the judge's verdict, and what became of faults."""
-        verdict = self.judge.verdict()
-        found = self.recorder.record(
+        verdict = self.recorder.judge.verdict()
+        return self.recorder.record(
             now_s, faults=faults, mission="success" if verdict.success else "fail",
             safety=_SAFETY[verdict.safe],
             reasons=() if verdict.success and verdict.safe else (
                 *verdict.reasons, f"ended: {why}"))
-        return _mission(found)
 
     def summary(self, record: RunRecord) -> dict[str, Any]:
         """Return what scripts rely on, the lights too."""
@@ -90,12 +87,12 @@ class MissionTrial(Trial):
 
     def figures(self, record: RunRecord) -> dict[str, Any]:
         """Return what ground truth shows: collisions, clearances, and when it became unsafe."""
-        verdict, found = self.judge.verdict(), _mission(record)
+        found = _mission(record)
         return {
             "collisions": found.collisions, "prohibited_s": round(found.prohibited_s, 3),
-            "obstacle_m": _metres(verdict.closest_obstacle_m),
-            "prohibited_m": _metres(verdict.closest_prohibited_m),
-            "unsafe_s": verdict.first_unsafe_s}
+            "obstacle_m": _metres(found.obstacle_clearance_m),
+            "prohibited_m": _metres(found.prohibited_clearance_m),
+            "unsafe_s": self.recorder.judge.first_unsafe_s}
 
     def report(self, record: RunRecord, directory: Path) -> Written:
         """Write as much of the inspection report as can be written."""
@@ -108,5 +105,5 @@ def _mission(record: RunRecord) -> MissionRecord:
     return record
 
 
-def _metres(value: float) -> float | None:
-    return round(value, 4) if math.isfinite(value) else None
+def _metres(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)

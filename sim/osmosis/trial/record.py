@@ -14,6 +14,7 @@ from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
 from rampart.actors.osmosis.airport.model import Airport, Mission
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
+from rampart.sim.osmosis.trial.judge import Judge
 from rampart.sim.runs.record import KEPT, RunRecord, RunRecorder, Safety
 
 TRACK_STEP_M = 0.2
@@ -93,30 +94,30 @@ class MissionRecord(RunRecord, frozen=True, kw_only=True):
 
 
 class MissionRecorder(RunRecorder):
-    """Builds a `MissionRecord` from the messages of a run.
+    """Builds a `MissionRecord` from the messages of a run, and shows its judge what it has to see.
 
     Args:
         plan: of the run.
         strategy: of the manager; empty without FTMs.
         airport: where it takes place.
         mission: to be driven.
+
+    Attributes:
+        judge: of the mission.
     """
 
     def __init__(self, plan: RunPlan, strategy: str, airport: Airport, mission: Mission) -> None:
         super().__init__(plan, strategy)
         self._airport = airport
         self._mission = mission
+        self.judge = Judge(mission.goals)
+        self._mode = ""
         self._track: list[tuple[float, float, float]] = []
         self._believed: list[tuple[float, float, float]] = []
         self._lights: dict[str, m.LightMeasurement] = {}
         self._reached: tuple[float, ...] = ()
         self._known_lights = frozenset(light.name for light in airport.lights)
         self._obstacles: dict[str, ObstacleSeen] = Remembered(KEPT)
-        self._collisions = 0
-        self._prohibited_s = 0.0
-        self._obstacle_clearance_m = math.inf
-        self._prohibited_clearance_m = math.inf
-        self._narrowest_s: float | None = None
         self._take |= {
             topics.TRUTH.key: self._truth,
             topics.POSE.key: self._pose,
@@ -128,6 +129,7 @@ class MissionRecorder(RunRecorder):
 
     def record(self, duration_s: float, **more: Any) -> MissionRecord:
         """Return the record of the run so far; `more` are at least the verdicts."""
+        judge = self.judge
         return MissionRecord(
             **self.fields(duration_s), **more,
             airport=draw(self._airport),
@@ -142,23 +144,15 @@ class MissionRecorder(RunRecorder):
                            self._reached[i] if i < len(self._reached) else None)
                 for i, goal in enumerate(self._mission.goals)),
             obstacles=tuple(self._obstacles.values()),
-            collisions=self._collisions,
-            prohibited_s=self._prohibited_s,
-            obstacle_clearance_m=_finite(self._obstacle_clearance_m),
-            prohibited_clearance_m=_finite(self._prohibited_clearance_m),
-            narrowest_s=self._narrowest_s,
-        )
+            collisions=judge.collisions,
+            prohibited_s=judge.prohibited_s,
+            obstacle_clearance_m=_finite(judge.obstacle_m),
+            prohibited_clearance_m=_finite(judge.prohibited_m),
+            narrowest_s=judge.narrowest_s)
 
     def _truth(self, truth: m.GroundTruth, header: Header) -> None:
         self._append(self._track, header.stamp, truth.pose)
-        self._collisions = max(self._collisions, truth.collisions)
-        self._prohibited_s = max(self._prohibited_s, truth.prohibited_s)
-        if min(truth.obstacle_clearance_m, truth.prohibited_clearance_m) < min(
-                self._obstacle_clearance_m, self._prohibited_clearance_m):
-            self._narrowest_s = header.stamp
-        self._obstacle_clearance_m = min(self._obstacle_clearance_m, truth.obstacle_clearance_m)
-        self._prohibited_clearance_m = min(
-            self._prohibited_clearance_m, truth.prohibited_clearance_m)
+        self.judge.see(truth, self._mode, header.stamp)
 
     def _pose(self, pose: m.Pose, header: Header) -> None:
         self._append(self._believed, header.stamp, pose)
@@ -166,6 +160,8 @@ class MissionRecorder(RunRecorder):
     def _mission_status(self, status: m.MissionStatus, header: Header) -> None:
         for light in status.lights:
             self._light(light, header)
+        running = status.phase is m.MissionPhase.RUNNING and status.step < len(status.goals)
+        self._mode = status.goals[status.step].mode.value if running else ""
         newly = len(status.step_times_s) - len(self._reached)  # negative: it forgot, we do not
         self._reached += (header.stamp,) * newly
 

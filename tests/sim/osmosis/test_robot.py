@@ -140,7 +140,7 @@ def test_a_controlled_stop_from_1_mps_takes_less_than_25_cm():
     x0 = sim.pose[0]
     run(sim, 0.0, 0.0, 2)
     assert 0.1 < sim.pose[0] - x0 < 0.25
-    assert abs(sim.truth().linear_mps) < 0.005
+    assert abs(sim.truth().twist.linear_mps) < 0.005
 
 
 def test_the_brake_stops_in_a_shorter_way_whatever_is_commanded():
@@ -149,8 +149,8 @@ def test_the_brake_stops_in_a_shorter_way_whatever_is_commanded():
     sim.brake(True)
     run(sim, 1.0, 0.0, 2)
     assert 0.05 < sim.pose[0] - x0 < 0.18
-    assert abs(sim.truth().linear_mps) < 0.005
-    assert sim.base_state().brake_engaged
+    assert abs(sim.truth().twist.linear_mps) < 0.005
+    assert sim.base_status().brake_engaged
 
 
 def test_the_brake_stops_in_a_curve_as_well():
