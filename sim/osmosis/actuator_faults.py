@@ -72,8 +72,7 @@ def motor_of(model: Any, limits: DriveLimits) -> Motor:
         torque_nm=float(model.actuator_forcerange[0, 1]),
         servo_gain=float(model.actuator_gainprm[0, 0]),
         rated_radps=limits.linear_mps / WHEEL_RADIUS_M,
-        brake_torque_nm=moved_kg * limits.brake_mps2 * WHEEL_RADIUS_M / 4,
-    )
+        brake_torque_nm=moved_kg * limits.brake_mps2 * WHEEL_RADIUS_M / 4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,9 +181,8 @@ class ActuatorFaults:
         """Share of its deceleration that the brake has left."""
         return self._brake.share
 
-    def actuate(
-        self, targets_radps: WheelSpeeds, speeds_radps: WheelSpeeds, braking: bool
-    ) -> Actuation:
+    def actuate(self, targets_radps: WheelSpeeds, speeds_radps: WheelSpeeds, braking: bool
+                ) -> Actuation:
         """Return what motors and brake make of the drive's wish in one tick, and count.
 
         Args:

@@ -46,7 +46,7 @@ class LaserSpec:
     """The 2D laser, above `base_link`, so its ranges are from the robot's centre.
 
     Args:
-        rays: number of rays, evenly over the field of view, from right to left.
+        rays: number of rays, two or more, evenly over the field of view, from right to left.
         field_of_view_rad: centred on straight ahead.
         range_max_m: also the reading when there is no echo.
         height_m: above the ground; clears the chassis, below the top of every obstacle.
@@ -60,10 +60,6 @@ class LaserSpec:
     height_m: float = 0.45
     noise_m: float = 0.01
     reference_m: float = 0.1
-
-    def __post_init__(self) -> None:
-        if self.rays < 2 or not self.range_max_m > 0:
-            raise ValueError(f"laser: {self}: needs two rays or more and a positive range_max_m")
 
     @property
     def angle_min_rad(self) -> float:

@@ -278,9 +278,7 @@ class World:
         Raises:
             WorldError: not finite, out of bounds, on the robot, or too many.
         """
-        preset = self._scene.preset(name)
-        shape = preset.shape if preset else "cylinder"
-        self._scene.put(Solid(name, shape, x_m, y_m, radius_m), footprint(self.pose))
+        self._scene.put(name, x_m, y_m, radius_m, footprint(self.pose))
         self._changed(name)
 
     def remove_obstacle(self, name: str) -> bool:

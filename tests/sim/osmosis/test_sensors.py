@@ -202,9 +202,3 @@ def test_an_airport_without_lights_is_dark():
                                                 (3.5 * math.pi, -0.5 * math.pi)])  # fmt: skip
 def test_angles_wrap_into_minus_pi_to_pi(angle, wrapped):
     assert wrap(angle) == pytest.approx(wrapped)
-
-
-@pytest.mark.parametrize("bad", [{"rays": 1}, {"range_max_m": 0.0}, {"range_max_m": math.nan}])
-def test_an_impossible_laser_is_refused(bad):
-    with pytest.raises(ValueError, match="laser"):
-        LaserSpec(**bad)
