@@ -15,15 +15,14 @@ from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
-from rampart.actors.osmosis.detection.area.geofence import FenceLimits
+from rampart.actors.osmosis.detection.area.geofence import FenceLimits, FenceMonitor
 from rampart.actors.osmosis.detection.area.position_vote import GPS, PositionVote
 from rampart.actors.osmosis.detection.area.prohibited_area import (
     GPS_PERIOD_S,
     half_diagonal_m,
     reaction_s,
 )
-from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.osmosis.detection.freshness import FreshnessMonitor
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.manager.spec.tables import NonNegative, Positive
 
