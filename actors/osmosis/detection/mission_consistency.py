@@ -1,8 +1,8 @@
 """DM11: the mission does not advance, or somebody in the control chain has got stuck.
 
 A node may be alive and beat, and its timer repeat a message that is no longer true. Watchdogs do
-not see that. This module hears what Mission Manager, Graph Planner and Osmosis Control hand on and names the one that
-contradicts the others, so that it can be respawned.
+not see that. This module hears what Mission Manager, Graph Planner and Osmosis Control hand on and
+names the one that contradicts the others, so that it can be respawned.
 
 The three hand a mission on: status and goal, route, progress. Each repeats what it says, so that
 whoever contradicts the one before it for longer than a message takes is in error, and so is one

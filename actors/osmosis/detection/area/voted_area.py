@@ -14,15 +14,8 @@ import math
 from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.detection.area.geofence import FenceLimits, FenceMonitor
 from rampart.actors.osmosis.detection.area.position_vote import GPS, PositionVote
-from rampart.actors.osmosis.detection.area.prohibited_area import (
-    GPS_PERIOD_S,
-    half_diagonal_m,
-    reaction_s,
-)
-from rampart.actors.osmosis.detection.freshness import FreshnessMonitor
+from rampart.actors.osmosis.detection.area.prohibited_area import GPS_PERIOD_S, fence_of
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.manager.spec.tables import NonNegative, Positive
 
@@ -104,20 +97,13 @@ class VotedArea(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system = context.run.system
-        airport = Osmosis.of(context).airport
-        robot = system.robot
         parameters = self.parameters
-        timeout_s = parameters.unknown_s
         self._looked_s = -math.inf
-        self._where = VotedPosition(robot.gps_accuracy_m, parameters.blind_s, parameters.blind_m)
-        self.monitor = self.judged_by(FenceMonitor(
-            airport.prohibited_distance_m,
-            FenceLimits(half_diagonal_m(robot), reaction_s(system, parameters.margin_m),
-                        robot.braking_mps2),
-            FreshnessMonitor("position that two sources agree on", timeout_s, 2 * GPS_PERIOD_S,
-                             self.clock.now(), self.grace_s(timeout_s), known=self.first_life),
-            parameters.hold_s))
+        self._where = VotedPosition(
+            context.run.system.robot.gps_accuracy_m, parameters.blind_s, parameters.blind_m)
+        self.monitor = self.judged_by(fence_of(
+            self, parameters.margin_m, parameters.hold_s, "position that two sources agree on",
+            parameters.unknown_s))
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
