@@ -105,8 +105,7 @@ class Laser:
         self._origin[:2] = x_m, y_m
         mujoco.mj_multiRay(
             model, data, self._origin, self._flat, self._groups, True, -1,
-            self._geoms, self._ranges, None, self.spec.rays, self.spec.range_max_m,
-        )  # fmt: skip
+            self._geoms, self._ranges, None, self.spec.rays, self.spec.range_max_m)
         self._ranges[self._geoms < 0] = math.inf
         return self._ranges
 
@@ -119,10 +118,6 @@ class Laser:
         np.maximum(ranges, 0.0, out=ranges)
         np.minimum(ranges, self.spec.range_max_m, out=ranges)
         return ranges
-
-    def scan(self, model: Any, data: Any, pose: tuple[float, float, float]) -> Floats:
-        """Return one sweep, m, from the first to the last ray."""
-        return self.sweep(self.cast(model, data, pose))
 
 
 class Gps:

@@ -37,8 +37,7 @@ MAX_CATCH_UP_S = 1.0
 
 _JOBS = (
     topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE, topics.SCAN, topics.UPPER_SCAN,
-    topics.LIGHT, topics.GPS, topics.BASE_STATUS, topics.TRUTH, topics.OBSTACLES,
-)  # fmt: skip
+    topics.LIGHT, topics.GPS, topics.BASE_STATUS, topics.TRUTH, topics.OBSTACLES)
 
 
 class Simulator(Actor):
@@ -89,13 +88,11 @@ class Simulator(Actor):
             laser=self._laser, start_s=now_s, max_catch_up_s=MAX_CATCH_UP_S)
         self._asked_s = now_s
         readings: dict[Topic[Any], Callable[[], Any]] = {
-            topics.IMU: world.imu,
-            topics.ODOMETRY: world.odometry,
+            topics.IMU: world.imu, topics.ODOMETRY: world.odometry,
             topics.ABSOLUTE_POSE: lambda: m.Pose(*world.pose),
             topics.SCAN: lambda: self._scan(0),
             topics.LIGHT: lambda: m.LightSample(world.light()),
-            topics.GPS: world.gps,
-            topics.BASE_STATUS: world.base_status,
+            topics.GPS: world.gps, topics.BASE_STATUS: world.base_status,
             topics.TRUTH: lambda: world.truth(self._real_time_factor),
             topics.OBSTACLES: self._obstacles,
         }
@@ -158,8 +155,7 @@ class Simulator(Actor):
         self._advance()
         try:
             if message.present:
-                self._world.add_obstacle(
-                    message.name, message.x_m, message.y_m, message.radius_m)
+                self._world.add_obstacle(message.name, message.x_m, message.y_m, message.radius_m)
             else:
                 self._world.remove_obstacle(message.name)
         except WorldError as error:

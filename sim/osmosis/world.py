@@ -15,26 +15,10 @@ import shapely
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.airport.world import WorldTruth
+from rampart.sim.osmosis import robot, sensors
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, FaultNews, motor_of
 from rampart.sim.osmosis.clearance import Clearance, Pose, footprint
-from rampart.sim.osmosis.robot import (
-    CIRCUMRADIUS_M,
-    Drive,
-    DriveLimits,
-    WheelSpeeds,
-    twist_from_wheels,
-)
 from rampart.sim.osmosis.scene import Scene, Solid, WorldError
-from rampart.sim.osmosis.sensors import (
-    Floats,
-    Gps,
-    Imu,
-    Laser,
-    LaserSpec,
-    LightSensor,
-    WheelOdometry,
-    wrap,
-)
 
 TICK_S = 0.01
 """The drive electronics' period, and the grain of `step_to`."""
@@ -75,8 +59,8 @@ class World:
 
     def __init__(self, airport: Airport, truth: WorldTruth | None = None, seed: int = 0,
                  obstacles: int = 0, *, dead_man_timeout_s: float | None = 0.4,
-                 laser: LaserSpec | None = None, start_s: float = 0.0, max_catch_up_s: float = 1.0
-                 ) -> None:
+                 laser: sensors.LaserSpec | None = None, start_s: float = 0.0,
+                 max_catch_up_s: float = 1.0) -> None:
         if not 0 <= obstacles <= len(airport.obstacles):
             raise WorldError(f"obstacles: {obstacles}: {airport.name} has presets for 0 to "
                              f"{len(airport.obstacles)}")
@@ -94,22 +78,22 @@ class World:
         self._base_q, self._base_v = self._data.qpos[:7], self._data.qvel[:6]
         self._wheel_q, self._wheel_v = self._data.qpos[7:11], self._data.qvel[6:10]
         self._servos = self._data.ctrl
-        self._targets: WheelSpeeds | None = None
+        self._targets: robot.WheelSpeeds | None = None
         self._damping = self._model.dof_damping[6:10]
         self._free_damping = self._damping.copy()
         self._locked = False
-        self._drive = Drive(DriveLimits(), dead_man_timeout_s)
+        self._drive = robot.Drive(robot.DriveLimits(), dead_man_timeout_s)
         self._torque_ranges = self._model.actuator_forcerange
         self._faults = ActuatorFaults(motor_of(self._model, self._drive.limits))
         self._faulty = False
-        self.laser = laser or LaserSpec()
+        self.laser = laser or sensors.LaserSpec()
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5)]
-        self._lasers = (Laser(self.laser, streams[0]), Laser(self.laser, streams[4]))
-        self._echoes: tuple[int, Floats] = (-1, np.empty(0))
-        self._gps = Gps(streams[1])
-        self._imu = Imu(streams[2], self.pose[2], start_s)
-        self._light = LightSensor(airport, truth or WorldTruth(), streams[3])
-        self._odometry = WheelOdometry(self._wheel_angles(), start_s)
+        self._lasers = [sensors.Laser(self.laser, streams[i]) for i in (0, 4)]
+        self._echoes: tuple[int, sensors.Floats] = (-1, np.empty(0))
+        self._gps = sensors.Gps(streams[1])
+        self._imu = sensors.Imu(streams[2], self.pose[2], start_s)
+        self._light = sensors.LightSensor(airport, truth or WorldTruth(), streams[3])
+        self._odometry = sensors.WheelOdometry(self._wheel_angles(), start_s)
         self._collisions = 0
         self._contact_s: dict[str, float] = {}
         self._prohibited_s = 0.0
@@ -210,7 +194,7 @@ class World:
         blocked = np.array(actuation.blocked) | self._locked
         self._damping[:] = np.where(blocked, LOCKED_DAMPING, self._free_damping)
         if drive.braking and drive.brake_share < 1:
-            drive.give_way(*twist_from_wheels(speeds))
+            drive.give_way(*robot.twist_from_wheels(speeds))
 
     # -- sensors --------------------------------------------------------------------------------
 
@@ -220,7 +204,7 @@ class World:
         x, y, _, qw, qx, qy, qz = self._base_q.tolist()
         return x, y, math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
 
-    def scan(self, laser: int = 0) -> Floats:
+    def scan(self, laser: int = 0) -> sensors.Floats:
         """One sweep of a laser, m: 0 is the lower one, 1 the upper one."""
         # The clearance is from the footprint's edge, the laser in its middle: nothing in range
         # needs no rays. It may be one look old, in which the robot moves less than the radius.
@@ -261,7 +245,7 @@ class World:
             self._drive.braking, self._drive.dead_man_tripped(self.time_s),
             max(0.0, min(NEVER_S, self._drive.command_age_s(self.time_s))), (fl, fr, rl, rr))
 
-    def _wheel_angles(self) -> WheelSpeeds:
+    def _wheel_angles(self) -> robot.WheelSpeeds:
         fl, fr, rl, rr = self._wheel_q.tolist()
         return fl, fr, rl, rr
 
@@ -325,7 +309,7 @@ class World:
         x_m, y_m, yaw_rad = self.pose
         vx, vy, *_ = self._base_v.tolist()
         return m.GroundTruth(
-            m.Pose(x_m, y_m, wrap(yaw_rad)),
+            m.Pose(x_m, y_m, sensors.wrap(yaw_rad)),
             m.Twist(vx * math.cos(yaw_rad) + vy * math.sin(yaw_rad), float(self._base_v[5])),
             self._collisions, self._prohibited_s, self._obstacle_clearance_m,
             self._prohibited_clearance_m, real_time_factor)
@@ -341,7 +325,7 @@ class World:
         pose = self.pose
         self._obstacle_clearance_m = self._near_obstacle.measure(pose)
         self._prohibited_clearance_m = self._near_prohibited.measure(pose)
-        if self._prohibited_clearance_m <= CIRCUMRADIUS_M and \
+        if self._prohibited_clearance_m <= robot.CIRCUMRADIUS_M and \
                 self.airport.footprint_in_prohibited(footprint(pose)):
             self._prohibited_s += self.time_s - self._examined_s
         near = min(self._obstacle_clearance_m, self._prohibited_clearance_m) < NEAR_M

@@ -118,7 +118,7 @@ class ConsistencyMonitor(Finding):
         Args:
             body: the message.
             source: who says it.
-            incarnation: in which life; with a new one all its errors are forgiven.
+            incarnation: of the source; with a new one all its errors are forgiven.
             stamp_s: when it was true; one from the future, or that is no number, says that it
                 is not updated.
             now_s: now.
@@ -128,7 +128,7 @@ class ConsistencyMonitor(Finding):
         if before is not None and incarnation > before.incarnation:
             for other, said in list(self._said.items()):
                 if said.source == source and said.incarnation < incarnation:
-                    del self._said[other]  # what its former life said is void
+                    del self._said[other]  # what its former incarnation said is void
             self._since_s.clear()
         true_s = min(stamp_s, now_s) if is_possible(stamp_s, now_s) else -math.inf
         self._said[kind] = _Said(body, true_s, source, incarnation)
@@ -171,11 +171,10 @@ class ConsistencyMonitor(Finding):
             yield from self._against_the_world(status, goal.body, control)
 
     def _silences(self) -> Iterator[Contradiction]:
-        now_s, silence_s = self._now_s, self._limits.silence_s
-        silent = [(kind, said) for kind, said in self._said.items()
-                  if now_s >= said.stamp_s + silence_s - 1e-9]
-        for kind, said in sorted(silent) if silent else ():
-            yield (f"silent {kind}", said, f"its {_WORDS[kind]} is not updated", 0.0)
+        for kind, words in _WORDS.items():
+            said = self._said.get(kind)
+            if said is not None and self._now_s >= said.stamp_s + self._limits.silence_s - 1e-9:
+                yield f"silent {kind}", said, f"its {words} is not updated", 0.0
 
     def _against_the_world(self, status: _Said, goal: m.GoalOrder, control: _Said
                            ) -> Iterator[Contradiction]:
@@ -186,15 +185,15 @@ class ConsistencyMonitor(Finding):
         elif said.phase is m.ControlPhase.FOLLOWING:
             if self._odometer_m - self._progress[1] >= limits.moved_m:
                 yield ("progress", control, "reports no progress, and the robot moves", 0.0)
-            at_goal = self._pose is not None and math.dist(
-                self._pose, (goal.goal.x_m, goal.goal.y_m)) <= limits.arrival_m
-            if at_goal:
+            if self._pose is not None and math.dist(
+                    self._pose, (goal.goal.x_m, goal.goal.y_m)) <= limits.arrival_m:
                 yield ("standing", control, "reports no arrival, and the robot is there",
                        limits.arrival_s)
 
 
-_WORDS = {"MissionStatus": "mission status", "GoalOrder": "goal", "Route": "route",
-          "ControlStatus": "progress"}
+_WORDS = {"ControlStatus": "progress", "GoalOrder": "goal", "MissionStatus": "mission status",
+          "Route": "route"}
+"""In the order in which the silent are accused."""
 
 
 def _place(said: Any) -> tuple[str, int]:

@@ -96,8 +96,7 @@ class OsmosisHmi(Hmi):
             "left_out": self._map.left_out if self._map else {},
             "footprint_m": (robot.length_m, robot.width_m) if robot else None,
             "missions": [name for name in self._missions if name == clip(name, MAX_NAME)][:200],
-            "track": list(self._state.track),
-        }
+            "track": list(self._state.track)}
 
     @cached_property
     def _map(self) -> PageMap | None:

@@ -76,6 +76,4 @@ def _is_plain(light: Light) -> bool:
 
 
 def _paths_bytes(drawn: AirportDrawing) -> int:
-    return len(drawn.prohibited) + sum(
-        len(path) for _, path in (*drawn.surfaces, *drawn.buildings))
-
+    return len(drawn.prohibited) + sum(len(path) for _, path in (*drawn.surfaces, *drawn.buildings))

@@ -60,25 +60,20 @@ def map_scene(airport: Airport, at: fg.Time) -> fg.SceneUpdate:
         _entity("buildings", at, cubes=buildings))
 
 
-def lights_scene(
-    airport: Airport, measured: Mapping[str, m.LightMeasurement], at: fg.Time
-) -> fg.SceneUpdate:
+def lights_scene(airport: Airport, measured: Mapping[str, m.LightMeasurement], at: fg.Time
+                 ) -> fg.SceneUpdate:
     """Return the lights, coloured by verdict; grey if not measured."""
-    found = []
+    cylinders, texts = [], []
     for light in airport.lights:
         result = measured.get(light.name)
         text = light.name if result is None else (
             f"{light.name} {result.verdict.value} {result.ratio:.0%}")
         colour = _VERDICT[result.verdict if result else None]
-        found.append((light, colour, text))
-    return _scene(_entity(
-        "lights", at,
-        cylinders=tuple(fg.CylinderPrimitive(
-            fg.pose_at(light.x_m, light.y_m, 0.05), fg.Vector3(0.4, 0.4, 0.1), 1.0, 1.0, colour)
-            for light, colour, _ in found),
-        texts=tuple(fg.TextPrimitive(
-            fg.pose_at(light.x_m, light.y_m, 0.8), True, 12.0, True, colour, text)
-            for light, colour, text in found)))
+        cylinders.append(fg.CylinderPrimitive(
+            fg.pose_at(light.x_m, light.y_m, 0.05), fg.Vector3(0.4, 0.4, 0.1), 1.0, 1.0, colour))
+        texts.append(fg.TextPrimitive(
+            fg.pose_at(light.x_m, light.y_m, 0.8), True, 12.0, True, colour, text))
+    return _scene(_entity("lights", at, cylinders=tuple(cylinders), texts=tuple(texts)))
 
 
 def obstacles_scene(obstacles: Iterable[m.ObstacleCommand], at: fg.Time) -> fg.SceneUpdate:
@@ -103,8 +98,8 @@ def robot_scene(footprint_m: tuple[float, float], at: fg.Time) -> fg.SceneUpdate
         fg.pose_at(0.0, 0.0, _HEIGHT_M + 0.1), 0.6 * length_m, 0.06, 0.3 * length_m, 0.18, _ROBOT)
     box = fg.CubePrimitive(
         fg.pose_at(0.0, 0.0, _HEIGHT_M / 2), fg.Vector3(length_m, width_m, _HEIGHT_M), _ROBOT)
-    return _scene(fg.SceneEntity(at, "base_link", "robot", _EVER, True, arrows=(arrow,),
-                                 cubes=(box,)))
+    return _scene(
+        fg.SceneEntity(at, "base_link", "robot", _EVER, True, arrows=(arrow,), cubes=(box,)))
 
 
 def _scene(*entities: fg.SceneEntity) -> fg.SceneUpdate:

@@ -119,33 +119,27 @@ class MissionRecorder(RunRecorder):
         self._known_lights = frozenset(light.name for light in airport.lights)
         self._obstacles: dict[str, ObstacleSeen] = Remembered(KEPT)
         self._take |= {
-            topics.TRUTH.key: self._truth,
-            topics.POSE.key: self._pose,
+            topics.TRUTH.key: self._truth, topics.POSE.key: self._pose,
             topics.MISSION_STATUS.key: self._mission_status,
-            topics.LIGHT_MEASURED.key: self._light,
-            topics.OBSTACLES.key: self._obstacle_list,
-            topics.PILOT_STATUS.key: self._pilot,
-        }
+            topics.LIGHT_MEASURED.key: self._light, topics.OBSTACLES.key: self._obstacle_list,
+            topics.PILOT_STATUS.key: self._pilot}
 
     def record(self, duration_s: float, **more: Any) -> MissionRecord:
         """Return the record of the run so far; `more` are at least the verdicts."""
-        judge = self.judge
+        judge, drawing = self.judge, draw(self._airport)
         return MissionRecord(
             **self.fields(duration_s), **more,
-            airport=draw(self._airport),
-            mission_name=self._mission.name,
+            airport=drawing, mission_name=self._mission.name,
             distance_m=sum(math.dist(a[1:], b[1:])
                            for a, b in zip(self._track, self._track[1:], strict=False)),
-            track=tuple(self._track),
-            believed=tuple(self._believed),
-            lights=tuple(self._light_result(light) for light in draw(self._airport).lights),
+            track=tuple(self._track), believed=tuple(self._believed),
+            lights=tuple(map(self._light_result, drawing.lights)),
             steps=tuple(
                 StepResult(str(goal.mode), goal.x_m, goal.y_m,
                            self._reached[i] if i < len(self._reached) else None)
                 for i, goal in enumerate(self._mission.goals)),
             obstacles=tuple(self._obstacles.values()),
-            collisions=judge.collisions,
-            prohibited_s=judge.prohibited_s,
+            collisions=judge.collisions, prohibited_s=judge.prohibited_s,
             obstacle_clearance_m=_finite(judge.obstacle_m),
             prohibited_clearance_m=_finite(judge.prohibited_m),
             narrowest_s=judge.narrowest_s)
@@ -187,9 +181,8 @@ class MissionRecorder(RunRecorder):
     def _light_result(self, light: Any) -> LightResult:
         known = (light.name, light.row, light.x_m, light.y_m, light.nominal_cd)
         seen = self._lights.get(light.name)
-        if seen is None:
-            return LightResult(*known)
-        return LightResult(*known, seen.verdict.value, seen.intensity_cd, seen.ratio)
+        return LightResult(*known) if seen is None else LightResult(
+            *known, seen.verdict.value, seen.intensity_cd, seen.ratio)
 
 
 def _finite(value: float) -> float | None:

@@ -10,13 +10,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from rampart.actors.osmosis.messages import (
-    ControlPhase,
-    ControlStatus,
-    MissionPhase,
-    MissionStatus,
-    Twist,
-)
+from rampart.actors.osmosis import messages as m
+
+_ENDED = (m.MissionPhase.SUCCEEDED, m.MissionPhase.FAILED, m.MissionPhase.CANCELLED)
 
 SETTLE_S = 1.5
 """After the mission's end the robot gets this long to come to rest, and the records to arrive."""
@@ -58,36 +54,35 @@ class RunEnd:
     _truth_at_s: float | None = None
     _moves: bool = False
 
-    def mission(self, status: MissionStatus, now_s: float) -> None:
+    def mission(self, status: m.MissionStatus, now_s: float) -> None:
         """Take the mission's state."""
-        running = status.phase not in (MissionPhase.IDLE,)
         if self._mission_id and status.mission_id != self._mission_id:
             self._lost_at_s = self._lost_at_s or now_s
             return
         self._lost_at_s = None
-        if not running:
+        if status.phase is m.MissionPhase.IDLE:
             return
         self._mission_id = status.mission_id
         progress = (status.step, len(status.lights))
-        another_way = status.phase is MissionPhase.RUNNING and status.reason not in self._ways \
+        another_way = status.phase is m.MissionPhase.RUNNING and status.reason not in self._ways \
             and len(self._ways) < _WAYS
         if another_way:
             self._ways.add(status.reason)
         if progress != self._progress or another_way:
             self._progress, self._progress_at_s = progress, now_s
             self._nearest_m = float("inf")
-        if status.phase in (MissionPhase.SUCCEEDED, MissionPhase.FAILED, MissionPhase.CANCELLED):
+        if status.phase in _ENDED:
             if self._over_at_s is None:
                 self._over_at_s = now_s
             self._over = status.reason or f"mission {status.phase.value}"
 
-    def control(self, status: ControlStatus, now_s: float) -> None:
+    def control(self, status: m.ControlStatus, now_s: float) -> None:
         """Take the progress along the route; only who follows it knows how far it is."""
-        if status.phase is ControlPhase.FOLLOWING and \
+        if status.phase is m.ControlPhase.FOLLOWING and \
                 status.distance_to_go_m < self._nearest_m - _STEP_TOWARDS_GOAL_M:
             self._nearest_m, self._progress_at_s = status.distance_to_go_m, now_s
 
-    def truth(self, twist: Twist, now_s: float) -> None:
+    def truth(self, twist: m.Twist, now_s: float) -> None:
         """Note that the world turns, and whether the robot moves in it."""
         self._truth_at_s = now_s
         self._moves = (abs(twist.linear_mps) > STANDING_MPS
