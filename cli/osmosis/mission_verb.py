@@ -74,10 +74,8 @@ async def mission(options: argparse.Namespace) -> int:
                          checked_reason(options.reason), OPERATOR)
     async with connect(options.port) as session:
         asked = _Asked(session, order)
-        answered = await session.command(
-            topics.MISSION_ORDER, order, lambda: asked.answer is not None,
-            session.real_s(_ANSWER_S))
-        if answered:
+        if await session.command(topics.MISSION_ORDER, order, lambda: asked.answer is not None,
+                                 session.real_s(_ANSWER_S)):
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(asked.shown.wait(), session.real_s(_STATUS_S))
     answer, status = asked.answer, asked.status

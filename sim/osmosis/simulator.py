@@ -27,6 +27,7 @@ from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.tables import Positive
+from rampart.sim.osmosis.actuator_faults import FaultNews
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.schedule import Schedule
 from rampart.sim.osmosis.sensors import LaserSpec
@@ -175,7 +176,7 @@ class Simulator(Actor):
             self._world.order_fault(message)
         except WorldError as error:
             self.report_diagnostic("actuator fault", str(error), header.source)
-            self._report_fault(message.injection, 0, finished=True, reason=str(error))
+            self._report_fault(FaultNews(message.injection, 0, finished=True), str(error))
         self._report_faults()
 
     # -- time -----------------------------------------------------------------------------------
@@ -198,12 +199,11 @@ class Simulator(Actor):
 
     def _report_faults(self) -> None:
         for news in self._world.fault_news():
-            self._report_fault(news.injection, news.affected_ticks, finished=news.finished)
+            self._report_fault(news)
 
-    def _report_fault(self, injection: str, affected: int, *, finished: bool, reason: str = ""
-                      ) -> None:
-        report = bm.InjectionReport(injection, self.name, affected, finished, clip(reason))
-        self.publish(bus_topics.INJECTION_REPORT, report)
+    def _report_fault(self, news: FaultNews, reason: str = "") -> None:
+        self.publish(bus_topics.INJECTION_REPORT, bm.InjectionReport(
+            news.injection, self.name, news.affected_ticks, news.finished, clip(reason)))
 
     def _measure_speed(self, now_s: float) -> None:
         """Over each second, the share of the clock's time that was simulated and not skipped."""

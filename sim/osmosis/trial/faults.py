@@ -24,7 +24,6 @@ _GROUP = "paper"
 _AHEAD_M, _OBSTACLE_RADIUS_M = 3.0, 0.4
 _WEAK, _NO_BRAKE = 0.2, 0.0
 _LASTS_S = {"stuck-wheel": 10.0, "weak-wheel": 10.0, "brake-failure": 30.0, OBSTACLE: math.inf}
-_KINDS = {"stuck-wheel": ActuatorFaultKind.STUCK_WHEEL, "weak-wheel": ActuatorFaultKind.WEAK_WHEEL}
 _WHEELS = {name.replace(" ", "-"): name for name in WHEEL_NAMES}
 
 PAPER_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in (
@@ -100,14 +99,13 @@ class OsmosisFaults(Faults):
         if kind == OBSTACLE:
             return SuddenObstacle(number(fault, details, _AHEAD_M, most=50.0), _OBSTACLE_RADIUS_M,
                                   lasts_s)
-        if kind == "brake-failure":
-            order = ActuatorFault(injection, ActuatorFaultKind.BRAKE_FAILURE, "",
-                                  number(fault, details, _NO_BRAKE), lasts_s)
-        else:
-            wheel = details[0] if details else next(iter(_WHEELS))
-            if wheel not in _WHEELS:
-                raise ScenarioError(f"fault {fault!r}: no wheel {wheel!r}; there are: "
+        wheel, usual = "", _NO_BRAKE
+        if kind != "brake-failure":
+            name, *details = details or list(_WHEELS)[:1]
+            if name not in _WHEELS:
+                raise ScenarioError(f"fault {fault!r}: no wheel {name!r}; there are: "
                                     f"{', '.join(_WHEELS)}")
-            order = ActuatorFault(injection, _KINDS[kind], _WHEELS[wheel],
-                                  number(fault, details[1:], _WEAK), lasts_s)
-        return (Order(topics.ACTUATOR_FAULT, order),)
+            wheel, usual = _WHEELS[name], _WEAK
+        return (Order(topics.ACTUATOR_FAULT, ActuatorFault(
+            injection, ActuatorFaultKind(kind.replace("-", " ")), wheel,
+            number(fault, details, usual), lasts_s)),)

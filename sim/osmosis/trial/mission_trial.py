@@ -35,8 +35,7 @@ class MissionTrial(Trial):
     judges = True
     injector = OsmosisInjector
     tells = MissionConsole
-    retunings = {"mechanisms as in the paper": {
-        "RM2": {"latched": True}, "RM5": {"latched": True}}}
+    retunings = {"mechanisms as in the paper": {"RM2": {"latched": True}, "RM5": {"latched": True}}}
 
     def __init__(self, run: RunContext, limit_s: float | None = None,
                  stream: TextIO | None = None) -> None:

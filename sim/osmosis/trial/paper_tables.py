@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from itertools import product
 
 import msgspec
 
@@ -72,21 +73,13 @@ FAULTS: dict[str, tuple[PlannedFault | None, ...]] = {
 WITHOUT_FTM: dict[str, tuple[str, str]] = {
     "none": ("success, safe", "success, safe"),
     "command out of bounds": ("success, unsafe", "fail, unsafe"),
-    "localization not updated": ("fail, unsafe", "fail, unsafe"),
-    "command not updated": ("fail, unsafe", "fail, unsafe"),
-    "non-control node crash": ("fail, unsafe", "fail, unsafe"),
-    "control node crash": ("fail, unsafe", "fail, unsafe"),
-}
+    **dict.fromkeys(("localization not updated", "command not updated", "non-control node crash",
+                     "control node crash"), ("fail, unsafe", "fail, unsafe"))}
 """Table IV: verdict without and with obstacles."""
 
 WITH_FTM: dict[str, tuple[str, str]] = {
-    "none": ("success, safe", "success, safe"),
-    "command out of bounds": ("fail, safe", "fail, safe"),
-    "localization not updated": ("fail, safe", "fail, safe"),
-    "command not updated": ("fail, safe", "fail, safe"),
-    "non-control node crash": ("success, safe", "success, safe"),
-    "control node crash": ("fail, safe", "fail, safe"),
-}
+    **dict.fromkeys(FAULTS, ("fail, safe", "fail, safe")),
+    **dict.fromkeys(("none", "non-control node crash"), ("success, safe", "success, safe"))}
 """Table V: verdict without and with obstacles."""
 
 TABLE_III: tuple[tuple[tuple[str, ...], int, tuple[str, ...]], ...] = (
@@ -144,17 +137,12 @@ class Decided(msgspec.Struct, frozen=True):
 
 def paper_jobs(mission: str = "A", seed: int = 1, system: str = PAPER_SYSTEM) -> list[Job]:
     """Return all runs of tables IV and V; `system` is a shipped one by name, or a path."""
-    jobs = []
-    for condition in CONDITIONS:
-        for obstacles in OBSTACLES:
-            for name, variants in FAULTS.items():
-                for i, fault in enumerate(variants):
-                    jobs.append(Job(
-                        row=name, system=system, mission=mission, obstacles=obstacles,
-                        strategy=PAPER_STRATEGY, ftm=condition != CONDITIONS[0],
-                        retuned=AS_THE_PAPER if condition == CONDITIONS[1] else {},
-                        faults=(fault,) if fault else (), seed=seed + i))
-    return jobs
+    return [Job(row=name, system=system, mission=mission, obstacles=obstacles,
+                strategy=PAPER_STRATEGY, ftm=condition != CONDITIONS[0],
+                retuned=AS_THE_PAPER if condition == CONDITIONS[1] else {},
+                faults=(fault,) if fault else (), seed=seed + i)
+            for condition, obstacles, name in product(CONDITIONS, OBSTACLES, FAULTS)
+            for i, fault in enumerate(FAULTS[name])]
 
 
 def full_jobs(mission: str = "A", seed: int = 1, system: str = FULL_SYSTEM) -> list[Job]:
@@ -178,13 +166,10 @@ def cells(runs: Iterable[Run]) -> list[Cell]:
     for run in runs:
         found.setdefault((condition_of(run.job), run.job.row, run.job.obstacles), []).append(run)
     table = []
-    for condition in (*CONDITIONS, FULL):
-        verdicts = WITHOUT_FTM if condition == CONDITIONS[0] else WITH_FTM
-        for name in FAULTS:
-            for column, obstacles in enumerate(OBSTACLES):
-                there = found.get((condition, name, obstacles))
-                if there:
-                    table.append(_cell(condition, verdicts[name][column], there))
+    for condition, name, obstacles in product((*CONDITIONS, FULL), FAULTS, OBSTACLES):
+        if there := found.get((condition, name, obstacles)):
+            verdicts = WITHOUT_FTM if condition == CONDITIONS[0] else WITH_FTM
+            table.append(_cell(condition, verdicts[name][OBSTACLES.index(obstacles)], there))
     return table
 
 
