@@ -14,9 +14,11 @@ from rampart.actors.recording import foxglove as fg
 MARGIN_M = 4.0
 """Strip of prohibited ground that is drawn round the airport."""
 
-_GROUND_Z_M = {"apron": 0.0, "area": 0.0, "taxiway": 0.01, "runway": 0.02}
-_GROUND = {"apron": fg.Color(0.42, 0.44, 0.47, 1.0), "area": fg.Color(0.42, 0.44, 0.47, 1.0),
-           "taxiway": fg.Color(0.36, 0.38, 0.41, 1.0), "runway": fg.Color(0.25, 0.26, 0.29, 1.0)}
+_APRON = (0.0, fg.Color(0.42, 0.44, 0.47, 1.0))
+_GROUND = {"taxiway": (0.01, fg.Color(0.36, 0.38, 0.41, 1.0)),
+           "runway": (0.02, fg.Color(0.25, 0.26, 0.29, 1.0))}
+"""Height in m and colour of the pavement; of any other kind it is like the apron."""
+
 _PROHIBITED = fg.Color(0.75, 0.15, 0.15, 0.45)
 _EDGE = fg.Color(0.9, 0.2, 0.2, 1.0)
 _GRAPH = fg.Color(0.95, 0.8, 0.2, 0.7)
@@ -40,8 +42,7 @@ _HEIGHT_M = 0.4
 def map_scene(airport: Airport, at: fg.Time) -> fg.SceneUpdate:
     """Return pavement, prohibited area, graph and buildings."""
     ground = tuple(
-        _surface(s.polygon, _GROUND_Z_M.get(s.kind, 0.0), _GROUND.get(s.kind, _GROUND["area"]))
-        for s in airport.surfaces)
+        _surface(s.polygon, *_GROUND.get(s.kind, _APRON)) for s in airport.surfaces)
     prohibited = _surface(airport.prohibited_polygon(MARGIN_M), -0.01, _PROHIBITED)
     edges = tuple(_outline(ring) for ring in shapely.get_rings(
         shapely.get_parts(shapely.simplify(airport.allowed, 0.05))))

@@ -81,14 +81,12 @@ class OsmosisViews(Views):
     # -- the scene ------------------------------------------------------------------------------
 
     def _obstacles(self, key: str, _header: Header, body: m.ObstacleList, at_ns: int) -> list[View]:
-        if not self.is_new(key, body.obstacles):
-            return []
-        return [("view/obstacles", scene.obstacles_scene(body.obstacles, fg.time_of(at_ns)))]
+        return [("view/obstacles", scene.obstacles_scene(body.obstacles, fg.time_of(at_ns)))] \
+            if self.is_new(key, body.obstacles) else []
 
     def _route(self, key: str, _header: Header, body: m.Route, at_ns: int) -> list[View]:
-        if not self.is_new(key, (body.active, body.waypoints)):
-            return []
-        return [("view/route", scene.route_scene(body, fg.time_of(at_ns)))]
+        return [("view/route", scene.route_scene(body, fg.time_of(at_ns)))] \
+            if self.is_new(key, (body.active, body.waypoints)) else []
 
     def _light(self, _key: str, _header: Header, body: m.LightMeasurement, at_ns: int
                ) -> list[View]:
@@ -116,17 +114,19 @@ class OsmosisViews(Views):
         return views
 
     def _order(self, key: str, header: Header, body: m.MissionOrder, at_ns: int) -> list[View]:
-        if not self.is_new(key, body.order):
-            return []
-        return [line(at_ns, fg.LogLevel.INFO, header.source,
-                      f"order {body.action.value} by {body.by}: {body.reason}")]
+        return self._told(key, header, body.order, at_ns,
+                          f"order {body.action.value} by {body.by}: {body.reason}")
 
     def _answer(self, key: str, header: Header, body: m.MissionOrderAnswer, at_ns: int
                 ) -> list[View]:
-        if not self.is_new(key, body.order):
-            return []
-        return [line(at_ns, fg.LogLevel.INFO, header.source,
-                      f"order {'obeyed' if body.accepted else 'refused'}: {body.reason}")]
+        return self._told(key, header, body.order, at_ns,
+                          f"order {'obeyed' if body.accepted else 'refused'}: {body.reason}")
+
+    def _told(self, key: str, header: Header, order: str, at_ns: int, text: str) -> list[View]:
+        """Return a line of the log for an order that nothing was told of on that key."""
+        return [line(at_ns, fg.LogLevel.INFO, header.source, text)] \
+            if self.is_new(key, order) else []
+
 
 def _finite(pose: m.Pose) -> bool:
     return all(map(math.isfinite, (pose.x_m, pose.y_m, pose.yaw_rad)))

@@ -113,8 +113,6 @@ def intrusion(fix: GpsFix, distance_m: ProhibitedDistance, limits: FenceLimits,
                 f"{radius_m:.2f} m is the least")
     speed_mps = math.hypot(fix.velocity_x_mps, fix.velocity_y_mps)
     length_m = stopping_distance_m(speed_mps, limits)
-    if here_m - length_m > radius_m:  # wherever it goes: most fixes end here
-        return ""
     # Sphere tracing: a distance changes by no more than the way made, so from a point that is
     # d away one may go on by d - radius without looking.
     along_m, gap_m = 0.0, here_m - radius_m
