@@ -26,14 +26,12 @@ _ANSWER_S = 5.0
 _STATUS_S = 1.0
 """Simulated seconds within which it repeats its status (nominally each half second)."""
 
-_WHAT = {
-    m.MissionAction.PAUSE: "stop, and keep the goal",
-    m.MissionAction.RESUME: "go on with the goal it was paused at",
-    m.MissionAction.REPLAN: "drive on, by a way that is planned anew",
-    m.MissionAction.SKIP: "leave the present goal out; the mission cannot succeed any more",
-    m.MissionAction.CANCEL: "give the mission up where the robot is",
-    m.MissionAction.HOME: "give the mission up and drive to where it began",
-}
+_WHAT = {m.MissionAction.PAUSE: "stop, and keep the goal",
+         m.MissionAction.RESUME: "go on with the goal it was paused at",
+         m.MissionAction.REPLAN: "drive on, by a way that is planned anew",
+         m.MissionAction.SKIP: "leave the present goal out; the mission cannot succeed any more",
+         m.MissionAction.CANCEL: "give the mission up where the robot is",
+         m.MissionAction.HOME: "give the mission up and drive to where it began"}
 
 _EPILOG = """examples:
   rampart mission pause --reason "runway in use"

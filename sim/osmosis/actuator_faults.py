@@ -68,11 +68,10 @@ def motor_of(model: Any, limits: DriveLimits) -> Motor:
     # The free joint has the first six degrees of freedom, the wheels come next.
     inertia = float(model.dof_armature[6] + model.body("wheel_front_left").inertia[1])
     moved_kg = float(model.body("base").subtreemass[0]) + 4 * inertia / WHEEL_RADIUS_M**2
-    return Motor(
-        torque_nm=float(model.actuator_forcerange[0, 1]),
-        servo_gain=float(model.actuator_gainprm[0, 0]),
-        rated_radps=limits.linear_mps / WHEEL_RADIUS_M,
-        brake_torque_nm=moved_kg * limits.brake_mps2 * WHEEL_RADIUS_M / 4)
+    return Motor(torque_nm=float(model.actuator_forcerange[0, 1]),
+                 servo_gain=float(model.actuator_gainprm[0, 0]),
+                 rated_radps=limits.linear_mps / WHEEL_RADIUS_M,
+                 brake_torque_nm=moved_kg * limits.brake_mps2 * WHEEL_RADIUS_M / 4)
 
 
 @dataclass(frozen=True, slots=True)

@@ -134,10 +134,9 @@ def dress(spec: Any, airport: Airport) -> None:
     floor.material = "ground"
     floor.size = [(x1 - x0) / 2, (y1 - y0) / 2, 1]
     floor.pos = [(x0 + x1) / 2, (y0 + y1) / 2, 0]
-    spec.worldbody.add_light(
-        pos=[(x0 + x1) / 2, (y0 + y1) / 2, 60], dir=[0.3, 0.2, -1],
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False,
-        diffuse=[0.75, 0.75, 0.72], ambient=[0.3, 0.3, 0.32])
+    spec.worldbody.add_light(pos=[(x0 + x1) / 2, (y0 + y1) / 2, 60], dir=[0.3, 0.2, -1],
+                             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False,
+                             diffuse=[0.75, 0.75, 0.72], ambient=[0.3, 0.3, 0.32])
     spec.geom("chassis").rgba = [0.16, 0.17, 0.2, 1]
     for geom in spec.geoms:
         if geom.name.startswith("obstacle/"):

@@ -103,9 +103,8 @@ class Drive:
         if not (math.isfinite(linear_mps) and math.isfinite(angular_radps)):
             return False
         limits = self.limits
-        self._wanted = (
-            max(-limits.linear_mps, min(limits.linear_mps, linear_mps)),
-            max(-limits.angular_radps, min(limits.angular_radps, angular_radps)))
+        self._wanted = (max(-limits.linear_mps, min(limits.linear_mps, linear_mps)),
+                        max(-limits.angular_radps, min(limits.angular_radps, angular_radps)))
         self._wanted_at_s = now_s
         return True
 

@@ -62,8 +62,7 @@ class Scene:
             is compiled.
     """
 
-    def __init__(self, airport: Airport, dress: Callable[[Any], None] = lambda _spec: None
-                 ) -> None:
+    def __init__(self, airport: Airport, dress: Callable[[Any], None] = lambda _spec: None) -> None:
         spec = mujoco.MjSpec.from_file(str(MODEL_FILE))
         for building in airport.buildings:
             spec.worldbody.add_geom(

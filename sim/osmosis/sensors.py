@@ -103,9 +103,8 @@ class Laser:
         self._turn[1, :2] = -sin, cos
         np.dot(self._body, self._turn, out=self._rays)
         self._origin[:2] = x_m, y_m
-        mujoco.mj_multiRay(
-            model, data, self._origin, self._flat, self._groups, True, -1,
-            self._geoms, self._ranges, None, self.spec.rays, self.spec.range_max_m)
+        mujoco.mj_multiRay(model, data, self._origin, self._flat, self._groups, True, -1,
+                           self._geoms, self._ranges, None, self.spec.rays, self.spec.range_max_m)
         self._ranges[self._geoms < 0] = math.inf
         return self._ranges
 
@@ -132,10 +131,9 @@ class Gps:
     def read(self, x_m: float, y_m: float, vx_mps: float, vy_mps: float) -> m.GpsFix:
         """Return a fix for the true position and velocity in `map`."""
         n = self._noise.take()
-        return m.GpsFix(
-            x_m + self.POSITION_SIGMA_M * n[0], y_m + self.POSITION_SIGMA_M * n[1],
-            vx_mps + self.VELOCITY_SIGMA_MPS * n[2], vy_mps + self.VELOCITY_SIGMA_MPS * n[3],
-            self.POSITION_SIGMA_M)
+        return m.GpsFix(x_m + self.POSITION_SIGMA_M * n[0], y_m + self.POSITION_SIGMA_M * n[1],
+                        vx_mps + self.VELOCITY_SIGMA_MPS * n[2],
+                        vy_mps + self.VELOCITY_SIGMA_MPS * n[3], self.POSITION_SIGMA_M)
 
 
 class Imu:
@@ -166,10 +164,8 @@ class Imu:
         self._heading = wrap(self._heading + rate * dt_s)
         ax, ay = (vx_mps - then_vx) / dt_s, (vy_mps - then_vy) / dt_s
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        return m.Imu(
-            self._heading, rate,
-            ax * cos + ay * sin + self.ACCELERATION_SIGMA_MPS2 * n[1],
-            ay * cos - ax * sin + self.ACCELERATION_SIGMA_MPS2 * n[2])
+        return m.Imu(self._heading, rate, ax * cos + ay * sin + self.ACCELERATION_SIGMA_MPS2 * n[1],
+                     ay * cos - ax * sin + self.ACCELERATION_SIGMA_MPS2 * n[2])
 
 
 class WheelOdometry:

@@ -36,9 +36,8 @@ from rampart.sim.osmosis.world import World
 WAKE_UP_S = 0.02
 MAX_CATCH_UP_S = 1.0
 
-_JOBS = (
-    topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE, topics.SCAN, topics.UPPER_SCAN,
-    topics.LIGHT, topics.GPS, topics.BASE_STATUS, topics.TRUTH, topics.OBSTACLES)
+_JOBS = (topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE, topics.SCAN, topics.UPPER_SCAN,
+         topics.LIGHT, topics.GPS, topics.BASE_STATUS, topics.TRUTH, topics.OBSTACLES)
 
 
 class Simulator(Actor):
@@ -90,13 +89,11 @@ class Simulator(Actor):
         self._asked_s = now_s
         readings: dict[Topic[Any], Callable[[], Any]] = {
             topics.IMU: world.imu, topics.ODOMETRY: world.odometry,
-            topics.ABSOLUTE_POSE: lambda: m.Pose(*world.pose),
-            topics.SCAN: lambda: self._scan(0),
-            topics.LIGHT: lambda: m.LightSample(world.light()),
-            topics.GPS: world.gps, topics.BASE_STATUS: world.base_status,
+            topics.ABSOLUTE_POSE: lambda: m.Pose(*world.pose), topics.SCAN: lambda: self._scan(0),
+            topics.LIGHT: lambda: m.LightSample(world.light()), topics.GPS: world.gps,
+            topics.BASE_STATUS: world.base_status,
             topics.TRUTH: lambda: world.truth(self._real_time_factor),
-            topics.OBSTACLES: self._obstacles,
-        }
+            topics.OBSTACLES: self._obstacles}
         if parameters.upper_laser:
             readings[topics.UPPER_SCAN] = lambda: self._scan(1)
         self._readings = {topic.key: (topic, read) for topic, read in readings.items()}

@@ -181,8 +181,7 @@ class ActuatorFailure(DetectionModule):
         limits = MotionLimits(
             wheel_radius_m=self.parameters.wheel_radius_m, hold_s=self.parameters.hold_s,
             braking_mps2=context.run.system.robot.braking_mps2)
-        self.monitor = self.judged_by(
-            ActuatorMonitor(limits, self.known_after_s(_FIRST_STATUS_S)))
+        self.monitor = self.judged_by(ActuatorMonitor(limits, self.known_after_s(_FIRST_STATUS_S)))
 
     @on(topics.BASE_COMMAND)
     def command(self, message: m.BaseCommand, _header: Header) -> None:

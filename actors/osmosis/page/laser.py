@@ -41,8 +41,6 @@ def thin(scan: LaserScan | None) -> dict[str, Any] | None:
     nearest = padded.reshape(-1, rays).min(axis=1)
     echo = nearest < min(scan.range_max_m, MAX_RANGE_M) - 0.005
     centimetres = np.where(echo, np.round(100 * np.where(echo, nearest, 0)), -1).astype(int)
-    return {
-        "from_rad": round(scan.angle_min_rad + scan.angle_increment_rad * (rays - 1) / 2, 5),
-        "step_rad": round(scan.angle_increment_rad * rays, 6),
-        "max_m": scan.range_max_m,
-        "cm": centimetres.tolist()}
+    return {"from_rad": round(scan.angle_min_rad + scan.angle_increment_rad * (rays - 1) / 2, 5),
+            "step_rad": round(scan.angle_increment_rad * rays, 6), "max_m": scan.range_max_m,
+            "cm": centimetres.tolist()}

@@ -99,7 +99,6 @@ def _mission(heard: Heard | None) -> dict[str, Any] | None:
     if heard is None:
         return None
     status: m.MissionStatus = heard.value
-    return {
-        "name": status.name, "phase": status.phase, "step": status.step,
-        "goals": status.goals, "times_s": status.step_times_s, "reason": status.reason,
-        "stale": heard.stale, "orders": status.orders, "skipped": status.skipped}
+    return {"name": status.name, "phase": status.phase, "step": status.step, "goals": status.goals,
+            "times_s": status.step_times_s, "reason": status.reason, "stale": heard.stale,
+            "orders": status.orders, "skipped": status.skipped}

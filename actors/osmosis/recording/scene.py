@@ -26,10 +26,9 @@ _BUILDING = fg.Color(0.6, 0.6, 0.65, 1.0)
 _ROBOT = fg.Color(0.15, 0.45, 0.85, 1.0)
 _OBSTACLE = fg.Color(0.9, 0.5, 0.1, 1.0)
 _ROUTE = fg.Color(0.2, 0.8, 0.9, 1.0)
-_VERDICT = {
-    None: fg.Color(0.6, 0.6, 0.6, 1.0), m.LightVerdict.OK: fg.Color(0.2, 0.8, 0.3, 1.0),
-    m.LightVerdict.DIM: fg.Color(0.95, 0.75, 0.1, 1.0),
-    m.LightVerdict.OUT: fg.Color(0.9, 0.15, 0.15, 1.0)}
+_VERDICT = {None: fg.Color(0.6, 0.6, 0.6, 1.0), m.LightVerdict.OK: fg.Color(0.2, 0.8, 0.3, 1.0),
+            m.LightVerdict.DIM: fg.Color(0.95, 0.75, 0.1, 1.0),
+            m.LightVerdict.OUT: fg.Color(0.9, 0.15, 0.15, 1.0)}
 _EVER = fg.Time(0, 0)
 _HERE = fg.pose_at(0.0, 0.0)
 
@@ -41,8 +40,7 @@ _HEIGHT_M = 0.4
 
 def map_scene(airport: Airport, at: fg.Time) -> fg.SceneUpdate:
     """Return pavement, prohibited area, graph and buildings."""
-    ground = tuple(
-        _surface(s.polygon, *_GROUND.get(s.kind, _APRON)) for s in airport.surfaces)
+    ground = tuple(_surface(s.polygon, *_GROUND.get(s.kind, _APRON)) for s in airport.surfaces)
     prohibited = _surface(airport.prohibited_polygon(MARGIN_M), -0.01, _PROHIBITED)
     edges = tuple(_outline(ring) for ring in shapely.get_rings(
         shapely.get_parts(shapely.simplify(airport.allowed, 0.05))))
@@ -54,11 +52,9 @@ def map_scene(airport: Airport, at: fg.Time) -> fg.SceneUpdate:
         fg.CubePrimitive(fg.pose_at(b.x_m, b.y_m, b.height_m / 2, b.yaw_rad),
                          fg.Vector3(b.length_m, b.width_m, b.height_m), _BUILDING)
         for b in airport.buildings)
-    return _scene(
-        _entity("ground", at, triangles=ground),
-        _entity("prohibited", at, triangles=(prohibited,), lines=edges),
-        _entity("graph", at, lines=(graph,)),
-        _entity("buildings", at, cubes=buildings))
+    return _scene(_entity("ground", at, triangles=ground),
+                  _entity("prohibited", at, triangles=(prohibited,), lines=edges),
+                  _entity("graph", at, lines=(graph,)), _entity("buildings", at, cubes=buildings))
 
 
 def lights_scene(airport: Airport, measured: Mapping[str, m.LightMeasurement], at: fg.Time

@@ -68,9 +68,8 @@ class EmergencyStop(RecoveryModule):
                 self.resume(_FOUND_ENGAGED)
             else:
                 self._tell_change()
-        self._order.status(
-            in_force=message.brake_engaged, stamp_s=header.stamp,
-            reason="brake engaged" if message.brake_engaged else "brake not engaged")
+        self._order.status(in_force=message.brake_engaged, stamp_s=header.stamp,
+                           reason="brake engaged" if message.brake_engaged else "brake not engaged")
 
     def _tell(self) -> None:
         if not self._looking:

@@ -83,10 +83,9 @@ class OsmosisFaults(Faults):
            for wheel, name in _WHEELS.items()},
         "brake-failure": ("actuator", "the brakes do not brake"),
     }
-    kinds = {
-        "none": "no fault", "paper": "paper's faults", "topic": "topics", "sensor": "sensors",
-        "process": "processes", "actuator": "actuators", "world": "the world",
-        "several": "several at once"}
+    kinds = {"none": "no fault", "paper": "paper's faults", "topic": "topics", "sensor": "sensors",
+             "process": "processes", "actuator": "actuators", "world": "the world",
+             "several": "several at once"}
     intruder = (OBSTACLE, 1.2, 6.0)
 
     def own(self, fault: str, injection: str, duration_s: float | None

@@ -76,8 +76,7 @@ class MissionTrial(Trial):
         return self.recorder.record(
             now_s, faults=faults, mission="success" if verdict.success else "fail",
             safety=_SAFETY[verdict.safe],
-            reasons=() if verdict.success and verdict.safe else (
-                *verdict.reasons, f"ended: {why}"))
+            reasons=() if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}"))
 
     def summary(self, record: RunRecord) -> dict[str, Any]:
         """Return what scripts rely on, the lights too."""
@@ -87,11 +86,10 @@ class MissionTrial(Trial):
     def figures(self, record: RunRecord) -> dict[str, Any]:
         """Return what ground truth shows: collisions, clearances, and when it became unsafe."""
         found = _mission(record)
-        return {
-            "collisions": found.collisions, "prohibited_s": round(found.prohibited_s, 3),
-            "obstacle_m": _metres(found.obstacle_clearance_m),
-            "prohibited_m": _metres(found.prohibited_clearance_m),
-            "unsafe_s": self.recorder.judge.first_unsafe_s}
+        return {"collisions": found.collisions, "prohibited_s": round(found.prohibited_s, 3),
+                "obstacle_m": _metres(found.obstacle_clearance_m),
+                "prohibited_m": _metres(found.prohibited_clearance_m),
+                "unsafe_s": self.recorder.judge.first_unsafe_s}
 
     def report(self, record: RunRecord, directory: Path) -> Written:
         """Write as much of the inspection report as can be written."""

@@ -57,10 +57,9 @@ def clearance(value: float | None) -> str:
 def _bounds(run: MissionRecord) -> tuple[float, float, float, float]:
     """Return the airport's bounds, widened to the whole track: an unsafe robot may leave them."""
     x0, y0, x1, y1 = run.airport.bounds_m
-    return (min([x0, *(x - 2 for _, x, _ in run.track)]),
-            min([y0, *(y - 2 for _, _, y in run.track)]),
-            max([x1, *(x + 2 for _, x, _ in run.track)]),
-            max([y1, *(y + 2 for _, _, y in run.track)]))
+    return (
+        min([x0, *(x - 2 for _, x, _ in run.track)]), min([y0, *(y - 2 for _, _, y in run.track)]),
+        max([x1, *(x + 2 for _, x, _ in run.track)]), max([y1, *(y + 2 for _, _, y in run.track)]))
 
 
 def points(track: Sequence[tuple[float, float, float]]) -> str:

@@ -83,8 +83,7 @@ class EstimationError(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.monitor = self.judged_by(EstimationMonitor(
-            self.known_after_s(self.grace_s(1.0))))
+        self.monitor = self.judged_by(EstimationMonitor(self.known_after_s(self.grace_s(1.0))))
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:

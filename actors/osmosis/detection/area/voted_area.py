@@ -114,8 +114,7 @@ class VotedArea(DetectionModule):
     @on(topics.ABSOLUTE_POSE)
     def absolute_pose(self, message: m.Pose, header: Header) -> None:
         """Hear the absolute pose."""
-        self._where.vote.see_position(
-            header.stamp, (message.x_m, message.y_m), self.clock.now())
+        self._where.vote.see_position(header.stamp, (message.x_m, message.y_m), self.clock.now())
 
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:
