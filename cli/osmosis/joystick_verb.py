@@ -84,7 +84,7 @@ async def joystick(options: argparse.Namespace) -> int:
                 say()
         if drive.ended:
             raise NoEffectError(drive.ended)
-        if drive.unanswered:
+        if drive.tried and not drive.answered:
             raise NoEffectError("no effect: teleoperation did not answer")
     return 0
 
@@ -111,6 +111,11 @@ class _Drive:
         session: in the run.
         keyboard: turns keys into positions; None if a device drives.
         stop: set when the user has had enough.
+
+    Attributes:
+        ended: why the drive has ended before the user had enough, or "".
+        tried: whether the stick was held for long enough to be answered.
+        answered: whether anything was ever made of it.
     """
 
     def __init__(self, session: Session, keyboard: KeyboardStick | None, stop: asyncio.Event
@@ -124,16 +129,11 @@ class _Drive:
         self._loop = asyncio.get_running_loop()
         self._held = Lasting(_ANSWER_S)
         self._releases = 0
-        self._tried = False
+        self.tried = False
         self._pilot = Latest[m.PilotStatus]()
         session.listen(topics.PILOT_STATUS, topics.PILOT_STATUS.at(), self._pilot.keep)
         session.listen(topics.TELEOP_COMMAND, topics.TELEOP_COMMAND.at(), self._hear_command)
         session.listen(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.pattern, self._hear_diagnostic)
-
-    @property
-    def unanswered(self) -> bool:
-        """Whether the stick was held and nobody ever made a command of it."""
-        return self._tried and not self.answered
 
     def press(self, key: str) -> None:
         """Take a key."""
@@ -181,7 +181,7 @@ class _Drive:
     def _send(self) -> None:
         stick = self._stick()
         if stick.dead_man:
-            self._tried = self._held.note(True, self._loop.time()) or self._tried
+            self.tried = self._held.note(True, self._loop.time()) or self.tried
             self._releases = _RELEASES
         else:
             self._held.forget()

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 LENGTH_M = 0.72
 WIDTH_M = 0.614
-HEIGHT_M = 0.416
 WHEEL_RADIUS_M = 0.1175
 WHEEL_X_M = 0.229
 WHEEL_Y_M = 0.235

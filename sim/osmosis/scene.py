@@ -71,8 +71,8 @@ class Scene:
                 pos=[building.x_m, building.y_m, building.height_m / 2],
                 quat=_turned(building.yaw_rad),
                 contype=0, conaffinity=COLLIDES_WITH_CHASSIS, group=SOLID_GROUP)
-        self._presets = {preset.name: preset for preset in airport.obstacles}
-        shapes = [preset.shape for preset in airport.obstacles] + ["cylinder"] * SPARE_OBSTACLES
+        self._shapes = {preset.name: preset.shape for preset in airport.obstacles}
+        shapes = [*self._shapes.values(), *["cylinder"] * SPARE_OBSTACLES]
         for i, shape in enumerate(shapes):
             body = spec.worldbody.add_body(name=f"obstacle/{i}", mocap=True)
             box = shape == "box"
@@ -84,8 +84,8 @@ class Scene:
         dress(spec)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
-        self._slots = {name: i for i, name in enumerate(self._presets)}
-        self._spare = list(range(len(self._presets), len(shapes)))
+        self._slots = {name: i for i, name in enumerate(self._shapes)}
+        self._spare = list(range(len(self._shapes), len(shapes)))
         self.present: dict[str, Solid] = {}
         self._buildings = [building.polygon for building in airport.buildings]
         self.base = self.model.body("base").id
@@ -114,8 +114,7 @@ class Scene:
             WorldError: not finite, too far away, a radius out of bounds, on the robot, or no room
                 in the pool.
         """
-        preset = self._presets.get(name)
-        solid = Solid(name, preset.shape if preset else "cylinder", x_m, y_m, radius_m)
+        solid = Solid(name, self._shapes.get(name, "cylinder"), x_m, y_m, radius_m)
         if not all(map(math.isfinite, (x_m, y_m, radius_m))):
             raise WorldError(f"obstacle {name}: {solid}: position and radius must be finite")
         if not max(abs(x_m), abs(y_m)) <= FARTHEST_M:
@@ -145,11 +144,9 @@ class Scene:
         """Take an obstacle away; returns whether it was there."""
         if self.present.pop(name, None) is None:
             return False
-        slot = self._slots[name]
-        self._park(slot)
-        if name not in self._presets:
-            del self._slots[name]
-            self._spare.append(slot)
+        self._park(self._slots[name])
+        if name not in self._shapes:
+            self._spare.append(self._slots.pop(name))
         self._refresh()
         return True
 
@@ -176,9 +173,7 @@ class Scene:
 
     def clearance_m(self, footprint: Any) -> float:
         """Distance from a footprint to the nearest obstacle or building; NOTHING_M without."""
-        if self.outlines is None:
-            return NOTHING_M
-        return float(self.outlines.distance(footprint))
+        return NOTHING_M if self.outlines is None else float(self.outlines.distance(footprint))
 
     def touched(self) -> set[str]:
         """Names of the geoms that the chassis touches now."""

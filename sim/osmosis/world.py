@@ -93,7 +93,7 @@ class World:
         self._gps = sensors.Gps(streams[1])
         self._imu = sensors.Imu(streams[2], self.pose[2], start_s)
         self._light = sensors.LightSensor(airport, truth or WorldTruth(), streams[3])
-        self._odometry = sensors.WheelOdometry(self._wheel_angles(), start_s)
+        self._odometry = sensors.WheelOdometry(_four(self._wheel_q), start_s)
         self._collisions = 0
         self._contact_s: dict[str, float] = {}
         self._prohibited_s = 0.0
@@ -184,8 +184,7 @@ class World:
         drive = self._drive
         drive.brake_share = self._faults.brake_share
         targets = drive.update(self.time_s, TICK_S)
-        fl, fr, rl, rr = self._wheel_v.tolist()
-        speeds = (fl, fr, rl, rr)
+        speeds = _four(self._wheel_v)
         actuation = self._faults.actuate(targets, speeds, drive.braking)
         self._servos[:] = actuation.targets_radps
         self._targets = None
@@ -232,7 +231,7 @@ class World:
 
     def odometry(self) -> m.Odometry:
         """Wheel odometry up to now."""
-        return self._odometry.read(self._wheel_angles(), self.time_s)
+        return self._odometry.read(_four(self._wheel_q), self.time_s)
 
     def light(self) -> float:
         """One reading of the light sensor, lux."""
@@ -240,14 +239,9 @@ class World:
 
     def base_status(self) -> m.BaseStatus:
         """Brake, dead man and wheel speeds."""
-        fl, fr, rl, rr = self._wheel_v.tolist()
         return m.BaseStatus(
             self._drive.braking, self._drive.dead_man_tripped(self.time_s),
-            max(0.0, min(NEVER_S, self._drive.command_age_s(self.time_s))), (fl, fr, rl, rr))
-
-    def _wheel_angles(self) -> robot.WheelSpeeds:
-        fl, fr, rl, rr = self._wheel_q.tolist()
-        return fl, fr, rl, rr
+            max(0.0, min(NEVER_S, self._drive.command_age_s(self.time_s))), _four(self._wheel_v))
 
     # -- obstacles ------------------------------------------------------------------------------
 
@@ -285,8 +279,7 @@ class World:
         x_m, y_m, _ = self.pose
         for preset in list(self._waiting):
             near_m = preset.appears_within_m
-            is_far = near_m is not None and \
-                math.dist((x_m, y_m), (preset.x_m, preset.y_m)) > near_m
+            is_far = near_m is not None and math.dist((x_m, y_m), (preset.x_m, preset.y_m)) > near_m
             if elapsed_s < preset.present_from_s or is_far:
                 continue
             try:
@@ -336,3 +329,9 @@ class World:
         """Distance of the footprint's nearest corner to the prohibited area, m."""
         corners = shapely.get_coordinates(footprint(pose))[:4]
         return float(self.airport.prohibited_distances_m(corners).min())
+
+
+def _four(wheels: sensors.Floats) -> robot.WheelSpeeds:
+    """Return a view of what MuJoCo has of the wheels as plain numbers."""
+    fl, fr, rl, rr = wheels.tolist()
+    return fl, fr, rl, rr

@@ -79,8 +79,7 @@ class PilotOutputMonitor(Finding):
         self._last: tuple[float, float, float] | None = None
         self._wrong = Lasting(self.limits.wrong_s)
         self._well = Lasting(self.limits.hold_s)
-        self._says_stop = False
-        self._says_unchanged = False
+        self._says = (False, False)  # that it stops the robot, that commands pass unchanged
         self._said_s = -math.inf
 
     @property
@@ -109,10 +108,9 @@ class PilotOutputMonitor(Finding):
 
     def said(self, *, stopped: bool, reason: str, now_s: float) -> None:
         """Take the pilot's own word: whether it stops the robot, and why commands are changed."""
-        unchanged = not stopped and not reason
-        if (stopped, unchanged) != (self._says_stop, self._says_unchanged):
+        before, self._says = self._says, (stopped, not stopped and not reason)
+        if self._says != before:
             self._said_s = now_s
-        self._says_stop, self._says_unchanged = stopped, unchanged
 
     def sent(self, linear_mps: float, angular_radps: float, stamp_s: float, incarnation: int,
              now_s: float) -> None:
@@ -139,9 +137,10 @@ class PilotOutputMonitor(Finding):
             return ""
         limits = self.limits
         has_said = sent_s - self._said_s > limits.status_s
-        if self._says_stop and has_said:
+        says_stop, says_unchanged = self._says
+        if says_stop and has_said:
             return f"{_shown(linear_mps, angular_radps)} while the safety pilot says that it stops"
-        exactly = self._says_unchanged and has_said
+        exactly = says_unchanged and has_said
         moves = turns = False
         recent = takewhile(lambda asked: sent_s - asked[0] <= limits.recent_s,
                            reversed(self._asked))

@@ -47,10 +47,9 @@ class OsmosisHmi(Hmi):
     outputs = (*Hmi.outputs, topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.JOYSTICK,
                topics.ACTUATOR_FAULT)
     requests = OSMOSIS_REQUESTS
-    shown = (
-        *Hmi.shown, topics.POSE, topics.SCAN, topics.UPPER_SCAN, topics.ROUTE,
-        topics.CONTROL_STATUS, topics.PILOT_STATUS, topics.OBSTACLES, topics.LIGHT_MEASURED,
-        topics.BASE_STATUS)
+    shown = (*Hmi.shown, topics.POSE, topics.SCAN, topics.UPPER_SCAN, topics.ROUTE,
+             topics.CONTROL_STATUS, topics.PILOT_STATUS, topics.OBSTACLES, topics.LIGHT_MEASURED,
+             topics.BASE_STATUS)
     _state: OsmosisState
     _operating: Driving
 

@@ -13,7 +13,7 @@ from rampart.sim.faults.disturbance import Disturbance, Fault
 from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.scenario import ScenarioError, number
 from rampart.sim.osmosis.robot import WHEEL_NAMES
-from rampart.sim.osmosis.trial.sensor_faults import LEFT_OUT, sensor_faults
+from rampart.sim.osmosis.trial.sensor_faults import LEFT_OUT, SENSOR_FAULTS
 
 OBSTACLE = "obstacle-ahead"
 
@@ -27,16 +27,14 @@ _LASTS_S = {"stuck-wheel": 10.0, "weak-wheel": 10.0, "brake-failure": 30.0, OBST
 _WHEELS = {name.replace(" ", "-"): name for name in WHEEL_NAMES}
 
 PAPER_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in (
-    Fault("command-not-updated",
-          "Osmosis Control repeats its last velocity command for ever",
+    Fault("command-not-updated", "Osmosis Control repeats its last velocity command for ever",
           (Disturbance(_COMMAND, "freeze"),), ("DM2",), 10.0, _GROUP),
     Fault("command-out-of-bounds",
           "Osmosis Control commands 3 m/s straight ahead, three times the top speed",
           (Disturbance(_COMMAND, "corrupt",
                        set_fields={"linear_mps": 3.0, "angular_radps": 0.0}),), ("DM3",), 10.0,
           _GROUP),
-    Fault("localization-not-updated",
-          "Localization repeats its last pose for ever",
+    Fault("localization-not-updated", "Localization repeats its last pose for ever",
           (Disturbance(_POSE, "freeze"),), ("DM6",), 10.0, _GROUP),
     Fault("prohibited-area",
           "Localization drifts north by 0.25 m/s: the controller leads the robot into the grass "
@@ -48,9 +46,6 @@ PAPER_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in (
           _GROUP),
 )}
 """The faults that the paper injects, other than crashes."""
-
-SENSOR_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in sensor_faults()}
-"""The faults of the sensors."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,6 @@ import msgspec
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.messages import ControlStatus, GroundTruth, MissionStatus
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
@@ -52,12 +51,7 @@ class MissionTrial(Trial):
         """Return what wants to hear the run's messages."""
 
         def to_end(_topic: Topic[Any], message: Any, _header: Header) -> None:
-            if isinstance(message, MissionStatus):
-                self._end.mission(message, clock.now())
-            elif isinstance(message, ControlStatus):
-                self._end.control(message, clock.now())
-            elif isinstance(message, GroundTruth):
-                self._end.truth(message.twist, clock.now())
+            self._end.take(message, clock.now())
 
         return [to_end, *super().sinks(clock)]
 

@@ -50,24 +50,23 @@ to the last goal."""
 _OUT_OF_BOUNDS_S = 4.0
 """The paper calls this fault temporary and does not say how long it lasts."""
 
-_EVER = math.inf
-_NON_CONTROL = ("hmi", "teleoperation", "localization")
-_CONTROL = ("mission_manager", "graph_planner", "osmosis_control")
+
+
+def _lasting(fault: str, duration_s: float) -> tuple[PlannedFault, ...]:
+    return tuple(PlannedFault(fault, at_s, duration_s=duration_s) for at_s in _AT_S)
+
+
+def _crashes(*nodes: str) -> tuple[PlannedFault, ...]:
+    return tuple(PlannedFault(f"kill:{node}", at_s) for node in nodes for at_s in _AT_S[:3])
+
 
 FAULTS: dict[str, tuple[PlannedFault | None, ...]] = {
     "none": (None,),
-    "command out of bounds": tuple(
-        PlannedFault("command-out-of-bounds", at_s, duration_s=_OUT_OF_BOUNDS_S)
-        for at_s in _AT_S),
-    "localization not updated": tuple(
-        PlannedFault("localization-not-updated", at_s, duration_s=_EVER) for at_s in _AT_S),
-    "command not updated": tuple(
-        PlannedFault("command-not-updated", at_s, duration_s=_EVER) for at_s in _AT_S),
-    "non-control node crash": tuple(
-        PlannedFault(f"kill:{node}", at_s) for node in _NON_CONTROL for at_s in _AT_S[:3]),
-    "control node crash": tuple(
-        PlannedFault(f"kill:{node}", at_s) for node in _CONTROL for at_s in _AT_S[:3]),
-}
+    "command out of bounds": _lasting("command-out-of-bounds", _OUT_OF_BOUNDS_S),
+    "localization not updated": _lasting("localization-not-updated", math.inf),
+    "command not updated": _lasting("command-not-updated", math.inf),
+    "non-control node crash": _crashes("hmi", "teleoperation", "localization"),
+    "control node crash": _crashes("mission_manager", "graph_planner", "osmosis_control")}
 """The runs of each row: the fault at different moments, or in different nodes."""
 
 WITHOUT_FTM: dict[str, tuple[str, str]] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Any, Literal
 
 import msgspec
@@ -11,7 +12,7 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
-from rampart.actors.osmosis.airport.model import Airport, Mission
+from rampart.actors.osmosis.airport.model import Airport, Light, Mission
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.sim.osmosis.trial.judge import Judge
@@ -127,6 +128,7 @@ class MissionRecorder(RunRecorder):
     def record(self, duration_s: float, **more: Any) -> MissionRecord:
         """Return the record of the run so far; `more` are at least the verdicts."""
         judge, drawing = self.judge, draw(self._airport)
+        reached = dict(enumerate(self._reached))
         return MissionRecord(
             **self.fields(duration_s), **more,
             airport=drawing, mission_name=self._mission.name,
@@ -134,10 +136,8 @@ class MissionRecorder(RunRecorder):
                            for a, b in zip(self._track, self._track[1:], strict=False)),
             track=tuple(self._track), believed=tuple(self._believed),
             lights=tuple(map(self._light_result, drawing.lights)),
-            steps=tuple(
-                StepResult(str(goal.mode), goal.x_m, goal.y_m,
-                           self._reached[i] if i < len(self._reached) else None)
-                for i, goal in enumerate(self._mission.goals)),
+            steps=tuple(StepResult(str(goal.mode), goal.x_m, goal.y_m, reached.get(i))
+                        for i, goal in enumerate(self._mission.goals)),
             obstacles=tuple(self._obstacles.values()),
             collisions=judge.collisions, prohibited_s=judge.prohibited_s,
             obstacle_clearance_m=_finite(judge.obstacle_m),
@@ -178,11 +178,10 @@ class MissionRecorder(RunRecorder):
         if moved and self.has_room(track, TRACK_KEPT):
             track.append((round(t_s, 2), round(pose.x_m, 3), round(pose.y_m, 3)))
 
-    def _light_result(self, light: Any) -> LightResult:
-        known = (light.name, light.row, light.x_m, light.y_m, light.nominal_cd)
-        seen = self._lights.get(light.name)
-        return LightResult(*known) if seen is None else LightResult(
-            *known, seen.verdict.value, seen.intensity_cd, seen.ratio)
+    def _light_result(self, light: Light) -> LightResult:
+        known, seen = asdict(light), self._lights.get(light.name)
+        return LightResult(**known) if seen is None else LightResult(
+            **known, verdict=seen.verdict.value, intensity_cd=seen.intensity_cd, ratio=seen.ratio)
 
 
 def _finite(value: float) -> float | None:

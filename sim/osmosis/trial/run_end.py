@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 from rampart.actors.osmosis import messages as m
 
@@ -54,6 +55,15 @@ class RunEnd:
     _lost_at_s: float = math.inf
     _truth_at_s: float = math.inf
     _moves: bool = False
+
+    def take(self, message: Any, now_s: float) -> None:
+        """Take what the observer hears; what says nothing of the end does not matter."""
+        if isinstance(message, m.MissionStatus):
+            self.mission(message, now_s)
+        elif isinstance(message, m.ControlStatus):
+            self.control(message, now_s)
+        elif isinstance(message, m.GroundTruth):
+            self.truth(message.twist, now_s)
 
     def mission(self, status: m.MissionStatus, now_s: float) -> None:
         """Take the mission's state."""

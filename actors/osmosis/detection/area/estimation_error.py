@@ -88,14 +88,12 @@ class EstimationError(DetectionModule):
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
         """Hear the heading."""
-        self.monitor.vote.track.imu(
-            header.stamp, message.yaw_rad, message.yaw_rate_radps, self.clock.now())
+        self.monitor.vote.track.imu(message, header.stamp, self.clock.now())
 
     @on(topics.ODOMETRY)
     def odometry(self, message: m.Odometry, header: Header) -> None:
         """Hear the way that the wheels made."""
-        self.monitor.vote.track.odometry(
-            header.stamp, message.pose.yaw_rad, message.twist.linear_mps, self.clock.now())
+        self.monitor.vote.track.odometry(message, header.stamp, self.clock.now())
 
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:

@@ -43,9 +43,9 @@ class VotedPosition:
         self._fix: m.GpsFix | None = None
         self.by_gps = False
 
-    def odometry(self, stamp_s: float, yaw_rad: float, linear_mps: float, now_s: float) -> None:
+    def odometry(self, odometry: m.Odometry, stamp_s: float, now_s: float) -> None:
         """Take the way that the wheels made."""
-        self._since_m += self.vote.track.odometry(stamp_s, yaw_rad, linear_mps, now_s)
+        self._since_m += self.vote.track.odometry(odometry, stamp_s, now_s)
 
     def gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> None:
         """Take a GPS fix."""
@@ -108,8 +108,7 @@ class VotedArea(DetectionModule):
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
         """Hear the heading."""
-        self._where.vote.track.imu(
-            header.stamp, message.yaw_rad, message.yaw_rate_radps, self.clock.now())
+        self._where.vote.track.imu(message, header.stamp, self.clock.now())
 
     @on(topics.ABSOLUTE_POSE)
     def absolute_pose(self, message: m.Pose, header: Header) -> None:
@@ -126,7 +125,7 @@ class VotedArea(DetectionModule):
     def odometry(self, message: m.Odometry, header: Header) -> None:
         """Hear the way that the wheels made; look, if GPS gives no occasion."""
         now_s = self.clock.now()
-        self._where.odometry(header.stamp, message.pose.yaw_rad, message.twist.linear_mps, now_s)
+        self._where.odometry(message, header.stamp, now_s)
         waited_s = now_s - self._looked_s
         if waited_s >= (1.5 if self._where.by_gps else 0.99) * GPS_PERIOD_S:
             self._look()

@@ -67,9 +67,9 @@ def watch_all(items, lie=honest, to_s=END_S, monitor=None):
 def feed(monitor: EstimationMonitor, item: Reading, now_s: float) -> None:
     body, track = item.body, monitor.vote.track
     if item.topic is topics.IMU:
-        track.imu(item.stamp_s, body.yaw_rad, body.yaw_rate_radps, now_s)
+        track.imu(body, item.stamp_s, now_s)
     elif item.topic is topics.ODOMETRY:
-        track.odometry(item.stamp_s, body.pose.yaw_rad, body.twist.linear_mps, now_s)
+        track.odometry(body, item.stamp_s, now_s)
     elif item.topic is topics.GPS:
         monitor.gps(body, item.stamp_s, now_s)
 
