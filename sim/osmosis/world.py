@@ -309,8 +309,7 @@ class World:
 
     def _count_contacts(self) -> None:
         for name in self._scene.touched():
-            last_s = self._contact_s.get(name, -math.inf)
-            if self.time_s - last_s > SAME_CONTACT_S:
+            if self.time_s - self._contact_s.get(name, -math.inf) > SAME_CONTACT_S:
                 self._collisions += 1
             self._contact_s[name] = self.time_s
 

@@ -44,8 +44,7 @@ class FreshnessMonitor(Finding):
 
     def __init__(self, subject: str, timeout_s: float, hold_s: float, start_s: float,
                  grace_s: float, *, known: bool = True) -> None:
-        super().__init__()
-        self.known = known
+        super().__init__(-math.inf if known else math.inf)
         self.subject = subject
         self.timeout_s = timeout_s
         self.hold_s = hold_s

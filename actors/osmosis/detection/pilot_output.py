@@ -67,8 +67,7 @@ class PilotOutputMonitor(Finding):
 
     def __init__(self, pilot: str, start_s: float, grace_s: float,
                  limits: PilotLimits | None = None, *, known: bool = True) -> None:
-        super().__init__()
-        self.known = known
+        super().__init__(-math.inf if known else math.inf)
         self.limits = limits or PilotLimits()
         self._pilot = pilot
         self._incarnation = 0

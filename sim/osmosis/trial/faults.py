@@ -43,8 +43,7 @@ PAPER_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in (
     Fault("wrong-graph",
           "Graph Planner gives a way straight to the goal, along an edge that does not exist",
           (Disturbance(topics.ROUTE.key, "corrupt", keep_ends=("waypoints",)),), ("DM1",), 30.0,
-          _GROUP),
-)}
+          _GROUP))}
 """The faults that the paper injects, other than crashes."""
 
 
@@ -68,16 +67,14 @@ class OsmosisFaults(Faults):
         "actuator": (*(f"stuck-wheel:{wheel}" for wheel in _WHEELS),
                      *(f"weak-wheel:{wheel}:{_WEAK}" for wheel in _WHEELS),
                      "brake-failure:0", "brake-failure:0.3"),
-        "world": tuple(f"{OBSTACLE}:{distance}" for distance in (2, 3, 5)),
-    }
+        "world": tuple(f"{OBSTACLE}:{distance}" for distance in (2, 3, 5))}
     titled = {
         **{f"stuck-wheel:{wheel}": ("actuator", f"the {name} wheel is stuck")
            for wheel, name in _WHEELS.items()},
         **{f"weak-wheel:{wheel}": (
             "actuator", f"the {name} wheel has a fifth of its torque and speed left")
            for wheel, name in _WHEELS.items()},
-        "brake-failure": ("actuator", "the brakes do not brake"),
-    }
+        "brake-failure": ("actuator", "the brakes do not brake")}
     kinds = {"none": "no fault", "paper": "paper's faults", "topic": "topics", "sensor": "sensors",
              "process": "processes", "actuator": "actuators", "world": "the world",
              "several": "several at once"}

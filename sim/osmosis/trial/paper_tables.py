@@ -85,8 +85,7 @@ TABLE_III: tuple[tuple[tuple[str, ...], int, tuple[str, ...]], ...] = (
     (("FTM7",), 1, ("RM4",)),
     (("FTM1", "FTM6"), 2, ("RM1",)),
     (("FTM3", "FTM4"), 3, ("RM2",)),
-    (("FTM2", "FTM5", "FTM6"), 4, ("RM1",)),
-)
+    (("FTM2", "FTM5", "FTM6"), 4, ("RM1",)))
 """Active mechanisms, block, recovery executed."""
 
 

@@ -85,16 +85,14 @@ SENSORS = (
             says={"bias": "is 1 m off to the north-east",
                   "drift": "drifts by 0.14 m/s and 0.01 rad/s",
                   "noise": "has noise of 0.3 m and 0.1 rad"},
-            seen_by={"bias": ("DM1",), "drift": ("DM1",), "dropout": ("DM6",)}),
-)
+            seen_by={"bias": ("DM1",), "drift": ("DM1",), "dropout": ("DM6",)}))
 """The sensors of the robot. Bias of the light sensor: 200 cd at 0.35 m give 1633 lux
 (`rampart.actors.osmosis.airport.photometry`), so 800 lux lift a dead light near the limit of half
 its intensity."""
 
 LEFT_OUT: Mapping[str, str] = {
     "laser-drift": "time of flight is held by a quartz: it drifts by millimetres an hour",
-    "light-drift": "a photodiode ages over years; within one mission that is light-bias",
-}
+    "light-drift": "a photodiode ages over years; within one mission that is light-bias"}
 """Combinations that make no sense, and why. A bias of the odometry is one of its twist only: a
 constant offset of a pose in `odom`, whose origin is arbitrary (REP-105), is no error."""
 

@@ -41,14 +41,11 @@ class EstimationMonitor(Finding):
         self._turned = 0
 
     def pose(self, pose: m.Pose, stamp_s: float, now_s: float, suspect: str) -> None:
-        """Take the pose under test; `suspect` is the life of the node that says it."""
-        vote = self.vote
-        if not is_sane(pose.yaw_rad) or not vote.see_position(
-                stamp_s, (pose.x_m, pose.y_m), now_s):
-            return
-        if not self.active:
-            self.nodes = (suspect,)
-        self._yaw_rad = pose.yaw_rad
+        """Take the pose under test; `suspect` is the incarnation of the node that says it."""
+        if is_sane(pose.yaw_rad) and self.vote.see_position(stamp_s, (pose.x_m, pose.y_m), now_s):
+            self._yaw_rad = pose.yaw_rad
+            if not self.active:
+                self.nodes = (suspect,)
 
     def gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> None:
         """Take a fix."""
