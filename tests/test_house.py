@@ -47,7 +47,7 @@ STILL_ROBOTIC: set[str] = set()
 
 STILL_NAMED = {"cli.operate.inject_verbs", "manager.spec.mobile_robot"}
 
-STILL_TOO_LONG = {"sim.osmosis.world"}
+STILL_TOO_LONG: set[str] = set()
 
 STILL_CIRCULAR: set[tuple[str, str]] = set()
 

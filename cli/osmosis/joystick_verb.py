@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import math
 import sys
 from typing import Any
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
+from rampart.actors.detection.lasting import Lasting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import TELEOPERATION
@@ -21,7 +23,7 @@ from rampart.cli import systems
 from rampart.cli.following import is_over, stopped_by_signals
 from rampart.cli.osmosis.keyboard_stick import KeyboardStick
 from rampart.cli.output import NoEffectError, UsageError, say
-from rampart.cli.session import Session, connect
+from rampart.cli.session import Latest, Session, connect
 from rampart.cli.terminal import END, keys
 from rampart.files.plain_text import printable
 
@@ -82,7 +84,7 @@ async def joystick(options: argparse.Namespace) -> int:
                 say()
         if drive.ended:
             raise NoEffectError(drive.ended)
-        if drive.unanswered:
+        if drive.tried and not drive.answered:
             raise NoEffectError("no effect: teleoperation did not answer")
     return 0
 
@@ -109,11 +111,15 @@ class _Drive:
         session: in the run.
         keyboard: turns keys into positions; None if a device drives.
         stop: set when the user has had enough.
+
+    Attributes:
+        ended: why the drive has ended before the user had enough, or "".
+        tried: whether the stick was held for long enough to be answered.
+        answered: whether anything was ever made of it.
     """
 
-    def __init__(
-        self, session: Session, keyboard: KeyboardStick | None, stop: asyncio.Event
-    ) -> None:
+    def __init__(self, session: Session, keyboard: KeyboardStick | None, stop: asyncio.Event
+                 ) -> None:
         self.ended = ""
         self.answered = False
         self._session = session
@@ -121,18 +127,13 @@ class _Drive:
         self._device = m.Joystick(0.0, 0.0, False)
         self._stop = stop
         self._loop = asyncio.get_running_loop()
-        self._held_since_s: float | None = None
+        self._held = Lasting(_ANSWER_S)
         self._releases = 0
-        self._tried = False
-        self._pilot: m.PilotStatus | None = None
-        session.listen(topics.PILOT_STATUS, topics.PILOT_STATUS.at(), self._hear_pilot)
+        self.tried = False
+        self._pilot = Latest[m.PilotStatus]()
+        session.listen(topics.PILOT_STATUS, topics.PILOT_STATUS.at(), self._pilot.keep)
         session.listen(topics.TELEOP_COMMAND, topics.TELEOP_COMMAND.at(), self._hear_command)
         session.listen(bus_topics.DIAGNOSTIC, bus_topics.DIAGNOSTIC.pattern, self._hear_diagnostic)
-
-    @property
-    def unanswered(self) -> bool:
-        """Whether the stick was held and nobody ever made a command of it."""
-        return self._tried and not self.answered
 
     def press(self, key: str) -> None:
         """Take a key."""
@@ -180,18 +181,16 @@ class _Drive:
     def _send(self) -> None:
         stick = self._stick()
         if stick.dead_man:
-            if self._held_since_s is None:
-                self._held_since_s = self._loop.time()
-            self._tried = self._tried or self._loop.time() - self._held_since_s > _ANSWER_S
+            self.tried = self._held.note(True, self._loop.time()) or self.tried
             self._releases = _RELEASES
         else:
-            self._held_since_s = None
+            self._held.forget()
             self._releases -= 1
         if self._releases >= 0:
             self._session.publish(topics.JOYSTICK, stick)
 
     def _show(self) -> None:
-        stick, pilot = self._stick(), self._pilot
+        stick, pilot = self._stick(), self._pilot.value
         text = (f"forward {stick.forward:+.0%} left {stick.left:+.0%}" if stick.dead_man
                 else "let go")
         if self._keyboard is not None:
@@ -202,11 +201,8 @@ class _Drive:
         sys.stdout.write(f"\r{printable(text)[:78]:<78}")
         sys.stdout.flush()
 
-    def _hear_pilot(self, _key: str, _header: Header, status: m.PilotStatus) -> None:
-        self._pilot = status
-
     def _hear_command(self, _key: str, _header: Header, _twist: m.Twist) -> None:
-        self.answered = self.answered or self._held_since_s is not None
+        self.answered = self.answered or self._held.since_s < math.inf
 
     def _hear_diagnostic(self, _key: str, _header: Header, report: bm.Diagnostic) -> None:
         if report.offender == self._session.name:

@@ -18,8 +18,7 @@ STEP = 0.1
 _DIRECTIONS: dict[str, tuple[float, float]] = {
     "up": (1, 0), "down": (-1, 0), "left": (0, 1), "right": (0, -1),
     "u": (1, 1), "i": (1, 0), "o": (1, -1), "j": (0, 1), "l": (0, -1),
-    "m": (-1, -1), ",": (-1, 0), ".": (-1, 1),
-}
+    "m": (-1, -1), ",": (-1, 0), ".": (-1, 1)}
 """Arrow keys, and the letters of ROS's teleop_twist_keyboard, which can do both at once. Backing
 up, m and . turn so that the robot's tail goes to their side."""
 

@@ -79,12 +79,10 @@ class OsmosisLines(RobotLines):
         truth: m.GroundTruth | None = latest(topics.TRUTH)
         if truth is None:
             return
-        for name, doc, value in (
-                ("obstacle_clearance_meters", "Footprint to the nearest obstacle.",
-                 truth.obstacle_clearance_m),
-                ("prohibited_clearance_meters", "Footprint to the prohibited area.",
-                 truth.prohibited_clearance_m)):
-            yield gauge(name, doc, (), [((), value)])
+        yield gauge("obstacle_clearance_meters", "Footprint to the nearest obstacle.", (), [
+            ((), truth.obstacle_clearance_m)])
+        yield gauge("prohibited_clearance_meters", "Footprint to the prohibited area.", (), [
+            ((), truth.prohibited_clearance_m)])
         yield counter("collisions", "Collisions, by ground truth.", (), [((), truth.collisions)])
         yield counter("prohibited_seconds", "Time in the prohibited area, by ground truth.", (), [
             ((), truth.prohibited_s)])

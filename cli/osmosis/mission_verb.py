@@ -9,14 +9,8 @@ import uuid
 from typing import Any
 
 from rampart.actors.bus.envelope import Header
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import (
-    MissionAction,
-    MissionOrder,
-    MissionOrderAnswer,
-    MissionPhase,
-    MissionStatus,
-)
 from rampart.cli.output import NoEffectError, UsageError, print_json, say
 from rampart.cli.session import Session, connect
 
@@ -32,14 +26,12 @@ _ANSWER_S = 5.0
 _STATUS_S = 1.0
 """Simulated seconds within which it repeats its status (nominally each half second)."""
 
-_WHAT = {
-    MissionAction.PAUSE: "stop, and keep the goal",
-    MissionAction.RESUME: "go on with the goal it was paused at",
-    MissionAction.REPLAN: "drive on, by a way that is planned anew",
-    MissionAction.SKIP: "leave the present goal out; the mission cannot succeed any more",
-    MissionAction.CANCEL: "give the mission up where the robot is",
-    MissionAction.HOME: "give the mission up and drive to where it began",
-}
+_WHAT = {m.MissionAction.PAUSE: "stop, and keep the goal",
+         m.MissionAction.RESUME: "go on with the goal it was paused at",
+         m.MissionAction.REPLAN: "drive on, by a way that is planned anew",
+         m.MissionAction.SKIP: "leave the present goal out; the mission cannot succeed any more",
+         m.MissionAction.CANCEL: "give the mission up where the robot is",
+         m.MissionAction.HOME: "give the mission up and drive to where it began"}
 
 _EPILOG = """examples:
   rampart mission pause --reason "runway in use"
@@ -61,8 +53,8 @@ def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
         description="Give the Mission Manager an order, wait for its answer, and say what became\n"
                     f"of the mission.\n\norders:\n{orders}",
         epilog=_EPILOG)
-    parser.add_argument("action", metavar="ORDER", choices=[a.value for a in MissionAction],
-                        help=", ".join(a.value for a in MissionAction))
+    parser.add_argument("action", metavar="ORDER", choices=[a.value for a in m.MissionAction],
+                        help=", ".join(a.value for a in m.MissionAction))
     parser.add_argument("--reason", metavar="TEXT", default="no reason given",
                         help="why; it is kept and shown with the mission")
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -76,14 +68,12 @@ async def mission(options: argparse.Namespace) -> int:
         NoEffectError: it was refused, or nobody answered.
         UsageError: the reason is none, or there is no run.
     """
-    order = MissionOrder(f"rampart-{uuid.uuid4().hex[:10]}", MissionAction(options.action),
+    order = m.MissionOrder(f"rampart-{uuid.uuid4().hex[:10]}", m.MissionAction(options.action),
                          checked_reason(options.reason), OPERATOR)
     async with connect(options.port) as session:
         asked = _Asked(session, order)
-        answered = await session.command(
-            topics.MISSION_ORDER, order, lambda: asked.answer is not None,
-            session.real_s(_ANSWER_S))
-        if answered:
+        if await session.command(topics.MISSION_ORDER, order, lambda: asked.answer is not None,
+                                 session.real_s(_ANSWER_S)):
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(asked.shown.wait(), session.real_s(_STATUS_S))
     answer, status = asked.answer, asked.status
@@ -116,12 +106,12 @@ def checked_reason(text: str) -> str:
     return reason
 
 
-def in_words(status: MissionStatus | None) -> str:
+def in_words(status: m.MissionStatus | None) -> str:
     """Return where the mission is, for people."""
     if status is None:
         return "the Mission Manager has not shown its status since"
     step = f", step {min(status.step + 1, len(status.goals))} of {len(status.goals)}" if (
-        status.phase in (MissionPhase.RUNNING, MissionPhase.PAUSED)) else ""
+        status.phase in (m.MissionPhase.RUNNING, m.MissionPhase.PAUSED)) else ""
     why = f": {status.reason}" if status.reason else ""
     return f"mission {status.name} is {status.phase.value}{step}{why}"
 
@@ -129,20 +119,20 @@ def in_words(status: MissionStatus | None) -> str:
 class _Asked:
     """What the Mission Manager says about one order, and of its mission afterwards."""
 
-    def __init__(self, session: Session, order: MissionOrder) -> None:
+    def __init__(self, session: Session, order: m.MissionOrder) -> None:
         self._order = order
         self._answered_s = 0.0
-        self.answer: MissionOrderAnswer | None = None
-        self.status: MissionStatus | None = None
+        self.answer: m.MissionOrderAnswer | None = None
+        self.status: m.MissionStatus | None = None
         self.shown = asyncio.Event()
         session.listen(topics.MISSION_ORDER_ANSWER, topics.MISSION_ORDER_ANSWER.at(), self._hear)
         session.listen(topics.MISSION_STATUS, topics.MISSION_STATUS.at(), self._see)
 
-    def _hear(self, _key: str, header: Header, answer: MissionOrderAnswer) -> None:
+    def _hear(self, _key: str, header: Header, answer: m.MissionOrderAnswer) -> None:
         if answer.order == self._order.order and self.answer is None:
             self.answer, self._answered_s = answer, header.stamp
 
-    def _see(self, _key: str, header: Header, status: MissionStatus) -> None:
+    def _see(self, _key: str, header: Header, status: m.MissionStatus) -> None:
         # Only a status of after the answer tells what the order has led to.
         if self.answer is not None and header.stamp >= self._answered_s:
             self.status = status

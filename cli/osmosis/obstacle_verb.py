@@ -54,13 +54,12 @@ async def obstacle_list(options: argparse.Namespace) -> int:
     """Print the obstacles."""
     async with connect(options.port) as session:
         present = await _World(session).obstacles()
+    head = ("name", "x_m", "y_m", "radius_m")
     if options.json:
-        print_json([{"name": o.name, "x_m": o.x_m, "y_m": o.y_m, "radius_m": o.radius_m}
-                    for o in present.values()])
+        print_json([{name: getattr(o, name) for name in head} for o in present.values()])
     else:
-        print_table(("name", "x_m", "y_m", "radius_m"),
-                    [(o.name, round(o.x_m, 2), round(o.y_m, 2), o.radius_m)
-                     for o in present.values()])
+        print_table(head, [(o.name, round(o.x_m, 2), round(o.y_m, 2), o.radius_m)
+                           for o in present.values()])
     return 0
 
 
@@ -76,9 +75,8 @@ async def obstacle_add(options: argparse.Namespace) -> int:
 
     def there(obstacle: m.ObstacleCommand | None) -> bool:
         return obstacle is not None and all(
-            math.isclose(is_, wanted, abs_tol=1e-6) for is_, wanted in (
-                (obstacle.x_m, order.x_m), (obstacle.y_m, order.y_m),
-                (obstacle.radius_m, order.radius_m)))
+            math.isclose(getattr(obstacle, name), getattr(order, name), abs_tol=1e-6)
+            for name in ("x_m", "y_m", "radius_m"))
 
     async with connect(options.port) as session:
         await _World(session).change(order, there)
@@ -122,9 +120,8 @@ class _World:
         await self._listed.first(self._session.real_s(_OBSTACLES_PERIOD_S))
         return self._present()
 
-    async def change(
-        self, order: m.ObstacleCommand, done: Callable[[m.ObstacleCommand | None], bool]
-    ) -> None:
+    async def change(self, order: m.ObstacleCommand,
+                     done: Callable[[m.ObstacleCommand | None], bool]) -> None:
         """Order a change and wait until it shows.
 
         Raises:

@@ -68,12 +68,10 @@ def motor_of(model: Any, limits: DriveLimits) -> Motor:
     # The free joint has the first six degrees of freedom, the wheels come next.
     inertia = float(model.dof_armature[6] + model.body("wheel_front_left").inertia[1])
     moved_kg = float(model.body("base").subtreemass[0]) + 4 * inertia / WHEEL_RADIUS_M**2
-    return Motor(
-        torque_nm=float(model.actuator_forcerange[0, 1]),
-        servo_gain=float(model.actuator_gainprm[0, 0]),
-        rated_radps=limits.linear_mps / WHEEL_RADIUS_M,
-        brake_torque_nm=moved_kg * limits.brake_mps2 * WHEEL_RADIUS_M / 4,
-    )
+    return Motor(torque_nm=float(model.actuator_forcerange[0, 1]),
+                 servo_gain=float(model.actuator_gainprm[0, 0]),
+                 rated_radps=limits.linear_mps / WHEEL_RADIUS_M,
+                 brake_torque_nm=moved_kg * limits.brake_mps2 * WHEEL_RADIUS_M / 4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,9 +180,8 @@ class ActuatorFaults:
         """Share of its deceleration that the brake has left."""
         return self._brake.share
 
-    def actuate(
-        self, targets_radps: WheelSpeeds, speeds_radps: WheelSpeeds, braking: bool
-    ) -> Actuation:
+    def actuate(self, targets_radps: WheelSpeeds, speeds_radps: WheelSpeeds, braking: bool
+                ) -> Actuation:
         """Return what motors and brake make of the drive's wish in one tick, and count.
 
         Args:

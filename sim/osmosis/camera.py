@@ -12,6 +12,7 @@ The physics never waits for it. It runs at the lowest priority, and where nothin
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import io
 import math
@@ -29,7 +30,7 @@ from PIL import Image, ImageDraw
 
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.airport.model import Airport
-from rampart.sim.osmosis.scene import Scene, Solid, WorldError
+from rampart.sim.osmosis.scene import Scene, WorldError
 
 PIXELS_PER_M = 10
 MAX_PIXELS = 8192
@@ -53,8 +54,12 @@ class Order(msgspec.Struct, forbid_unknown_fields=True):
     height: int = 260
 
 
+Obstacle = tuple[str, float | None, float | None, float | None]
+"""Name, x, y and radius."""
+
+
 class View(msgspec.Struct, forbid_unknown_fields=True):
-    """A line that asks for a picture: the pose, and obstacles as (name, x, y, radius) in `map`.
+    """A line that asks for a picture: the pose, and obstacles, in `map`.
 
     Numbers that are not finite come as null: JSON has no other way to say them.
     """
@@ -62,7 +67,7 @@ class View(msgspec.Struct, forbid_unknown_fields=True):
     x_m: float | None
     y_m: float | None
     yaw_rad: float | None
-    obstacles: tuple[tuple[str, float | None, float | None, float | None], ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
 
 
 class Camera:
@@ -85,8 +90,7 @@ class Camera:
         scene = self._scene
         x_m, y_m, yaw_rad = map(_number, (view.x_m, view.y_m, view.yaw_rad))
         if all(map(math.isfinite, (x_m, y_m, yaw_rad))):
-            scene.data.qpos[0:2] = x_m, y_m
-            scene.data.qpos[3:7] = math.cos(yaw_rad / 2), 0, 0, math.sin(yaw_rad / 2)
+            scene.place_robot(x_m, y_m, yaw_rad)
             ahead = 1.2
             self._camera.lookat[:] = (x_m + ahead * math.cos(yaw_rad),
                                       y_m + ahead * math.sin(yaw_rad), 0.3)
@@ -98,21 +102,16 @@ class Camera:
         Image.fromarray(self._renderer.render()).save(out, "JPEG", quality=_JPEG_QUALITY)
         return out.getvalue()
 
-    def _put(
-        self, obstacles: tuple[tuple[str, float | None, float | None, float | None], ...]
-    ) -> None:
+    def _put(self, obstacles: tuple[Obstacle, ...]) -> None:
+        scene = self._scene
         wanted = {name: (_number(x), _number(y), _number(r)) for name, x, y, r in obstacles}
-        for name in [n for n in self._scene.present if n not in wanted]:
-            self._scene.remove(name)
+        for name in [n for n in scene.present if n not in wanted]:
+            scene.remove(name)
         for name, (x, y, r) in wanted.items():
-            there = self._scene.present.get(name)
+            there = scene.present.get(name)
             if there is None or (there.x_m, there.y_m, there.radius_m) != (x, y, r):
-                preset = self._scene.preset(name)
-                try:
-                    self._scene.put(Solid(name, preset.shape if preset else "cylinder", x, y, r),
-                                    shapely.Polygon())
-                except WorldError:
-                    continue  # one too many, or one that makes no sense: the others are shown
+                with contextlib.suppress(WorldError):  # one too many, or one that makes no sense
+                    scene.put(name, x, y, r, shapely.Polygon())
 
 
 def _number(value: float | None) -> float:
@@ -122,8 +121,7 @@ def _number(value: float | None) -> float:
 def dress(spec: Any, airport: Airport) -> None:
     """Give a model what makes it worth looking at: ground, sky, light, colours."""
     x0, y0, x1, y1 = _extent(airport)
-    ground = spec.add_texture(
-        name="ground", type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
+    ground = spec.add_texture(name="ground", type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
     image = ground_image(airport)
     ground.width, ground.height = image.size
     ground.data = np.asarray(image, dtype=np.uint8).tobytes()
@@ -136,10 +134,9 @@ def dress(spec: Any, airport: Airport) -> None:
     floor.material = "ground"
     floor.size = [(x1 - x0) / 2, (y1 - y0) / 2, 1]
     floor.pos = [(x0 + x1) / 2, (y0 + y1) / 2, 0]
-    spec.worldbody.add_light(
-        pos=[(x0 + x1) / 2, (y0 + y1) / 2, 60], dir=[0.3, 0.2, -1],
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False,
-        diffuse=[0.75, 0.75, 0.72], ambient=[0.3, 0.3, 0.32])
+    spec.worldbody.add_light(pos=[(x0 + x1) / 2, (y0 + y1) / 2, 60], dir=[0.3, 0.2, -1],
+                             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False,
+                             diffuse=[0.75, 0.75, 0.72], ambient=[0.3, 0.3, 0.32])
     spec.geom("chassis").rgba = [0.16, 0.17, 0.2, 1]
     for geom in spec.geoms:
         if geom.name.startswith("obstacle/"):

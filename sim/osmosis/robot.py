@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 LENGTH_M = 0.72
 WIDTH_M = 0.614
-HEIGHT_M = 0.416
 WHEEL_RADIUS_M = 0.1175
 WHEEL_X_M = 0.229
 WHEEL_Y_M = 0.235
@@ -79,22 +78,20 @@ class Drive:
 
     Attributes:
         brake_ordered: the brake is wanted.
+        braking: whether the brake was on in the last update, ordered or by the dead man.
         brake_share: share of its deceleration that the brake has left; below 1 it does not lock.
     """
 
     def __init__(self, limits: DriveLimits, dead_man_timeout_s: float | None) -> None:
-        if dead_man_timeout_s is not None and not dead_man_timeout_s > 0:
-            raise ValueError(f"dead_man_timeout_s: {dead_man_timeout_s}: must be positive or None")
         self.limits = limits
         self.dead_man_timeout_s = dead_man_timeout_s
         self.brake_ordered = False
         self.brake_share = 1.0
-        self.refused_commands = 0
         self._wanted = (0.0, 0.0)
         self._wanted_at_s = -math.inf
         self._linear = 0.0
         self._angular = 0.0
-        self._braking = False
+        self.braking = False
 
     def command(self, linear_mps: float, angular_radps: float, now_s: float) -> bool:
         """Take a velocity command; one that is not finite is refused and does not count as fresh.
@@ -103,13 +100,10 @@ class Drive:
             Whether it was taken.
         """
         if not (math.isfinite(linear_mps) and math.isfinite(angular_radps)):
-            self.refused_commands += 1
             return False
         limits = self.limits
-        self._wanted = (
-            max(-limits.linear_mps, min(limits.linear_mps, linear_mps)),
-            max(-limits.angular_radps, min(limits.angular_radps, angular_radps)),
-        )
+        self._wanted = (max(-limits.linear_mps, min(limits.linear_mps, linear_mps)),
+                        max(-limits.angular_radps, min(limits.angular_radps, angular_radps)))
         self._wanted_at_s = now_s
         return True
 
@@ -131,44 +125,33 @@ class Drive:
         self._angular = _between_zero_and(self._angular, angular_radps)
 
     @property
-    def braking(self) -> bool:
-        """Whether the brake was on in the last update, ordered or by the dead man."""
-        return self._braking
-
-    @property
     def locked(self) -> bool:
         """Whether the wheels are blocked: braked, and the ramp has come to zero."""
         stopped = self._linear == 0.0 and self._angular == 0.0
-        return self._braking and stopped and self.brake_share == 1.0
+        return self.braking and stopped and self.brake_share == 1.0
 
     def update(self, now_s: float, dt_s: float) -> WheelSpeeds:
         """Advance the ramps by `dt_s` and return the wheel speeds to servo to, rad/s."""
         limits = self.limits
-        self._braking = self.brake_ordered or self.dead_man_tripped(now_s)
-        if self._braking:
+        self.braking = self.brake_ordered or self.dead_man_tripped(now_s)
+        if self.braking:
             brake_s = self.brake_share * dt_s
             self._linear = _towards(self._linear, 0.0, limits.brake_mps2 * brake_s)
             self._angular = _towards(self._angular, 0.0, limits.brake_radps2 * brake_s)
         else:
             linear, angular = self._wanted
             slowing = self._linear * linear <= 0 or abs(linear) < abs(self._linear)
-            rate = limits.deceleration_mps2 if slowing and self._linear else (
+            rate = limits.deceleration_mps2 if slowing and self._linear else \
                 limits.acceleration_mps2
-            )
             self._linear = _towards(self._linear, linear, rate * dt_s)
             self._angular = _towards(
-                self._angular, angular, limits.angular_acceleration_radps2 * dt_s
-            )
+                self._angular, angular, limits.angular_acceleration_radps2 * dt_s)
         return wheel_speeds(self._linear, self._angular)
 
 
 def _between_zero_and(value: float, bound: float) -> float:
-    if value > 0:
-        return max(0.0, min(value, bound))
-    return min(0.0, max(value, bound))
+    return max(0.0, min(value, bound)) if value > 0 else min(0.0, max(value, bound))
 
 
 def _towards(value: float, goal: float, step: float) -> float:
-    if value < goal:
-        return min(goal, value + step)
-    return max(goal, value - step)
+    return min(goal, value + step) if value < goal else max(goal, value - step)

@@ -17,7 +17,7 @@ import mujoco
 import shapely
 from shapely.geometry import Point
 
-from rampart.actors.osmosis.airport.model import Airport, ObstaclePreset, ObstacleShape, rectangle
+from rampart.actors.osmosis.airport.model import Airport, ObstacleShape, rectangle
 
 MODEL_FILE = Path(__file__).with_name("summit_xl.xml")
 SPARE_OBSTACLES = 6
@@ -62,25 +62,17 @@ class Scene:
             is compiled.
     """
 
-    def __init__(
-        self, airport: Airport, dress: Callable[[Any], None] = lambda _spec: None
-    ) -> None:
+    def __init__(self, airport: Airport, dress: Callable[[Any], None] = lambda _spec: None) -> None:
         spec = mujoco.MjSpec.from_file(str(MODEL_FILE))
         for building in airport.buildings:
-            half_yaw = building.yaw_rad / 2
             spec.worldbody.add_geom(
-                name=f"building/{building.name}",
-                type=mujoco.mjtGeom.mjGEOM_BOX,
+                name=f"building/{building.name}", type=mujoco.mjtGeom.mjGEOM_BOX,
                 size=[building.length_m / 2, building.width_m / 2, building.height_m / 2],
                 pos=[building.x_m, building.y_m, building.height_m / 2],
-                quat=[math.cos(half_yaw), 0, 0, math.sin(half_yaw)],
-                contype=0,
-                conaffinity=COLLIDES_WITH_CHASSIS,
-                group=SOLID_GROUP,
-            )
-        self._presets = {preset.name: preset for preset in airport.obstacles}
-        shapes = [preset.shape for preset in airport.obstacles]
-        shapes += ["cylinder"] * SPARE_OBSTACLES
+                quat=_turned(building.yaw_rad),
+                contype=0, conaffinity=COLLIDES_WITH_CHASSIS, group=SOLID_GROUP)
+        self._shapes = {preset.name: preset.shape for preset in airport.obstacles}
+        shapes = [*self._shapes.values(), *["cylinder"] * SPARE_OBSTACLES]
         for i, shape in enumerate(shapes):
             body = spec.worldbody.add_body(name=f"obstacle/{i}", mocap=True)
             box = shape == "box"
@@ -88,101 +80,90 @@ class Scene:
                 name=f"obstacle/{i}",
                 type=mujoco.mjtGeom.mjGEOM_BOX if box else mujoco.mjtGeom.mjGEOM_CYLINDER,
                 size=[0.3, 0.3 if box else OBSTACLE_HALF_HEIGHT_M, OBSTACLE_HALF_HEIGHT_M],
-                contype=0,
-                conaffinity=0,
-                group=ABSENT_GROUP,
-            )
+                contype=0, conaffinity=0, group=ABSENT_GROUP)
         dress(spec)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
-        self._slots = {name: i for i, name in enumerate(self._presets)}
-        self._spare = list(range(len(self._presets), len(shapes)))
+        self._slots = {name: i for i, name in enumerate(self._shapes)}
+        self._spare = list(range(len(self._shapes), len(shapes)))
         self.present: dict[str, Solid] = {}
         self._buildings = [building.polygon for building in airport.buildings]
         self.base = self.model.body("base").id
-        self._names = {
-            self.model.geom(i).id: self.model.geom(i).name for i in range(self.model.ngeom)
-        }
         for i in range(len(shapes)):
             self._park(i)
-        self._place_robot(airport.start.x_m, airport.start.y_m, airport.start.yaw_rad)
+        self.place_robot(airport.start.x_m, airport.start.y_m, airport.start.yaw_rad)
+        mujoco.mj_forward(self.model, self.data)
         self._refresh()
 
-    def _place_robot(self, x_m: float, y_m: float, yaw_rad: float) -> None:
+    def place_robot(self, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Have the robot stand somewhere else; `mj_forward` follows."""
         self.data.qpos[0:2] = x_m, y_m
-        self.data.qpos[3:7] = math.cos(yaw_rad / 2), 0, 0, math.sin(yaw_rad / 2)
-        mujoco.mj_forward(self.model, self.data)
+        self.data.qpos[3:7] = _turned(yaw_rad)
 
-    def preset(self, name: str) -> ObstaclePreset | None:
-        """Return the airport's preset of that name, if there is one."""
-        return self._presets.get(name)
-
-    def put(self, solid: Solid, footprint: Any) -> None:
-        """Make an obstacle appear, or move it.
+    def put(self, name: str, x_m: float, y_m: float, radius_m: float, footprint: Any) -> None:
+        """Make an obstacle appear, or move it; a preset's name keeps the preset's shape.
 
         Args:
-            solid: where and how large.
+            name: of the obstacle.
+            x_m: where.
+            y_m: where.
+            radius_m: how large.
             footprint: the robot's, as a shapely polygon; nothing can appear on it.
 
         Raises:
             WorldError: not finite, too far away, a radius out of bounds, on the robot, or no room
                 in the pool.
         """
-        if not all(map(math.isfinite, (solid.x_m, solid.y_m, solid.radius_m))):
-            raise WorldError(f"obstacle {solid.name}: {solid}: position and radius must be finite")
-        if not max(abs(solid.x_m), abs(solid.y_m)) <= FARTHEST_M:
-            raise WorldError(f"obstacle {solid.name}: ({solid.x_m:g}, {solid.y_m:g}): must be "
-                             f"within {FARTHEST_M:g} m of the origin")
-        if not 0.05 <= solid.radius_m <= 5.0:
-            raise WorldError(
-                f"obstacle {solid.name}: radius_m: {solid.radius_m:g}: must be in 0.05 to 5 m"
-            )
+        solid = Solid(name, self._shapes.get(name, "cylinder"), x_m, y_m, radius_m)
+        if not all(map(math.isfinite, (x_m, y_m, radius_m))):
+            raise WorldError(f"obstacle {name}: {solid}: position and radius must be finite")
+        if not max(abs(x_m), abs(y_m)) <= FARTHEST_M:
+            raise WorldError(f"obstacle {name}: ({x_m:g}, {y_m:g}): must be within "
+                             f"{FARTHEST_M:g} m of the origin")
+        if not 0.05 <= radius_m <= 5.0:
+            raise WorldError(f"obstacle {name}: radius_m: {radius_m:g}: must be in 0.05 to 5 m")
         if solid.outline.intersects(footprint):
-            raise WorldError(
-                f"obstacle {solid.name}: ({solid.x_m:g}, {solid.y_m:g}): on the robot; "
-                "choose a place clear of it"
-            )
-        if solid.name not in self._slots:
+            raise WorldError(f"obstacle {name}: ({x_m:g}, {y_m:g}): on the robot; choose a place "
+                             "clear of it")
+        if name not in self._slots:
             if not self._spare:
-                raise WorldError(
-                    f"obstacle {solid.name}: {SPARE_OBSTACLES} besides the presets are there; "
-                    "take one away first"
-                )
-            self._slots[solid.name] = self._spare.pop()
-        slot = self._slots[solid.name]
-        geom = self.model.geom(f"obstacle/{slot}").id
-        body = self.model.body(f"obstacle/{slot}").id
-        r, h = solid.radius_m, OBSTACLE_HALF_HEIGHT_M
-        self.model.geom_size[geom] = (r, r, h) if solid.shape == "box" else (r, h, 0)
-        self.model.geom_rbound[geom] = math.hypot(r * (2**0.5 if solid.shape == "box" else 1), h)
+                raise WorldError(f"obstacle {name}: {SPARE_OBSTACLES} besides the presets are "
+                                 "there; take one away first")
+            self._slots[name] = self._spare.pop()
+        r, h = radius_m, OBSTACLE_HALF_HEIGHT_M
+        box = solid.shape == "box"
+        geom, body = self._place(self._slots[name], (x_m, y_m, h), present=True)
+        self.model.geom_size[geom] = (r, r, h) if box else (r, h, 0)
+        self.model.geom_rbound[geom] = math.hypot(r * (2**0.5 if box else 1), h)
         self.model.geom_aabb[geom] = (0, 0, 0, r, r, h)
         self.model.bvh_aabb[self.model.body_bvhadr[body]] = (0, 0, 0, r, r, h)
-        self.model.geom_conaffinity[geom] = COLLIDES_WITH_CHASSIS
-        self.model.body_conaffinity[body] = COLLIDES_WITH_CHASSIS
-        self.model.geom_group[geom] = PRESENT_GROUP
-        self.data.mocap_pos[self.model.body_mocapid[body]] = solid.x_m, solid.y_m, h
-        self.present[solid.name] = solid
+        self.present[name] = solid
         self._refresh()
 
     def remove(self, name: str) -> bool:
         """Take an obstacle away; returns whether it was there."""
         if self.present.pop(name, None) is None:
             return False
-        slot = self._slots[name]
-        self._park(slot)
-        if name not in self._presets:
-            del self._slots[name]
-            self._spare.append(slot)
+        self._park(self._slots[name])
+        if name not in self._shapes:
+            self._spare.append(self._slots.pop(name))
         self._refresh()
         return True
 
     def _park(self, slot: int) -> None:
+        self._place(slot, (0.0, 3.0 * slot, _PARKED_Z_M), present=False)
+
+    def _place(self, slot: int, at: tuple[float, float, float], *, present: bool
+               ) -> tuple[int, int]:
+        """Move an obstacle of the pool; return its geom and its body."""
+        collides_with = COLLIDES_WITH_CHASSIS if present else 0
         geom = self.model.geom(f"obstacle/{slot}").id
         body = self.model.body(f"obstacle/{slot}").id
-        self.model.geom_conaffinity[geom] = 0
-        self.model.body_conaffinity[body] = 0
-        self.model.geom_group[geom] = ABSENT_GROUP
-        self.data.mocap_pos[self.model.body_mocapid[body]] = (0, 3.0 * slot, _PARKED_Z_M)
+        self.model.geom_conaffinity[geom] = collides_with
+        self.model.body_conaffinity[body] = collides_with
+        self.model.geom_group[geom] = PRESENT_GROUP if present else ABSENT_GROUP
+        self.data.mocap_pos[self.model.body_mocapid[body]] = at
+        return geom, body
 
     def _refresh(self) -> None:
         """Bring derived positions up to date, so that a ray cast at once sees the change."""
@@ -192,16 +173,15 @@ class Scene:
 
     def clearance_m(self, footprint: Any) -> float:
         """Distance from a footprint to the nearest obstacle or building; NOTHING_M without."""
-        if self.outlines is None:
-            return NOTHING_M
-        return float(self.outlines.distance(footprint))
+        return NOTHING_M if self.outlines is None else float(self.outlines.distance(footprint))
 
     def touched(self) -> set[str]:
         """Names of the geoms that the chassis touches now."""
         chassis = self.model.geom("chassis").id
-        pairs = self.data.contact.geom
-        return {
-            self._names[int(b if a == chassis else a)]
-            for a, b in pairs
-            if chassis in (a, b)
-        }
+        return {self.model.geom(int(b if a == chassis else a)).name
+                for a, b in self.data.contact.geom if chassis in (a, b)}
+
+
+def _turned(yaw_rad: float) -> tuple[float, float, float, float]:
+    """Return a quaternion about the vertical axis."""
+    return math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2)

@@ -18,15 +18,9 @@ class Schedule:
         start_s: time of the first due times.
         keep_s: due times that are older than this when asked for are dropped, so that a
             simulator that was held up publishes fresh readings and not a flood of late ones.
-
-    Raises:
-        ValueError: a rate is not positive.
     """
 
     def __init__(self, rates_hz: Mapping[str, float], start_s: float, keep_s: float) -> None:
-        for name, rate_hz in rates_hz.items():
-            if not rate_hz > 0:
-                raise ValueError(f"schedule: {name}: {rate_hz}: a rate must be positive")
         self._start_s = start_s
         self._keep_s = keep_s
         # Due time, place in the sequence, name, count of periods, period.

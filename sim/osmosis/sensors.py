@@ -10,11 +10,11 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import msgspec
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.airport.photometry import SENSOR_HEIGHT_M, sensor_position
 from rampart.actors.osmosis.airport.world import WorldTruth
@@ -46,7 +46,7 @@ class LaserSpec:
     """The 2D laser, above `base_link`, so its ranges are from the robot's centre.
 
     Args:
-        rays: number of rays, evenly over the field of view, from right to left.
+        rays: number of rays, two or more, evenly over the field of view, from right to left.
         field_of_view_rad: centred on straight ahead.
         range_max_m: also the reading when there is no echo.
         height_m: above the ground; clears the chassis, below the top of every obstacle.
@@ -60,10 +60,6 @@ class LaserSpec:
     height_m: float = 0.45
     noise_m: float = 0.01
     reference_m: float = 0.1
-
-    def __post_init__(self) -> None:
-        if self.rays < 2 or not self.range_max_m > 0:
-            raise ValueError(f"laser: {self}: needs two rays or more and a positive range_max_m")
 
     @property
     def angle_min_rad(self) -> float:
@@ -107,10 +103,8 @@ class Laser:
         self._turn[1, :2] = -sin, cos
         np.dot(self._body, self._turn, out=self._rays)
         self._origin[:2] = x_m, y_m
-        mujoco.mj_multiRay(
-            model, data, self._origin, self._flat, self._groups, True, -1,
-            self._geoms, self._ranges, None, self.spec.rays, self.spec.range_max_m,
-        )  # fmt: skip
+        mujoco.mj_multiRay(model, data, self._origin, self._flat, self._groups, True, -1,
+                           self._geoms, self._ranges, None, self.spec.rays, self.spec.range_max_m)
         self._ranges[self._geoms < 0] = math.inf
         return self._ranges
 
@@ -124,20 +118,6 @@ class Laser:
         np.minimum(ranges, self.spec.range_max_m, out=ranges)
         return ranges
 
-    def scan(self, model: Any, data: Any, pose: tuple[float, float, float]) -> Floats:
-        """Return one sweep, m, from the first to the last ray."""
-        return self.sweep(self.cast(model, data, pose))
-
-
-class GpsReading(msgspec.Struct, frozen=True, gc=False):
-    """Position and velocity over ground in `map`."""
-
-    x_m: float
-    y_m: float
-    velocity_x_mps: float
-    velocity_y_mps: float
-    accuracy_m: float
-
 
 class Gps:
     """RTK-GPS with its antenna above `base_link`."""
@@ -148,25 +128,12 @@ class Gps:
     def __init__(self, rng: np.random.Generator) -> None:
         self._noise = Noise(rng, 4)
 
-    def read(self, x_m: float, y_m: float, vx_mps: float, vy_mps: float) -> GpsReading:
+    def read(self, x_m: float, y_m: float, vx_mps: float, vy_mps: float) -> m.GpsFix:
         """Return a fix for the true position and velocity in `map`."""
         n = self._noise.take()
-        return GpsReading(
-            x_m + self.POSITION_SIGMA_M * n[0],
-            y_m + self.POSITION_SIGMA_M * n[1],
-            vx_mps + self.VELOCITY_SIGMA_MPS * n[2],
-            vy_mps + self.VELOCITY_SIGMA_MPS * n[3],
-            self.POSITION_SIGMA_M,
-        )
-
-
-class ImuReading(msgspec.Struct, frozen=True, gc=False):
-    """Heading integrated from the gyro, turning rate, and acceleration in `base_link`."""
-
-    yaw_rad: float
-    yaw_rate_radps: float
-    accel_x_mps2: float
-    accel_y_mps2: float
+        return m.GpsFix(x_m + self.POSITION_SIGMA_M * n[0], y_m + self.POSITION_SIGMA_M * n[1],
+                        vx_mps + self.VELOCITY_SIGMA_MPS * n[2],
+                        vy_mps + self.VELOCITY_SIGMA_MPS * n[3], self.POSITION_SIGMA_M)
 
 
 class Imu:
@@ -185,36 +152,20 @@ class Imu:
         self._heading = yaw_rad
         self._last = (now_s, yaw_rad, 0.0, 0.0)
 
-    def read(
-        self, now_s: float, yaw_rad: float, vx_mps: float, vy_mps: float
-    ) -> ImuReading:
+    def read(self, now_s: float, yaw_rad: float, vx_mps: float, vy_mps: float) -> m.Imu:
         """Return a reading for the true heading and velocity (in `map`)."""
         then_s, then_yaw, then_vx, then_vy = self._last
         dt_s = now_s - then_s
         n = self._noise.take()
         if dt_s <= 0:
-            return ImuReading(self._heading, self._bias + self.RATE_SIGMA_RADPS * n[0], 0.0, 0.0)
+            return m.Imu(self._heading, self._bias + self.RATE_SIGMA_RADPS * n[0], 0.0, 0.0)
         self._last = (now_s, yaw_rad, vx_mps, vy_mps)
         rate = wrap(yaw_rad - then_yaw) / dt_s + self._bias + self.RATE_SIGMA_RADPS * n[0]
         self._heading = wrap(self._heading + rate * dt_s)
         ax, ay = (vx_mps - then_vx) / dt_s, (vy_mps - then_vy) / dt_s
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        return ImuReading(
-            self._heading,
-            rate,
-            ax * cos + ay * sin + self.ACCELERATION_SIGMA_MPS2 * n[1],
-            ay * cos - ax * sin + self.ACCELERATION_SIGMA_MPS2 * n[2],
-        )
-
-
-class OdometryReading(msgspec.Struct, frozen=True, gc=False):
-    """Pose in `odom` (starts at the origin) and twist in `base_link`, believed by the wheels."""
-
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    linear_mps: float
-    angular_radps: float
+        return m.Imu(self._heading, rate, ax * cos + ay * sin + self.ACCELERATION_SIGMA_MPS2 * n[1],
+                     ay * cos - ax * sin + self.ACCELERATION_SIGMA_MPS2 * n[2])
 
 
 class WheelOdometry:
@@ -225,28 +176,24 @@ class WheelOdometry:
     def __init__(self, angles: WheelSpeeds, now_s: float) -> None:
         self._counts = self._count(angles)
         self._at_s = now_s
-        self._reading = OdometryReading(0.0, 0.0, 0.0, 0.0, 0.0)
+        self._reading = m.Odometry(m.Pose(0.0, 0.0, 0.0), m.Twist(0.0, 0.0))
 
-    def read(self, angles: WheelSpeeds, now_s: float) -> OdometryReading:
+    def read(self, angles: WheelSpeeds, now_s: float) -> m.Odometry:
         """Return the odometry for wheel angles (rad: front left, front right, rear left, right)."""
         dt_s = now_s - self._at_s
         if dt_s <= 0:
             return self._reading
         counts = self._count(angles)
         fl, fr, rl, rr = (
-            (new - old) * self.COUNT_RAD for new, old in zip(counts, self._counts, strict=True)
-        )
+            (new - old) * self.COUNT_RAD for new, old in zip(counts, self._counts, strict=True))
         self._counts, self._at_s = counts, now_s
         forward_m, turn_rad = twist_from_wheels((fl, fr, rl, rr))
-        was = self._reading
+        was = self._reading.pose
         middle = was.yaw_rad + turn_rad / 2
-        self._reading = OdometryReading(
-            was.x_m + forward_m * math.cos(middle),
-            was.y_m + forward_m * math.sin(middle),
-            wrap(was.yaw_rad + turn_rad),
-            forward_m / dt_s,
-            turn_rad / dt_s,
-        )
+        self._reading = m.Odometry(
+            m.Pose(was.x_m + forward_m * math.cos(middle), was.y_m + forward_m * math.sin(middle),
+                   wrap(was.yaw_rad + turn_rad)),
+            m.Twist(forward_m / dt_s, turn_rad / dt_s))
         return self._reading
 
     def _count(self, angles: WheelSpeeds) -> tuple[int, ...]:

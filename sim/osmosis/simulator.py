@@ -27,6 +27,7 @@ from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
 from rampart.manager.spec.tables import Positive
+from rampart.sim.osmosis.actuator_faults import FaultNews
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.schedule import Schedule
 from rampart.sim.osmosis.sensors import LaserSpec
@@ -35,10 +36,8 @@ from rampart.sim.osmosis.world import World
 WAKE_UP_S = 0.02
 MAX_CATCH_UP_S = 1.0
 
-_JOBS = (
-    topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE, topics.SCAN, topics.UPPER_SCAN,
-    topics.LIGHT, topics.GPS, topics.BASE_STATUS, topics.TRUTH, topics.OBSTACLES,
-)  # fmt: skip
+_JOBS = (topics.IMU, topics.ODOMETRY, topics.ABSOLUTE_POSE, topics.SCAN, topics.UPPER_SCAN,
+         topics.LIGHT, topics.GPS, topics.BASE_STATUS, topics.TRUTH, topics.OBSTACLES)
 
 
 class Simulator(Actor):
@@ -83,28 +82,18 @@ class Simulator(Actor):
     def on_start(self) -> None:
         """Build the world at the present time."""
         now_s, parameters = self.clock.now(), self.parameters
-        self._world = World(
-            self._airport,
-            Osmosis.of(self.context).world,
-            seed=parameters.seed,
-            obstacles=parameters.obstacles,
+        self._world = world = World(
+            self._airport, Osmosis.of(self.context).world, parameters.seed, parameters.obstacles,
             dead_man_timeout_s=parameters.dead_man_timeout_s if parameters.dead_man else None,
-            laser=self._laser,
-            start_s=now_s,
-            max_catch_up_s=MAX_CATCH_UP_S,
-        )
+            laser=self._laser, start_s=now_s, max_catch_up_s=MAX_CATCH_UP_S)
         self._asked_s = now_s
         readings: dict[Topic[Any], Callable[[], Any]] = {
-            topics.IMU: self._imu,
-            topics.ODOMETRY: self._odometry,
-            topics.ABSOLUTE_POSE: self._absolute_pose,
-            topics.SCAN: lambda: self._scan(0),
-            topics.LIGHT: self._light,
-            topics.GPS: self._gps,
-            topics.BASE_STATUS: self._base_status,
-            topics.TRUTH: self._truth,
-            topics.OBSTACLES: self._obstacles,
-        }
+            topics.IMU: world.imu, topics.ODOMETRY: world.odometry,
+            topics.ABSOLUTE_POSE: lambda: m.Pose(*world.pose), topics.SCAN: lambda: self._scan(0),
+            topics.LIGHT: lambda: m.LightSample(world.light()), topics.GPS: world.gps,
+            topics.BASE_STATUS: world.base_status,
+            topics.TRUTH: lambda: world.truth(self._real_time_factor),
+            topics.OBSTACLES: self._obstacles}
         if parameters.upper_laser:
             readings[topics.UPPER_SCAN] = lambda: self._scan(1)
         self._readings = {topic.key: (topic, read) for topic, read in readings.items()}
@@ -164,9 +153,7 @@ class Simulator(Actor):
         self._advance()
         try:
             if message.present:
-                self._world.add_obstacle(
-                    message.name, message.x_m, message.y_m, message.radius_m
-                )
+                self._world.add_obstacle(message.name, message.x_m, message.y_m, message.radius_m)
             else:
                 self._world.remove_obstacle(message.name)
         except WorldError as error:
@@ -186,7 +173,7 @@ class Simulator(Actor):
             self._world.order_fault(message)
         except WorldError as error:
             self.report_diagnostic("actuator fault", str(error), header.source)
-            self._report_fault(message.injection, 0, finished=True, reason=str(error))
+            self._report_fault(FaultNews(message.injection, 0, finished=True), str(error))
         self._report_faults()
 
     # -- time -----------------------------------------------------------------------------------
@@ -209,13 +196,11 @@ class Simulator(Actor):
 
     def _report_faults(self) -> None:
         for news in self._world.fault_news():
-            self._report_fault(news.injection, news.affected_ticks, finished=news.finished)
+            self._report_fault(news)
 
-    def _report_fault(
-        self, injection: str, affected: int, *, finished: bool, reason: str = ""
-    ) -> None:
-        report = bm.InjectionReport(injection, self.name, affected, finished, clip(reason))
-        self.publish(bus_topics.INJECTION_REPORT, report)
+    def _report_fault(self, news: FaultNews, reason: str = "") -> None:
+        self.publish(bus_topics.INJECTION_REPORT, bm.InjectionReport(
+            news.injection, self.name, news.affected_ticks, news.finished, clip(reason)))
 
     def _measure_speed(self, now_s: float) -> None:
         """Over each second, the share of the clock's time that was simulated and not skipped."""
@@ -227,54 +212,13 @@ class Simulator(Actor):
 
     # -- readings -------------------------------------------------------------------------------
 
-    def _imu(self) -> m.Imu:
-        r = self._world.imu()
-        return m.Imu(r.yaw_rad, r.yaw_rate_radps, r.accel_x_mps2, r.accel_y_mps2)
-
-    def _odometry(self) -> m.Odometry:
-        r = self._world.odometry()
-        return m.Odometry(m.Pose(r.x_m, r.y_m, r.yaw_rad), m.Twist(r.linear_mps, r.angular_radps))
-
-    def _absolute_pose(self) -> m.Pose:
-        return m.Pose(*self._world.pose)
-
     def _scan(self, which: int) -> m.LaserScan:
         ranges = self._world.scan(which).astype(np.dtype("<f4")).tobytes()
         laser = self._laser
-        return m.LaserScan(
-            laser.angle_min_rad, laser.angle_increment_rad, laser.range_max_m, ranges,
-            self._world.laser_reference(which),
-        )
-
-    def _light(self) -> m.LightSample:
-        return m.LightSample(self._world.light())
-
-    def _gps(self) -> m.GpsFix:
-        r = self._world.gps()
-        return m.GpsFix(r.x_m, r.y_m, r.velocity_x_mps, r.velocity_y_mps, r.accuracy_m)
-
-    def _base_status(self) -> m.BaseStatus:
-        r = self._world.base_state()
-        return m.BaseStatus(
-            r.brake_engaged, r.dead_man_tripped, r.command_age_s, r.wheel_speeds_radps
-        )
-
-    def _truth(self) -> m.GroundTruth:
-        t = self._world.truth()
-        return m.GroundTruth(
-            pose=m.Pose(t.x_m, t.y_m, t.yaw_rad),
-            twist=m.Twist(t.linear_mps, t.angular_radps),
-            collisions=t.collisions,
-            prohibited_s=t.prohibited_s,
-            obstacle_clearance_m=t.obstacle_clearance_m,
-            prohibited_clearance_m=t.prohibited_clearance_m,
-            real_time_factor=self._real_time_factor,
-        )
+        return m.LaserScan(laser.angle_min_rad, laser.angle_increment_rad, laser.range_max_m,
+                           ranges, self._world.laser_reference(which))
 
     def _obstacles(self) -> m.ObstacleList:
-        return m.ObstacleList(
-            tuple(
-                m.ObstacleCommand(solid.name, True, solid.x_m, solid.y_m, solid.radius_m)
-                for solid in self._world.obstacles
-            )
-        )
+        return m.ObstacleList(tuple(
+            m.ObstacleCommand(solid.name, True, solid.x_m, solid.y_m, solid.radius_m)
+            for solid in self._world.obstacles))

@@ -8,37 +8,17 @@ from __future__ import annotations
 
 import math
 
-import msgspec
 import mujoco
 import numpy as np
 import shapely
 
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.airport.model import Airport
 from rampart.actors.osmosis.airport.world import WorldTruth
-from rampart.actors.osmosis.messages import ActuatorFault
+from rampart.sim.osmosis import robot, sensors
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, FaultNews, motor_of
 from rampart.sim.osmosis.clearance import Clearance, Pose, footprint
-from rampart.sim.osmosis.robot import (
-    CIRCUMRADIUS_M,
-    Drive,
-    DriveLimits,
-    WheelSpeeds,
-    twist_from_wheels,
-)
 from rampart.sim.osmosis.scene import Scene, Solid, WorldError
-from rampart.sim.osmosis.sensors import (
-    Floats,
-    Gps,
-    GpsReading,
-    Imu,
-    ImuReading,
-    Laser,
-    LaserSpec,
-    LightSensor,
-    OdometryReading,
-    WheelOdometry,
-    wrap,
-)
 
 TICK_S = 0.01
 """The drive electronics' period, and the grain of `step_to`."""
@@ -59,35 +39,6 @@ LOCKED_DAMPING = 300.0
 """Wheel damping, N m s/rad, of a blocked wheel, braked or stuck: all that moves is the tyre."""
 
 
-class Truth(msgspec.Struct, frozen=True, gc=False):
-    """Ground truth now; counters are cumulative.
-
-    `obstacle_clearance_m` is from the footprint to the nearest obstacle or building
-    (`rampart.sim.osmosis.scene.NOTHING_M` if there is none), `prohibited_clearance_m` from the
-    footprint's nearest corner to the prohibited area, negative in it. Both are exact below 1 m and
-    lower bounds above (see `rampart.sim.osmosis.clearance`).
-    """
-
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    linear_mps: float
-    angular_radps: float
-    collisions: int
-    prohibited_s: float
-    obstacle_clearance_m: float
-    prohibited_clearance_m: float
-
-
-class BaseState(msgspec.Struct, frozen=True, gc=False):
-    """What the base reports about itself."""
-
-    brake_engaged: bool
-    dead_man_tripped: bool
-    command_age_s: float
-    wheel_speeds_radps: WheelSpeeds
-
-
 class World:
     """An airport with the robot in it.
 
@@ -97,7 +48,6 @@ class World:
         seed: of all noise; the same seed and calls give the same world, bit for bit.
         obstacles: how many of the airport's presets take part, the first ones first.
         dead_man_timeout_s: see `rampart.sim.osmosis.robot.Drive`.
-        limits: of the drive.
         laser: field of view, range, number of rays.
         start_s: time at which the world begins.
         max_catch_up_s: the most that one `step_to` simulates. If the caller was held up longer,
@@ -107,24 +57,13 @@ class World:
         WorldError: more obstacles asked for than the airport has presets.
     """
 
-    def __init__(
-        self,
-        airport: Airport,
-        truth: WorldTruth | None = None,
-        seed: int = 0,
-        obstacles: int = 0,
-        *,
-        dead_man_timeout_s: float | None = 0.4,
-        limits: DriveLimits | None = None,
-        laser: LaserSpec | None = None,
-        start_s: float = 0.0,
-        max_catch_up_s: float = 1.0,
-    ) -> None:
+    def __init__(self, airport: Airport, truth: WorldTruth | None = None, seed: int = 0,
+                 obstacles: int = 0, *, dead_man_timeout_s: float | None = 0.4,
+                 laser: sensors.LaserSpec | None = None, start_s: float = 0.0,
+                 max_catch_up_s: float = 1.0) -> None:
         if not 0 <= obstacles <= len(airport.obstacles):
-            raise WorldError(
-                f"obstacles: {obstacles}: {airport.name} has presets for 0 to "
-                f"{len(airport.obstacles)}"
-            )
+            raise WorldError(f"obstacles: {obstacles}: {airport.name} has presets for 0 to "
+                             f"{len(airport.obstacles)}")
         self.airport = airport
         self.time_s = start_s
         self.skipped_s = 0.0
@@ -139,22 +78,22 @@ class World:
         self._base_q, self._base_v = self._data.qpos[:7], self._data.qvel[:6]
         self._wheel_q, self._wheel_v = self._data.qpos[7:11], self._data.qvel[6:10]
         self._servos = self._data.ctrl
-        self._targets: WheelSpeeds | None = None
+        self._targets: robot.WheelSpeeds | None = None
         self._damping = self._model.dof_damping[6:10]
         self._free_damping = self._damping.copy()
         self._locked = False
-        self._drive = Drive(limits or DriveLimits(), dead_man_timeout_s)
+        self._drive = robot.Drive(robot.DriveLimits(), dead_man_timeout_s)
         self._torque_ranges = self._model.actuator_forcerange
         self._faults = ActuatorFaults(motor_of(self._model, self._drive.limits))
         self._faulty = False
-        self.laser = laser or LaserSpec()
+        self.laser = laser or sensors.LaserSpec()
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5)]
-        self._lasers = (Laser(self.laser, streams[0]), Laser(self.laser, streams[4]))
-        self._echoes: tuple[int, Floats] = (-1, np.empty(0))
-        self._gps = Gps(streams[1])
-        self._imu = Imu(streams[2], self.pose[2], start_s)
-        self._light = LightSensor(airport, truth or WorldTruth(), streams[3])
-        self._odometry = WheelOdometry(self._wheel_angles(), start_s)
+        self._lasers = [sensors.Laser(self.laser, streams[i]) for i in (0, 4)]
+        self._echoes: tuple[int, sensors.Floats] = (-1, np.empty(0))
+        self._gps = sensors.Gps(streams[1])
+        self._imu = sensors.Imu(streams[2], self.pose[2], start_s)
+        self._light = sensors.LightSensor(airport, truth or WorldTruth(), streams[3])
+        self._odometry = sensors.WheelOdometry(_four(self._wheel_q), start_s)
         self._collisions = 0
         self._contact_s: dict[str, float] = {}
         self._prohibited_s = 0.0
@@ -171,9 +110,8 @@ class World:
 
     # -- actuators ------------------------------------------------------------------------------
 
-    def command(
-        self, linear_mps: float, angular_radps: float, stamp_s: float | None = None
-    ) -> bool:
+    def command(self, linear_mps: float, angular_radps: float, stamp_s: float | None = None
+                ) -> bool:
         """Give the base a velocity command; returns False if it was refused as not finite.
 
         For the dead man the command is as old as its stamp says; without one it is from now.
@@ -185,7 +123,7 @@ class World:
         """Engage or release the brake."""
         self._drive.brake_ordered = engaged
 
-    def order_fault(self, order: ActuatorFault) -> None:
+    def order_fault(self, order: m.ActuatorFault) -> None:
         """Put a fault of the actuators in force from now on, or end it (duration 0).
 
         Raises:
@@ -246,8 +184,7 @@ class World:
         drive = self._drive
         drive.brake_share = self._faults.brake_share
         targets = drive.update(self.time_s, TICK_S)
-        fl, fr, rl, rr = self._wheel_v.tolist()
-        speeds = (fl, fr, rl, rr)
+        speeds = _four(self._wheel_v)
         actuation = self._faults.actuate(targets, speeds, drive.braking)
         self._servos[:] = actuation.targets_radps
         self._targets = None
@@ -256,7 +193,7 @@ class World:
         blocked = np.array(actuation.blocked) | self._locked
         self._damping[:] = np.where(blocked, LOCKED_DAMPING, self._free_damping)
         if drive.braking and drive.brake_share < 1:
-            drive.give_way(*twist_from_wheels(speeds))
+            drive.give_way(*robot.twist_from_wheels(speeds))
 
     # -- sensors --------------------------------------------------------------------------------
 
@@ -266,7 +203,7 @@ class World:
         x, y, _, qw, qx, qy, qz = self._base_q.tolist()
         return x, y, math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
 
-    def scan(self, laser: int = 0) -> Floats:
+    def scan(self, laser: int = 0) -> sensors.Floats:
         """One sweep of a laser, m: 0 is the lower one, 1 the upper one."""
         # The clearance is from the footprint's edge, the laser in its middle: nothing in range
         # needs no rays. It may be one look old, in which the robot moves less than the radius.
@@ -274,46 +211,37 @@ class World:
             return np.full(self.laser.rays, self.laser.range_max_m)
         # Both sweep at the same time, the lower one first: the rays are cast once.
         if laser == 0 or self._echoes[0] != self._ticks:
-            self._echoes = (
-                self._ticks, self._lasers[0].cast(self._model, self._data, self.pose))
+            self._echoes = self._ticks, self._lasers[0].cast(self._model, self._data, self.pose)
         return self._lasers[laser].sweep(self._echoes[1])
 
     def laser_reference(self, laser: int = 0) -> float:
         """A laser's measurement of the target in its housing, m; one a sweep."""
         return self._lasers[laser].reference()
 
-    def gps(self) -> GpsReading:
+    def gps(self) -> m.GpsFix:
         """One GPS fix."""
         x_m, y_m, _ = self.pose
         vx, vy, *_ = self._base_v.tolist()
         return self._gps.read(x_m, y_m, vx, vy)
 
-    def imu(self) -> ImuReading:
+    def imu(self) -> m.Imu:
         """One IMU reading."""
         vx, vy, *_ = self._base_v.tolist()
         return self._imu.read(self.time_s, self.pose[2], vx, vy)
 
-    def odometry(self) -> OdometryReading:
+    def odometry(self) -> m.Odometry:
         """Wheel odometry up to now."""
-        return self._odometry.read(self._wheel_angles(), self.time_s)
+        return self._odometry.read(_four(self._wheel_q), self.time_s)
 
     def light(self) -> float:
         """One reading of the light sensor, lux."""
         return self._light.read(self.pose)
 
-    def base_state(self) -> BaseState:
+    def base_status(self) -> m.BaseStatus:
         """Brake, dead man and wheel speeds."""
-        fl, fr, rl, rr = self._wheel_v.tolist()
-        return BaseState(
-            brake_engaged=self._drive.braking,
-            dead_man_tripped=self._drive.dead_man_tripped(self.time_s),
-            command_age_s=max(0.0, min(NEVER_S, self._drive.command_age_s(self.time_s))),
-            wheel_speeds_radps=(fl, fr, rl, rr),
-        )
-
-    def _wheel_angles(self) -> WheelSpeeds:
-        fl, fr, rl, rr = self._wheel_q.tolist()
-        return fl, fr, rl, rr
+        return m.BaseStatus(
+            self._drive.braking, self._drive.dead_man_tripped(self.time_s),
+            max(0.0, min(NEVER_S, self._drive.command_age_s(self.time_s))), _four(self._wheel_v))
 
     # -- obstacles ------------------------------------------------------------------------------
 
@@ -328,22 +256,18 @@ class World:
         Raises:
             WorldError: not finite, out of bounds, on the robot, or too many.
         """
-        preset = self._scene.preset(name)
-        shape = preset.shape if preset else "cylinder"
-        self._scene.put(Solid(name, shape, x_m, y_m, radius_m), footprint(self.pose))
-        self._waiting = [waiting for waiting in self._waiting if waiting.name != name]
-        self._leaving.pop(name, None)
-        self._look_again()
+        self._scene.put(name, x_m, y_m, radius_m, footprint(self.pose))
+        self._changed(name)
 
     def remove_obstacle(self, name: str) -> bool:
         """Take an obstacle away, or keep a preset from appearing; returns whether it was there."""
-        self._waiting = [waiting for waiting in self._waiting if waiting.name != name]
-        self._leaving.pop(name, None)
-        self._look_again()
+        self._changed(name)
         return self._scene.remove(name)
 
-    def _look_again(self) -> None:
-        """The obstacles have changed: what was known about the distance to them is void."""
+    def _changed(self, name: str) -> None:
+        """An obstacle has come or gone: its time window and the distance then known are void."""
+        self._waiting = [waiting for waiting in self._waiting if waiting.name != name]
+        self._leaving.pop(name, None)
         self._near_obstacle.forget()
         self._examine_at_s = self.time_s
 
@@ -355,9 +279,8 @@ class World:
         x_m, y_m, _ = self.pose
         for preset in list(self._waiting):
             near_m = preset.appears_within_m
-            if elapsed_s < preset.present_from_s or (
-                near_m is not None and math.dist((x_m, y_m), (preset.x_m, preset.y_m)) > near_m
-            ):
+            is_far = near_m is not None and math.dist((x_m, y_m), (preset.x_m, preset.y_m)) > near_m
+            if elapsed_s < preset.present_from_s or is_far:
                 continue
             try:
                 self.add_obstacle(preset.name, preset.x_m, preset.y_m, preset.radius_m)
@@ -368,26 +291,25 @@ class World:
 
     # -- ground truth ---------------------------------------------------------------------------
 
-    def truth(self) -> Truth:
-        """Ground truth; clearances are at most 50 ms old."""
+    def truth(self, real_time_factor: float = 1.0) -> m.GroundTruth:
+        """Ground truth; clearances are at most 50 ms old.
+
+        `obstacle_clearance_m` is from the footprint to the nearest obstacle or building
+        (`rampart.sim.osmosis.scene.NOTHING_M` if there is none), `prohibited_clearance_m` from the
+        footprint's nearest corner to the prohibited area, negative in it. Both are exact below 1 m
+        and lower bounds above (see `rampart.sim.osmosis.clearance`).
+        """
         x_m, y_m, yaw_rad = self.pose
         vx, vy, *_ = self._base_v.tolist()
-        return Truth(
-            x_m=x_m,
-            y_m=y_m,
-            yaw_rad=wrap(yaw_rad),
-            linear_mps=vx * math.cos(yaw_rad) + vy * math.sin(yaw_rad),
-            angular_radps=float(self._base_v[5]),
-            collisions=self._collisions,
-            prohibited_s=self._prohibited_s,
-            obstacle_clearance_m=self._obstacle_clearance_m,
-            prohibited_clearance_m=self._prohibited_clearance_m,
-        )
+        return m.GroundTruth(
+            m.Pose(x_m, y_m, sensors.wrap(yaw_rad)),
+            m.Twist(vx * math.cos(yaw_rad) + vy * math.sin(yaw_rad), float(self._base_v[5])),
+            self._collisions, self._prohibited_s, self._obstacle_clearance_m,
+            self._prohibited_clearance_m, real_time_factor)
 
     def _count_contacts(self) -> None:
         for name in self._scene.touched():
-            last_s = self._contact_s.get(name, -math.inf)
-            if self.time_s - last_s > SAME_CONTACT_S:
+            if self.time_s - self._contact_s.get(name, -math.inf) > SAME_CONTACT_S:
                 self._collisions += 1
             self._contact_s[name] = self.time_s
 
@@ -395,9 +317,8 @@ class World:
         pose = self.pose
         self._obstacle_clearance_m = self._near_obstacle.measure(pose)
         self._prohibited_clearance_m = self._near_prohibited.measure(pose)
-        if self._prohibited_clearance_m <= CIRCUMRADIUS_M and (
-            self.airport.footprint_in_prohibited(footprint(pose))
-        ):
+        if self._prohibited_clearance_m <= robot.CIRCUMRADIUS_M and \
+                self.airport.footprint_in_prohibited(footprint(pose)):
             self._prohibited_s += self.time_s - self._examined_s
         near = min(self._obstacle_clearance_m, self._prohibited_clearance_m) < NEAR_M
         self._examined_s = self.time_s
@@ -407,3 +328,9 @@ class World:
         """Distance of the footprint's nearest corner to the prohibited area, m."""
         corners = shapely.get_coordinates(footprint(pose))[:4]
         return float(self.airport.prohibited_distances_m(corners).min())
+
+
+def _four(wheels: sensors.Floats) -> robot.WheelSpeeds:
+    """Return a view of what MuJoCo has of the wheels as plain numbers."""
+    fl, fr, rl, rr = wheels.tolist()
+    return fl, fr, rl, rr

@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import Sequence
 from functools import partial
 
-
 from rampart.actors.bus.bus import SharedBus
 from rampart.actors.bus.run_folder import register_of
 from rampart.actors.run.run_plan import OBSERVER

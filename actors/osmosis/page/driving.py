@@ -154,8 +154,7 @@ class Driving(Operating):
         pilot = self._pilot
         patience_s = max(_STALE_S, 0.5 * self._actor.clock.rate)
         works, text = effect(
-            pilot_heard=now_s - self._pilot_heard_s <= patience_s,
-            mode=pilot.mode if pilot else "", forbids=pilot.forbids if pilot else "",
-            brake=self._brake, dead_nodes=self._dead)
+            pilot_heard=now_s - self._pilot_heard_s <= patience_s, mode=pilot.mode if pilot else "",
+            forbids=pilot.forbids if pilot else "", brake=self._brake, dead_nodes=self._dead)
         return {"holder": self._desk.holder, "works": works, "text": text, "note": self._note,
                 **super().view(now_s)}

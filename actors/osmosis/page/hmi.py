@@ -46,10 +46,9 @@ class OsmosisHmi(Hmi):
     outputs = (*Hmi.outputs, topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.JOYSTICK,
                topics.ACTUATOR_FAULT)
     requests = OSMOSIS_REQUESTS
-    shown = (
-        *Hmi.shown, topics.POSE, topics.SCAN, topics.UPPER_SCAN, topics.ROUTE,
-        topics.CONTROL_STATUS, topics.PILOT_STATUS, topics.OBSTACLES, topics.LIGHT_MEASURED,
-        topics.BASE_STATUS)
+    shown = (*Hmi.shown, topics.POSE, topics.SCAN, topics.UPPER_SCAN, topics.ROUTE,
+             topics.CONTROL_STATUS, topics.PILOT_STATUS, topics.OBSTACLES, topics.LIGHT_MEASURED,
+             topics.BASE_STATUS)
     _state: OsmosisState
     _operating: Driving
 
@@ -95,8 +94,7 @@ class OsmosisHmi(Hmi):
             "left_out": self._map.left_out if self._map else {},
             "footprint_m": (robot.length_m, robot.width_m) if robot else None,
             "missions": [name for name in self._missions if name == clip(name, MAX_NAME)][:200],
-            "track": list(self._state.track),
-        }
+            "track": list(self._state.track)}
 
     @cached_property
     def _map(self) -> PageMap | None:

@@ -28,10 +28,9 @@ def thin(scan: LaserScan | None) -> dict[str, Any] | None:
         of the laser; `cm`, the ranges in whole centimetres, with -1 where there is no echo. None
         for a sweep that makes no sense (a corrupt one, for instance), and for no sweep.
     """
-    if scan is None or len(scan.ranges_f32) % 4 or len(scan.ranges_f32) < 8:
-        return None
-    if not (math.isfinite(scan.angle_min_rad) and math.isfinite(scan.angle_increment_rad)
-            and math.isfinite(scan.range_max_m) and scan.range_max_m > 0):
+    if scan is None or len(scan.ranges_f32) % 4 or len(scan.ranges_f32) < 8 \
+            or not all(map(math.isfinite, (scan.angle_min_rad, scan.angle_increment_rad))) \
+            or not 0 < scan.range_max_m < math.inf:
         return None
     ranges = np.frombuffer(scan.ranges_f32, dtype="<f4").astype(np.float64)
     rays = -(-len(ranges) // POINTS)
@@ -42,9 +41,6 @@ def thin(scan: LaserScan | None) -> dict[str, Any] | None:
     nearest = padded.reshape(-1, rays).min(axis=1)
     echo = nearest < min(scan.range_max_m, MAX_RANGE_M) - 0.005
     centimetres = np.where(echo, np.round(100 * np.where(echo, nearest, 0)), -1).astype(int)
-    return {
-        "from_rad": round(scan.angle_min_rad + scan.angle_increment_rad * (rays - 1) / 2, 5),
-        "step_rad": round(scan.angle_increment_rad * rays, 6),
-        "max_m": scan.range_max_m,
-        "cm": centimetres.tolist(),
-    }
+    return {"from_rad": round(scan.angle_min_rad + scan.angle_increment_rad * (rays - 1) / 2, 5),
+            "step_rad": round(scan.angle_increment_rad * rays, 6), "max_m": scan.range_max_m,
+            "cm": centimetres.tolist()}

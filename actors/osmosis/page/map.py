@@ -54,13 +54,12 @@ def page_map(airport: Airport) -> PageMap:
         nodes={clip(name, MAX_NAME): at for name, at in islice(drawn.nodes.items(), MAX_GRAPH)},
         edges=drawn.edges[:MAX_GRAPH],
         lights=tuple(islice(filter(_is_plain, drawn.lights), MAX_LIGHTS)))
-    missing = {
-        "prohibited areas": int(shown.prohibited != drawn.prohibited),
-        "pieces of pavement": len(drawn.surfaces) - len(shown.surfaces),
-        "buildings": len(drawn.buildings) - len(shown.buildings),
-        "nodes of the graph": len(drawn.nodes) - len(shown.nodes),
-        "edges of the graph": len(drawn.edges) - len(shown.edges),
-        "lights": len(drawn.lights) - len(shown.lights)}
+    missing = {"prohibited areas": int(shown.prohibited != drawn.prohibited),
+               "pieces of pavement": len(drawn.surfaces) - len(shown.surfaces),
+               "buildings": len(drawn.buildings) - len(shown.buildings),
+               "nodes of the graph": len(drawn.nodes) - len(shown.nodes),
+               "edges of the graph": len(drawn.edges) - len(shown.edges),
+               "lights": len(drawn.lights) - len(shown.lights)}
     return PageMap(msgspec.Raw(msgspec.json.encode(shown)),
                    {what: count for what, count in missing.items() if count})
 
@@ -76,6 +75,4 @@ def _is_plain(light: Light) -> bool:
 
 
 def _paths_bytes(drawn: AirportDrawing) -> int:
-    return len(drawn.prohibited) + sum(
-        len(path) for _, path in (*drawn.surfaces, *drawn.buildings))
-
+    return len(drawn.prohibited) + sum(len(path) for _, path in (*drawn.surfaces, *drawn.buildings))

@@ -26,8 +26,7 @@ class Orders(Pending[m.MissionOrder]):
     """
 
     def __init__(self, prefix: str, by: str) -> None:
-        super().__init__(
-            prefix, "was not obeyed: the Mission Manager does not answer", GIVE_UP_S)
+        super().__init__(prefix, "was not obeyed: the Mission Manager does not answer", GIVE_UP_S)
         self._by = by
         self._status: m.MissionStatus | None = None
 

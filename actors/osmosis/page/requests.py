@@ -31,5 +31,4 @@ class StickRequest(Request, frozen=True, tag="stick"):
     left: float = 0.0
 
 
-OSMOSIS_REQUESTS: tuple[type[Request], ...] = (
-    *REQUESTS, StartRequest, OrderRequest, StickRequest)
+OSMOSIS_REQUESTS: tuple[type[Request], ...] = (*REQUESTS, StartRequest, OrderRequest, StickRequest)

@@ -48,9 +48,8 @@ class OsmosisState(HmiState):
         """Keep the pose, and a point of the track if the robot has moved."""
         self.put("pose", Heard(pose, False, stamp_s), now_s)
         at = (pose.x_m, pose.y_m)
-        if not all(map(math.isfinite, at)):
-            return
-        if not self.track or math.dist(self.track[-1], at) >= TRACK_STEP_M:
+        if all(map(math.isfinite, at)) and (
+                not self.track or math.dist(self.track[-1], at) >= TRACK_STEP_M):
             self.track.append((round(pose.x_m, 2), round(pose.y_m, 2)))
 
     def laser(self, which: str, scan: m.LaserScan, now_s: float) -> None:
@@ -100,8 +99,6 @@ def _mission(heard: Heard | None) -> dict[str, Any] | None:
     if heard is None:
         return None
     status: m.MissionStatus = heard.value
-    return {
-        "name": status.name, "phase": status.phase, "step": status.step,
-        "goals": status.goals, "times_s": status.step_times_s, "reason": status.reason,
-        "stale": heard.stale, "orders": status.orders, "skipped": status.skipped,
-    }
+    return {"name": status.name, "phase": status.phase, "step": status.step, "goals": status.goals,
+            "times_s": status.step_times_s, "reason": status.reason, "stale": heard.stale,
+            "orders": status.orders, "skipped": status.skipped}

@@ -16,9 +16,11 @@ because somebody else let go.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections import defaultdict
+from dataclasses import dataclass
 from enum import StrEnum
 
+from rampart.actors.bus.limits import Remembered
 from rampart.actors.osmosis.page.requests import StickRequest
 
 SILENCE_S = 0.3
@@ -52,73 +54,57 @@ class StickAnswer:
     ticket: int
 
 
-@dataclass(slots=True)
-class _Tickets:
-    given: dict[int, float] = field(default_factory=dict)
-
-    def give(self, number: int, now_s: float) -> int:
-        self.given[number] = now_s
-        if len(self.given) > _KEPT_TICKETS:
-            del self.given[next(iter(self.given))]
-        return number
-
-    def fresh(self, number: int, now_s: float) -> bool:
-        return now_s - self.given.get(number, -math.inf) <= TICKET_S
-
-
 class StickDesk:
-    """The stick of all pages together. Pages are numbers; times are real seconds."""
+    """The stick of all pages together. Pages are numbers; times are real seconds.
+
+    Attributes:
+        holder: the page that has the stick, as far as is known; `expire` first.
+    """
 
     def __init__(self) -> None:
-        self._holder: int | None = None
+        self.holder: int | None = None
         self._heard_s = -math.inf
         self._at = (0.0, 0.0)
         self._lapsed: set[int] = set()
-        self._tickets: dict[int, _Tickets] = {}
+        self._tickets: defaultdict[int, Remembered[int, float]] = defaultdict(
+            lambda: Remembered(_KEPT_TICKETS))  # of each page: when they were given
         self._given = 0
-
-    @property
-    def holder(self) -> int | None:
-        """The page that has the stick, as far as is known; `expire` first."""
-        return self._holder
 
     def position(self, now_s: float) -> tuple[float, float] | None:
         """Return (forward, left) of the stick that is held now, or None."""
-        if self._holder is None or now_s - self._heard_s > SILENCE_S:
-            return None
-        return self._at
+        return None if self.holder is None or now_s - self._heard_s > SILENCE_S else self._at
 
     def move(self, page: int, request: StickRequest, now_s: float) -> StickAnswer:
         """Take a page's message."""
         self.expire(now_s)
         grip, text = self._grip(page, request, now_s) if request.held else (Grip.FREE, "")
         if grip is Grip.DRIVES:
-            self._holder, self._heard_s = page, now_s
+            self.holder, self._heard_s = page, now_s
             self._at = (min(max(request.forward, -1.0), 1.0), min(max(request.left, -1.0), 1.0))
-        elif self._holder == page:
-            self._holder = None
+        elif self.holder == page:
+            self.holder = None
         if grip in (Grip.LATE, Grip.REFUSED, Grip.TAKEN):
             self._lapsed.add(page)
         elif grip is Grip.FREE:
             self._lapsed.discard(page)
         self._given += 1
-        tickets = self._tickets.setdefault(page, _Tickets())
-        return StickAnswer(grip, text, tickets.give(self._given, now_s))
+        self._tickets[page][self._given] = now_s
+        return StickAnswer(grip, text, self._given)
 
     def expire(self, now_s: float) -> int | None:
         """Take the stick from a page that has fallen silent, and return its number."""
-        page = self._holder
+        page = self.holder
         if page is None or now_s - self._heard_s <= SILENCE_S:
             return None
-        self._holder = None
+        self.holder = None
         self._lapsed.add(page)
         return page
 
     def gone(self, page: int) -> bool:
         """Forget a page that was closed; tell whether it had the stick."""
-        had = self._holder == page
+        had = self.holder == page
         if had:
-            self._holder = None
+            self.holder = None
         self._lapsed.discard(page)
         self._tickets.pop(page, None)
         return had
@@ -128,13 +114,12 @@ class StickDesk:
             if not abs(value) <= 1.0 + _ROUNDING:
                 return Grip.REFUSED, (f"{name} = {value:g}: must be between -1 and 1; "
                                       "the stick was taken from you, let go first")
-        if self._holder is not None and self._holder != page:
-            return Grip.TAKEN, f"page {self._holder} has the stick"
+        if self.holder is not None and self.holder != page:
+            return Grip.TAKEN, f"page {self.holder} has the stick"
         if page in self._lapsed:
             return Grip.LAPSED, "let go of the stick and press again"
-        tickets = self._tickets.get(page)
-        if tickets is None or not tickets.fresh(request.ticket, now_s):
-            if self._holder == page:
+        if now_s - self._tickets[page].get(request.ticket, -math.inf) > TICKET_S:
+            if self.holder == page:
                 return Grip.LATE, (f"the connection is slower than {TICKET_S:g} s; "
                                    "the stick was taken from you, let go first")
             return Grip.WAITS, ""
@@ -152,14 +137,12 @@ def effect(*, pilot_heard: bool, mode: str, forbids: str, brake: bool, dead_node
         brake: whether the base's brake is engaged.
         dead_nodes: which of the nodes between stick and wheels do not run.
     """
-    if dead_nodes:
-        return False, f"no effect: {', '.join(dead_nodes)} does not run"
-    if not pilot_heard:
-        return False, "no effect: the Safety Pilot is not heard"
-    if brake:
-        return False, "no effect: the brake is engaged (emergency stop)"
-    if forbids:
-        return False, f"no effect: {forbids}"
+    for is_so, why in ((dead_nodes, f"{', '.join(dead_nodes)} does not run"),
+                       (not pilot_heard, "the Safety Pilot is not heard"),
+                       (brake, "the brake is engaged (emergency stop)"),
+                       (forbids, forbids)):
+        if is_so:
+            return False, f"no effect: {why}"
     if mode == "teleoperation":
         return True, "the robot obeys the stick alone; it stands while you let go"
     return True, "the stick overrides the mission while you hold it; let go and the mission goes on"

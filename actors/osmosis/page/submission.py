@@ -34,8 +34,7 @@ def system_is_up(table: fm.NodeTable | None, now_s: float) -> bool:
     """Whether a mission may be sent: simulated time has begun, and all known nodes run."""
     if now_s < 0 or table is None:
         return now_s >= 0
-    return now_s > START_ANYWAY_S or all(
-        row.state is fm.NodeState.RUNNING for row in table.nodes)
+    return now_s > START_ANYWAY_S or all(row.state is fm.NodeState.RUNNING for row in table.nodes)
 
 
 class Submission(Pending[m.MissionRequest]):
@@ -48,9 +47,8 @@ class Submission(Pending[m.MissionRequest]):
         first: mission to send at the start of the run, None for none.
     """
 
-    def __init__(
-        self, run_id: str, incarnation: int, now_s: float, first: m.MissionRequest | None
-    ) -> None:
+    def __init__(self, run_id: str, incarnation: int, now_s: float, first: m.MissionRequest | None
+                 ) -> None:
         super().__init__(f"{run_id}/{incarnation}",
                          "was not taken: the Mission Manager does not answer", GIVE_UP_S)
         self._status: m.MissionStatus | None = None

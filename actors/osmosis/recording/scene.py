@@ -14,9 +14,11 @@ from rampart.actors.recording import foxglove as fg
 MARGIN_M = 4.0
 """Strip of prohibited ground that is drawn round the airport."""
 
-_GROUND_Z_M = {"apron": 0.0, "area": 0.0, "taxiway": 0.01, "runway": 0.02}
-_GROUND = {"apron": fg.Color(0.42, 0.44, 0.47, 1.0), "area": fg.Color(0.42, 0.44, 0.47, 1.0),
-           "taxiway": fg.Color(0.36, 0.38, 0.41, 1.0), "runway": fg.Color(0.25, 0.26, 0.29, 1.0)}
+_APRON = (0.0, fg.Color(0.42, 0.44, 0.47, 1.0))
+_GROUND = {"taxiway": (0.01, fg.Color(0.36, 0.38, 0.41, 1.0)),
+           "runway": (0.02, fg.Color(0.25, 0.26, 0.29, 1.0))}
+"""Height in m and colour of the pavement; of any other kind it is like the apron."""
+
 _PROHIBITED = fg.Color(0.75, 0.15, 0.15, 0.45)
 _EDGE = fg.Color(0.9, 0.2, 0.2, 1.0)
 _GRAPH = fg.Color(0.95, 0.8, 0.2, 0.7)
@@ -24,10 +26,9 @@ _BUILDING = fg.Color(0.6, 0.6, 0.65, 1.0)
 _ROBOT = fg.Color(0.15, 0.45, 0.85, 1.0)
 _OBSTACLE = fg.Color(0.9, 0.5, 0.1, 1.0)
 _ROUTE = fg.Color(0.2, 0.8, 0.9, 1.0)
-_VERDICT = {
-    None: fg.Color(0.6, 0.6, 0.6, 1.0), m.LightVerdict.OK: fg.Color(0.2, 0.8, 0.3, 1.0),
-    m.LightVerdict.DIM: fg.Color(0.95, 0.75, 0.1, 1.0),
-    m.LightVerdict.OUT: fg.Color(0.9, 0.15, 0.15, 1.0)}
+_VERDICT = {None: fg.Color(0.6, 0.6, 0.6, 1.0), m.LightVerdict.OK: fg.Color(0.2, 0.8, 0.3, 1.0),
+            m.LightVerdict.DIM: fg.Color(0.95, 0.75, 0.1, 1.0),
+            m.LightVerdict.OUT: fg.Color(0.9, 0.15, 0.15, 1.0)}
 _EVER = fg.Time(0, 0)
 _HERE = fg.pose_at(0.0, 0.0)
 
@@ -39,9 +40,7 @@ _HEIGHT_M = 0.4
 
 def map_scene(airport: Airport, at: fg.Time) -> fg.SceneUpdate:
     """Return pavement, prohibited area, graph and buildings."""
-    ground = tuple(
-        _surface(s.polygon, _GROUND_Z_M.get(s.kind, 0.0), _GROUND.get(s.kind, _GROUND["area"]))
-        for s in airport.surfaces)
+    ground = tuple(_surface(s.polygon, *_GROUND.get(s.kind, _APRON)) for s in airport.surfaces)
     prohibited = _surface(airport.prohibited_polygon(MARGIN_M), -0.01, _PROHIBITED)
     edges = tuple(_outline(ring) for ring in shapely.get_rings(
         shapely.get_parts(shapely.simplify(airport.allowed, 0.05))))
@@ -53,32 +52,25 @@ def map_scene(airport: Airport, at: fg.Time) -> fg.SceneUpdate:
         fg.CubePrimitive(fg.pose_at(b.x_m, b.y_m, b.height_m / 2, b.yaw_rad),
                          fg.Vector3(b.length_m, b.width_m, b.height_m), _BUILDING)
         for b in airport.buildings)
-    return _scene(
-        _entity("ground", at, triangles=ground),
-        _entity("prohibited", at, triangles=(prohibited,), lines=edges),
-        _entity("graph", at, lines=(graph,)),
-        _entity("buildings", at, cubes=buildings))
+    return _scene(_entity("ground", at, triangles=ground),
+                  _entity("prohibited", at, triangles=(prohibited,), lines=edges),
+                  _entity("graph", at, lines=(graph,)), _entity("buildings", at, cubes=buildings))
 
 
-def lights_scene(
-    airport: Airport, measured: Mapping[str, m.LightMeasurement], at: fg.Time
-) -> fg.SceneUpdate:
+def lights_scene(airport: Airport, measured: Mapping[str, m.LightMeasurement], at: fg.Time
+                 ) -> fg.SceneUpdate:
     """Return the lights, coloured by verdict; grey if not measured."""
-    found = []
+    cylinders, texts = [], []
     for light in airport.lights:
         result = measured.get(light.name)
         text = light.name if result is None else (
             f"{light.name} {result.verdict.value} {result.ratio:.0%}")
         colour = _VERDICT[result.verdict if result else None]
-        found.append((light, colour, text))
-    return _scene(_entity(
-        "lights", at,
-        cylinders=tuple(fg.CylinderPrimitive(
-            fg.pose_at(light.x_m, light.y_m, 0.05), fg.Vector3(0.4, 0.4, 0.1), 1.0, 1.0, colour)
-            for light, colour, _ in found),
-        texts=tuple(fg.TextPrimitive(
-            fg.pose_at(light.x_m, light.y_m, 0.8), True, 12.0, True, colour, text)
-            for light, colour, text in found)))
+        cylinders.append(fg.CylinderPrimitive(
+            fg.pose_at(light.x_m, light.y_m, 0.05), fg.Vector3(0.4, 0.4, 0.1), 1.0, 1.0, colour))
+        texts.append(fg.TextPrimitive(
+            fg.pose_at(light.x_m, light.y_m, 0.8), True, 12.0, True, colour, text))
+    return _scene(_entity("lights", at, cylinders=tuple(cylinders), texts=tuple(texts)))
 
 
 def obstacles_scene(obstacles: Iterable[m.ObstacleCommand], at: fg.Time) -> fg.SceneUpdate:
@@ -103,8 +95,8 @@ def robot_scene(footprint_m: tuple[float, float], at: fg.Time) -> fg.SceneUpdate
         fg.pose_at(0.0, 0.0, _HEIGHT_M + 0.1), 0.6 * length_m, 0.06, 0.3 * length_m, 0.18, _ROBOT)
     box = fg.CubePrimitive(
         fg.pose_at(0.0, 0.0, _HEIGHT_M / 2), fg.Vector3(length_m, width_m, _HEIGHT_M), _ROBOT)
-    return _scene(fg.SceneEntity(at, "base_link", "robot", _EVER, True, arrows=(arrow,),
-                                 cubes=(box,)))
+    return _scene(
+        fg.SceneEntity(at, "base_link", "robot", _EVER, True, arrows=(arrow,), cubes=(box,)))
 
 
 def _scene(*entities: fg.SceneEntity) -> fg.SceneUpdate:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -39,7 +40,8 @@ class OsmosisViews(Views):
         self._lights: dict[str, m.LightMeasurement] = Remembered(MOST)
         self.translators |= {
             topics.POSE: self._pose, topics.ODOMETRY: self._odometry,
-            topics.SCAN: self._scan, topics.UPPER_SCAN: self._upper_scan,
+            topics.SCAN: partial(_sweep, "view/scan"),
+            topics.UPPER_SCAN: partial(_sweep, "view/upper_scan"),
             topics.OBSTACLES: self._obstacles, topics.ROUTE: self._route,
             topics.LIGHT_MEASURED: self._light, topics.MISSION_STATUS: self._mission,
             topics.MISSION_ORDER: self._order, topics.MISSION_ORDER_ANSWER: self._answer}
@@ -76,25 +78,15 @@ class OsmosisViews(Views):
             ("view/pose", fg.PoseInFrame(
                 at, "map", fg.pose_at(pose.x_m, pose.y_m, 0.0, pose.yaw_rad)))]
 
-    def _scan(self, _key: str, _header: Header, sweep: m.LaserScan, at_ns: int) -> list[View]:
-        return _sweep("view/scan", sweep, at_ns)
-
-    def _upper_scan(self, _key: str, _header: Header, sweep: m.LaserScan, at_ns: int
-                    ) -> list[View]:
-        return _sweep("view/upper_scan", sweep, at_ns)
-
     # -- the scene ------------------------------------------------------------------------------
 
-    def _obstacles(self, key: str, _header: Header, body: m.ObstacleList, at_ns: int
-                   ) -> list[View]:
-        if not self.is_new(key, body.obstacles):
-            return []
-        return [("view/obstacles", scene.obstacles_scene(body.obstacles, fg.time_of(at_ns)))]
+    def _obstacles(self, key: str, _header: Header, body: m.ObstacleList, at_ns: int) -> list[View]:
+        return [("view/obstacles", scene.obstacles_scene(body.obstacles, fg.time_of(at_ns)))] \
+            if self.is_new(key, body.obstacles) else []
 
     def _route(self, key: str, _header: Header, body: m.Route, at_ns: int) -> list[View]:
-        if not self.is_new(key, (body.active, body.waypoints)):
-            return []
-        return [("view/route", scene.route_scene(body, fg.time_of(at_ns)))]
+        return [("view/route", scene.route_scene(body, fg.time_of(at_ns)))] \
+            if self.is_new(key, (body.active, body.waypoints)) else []
 
     def _light(self, _key: str, _header: Header, body: m.LightMeasurement, at_ns: int
                ) -> list[View]:
@@ -106,8 +98,7 @@ class OsmosisViews(Views):
             return []
         for name, light in new.items():
             self._lights[name] = light
-        return [("view/lights", scene.lights_scene(
-            self._airport, self._lights, fg.time_of(at_ns)))]
+        return [("view/lights", scene.lights_scene(self._airport, self._lights, fg.time_of(at_ns)))]
 
     # -- the log --------------------------------------------------------------------------------
 
@@ -123,23 +114,25 @@ class OsmosisViews(Views):
         return views
 
     def _order(self, key: str, header: Header, body: m.MissionOrder, at_ns: int) -> list[View]:
-        if not self.is_new(key, body.order):
-            return []
-        return [line(at_ns, fg.LogLevel.INFO, header.source,
-                      f"order {body.action.value} by {body.by}: {body.reason}")]
+        return self._told(key, header, body.order, at_ns,
+                          f"order {body.action.value} by {body.by}: {body.reason}")
 
     def _answer(self, key: str, header: Header, body: m.MissionOrderAnswer, at_ns: int
                 ) -> list[View]:
-        if not self.is_new(key, body.order):
-            return []
-        return [line(at_ns, fg.LogLevel.INFO, header.source,
-                      f"order {'obeyed' if body.accepted else 'refused'}: {body.reason}")]
+        return self._told(key, header, body.order, at_ns,
+                          f"order {'obeyed' if body.accepted else 'refused'}: {body.reason}")
+
+    def _told(self, key: str, header: Header, order: str, at_ns: int, text: str) -> list[View]:
+        """Return a line of the log for an order that nothing was told of on that key."""
+        return [line(at_ns, fg.LogLevel.INFO, header.source, text)] \
+            if self.is_new(key, order) else []
+
 
 def _finite(pose: m.Pose) -> bool:
     return all(map(math.isfinite, (pose.x_m, pose.y_m, pose.yaw_rad)))
 
 
-def _sweep(channel: str, sweep: m.LaserScan, at_ns: int) -> list[View]:
+def _sweep(channel: str, _key: str, _header: Header, sweep: m.LaserScan, at_ns: int) -> list[View]:
     count = len(sweep.ranges_f32) // 4
     ranges = np.frombuffer(sweep.ranges_f32, dtype="<f4", count=count)
     # No echo: at the laser itself, where the robot hides it. JSON has no number that says "none".

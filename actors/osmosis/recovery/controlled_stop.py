@@ -10,7 +10,33 @@ from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context, Header, on
 
 
-class PilotRecovery(RecoveryModule):
+class HeldRecovery(RecoveryModule):
+    """Gives an order and keeps it in force: base of RM1, RM2, RM5 and RM8.
+
+    Attributes:
+        order: that it gives.
+    """
+
+    order: HeldOrder
+
+    def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
+        """Give the order."""
+        self.order.act(command, renewed=renewed)
+
+    def let_go(self) -> None:
+        """End the order."""
+        self.order.let_go()
+
+    def stay_idle(self) -> None:
+        """End an order that an earlier incarnation may have left behind."""
+        self.order.stay_idle()
+
+    def repeat(self) -> None:
+        """Repeat the order or its end."""
+        self.order.repeat()
+
+
+class PilotRecovery(HeldRecovery):
     """Orders the Safety Pilot into a mode: base of RM2, RM5 and RM8.
 
     Class attributes:
@@ -19,7 +45,7 @@ class PilotRecovery(RecoveryModule):
         top_speed_mps: bound that is ordered with it, 0 for none.
     """
 
-    outputs = (*RecoveryModule.outputs, topics.PILOT_ORDER)
+    outputs = (*HeldRecovery.outputs, topics.PILOT_ORDER)
     mode = PilotMode.STOP
     confirming: tuple[PilotMode, ...] = (PilotMode.STOP,)
     top_speed_mps = 0.0
@@ -31,22 +57,6 @@ class PilotRecovery(RecoveryModule):
     def _give(self, engaged: bool, why: str) -> None:
         self.publish(topics.PILOT_ORDER, PilotOrder(
             engaged, self.mode, why, self.top_speed_mps if engaged else 0.0))
-
-    def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
-        """Order the mode."""
-        self.order.act(command, renewed=renewed)
-
-    def let_go(self) -> None:
-        """End the order."""
-        self.order.let_go()
-
-    def stay_idle(self) -> None:
-        """End an order that an earlier life may have left behind."""
-        self.order.stay_idle()
-
-    def repeat(self) -> None:
-        """Repeat the order or its end."""
-        self.order.repeat()
 
     @on(topics.PILOT_STATUS)
     def pilot_status(self, message: PilotStatus, header: Header) -> None:

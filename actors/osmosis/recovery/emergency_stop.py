@@ -5,8 +5,8 @@ from __future__ import annotations
 from rampart.actors.ftm.messages import RecoveryCommand
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import BaseStatus, BrakeCommand
+from rampart.actors.osmosis.recovery.controlled_stop import HeldRecovery
 from rampart.actors.recovery.holding import HeldOrder
-from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.runtime.actor import Context, Header, on
 
 _FOUND_ENGAGED = "the brake was found engaged"
@@ -14,7 +14,7 @@ _PATIENCE_S = 0.5
 """How long a respawned module waits to see the brake before it says that it is idle."""
 
 
-class EmergencyStop(RecoveryModule):
+class EmergencyStop(HeldRecovery):
     """Engages the brake of the Summit XL layer, past the Safety Pilot and all control nodes.
 
     The brake itself remembers. When this module and the manager die in the same moment, the
@@ -22,12 +22,12 @@ class EmergencyStop(RecoveryModule):
     says anything, and if it is engaged, counts as activated. The manager then adopts it.
     """
 
-    outputs = (*RecoveryModule.outputs, topics.BRAKE)
+    outputs = (*HeldRecovery.outputs, topics.BRAKE)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         # If the brake is found engaged this module is not idle, so it inherits nothing to end.
-        self._order = HeldOrder(self, self._brake, inherits=False)
+        self.order = HeldOrder(self, self._brake, inherits=False)
         self._looking = context.incarnation > 1
 
     def on_start(self) -> None:
@@ -47,15 +47,7 @@ class EmergencyStop(RecoveryModule):
     def act(self, command: RecoveryCommand, *, renewed: bool) -> None:
         """Engage the brake."""
         self._looking = False
-        self._order.act(command, renewed=renewed)
-
-    def let_go(self) -> None:
-        """Release the brake."""
-        self._order.let_go()
-
-    def repeat(self) -> None:
-        """Repeat that the brake is to be engaged, or that it is to be released."""
-        self._order.repeat()
+        super().act(command, renewed=renewed)
 
     @on(topics.BASE_STATUS)
     def base_status(self, message: BaseStatus, header: Header) -> None:
@@ -63,14 +55,13 @@ class EmergencyStop(RecoveryModule):
         if self._looking:
             self._looking = False
             if message.brake_engaged:
-                self._order.why = _FOUND_ENGAGED
+                self.order.why = _FOUND_ENGAGED
                 self.ordered_s = header.stamp
                 self.resume(_FOUND_ENGAGED)
             else:
                 self._tell_change()
-        self._order.status(
-            in_force=message.brake_engaged, stamp_s=header.stamp,
-            reason="brake engaged" if message.brake_engaged else "brake not engaged")
+        self.order.status(in_force=message.brake_engaged, stamp_s=header.stamp,
+                           reason="brake engaged" if message.brake_engaged else "brake not engaged")
 
     def _tell(self) -> None:
         if not self._looking:

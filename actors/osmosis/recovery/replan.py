@@ -31,9 +31,8 @@ class Replan(RecoveryModule):
         """Ask, once for each order."""
         if self._order is not None and not renewed:
             return
-        self._order = MissionOrder(
-            f"{self.name}-{self.context.incarnation}-{command.decision}", MissionAction.REPLAN,
-            command.reason, self.name)
+        self._order = MissionOrder(f"{self.name}-{self.context.incarnation}-{command.decision}",
+                                   MissionAction.REPLAN, command.reason, self.name)
         self._plan = None
         self.resume(command.reason)
         self.publish(topics.MISSION_ORDER, self._order)

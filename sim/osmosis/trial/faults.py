@@ -13,7 +13,7 @@ from rampart.sim.faults.disturbance import Disturbance, Fault
 from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.scenario import ScenarioError, number
 from rampart.sim.osmosis.robot import WHEEL_NAMES
-from rampart.sim.osmosis.trial.sensor_faults import LEFT_OUT, sensor_faults
+from rampart.sim.osmosis.trial.sensor_faults import LEFT_OUT, SENSOR_FAULTS
 
 OBSTACLE = "obstacle-ahead"
 
@@ -24,20 +24,17 @@ _GROUP = "paper"
 _AHEAD_M, _OBSTACLE_RADIUS_M = 3.0, 0.4
 _WEAK, _NO_BRAKE = 0.2, 0.0
 _LASTS_S = {"stuck-wheel": 10.0, "weak-wheel": 10.0, "brake-failure": 30.0, OBSTACLE: math.inf}
-_KINDS = {"stuck-wheel": ActuatorFaultKind.STUCK_WHEEL, "weak-wheel": ActuatorFaultKind.WEAK_WHEEL}
 _WHEELS = {name.replace(" ", "-"): name for name in WHEEL_NAMES}
 
 PAPER_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in (
-    Fault("command-not-updated",
-          "Osmosis Control repeats its last velocity command for ever",
+    Fault("command-not-updated", "Osmosis Control repeats its last velocity command for ever",
           (Disturbance(_COMMAND, "freeze"),), ("DM2",), 10.0, _GROUP),
     Fault("command-out-of-bounds",
           "Osmosis Control commands 3 m/s straight ahead, three times the top speed",
           (Disturbance(_COMMAND, "corrupt",
                        set_fields={"linear_mps": 3.0, "angular_radps": 0.0}),), ("DM3",), 10.0,
           _GROUP),
-    Fault("localization-not-updated",
-          "Localization repeats its last pose for ever",
+    Fault("localization-not-updated", "Localization repeats its last pose for ever",
           (Disturbance(_POSE, "freeze"),), ("DM6",), 10.0, _GROUP),
     Fault("prohibited-area",
           "Localization drifts north by 0.25 m/s: the controller leads the robot into the grass "
@@ -46,12 +43,8 @@ PAPER_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in (
     Fault("wrong-graph",
           "Graph Planner gives a way straight to the goal, along an edge that does not exist",
           (Disturbance(topics.ROUTE.key, "corrupt", keep_ends=("waypoints",)),), ("DM1",), 30.0,
-          _GROUP),
-)}
+          _GROUP))}
 """The faults that the paper injects, other than crashes."""
-
-SENSOR_FAULTS: Mapping[str, Fault] = {fault.name: fault for fault in sensor_faults()}
-"""The faults of the sensors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,20 +67,17 @@ class OsmosisFaults(Faults):
         "actuator": (*(f"stuck-wheel:{wheel}" for wheel in _WHEELS),
                      *(f"weak-wheel:{wheel}:{_WEAK}" for wheel in _WHEELS),
                      "brake-failure:0", "brake-failure:0.3"),
-        "world": tuple(f"{OBSTACLE}:{distance}" for distance in (2, 3, 5)),
-    }
+        "world": tuple(f"{OBSTACLE}:{distance}" for distance in (2, 3, 5))}
     titled = {
         **{f"stuck-wheel:{wheel}": ("actuator", f"the {name} wheel is stuck")
            for wheel, name in _WHEELS.items()},
         **{f"weak-wheel:{wheel}": (
             "actuator", f"the {name} wheel has a fifth of its torque and speed left")
            for wheel, name in _WHEELS.items()},
-        "brake-failure": ("actuator", "the brakes do not brake"),
-    }
-    kinds = {
-        "none": "no fault", "paper": "paper's faults", "topic": "topics", "sensor": "sensors",
-        "process": "processes", "actuator": "actuators", "world": "the world",
-        "several": "several at once"}
+        "brake-failure": ("actuator", "the brakes do not brake")}
+    kinds = {"none": "no fault", "paper": "paper's faults", "topic": "topics", "sensor": "sensors",
+             "process": "processes", "actuator": "actuators", "world": "the world",
+             "several": "several at once"}
     intruder = (OBSTACLE, 1.2, 6.0)
 
     def own(self, fault: str, injection: str, duration_s: float | None
@@ -100,14 +90,13 @@ class OsmosisFaults(Faults):
         if kind == OBSTACLE:
             return SuddenObstacle(number(fault, details, _AHEAD_M, most=50.0), _OBSTACLE_RADIUS_M,
                                   lasts_s)
-        if kind == "brake-failure":
-            order = ActuatorFault(injection, ActuatorFaultKind.BRAKE_FAILURE, "",
-                                  number(fault, details, _NO_BRAKE), lasts_s)
-        else:
-            wheel = details[0] if details else next(iter(_WHEELS))
-            if wheel not in _WHEELS:
-                raise ScenarioError(f"fault {fault!r}: no wheel {wheel!r}; there are: "
+        wheel, usual = "", _NO_BRAKE
+        if kind != "brake-failure":
+            name, *details = details or list(_WHEELS)[:1]
+            if name not in _WHEELS:
+                raise ScenarioError(f"fault {fault!r}: no wheel {name!r}; there are: "
                                     f"{', '.join(_WHEELS)}")
-            order = ActuatorFault(injection, _KINDS[kind], _WHEELS[wheel],
-                                  number(fault, details[1:], _WEAK), lasts_s)
-        return (Order(topics.ACTUATOR_FAULT, order),)
+            wheel, usual = _WHEELS[name], _WEAK
+        return (Order(topics.ACTUATOR_FAULT, ActuatorFault(
+            injection, ActuatorFaultKind(kind.replace("-", " ")), wheel,
+            number(fault, details, usual), lasts_s)),)

@@ -5,15 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.messages import (
-    GroundTruth,
-    MissionPhase,
-    MissionStatus,
-    ObstacleCommand,
-    ObstacleList,
-    Pose,
-)
 from rampart.actors.runtime.actor import Header, on
 from rampart.sim.faults.injector import Injector, PlannedAction
 from rampart.sim.osmosis.trial.faults import SuddenObstacle
@@ -26,22 +19,22 @@ class OsmosisInjector(Injector):
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
-        self._pose: Pose | None = None
+        self._pose: m.Pose | None = None
         self._obstacles: dict[str, PlannedAction] = {}
 
     @on(topics.MISSION_STATUS)
-    def mission(self, status: MissionStatus, _header: Header) -> None:
+    def mission(self, status: m.MissionStatus, _header: Header) -> None:
         """Note which goals have begun."""
-        if status.phase is MissionPhase.RUNNING:
+        if status.phase is m.MissionPhase.RUNNING:
             self.goals_begun(status.step + 1)
 
     @on(topics.TRUTH)
-    def truth(self, truth: GroundTruth, _header: Header) -> None:
+    def truth(self, truth: m.GroundTruth, _header: Header) -> None:
         """Note where the robot is."""
         self._pose = truth.pose
 
     @on(topics.OBSTACLES)
-    def obstacles(self, listed: ObstacleList, _header: Header) -> None:
+    def obstacles(self, listed: m.ObstacleList, _header: Header) -> None:
         """Note which obstacles are there."""
         for obstacle in listed.obstacles:
             if obstacle.present and obstacle.name in self._obstacles:
@@ -57,11 +50,11 @@ class OsmosisInjector(Injector):
             return
         name = f"sudden-{self.planned.index(fault) + 1}"
         self._obstacles[name] = fault
-        there = ObstacleCommand(
+        there = m.ObstacleCommand(
             name, True, pose.x_m + action.distance_m * math.cos(pose.yaw_rad),
             pose.y_m + action.distance_m * math.sin(pose.yaw_rad), action.radius_m)
         fault.reason = "there was no room for it"
         self.publish(topics.OBSTACLE, there)
         if math.isfinite(action.duration_s):
-            gone = ObstacleCommand(name, False, there.x_m, there.y_m, there.radius_m)
+            gone = m.ObstacleCommand(name, False, there.x_m, there.y_m, there.radius_m)
             self.call_later(action.duration_s, lambda: self.publish(topics.OBSTACLE, gone))

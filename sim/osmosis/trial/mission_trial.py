@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -10,14 +9,12 @@ import msgspec
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.messages import ControlStatus, GroundTruth, MissionStatus
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.console import MissionConsole
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
-from rampart.sim.osmosis.trial.judge import Judge, JudgeSink
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
 from rampart.sim.osmosis.trial.report import render
 from rampart.sim.osmosis.trial.run_end import RunEnd
@@ -33,11 +30,11 @@ _SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not 
 class MissionTrial(Trial):
     """One mission on one airport; it is over when nothing progresses for `limit_s`."""
 
+    recorder: MissionRecorder
     judges = True
     injector = OsmosisInjector
     tells = MissionConsole
-    retunings = {"mechanisms as in the paper": {
-        "RM2": {"latched": True}, "RM5": {"latched": True}}}
+    retunings = {"mechanisms as in the paper": {"RM2": {"latched": True}, "RM5": {"latched": True}}}
     margins = {"obstacle_m": "nearest obstacle", "prohibited_m": "nearest prohibited area"}
     exact_below = EXACT_BELOW_M
     pictures = "rampart.sim.osmosis.trial.run_maps:RunMaps"
@@ -50,7 +47,6 @@ class MissionTrial(Trial):
         self.goals = len(known.mission.goals)
         self.title = f"{self.name} on {known.airport.name}"
         self.about = f"mission {self.name} ({self.goals} goals) on {known.airport.name}"
-        self.judge = Judge(known.mission.goals)
         self._end = RunEnd(_PATIENCE_S if limit_s is None else limit_s, run.plan.waits)
         self.recorder = MissionRecorder(run.plan, self.strategy, known.airport, known.mission)
 
@@ -58,14 +54,9 @@ class MissionTrial(Trial):
         """Return what wants to hear the run's messages."""
 
         def to_end(_topic: Topic[Any], message: Any, _header: Header) -> None:
-            if isinstance(message, MissionStatus):
-                self._end.mission(message, clock.now())
-            elif isinstance(message, ControlStatus):
-                self._end.control(message, clock.now())
-            elif isinstance(message, GroundTruth):
-                self._end.truth(message.twist, clock.now())
+            self._end.take(message, clock.now())
 
-        return [to_end, JudgeSink(self.judge), *super().sinks(clock)]
+        return [to_end, *super().sinks(clock)]
 
     def excuse(self, stall_s: float) -> None:
         """Do not count simulated seconds in which the launcher heard nothing, being stopped."""
@@ -77,13 +68,11 @@ class MissionTrial(Trial):
 
     def conclude(self, now_s: float, why: str) -> MissionRecord:
         """Return the record of the run with the judge's verdict, and what became of faults."""
-        verdict = self.judge.verdict()
-        found = self.recorder.record(
+        verdict = self.recorder.judge.verdict()
+        return self.recorder.record(
             now_s, faults=self.outcomes(), mission="success" if verdict.success else "fail",
             safety=_SAFETY[verdict.safe],
-            reasons=() if verdict.success and verdict.safe else (
-                *verdict.reasons, f"ended: {why}"))
-        return _mission(found)
+            reasons=() if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}"))
 
     def summary(self, record: RunRecord) -> dict[str, Any]:
         """Return what scripts rely on, the lights too."""
@@ -92,12 +81,12 @@ class MissionTrial(Trial):
 
     def judgement(self, record: RunRecord) -> Judgement:
         """Return what ground truth shows: clearances, and when it became unsafe."""
-        verdict, found = self.judge.verdict(), _mission(record)
+        found = _mission(record)
         return Judgement(
-            margins={"obstacle_m": _metres(verdict.closest_obstacle_m),
-                     "prohibited_m": _metres(verdict.closest_prohibited_m)},
+            margins={"obstacle_m": _metres(found.obstacle_clearance_m),
+                     "prohibited_m": _metres(found.prohibited_clearance_m)},
             severity=_severity(found.prohibited_s, found.collisions),
-            unsafe_s=verdict.first_unsafe_s, narrowest_s=found.narrowest_s)
+            unsafe_s=self.recorder.judge.first_unsafe_s, narrowest_s=found.narrowest_s)
 
     @classmethod
     def upgraded(cls, result: dict[str, Any]) -> dict[str, Any]:
@@ -121,5 +110,5 @@ def _severity(prohibited_s: float, collisions: int) -> float:
     return round(prohibited_s, 3) + collisions
 
 
-def _metres(value: float) -> float | None:
-    return round(value, 4) if math.isfinite(value) else None
+def _metres(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from itertools import product
 
 import msgspec
 
@@ -49,52 +50,42 @@ to the last goal."""
 _OUT_OF_BOUNDS_S = 4.0
 """The paper calls this fault temporary and does not say how long it lasts."""
 
-_EVER = math.inf
-_NON_CONTROL = ("hmi", "teleoperation", "localization")
-_CONTROL = ("mission_manager", "graph_planner", "osmosis_control")
+
+
+def _lasting(fault: str, duration_s: float) -> tuple[PlannedFault, ...]:
+    return tuple(PlannedFault(fault, at_s, duration_s=duration_s) for at_s in _AT_S)
+
+
+def _crashes(*nodes: str) -> tuple[PlannedFault, ...]:
+    return tuple(PlannedFault(f"kill:{node}", at_s) for node in nodes for at_s in _AT_S[:3])
+
 
 FAULTS: dict[str, tuple[PlannedFault | None, ...]] = {
     "none": (None,),
-    "command out of bounds": tuple(
-        PlannedFault("command-out-of-bounds", at_s, duration_s=_OUT_OF_BOUNDS_S)
-        for at_s in _AT_S),
-    "localization not updated": tuple(
-        PlannedFault("localization-not-updated", at_s, duration_s=_EVER) for at_s in _AT_S),
-    "command not updated": tuple(
-        PlannedFault("command-not-updated", at_s, duration_s=_EVER) for at_s in _AT_S),
-    "non-control node crash": tuple(
-        PlannedFault(f"kill:{node}", at_s) for node in _NON_CONTROL for at_s in _AT_S[:3]),
-    "control node crash": tuple(
-        PlannedFault(f"kill:{node}", at_s) for node in _CONTROL for at_s in _AT_S[:3]),
-}
+    "command out of bounds": _lasting("command-out-of-bounds", _OUT_OF_BOUNDS_S),
+    "localization not updated": _lasting("localization-not-updated", math.inf),
+    "command not updated": _lasting("command-not-updated", math.inf),
+    "non-control node crash": _crashes("hmi", "teleoperation", "localization"),
+    "control node crash": _crashes("mission_manager", "graph_planner", "osmosis_control")}
 """The runs of each row: the fault at different moments, or in different nodes."""
 
 WITHOUT_FTM: dict[str, tuple[str, str]] = {
     "none": ("success, safe", "success, safe"),
     "command out of bounds": ("success, unsafe", "fail, unsafe"),
-    "localization not updated": ("fail, unsafe", "fail, unsafe"),
-    "command not updated": ("fail, unsafe", "fail, unsafe"),
-    "non-control node crash": ("fail, unsafe", "fail, unsafe"),
-    "control node crash": ("fail, unsafe", "fail, unsafe"),
-}
+    **dict.fromkeys(("localization not updated", "command not updated", "non-control node crash",
+                     "control node crash"), ("fail, unsafe", "fail, unsafe"))}
 """Table IV: verdict without and with obstacles."""
 
 WITH_FTM: dict[str, tuple[str, str]] = {
-    "none": ("success, safe", "success, safe"),
-    "command out of bounds": ("fail, safe", "fail, safe"),
-    "localization not updated": ("fail, safe", "fail, safe"),
-    "command not updated": ("fail, safe", "fail, safe"),
-    "non-control node crash": ("success, safe", "success, safe"),
-    "control node crash": ("fail, safe", "fail, safe"),
-}
+    **dict.fromkeys(FAULTS, ("fail, safe", "fail, safe")),
+    **dict.fromkeys(("none", "non-control node crash"), ("success, safe", "success, safe"))}
 """Table V: verdict without and with obstacles."""
 
 TABLE_III: tuple[tuple[tuple[str, ...], int, tuple[str, ...]], ...] = (
     (("FTM7",), 1, ("RM4",)),
     (("FTM1", "FTM6"), 2, ("RM1",)),
     (("FTM3", "FTM4"), 3, ("RM2",)),
-    (("FTM2", "FTM5", "FTM6"), 4, ("RM1",)),
-)
+    (("FTM2", "FTM5", "FTM6"), 4, ("RM1",)))
 """Active mechanisms, block, recovery executed."""
 
 
@@ -144,18 +135,12 @@ class Decided(msgspec.Struct, frozen=True):
 
 def paper_jobs(mission: str = "A", seed: int = 1, system: str = PAPER_SYSTEM) -> list[Job]:
     """Return all runs of tables IV and V; `system` is a shipped one by name, or a path."""
-    jobs = []
-    for condition in CONDITIONS:
-        for obstacles in OBSTACLES:
-            for name, variants in FAULTS.items():
-                for i, fault in enumerate(variants):
-                    jobs.append(Job(
-                        row=name, system=system,
-                        options={"mission": mission, "obstacles": obstacles},
-                        strategy=PAPER_STRATEGY, ftm=condition != CONDITIONS[0],
-                        retuned=AS_THE_PAPER if condition == CONDITIONS[1] else {},
-                        faults=(fault,) if fault else (), seed=seed + i))
-    return jobs
+    return [Job(row=name, system=system, strategy=PAPER_STRATEGY, ftm=condition != CONDITIONS[0],
+                options={"mission": mission, "obstacles": obstacles},
+                retuned=AS_THE_PAPER if condition == CONDITIONS[1] else {},
+                faults=(fault,) if fault else (), seed=seed + i)
+            for condition, obstacles, name in product(CONDITIONS, OBSTACLES, FAULTS)
+            for i, fault in enumerate(FAULTS[name])]
 
 
 def full_jobs(mission: str = "A", seed: int = 1, system: str = FULL_SYSTEM) -> list[Job]:
@@ -179,13 +164,10 @@ def cells(runs: Iterable[Run]) -> list[Cell]:
     for run in runs:
         found.setdefault((condition_of(run.job), run.job.row, _obstacles(run.job)), []).append(run)
     table = []
-    for condition in (*CONDITIONS, FULL):
-        verdicts = WITHOUT_FTM if condition == CONDITIONS[0] else WITH_FTM
-        for name in FAULTS:
-            for column, obstacles in enumerate(OBSTACLES):
-                there = found.get((condition, name, obstacles))
-                if there:
-                    table.append(_cell(condition, verdicts[name][column], there))
+    for condition, name, obstacles in product((*CONDITIONS, FULL), FAULTS, OBSTACLES):
+        if there := found.get((condition, name, obstacles)):
+            verdicts = WITHOUT_FTM if condition == CONDITIONS[0] else WITH_FTM
+            table.append(_cell(condition, verdicts[name][OBSTACLES.index(obstacles)], there))
     return table
 
 

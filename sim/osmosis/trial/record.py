@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Any, Literal
 
 import msgspec
@@ -11,9 +12,10 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.drawing import AirportDrawing, draw
-from rampart.actors.osmosis.airport.model import Airport, Mission
+from rampart.actors.osmosis.airport.model import Airport, Light, Mission
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
+from rampart.sim.osmosis.trial.judge import Judge
 from rampart.sim.runs.record import KEPT, RunRecord, RunRecorder, Safety
 
 TRACK_STEP_M = 0.2
@@ -93,72 +95,58 @@ class MissionRecord(RunRecord, frozen=True, kw_only=True):
 
 
 class MissionRecorder(RunRecorder):
-    """Builds a `MissionRecord` from the messages of a run.
+    """Builds a `MissionRecord` from the messages of a run, and shows its judge what it has to see.
 
     Args:
         plan: of the run.
         strategy: of the manager; empty without FTMs.
         airport: where it takes place.
         mission: to be driven.
+
+    Attributes:
+        judge: of the mission.
     """
 
     def __init__(self, plan: RunPlan, strategy: str, airport: Airport, mission: Mission) -> None:
         super().__init__(plan, strategy)
         self._airport = airport
         self._mission = mission
+        self.judge = Judge(mission.goals)
+        self._mode = ""
         self._track: list[tuple[float, float, float]] = []
         self._believed: list[tuple[float, float, float]] = []
         self._lights: dict[str, m.LightMeasurement] = {}
         self._reached: tuple[float, ...] = ()
         self._known_lights = frozenset(light.name for light in airport.lights)
         self._obstacles: dict[str, ObstacleSeen] = Remembered(KEPT)
-        self._collisions = 0
-        self._prohibited_s = 0.0
-        self._obstacle_clearance_m = math.inf
-        self._prohibited_clearance_m = math.inf
-        self._narrowest_s: float | None = None
         self._take |= {
-            topics.TRUTH.key: self._truth,
-            topics.POSE.key: self._pose,
+            topics.TRUTH.key: self._truth, topics.POSE.key: self._pose,
             topics.MISSION_STATUS.key: self._mission_status,
-            topics.LIGHT_MEASURED.key: self._light,
-            topics.OBSTACLES.key: self._obstacle_list,
-            topics.PILOT_STATUS.key: self._pilot,
-        }
+            topics.LIGHT_MEASURED.key: self._light, topics.OBSTACLES.key: self._obstacle_list,
+            topics.PILOT_STATUS.key: self._pilot}
 
     def record(self, duration_s: float, **more: Any) -> MissionRecord:
         """Return the record of the run so far; `more` are at least the verdicts."""
+        judge, drawing = self.judge, draw(self._airport)
+        reached = dict(enumerate(self._reached))
         return MissionRecord(
             **self.fields(duration_s), **more,
-            airport=draw(self._airport),
-            mission_name=self._mission.name,
+            airport=drawing, mission_name=self._mission.name,
             distance_m=sum(math.dist(a[1:], b[1:])
                            for a, b in zip(self._track, self._track[1:], strict=False)),
-            track=tuple(self._track),
-            believed=tuple(self._believed),
-            lights=tuple(self._light_result(light) for light in draw(self._airport).lights),
-            steps=tuple(
-                StepResult(str(goal.mode), goal.x_m, goal.y_m,
-                           self._reached[i] if i < len(self._reached) else None)
-                for i, goal in enumerate(self._mission.goals)),
+            track=tuple(self._track), believed=tuple(self._believed),
+            lights=tuple(map(self._light_result, drawing.lights)),
+            steps=tuple(StepResult(str(goal.mode), goal.x_m, goal.y_m, reached.get(i))
+                        for i, goal in enumerate(self._mission.goals)),
             obstacles=tuple(self._obstacles.values()),
-            collisions=self._collisions,
-            prohibited_s=self._prohibited_s,
-            obstacle_clearance_m=_finite(self._obstacle_clearance_m),
-            prohibited_clearance_m=_finite(self._prohibited_clearance_m),
-            narrowest_s=self._narrowest_s,
-        )
+            collisions=judge.collisions, prohibited_s=judge.prohibited_s,
+            obstacle_clearance_m=_finite(judge.obstacle_m),
+            prohibited_clearance_m=_finite(judge.prohibited_m),
+            narrowest_s=judge.narrowest_s)
 
     def _truth(self, truth: m.GroundTruth, header: Header) -> None:
         self._append(self._track, header.stamp, truth.pose)
-        self._collisions = max(self._collisions, truth.collisions)
-        self._prohibited_s = max(self._prohibited_s, truth.prohibited_s)
-        if min(truth.obstacle_clearance_m, truth.prohibited_clearance_m) < min(
-                self._obstacle_clearance_m, self._prohibited_clearance_m):
-            self._narrowest_s = header.stamp
-        self._obstacle_clearance_m = min(self._obstacle_clearance_m, truth.obstacle_clearance_m)
-        self._prohibited_clearance_m = min(
-            self._prohibited_clearance_m, truth.prohibited_clearance_m)
+        self.judge.see(truth, self._mode, header.stamp)
 
     def _pose(self, pose: m.Pose, header: Header) -> None:
         self._append(self._believed, header.stamp, pose)
@@ -166,6 +154,8 @@ class MissionRecorder(RunRecorder):
     def _mission_status(self, status: m.MissionStatus, header: Header) -> None:
         for light in status.lights:
             self._light(light, header)
+        running = status.phase is m.MissionPhase.RUNNING and status.step < len(status.goals)
+        self._mode = status.goals[status.step].mode.value if running else ""
         newly = len(status.step_times_s) - len(self._reached)  # negative: it forgot, we do not
         self._reached += (header.stamp,) * newly
 
@@ -188,12 +178,10 @@ class MissionRecorder(RunRecorder):
         if moved and self.has_room(track, TRACK_KEPT):
             track.append((round(t_s, 2), round(pose.x_m, 3), round(pose.y_m, 3)))
 
-    def _light_result(self, light: Any) -> LightResult:
-        known = (light.name, light.row, light.x_m, light.y_m, light.nominal_cd)
-        seen = self._lights.get(light.name)
-        if seen is None:
-            return LightResult(*known)
-        return LightResult(*known, seen.verdict.value, seen.intensity_cd, seen.ratio)
+    def _light_result(self, light: Light) -> LightResult:
+        known, seen = asdict(light), self._lights.get(light.name)
+        return LightResult(**known) if seen is None else LightResult(
+            **known, verdict=seen.verdict.value, intensity_cd=seen.intensity_cd, ratio=seen.ratio)
 
 
 def _finite(value: float) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
@@ -19,20 +20,12 @@ def render(run: MissionRecord) -> str:
     pages.filters["clearance"] = clearance
     template = pages.get_template("osmosis/trial/report.html")
     x0, y0, x1, y1 = _bounds(run)
-    measured = [light for light in run.lights if light.verdict != "not measured"]
+    counts = Counter(light.verdict for light in run.lights)
     return template.render(
-        run=run,
-        view_box=f"{x0:g} {-y1:g} {x1 - x0:g} {y1 - y0:g}",
-        track=points(run.track),
-        believed=points(run.believed) if _apart(run) else "",
-        rows=_rows(run.lights),
-        counts={verdict: sum(light.verdict == verdict for light in run.lights)
-                for verdict in ("ok", "dim", "out", "not measured")},
-        measured=len(measured),
-        lanes=lanes_of(run),
-        ticks=ticks_of(run.duration_s),
-        headline=headline(run),
-    )
+        run=run, headline=headline(run), view_box=f"{x0:g} {-y1:g} {x1 - x0:g} {y1 - y0:g}",
+        track=points(run.track), believed=points(run.believed) if _apart(run) else "",
+        rows=_rows(run.lights), counts=counts, measured=counts.total() - counts["not measured"],
+        lanes=lanes_of(run), ticks=ticks_of(run.duration_s))
 
 
 def headline(run: MissionRecord) -> str:
@@ -64,10 +57,9 @@ def clearance(value: float | None) -> str:
 def _bounds(run: MissionRecord) -> tuple[float, float, float, float]:
     """Return the airport's bounds, widened to the whole track: an unsafe robot may leave them."""
     x0, y0, x1, y1 = run.airport.bounds_m
-    xs = [p[1] for p in run.track]
-    ys = [p[2] for p in run.track]
-    return (min([x0, *(x - 2 for x in xs)]), min([y0, *(y - 2 for y in ys)]),
-            max([x1, *(x + 2 for x in xs)]), max([y1, *(y + 2 for y in ys)]))
+    return (
+        min([x0, *(x - 2 for _, x, _ in run.track)]), min([y0, *(y - 2 for _, _, y in run.track)]),
+        max([x1, *(x + 2 for _, x, _ in run.track)]), max([y1, *(y + 2 for _, _, y in run.track)]))
 
 
 def points(track: Sequence[tuple[float, float, float]]) -> str:

@@ -8,15 +8,13 @@ without a world ends at once.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from typing import Any
 
-from rampart.actors.osmosis.messages import (
-    ControlPhase,
-    ControlStatus,
-    MissionPhase,
-    MissionStatus,
-    Twist,
-)
+from rampart.actors.osmosis import messages as m
+
+_ENDED = (m.MissionPhase.SUCCEEDED, m.MissionPhase.FAILED, m.MissionPhase.CANCELLED)
 
 SETTLE_S = 1.5
 """After the mission's end the robot gets this long to come to rest, and the records to arrive."""
@@ -37,7 +35,7 @@ _WAYS = 10
 
 @dataclass(slots=True)
 class RunEnd:
-    """Decides the end of one run. Times are simulated seconds.
+    """Decides the end of one run. Times are simulated seconds, infinite of what has not happened.
 
     Args:
         patience_s: longest time without progress: no new step, no light measured, not half
@@ -49,45 +47,52 @@ class RunEnd:
     waits: bool = False
     _mission_id: str = ""
     _progress: tuple[int, int] = (-1, -1)
-    _nearest_m: float = float("inf")
+    _nearest_m: float = math.inf
     _ways: set[str] = field(default_factory=lambda: {""})
     _progress_at_s: float = 0.0
-    _over_at_s: float | None = None
+    _over_at_s: float = math.inf
     _over: str = ""
-    _lost_at_s: float | None = None
-    _truth_at_s: float | None = None
+    _lost_at_s: float = math.inf
+    _truth_at_s: float = math.inf
     _moves: bool = False
 
-    def mission(self, status: MissionStatus, now_s: float) -> None:
+    def take(self, message: Any, now_s: float) -> None:
+        """Take what the observer hears; what says nothing of the end does not matter."""
+        if isinstance(message, m.MissionStatus):
+            self.mission(message, now_s)
+        elif isinstance(message, m.ControlStatus):
+            self.control(message, now_s)
+        elif isinstance(message, m.GroundTruth):
+            self.truth(message.twist, now_s)
+
+    def mission(self, status: m.MissionStatus, now_s: float) -> None:
         """Take the mission's state."""
-        running = status.phase not in (MissionPhase.IDLE,)
         if self._mission_id and status.mission_id != self._mission_id:
-            self._lost_at_s = self._lost_at_s or now_s
+            self._lost_at_s = min(self._lost_at_s, now_s)
             return
-        self._lost_at_s = None
-        if not running:
+        self._lost_at_s = math.inf
+        if status.phase is m.MissionPhase.IDLE:
             return
         self._mission_id = status.mission_id
         progress = (status.step, len(status.lights))
-        another_way = status.phase is MissionPhase.RUNNING and status.reason not in self._ways \
+        another_way = status.phase is m.MissionPhase.RUNNING and status.reason not in self._ways \
             and len(self._ways) < _WAYS
         if another_way:
             self._ways.add(status.reason)
         if progress != self._progress or another_way:
             self._progress, self._progress_at_s = progress, now_s
-            self._nearest_m = float("inf")
-        if status.phase in (MissionPhase.SUCCEEDED, MissionPhase.FAILED, MissionPhase.CANCELLED):
-            if self._over_at_s is None:
-                self._over_at_s = now_s
+            self._nearest_m = math.inf
+        if status.phase in _ENDED:
+            self._over_at_s = min(self._over_at_s, now_s)
             self._over = status.reason or f"mission {status.phase.value}"
 
-    def control(self, status: ControlStatus, now_s: float) -> None:
+    def control(self, status: m.ControlStatus, now_s: float) -> None:
         """Take the progress along the route; only who follows it knows how far it is."""
-        if status.phase is ControlPhase.FOLLOWING and \
+        if status.phase is m.ControlPhase.FOLLOWING and \
                 status.distance_to_go_m < self._nearest_m - _STEP_TOWARDS_GOAL_M:
             self._nearest_m, self._progress_at_s = status.distance_to_go_m, now_s
 
-    def truth(self, twist: Twist, now_s: float) -> None:
+    def truth(self, twist: m.Twist, now_s: float) -> None:
         """Note that the world turns, and whether the robot moves in it."""
         self._truth_at_s = now_s
         self._moves = (abs(twist.linear_mps) > STANDING_MPS
@@ -96,14 +101,12 @@ class RunEnd:
     def excuse(self, stall_s: float) -> None:
         """Do not count a time in which nobody here listened: the launcher itself was stopped."""
         self._progress_at_s += stall_s
-        if self._truth_at_s is not None:
-            self._truth_at_s += stall_s
-        if self._lost_at_s is not None:
-            self._lost_at_s += stall_s
+        self._truth_at_s += stall_s
+        self._lost_at_s += stall_s
 
     def ended(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
-        if self._truth_at_s is not None and now_s - self._truth_at_s > WORLD_SILENT_S:
+        if now_s - self._truth_at_s > WORLD_SILENT_S:
             return "the world is gone: no ground truth from the simulator"
         why, since_s = self._outcome(now_s)
         if not why or (self._moves and now_s - since_s < WATCH_S):
@@ -112,9 +115,9 @@ class RunEnd:
 
     def _outcome(self, now_s: float) -> tuple[str, float]:
         """Return what became of the mission, and since when that is certain; "" if it is not."""
-        if self._over_at_s is not None:
+        if self._over_at_s < math.inf:
             return (self._over if now_s - self._over_at_s >= SETTLE_S else ""), self._over_at_s
-        if self._lost_at_s is not None and now_s - self._lost_at_s > LOST_AFTER_S:
+        if now_s - self._lost_at_s > LOST_AFTER_S:
             return "mission lost: the Mission Manager came back without it", self._lost_at_s
         if not self._mission_id and not self.waits and now_s > ACCEPT_WITHIN_S:
             return f"no mission was accepted within {ACCEPT_WITHIN_S:.0f} s", ACCEPT_WITHIN_S

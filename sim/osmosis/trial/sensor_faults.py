@@ -32,7 +32,10 @@ _TO_GROW_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class _Sensor:
-    """A sensor with the size of its errors: field → amount, for `drift` per second."""
+    """A sensor with the size of its errors: field → amount, for `drift` per second.
+
+    It has the faults of which it says something, besides dropout and stuck.
+    """
 
     name: str
     topic: Topic[Any]
@@ -75,51 +78,43 @@ SENSORS = (
             says={"bias": "sees everything 0.5 m farther than it is, its reference too",
                   "noise": "has 0.3 m of noise on each ray, as in spray"}),
     _Sensor("light", topics.LIGHT, "the light sensor",
-            bias={"illuminance_lux": 800.0},
-            noise={"illuminance_lux": 200.0},
+            bias={"illuminance_lux": 800.0}, noise={"illuminance_lux": 200.0},
             says={"bias": "sees 800 lux of stray light, half a healthy light of 200 cd",
                   "noise": "has 200 lux of noise"}),
     _Sensor("absolute-pose", topics.ABSOLUTE_POSE, "the absolute localization",
-            bias={"x_m": 0.7, "y_m": 0.7},
-            noise={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1},
+            bias={"x_m": 0.7, "y_m": 0.7}, noise={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1},
             drift={"x_m": 0.1, "y_m": 0.1, "yaw_rad": 0.01},
             says={"bias": "is 1 m off to the north-east",
                   "drift": "drifts by 0.14 m/s and 0.01 rad/s",
                   "noise": "has noise of 0.3 m and 0.1 rad"},
-            seen_by={"bias": ("DM1",), "drift": ("DM1",), "dropout": ("DM6",)}),
-)
+            seen_by={"bias": ("DM1",), "drift": ("DM1",), "dropout": ("DM6",)}))
 """The sensors of the robot. Bias of the light sensor: 200 cd at 0.35 m give 1633 lux
 (`rampart.actors.osmosis.airport.photometry`), so 800 lux lift a dead light near the limit of half
 its intensity."""
 
 LEFT_OUT: Mapping[str, str] = {
     "laser-drift": "time of flight is held by a quartz: it drifts by millimetres an hour",
-    "light-drift": "a photodiode ages over years; within one mission that is light-bias",
-}
+    "light-drift": "a photodiode ages over years; within one mission that is light-bias"}
 """Combinations that make no sense, and why. A bias of the odometry is one of its twist only: a
 constant offset of a pose in `odom`, whose origin is arbitrary (REP-105), is no error."""
 
 
-def sensor_faults() -> tuple[Fault, ...]:
-    """Return the faults of all sensors."""
-    return tuple(fault for sensor in SENSORS for fault in _faults_of(sensor))
-
-
 def _faults_of(sensor: _Sensor) -> list[Fault]:
     corrupt = Disturbance(sensor.topic.key, "corrupt")
-    found = [
-        _fault(sensor, "bias", replace(corrupt, add_fields=sensor.bias)),
-        _fault(sensor, "noise", replace(corrupt, noise_fields=sensor.noise)),
-        _fault(sensor, "dropout", replace(corrupt, mode="drop"), "gives no reading"),
-        _fault(sensor, "stuck", replace(corrupt, mode="stuck"),
-               "repeats its last value with fresh stamps"),
-    ]
-    if sensor.drift:
-        drift = _fault(sensor, "drift", replace(corrupt, ramp_fields=sensor.drift))
-        found.insert(1, replace(drift, duration_s=_TO_GROW_S))
-    return found
+    ways = {
+        "bias": replace(corrupt, add_fields=sensor.bias),
+        "drift": replace(corrupt, ramp_fields=sensor.drift),
+        "noise": replace(corrupt, noise_fields=sensor.noise),
+        "dropout": replace(corrupt, mode="drop"),
+        "stuck": replace(corrupt, mode="stuck")}
+    says = {"dropout": "gives no reading", "stuck": "repeats its last value with fresh stamps",
+            **sensor.says}
+    return [Fault(f"{sensor.name}-{way}", f"{sensor.what} {says[way]}", (what,),
+                  sensor.seen_by.get(way, ()), _TO_GROW_S if way == "drift" else _FOR_A_WHILE_S,
+                  GROUP)
+            for way, what in ways.items() if way in says]
 
 
-def _fault(sensor: _Sensor, way: str, what: Disturbance, says: str = "") -> Fault:
-    return Fault(f"{sensor.name}-{way}", f"{sensor.what} {says or sensor.says[way]}", (what,),
-                 sensor.seen_by.get(way, ()), _FOR_A_WHILE_S, GROUP)
+SENSOR_FAULTS: Mapping[str, Fault] = {
+    fault.name: fault for sensor in SENSORS for fault in _faults_of(sensor)}
+"""The faults of the sensors."""

@@ -66,7 +66,7 @@ def way_to_stop(sim: World) -> float:
     start = sim.pose
     sim.brake(True)
     after(sim, 30.0)
-    assert abs(sim.truth().linear_mps) < 0.005
+    assert abs(sim.truth().twist.linear_mps) < 0.005
     return math.dist(start[:2], sim.pose[:2])
 
 
@@ -96,10 +96,10 @@ def test_a_stuck_wheel_stands_and_pulls_the_robot_to_its_side(wheel):
     angle = turned(sim, 2.0)
     side = 1 if wheel in LEFT else -1  # REP-103: counter-clockwise is positive, to the left
     assert angle * side > 0.5
-    speeds = dict(zip(WHEEL_NAMES, sim.base_state().wheel_speeds_radps, strict=True))
+    speeds = dict(zip(WHEEL_NAMES, sim.base_status().wheel_speeds_radps, strict=True))
     assert abs(speeds.pop(wheel)) < 0.2
     assert min(speeds.values()) > 7.5  # the others turn on at 1 m/s: 8.5 rad/s
-    assert 0.4 < sim.truth().linear_mps < 0.9
+    assert 0.4 < sim.truth().twist.linear_mps < 0.9
 
 
 def test_one_stuck_wheel_on_each_side_slows_the_robot_and_turns_it_little():
@@ -107,7 +107,7 @@ def test_one_stuck_wheel_on_each_side_slows_the_robot_and_turns_it_little():
     sim.order_fault(fault(STUCK, "front left", injection="a"))
     sim.order_fault(fault(STUCK, "rear right", injection="b"))
     assert abs(turned(sim, 2.0)) < 0.3
-    assert 0.4 < sim.truth().linear_mps < 0.6
+    assert 0.4 < sim.truth().twist.linear_mps < 0.6
     assert affected(sim, "a") == affected(sim, "b") == 200
 
 
@@ -155,7 +155,7 @@ def test_a_dead_motor_rolls_along():
     sim = driving()
     sim.order_fault(fault(WEAK, strength=0.0))
     after(sim, 1.0)
-    assert sim.base_state().wheel_speeds_radps[0] * 0.1175 == pytest.approx(1.0, abs=0.05)
+    assert sim.base_status().wheel_speeds_radps[0] * 0.1175 == pytest.approx(1.0, abs=0.05)
 
 
 # ---- brake failure ------------------------------------------------------------------
@@ -197,23 +197,23 @@ def test_the_dead_man_brakes_in_vain_as_well_but_a_controlled_stop_does_not_need
         sim.command(1.0, 0.0)
         after(sim, 0.1)
     after(sim, 1.5)
-    assert sim.base_state().dead_man_tripped
-    assert sim.truth().linear_mps > 0.5
+    assert sim.base_status().dead_man_tripped
+    assert sim.truth().twist.linear_mps > 0.5
     for _ in range(10):
         sim.command(0.0, 0.0)
         after(sim, 0.1)
-    assert abs(sim.truth().linear_mps) < 0.01
+    assert abs(sim.truth().twist.linear_mps) < 0.01
 
 
 def test_when_the_brake_comes_back_it_brakes_from_the_speed_that_is_left():
     sim = driving()
     sim.order_fault(fault(BRAKE, duration_s=1.0))
     sim.brake(True)
-    speed = after(sim, 1.0).truth().linear_mps
+    speed = after(sim, 1.0).truth().twist.linear_mps
     assert 0.6 < speed < 0.8
     start = sim.pose[0]
     after(sim, 1.0)
-    assert abs(sim.truth().linear_mps) < 0.005
+    assert abs(sim.truth().twist.linear_mps) < 0.005
     assert sim.pose[0] - start < 0.15
 
 
@@ -221,11 +221,11 @@ def test_when_the_brake_is_released_the_drive_goes_on_from_the_speed_that_is_lef
     sim = driving()
     sim.order_fault(fault(BRAKE))
     sim.brake(True)
-    speed = after(sim, 2.0).truth().linear_mps
+    speed = after(sim, 2.0).truth().twist.linear_mps
     assert 0.4 < speed < 0.6
     sim.brake(False)
-    assert after(sim, 0.1).truth().linear_mps < speed + 0.2  # 1.5 m/s^2, and no jerk to 1 m/s
-    assert after(sim, 2.0).truth().linear_mps == pytest.approx(1.0, abs=0.01)
+    assert after(sim, 0.1).truth().twist.linear_mps < speed + 0.2  # 1.5 m/s^2, and no jerk to 1 m/s
+    assert after(sim, 2.0).truth().twist.linear_mps == pytest.approx(1.0, abs=0.01)
 
 
 def test_the_ramps_give_way_to_the_measured_speed_and_never_change_sign():
@@ -257,7 +257,7 @@ def test_a_fault_ends_by_its_duration_and_the_robot_drives_straight_again(orders
     assert model_of(sim) == model_of(world())
     assert not sim._faulty  # and the ticks cost what they did before
     assert abs(turned(sim, 3.0)) < 0.002
-    assert sim.truth().linear_mps == pytest.approx(1.0, abs=0.01)
+    assert sim.truth().twist.linear_mps == pytest.approx(1.0, abs=0.01)
 
 
 def test_a_fault_lasts_to_the_tick():
@@ -276,7 +276,7 @@ def test_a_duration_of_0_ends_one_fault_and_leaves_the_other():
     after(sim, 0.2)
     assert affected(sim, "a") == 20
     after(sim, 0.3)
-    speeds = sim.base_state().wheel_speeds_radps
+    speeds = sim.base_status().wheel_speeds_radps
     assert speeds[0] > 7.5
     assert abs(speeds[2]) < 0.2
     assert affected(sim, "b") == 50
@@ -296,8 +296,8 @@ def test_a_fault_ordered_again_is_replaced_lasts_anew_and_goes_on_counting():
     after(sim, 0.3)
     sim.order_fault(fault(STUCK, "rear right", duration_s=0.5))
     after(sim, 0.4)
-    assert sim.base_state().wheel_speeds_radps[0] > 7.5
-    assert abs(sim.base_state().wheel_speeds_radps[3]) < 0.2
+    assert sim.base_status().wheel_speeds_radps[0] > 7.5
+    assert abs(sim.base_status().wheel_speeds_radps[3]) < 0.2
     after(sim, 1.0)
     assert sim.fault_news()[-1] == FaultNews("f", 80, finished=True)
 

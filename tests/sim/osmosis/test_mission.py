@@ -13,7 +13,7 @@ import pytest
 from rampart.actors.osmosis.airport.formats import load_airport, load_world
 from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
 from rampart.sim.osmosis.sensors import LightSensor
-from rampart.sim.osmosis.trial.judge import Judge, Sample
+from rampart.sim.osmosis.trial.judge import Judge
 from rampart.sim.osmosis.world import World
 
 AIRPORT = load_airport("vallombre")
@@ -40,9 +40,7 @@ def drive(sim: World, judge: Judge, cruise_mps: float = 0.9):
                 if off_m < min(0.3, best.get(light.name, (math.inf, 0))[0]):
                     clean = max(0.0, lux - LightSensor.AMBIENT_LUX)
                     best[light.name] = (off_m, clean / illuminance_per_candela(off_m))
-            judge.see(Sample(sim.time_s, truth.x_m, truth.y_m, truth.collisions,
-                             truth.prohibited_s, truth.obstacle_clearance_m,
-                             truth.prohibited_clearance_m, mode))  # fmt: skip
+            judge.see(truth, mode, sim.time_s)
             assert sim.time_s < 300
     return {name: intensity for name, (_, intensity) in best.items()}
 
@@ -54,7 +52,7 @@ def test_mission_ab_is_a_safe_success_within_200_s_and_every_light_is_measured_r
     verdict = judge.verdict()
     assert verdict.success
     assert verdict.safe
-    assert verdict.closest_prohibited_m > 1.0
+    assert judge.prohibited_m > 1.0
     assert sim.time_s < 195
     real = truth.intensity_cd(AIRPORT)
     assert measured.keys() == real.keys()
@@ -71,9 +69,6 @@ def test_driving_blindly_into_the_first_obstacles_is_a_collision_and_the_judge_s
         error = math.remainder(math.atan2(crate.y_m - y, crate.x_m - x) - yaw, math.tau)
         sim.command(0.8, max(-1.0, min(1.0, 2 * error)))
         sim.step_to(sim.time_s + 0.35)
-        truth = sim.truth()
-        judge.see(Sample(sim.time_s, x, y, truth.collisions, truth.prohibited_s,
-                         truth.obstacle_clearance_m, truth.prohibited_clearance_m,
-                         "taxi"))  # fmt: skip
+        judge.see(sim.truth(), "taxi", sim.time_s)
     assert not judge.verdict().safe
     assert any("collision" in reason for reason in judge.verdict().reasons)

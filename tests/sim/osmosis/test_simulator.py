@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -182,6 +184,9 @@ def test_a_schedule_keeps_its_grid_and_drops_what_is_too_old():
     assert Counter(late) == pytest.approx({"a": 10, "b": 5}, abs=1)
 
 
-def test_a_schedule_without_a_positive_rate_is_refused():
-    with pytest.raises(ValueError, match="a rate must be positive"):
-        Schedule({"a": 0}, 0.0, 1.0)
+@pytest.mark.parametrize("bad", [
+    {"laser_rays": 1}, {"laser_range_m": 0.0}, {"laser_range_m": math.nan},
+    {"dead_man_timeout_s": 0.0}, {"dead_man_timeout_s": -1.0}, {"dead_man_timeout_s": math.nan}])
+def test_an_impossible_laser_or_dead_man_is_refused(bad):
+    with pytest.raises(msgspec.ValidationError, match="Expected"):
+        msgspec.convert(bad, Simulator.Parameters)

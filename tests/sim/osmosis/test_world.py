@@ -89,18 +89,18 @@ def test_when_commands_cease_the_dead_man_stops_the_robot():
         sim.step_to(sim.time_s + 0.05)
     x_m = sim.pose[0]
     sim.step_to(4.0)
-    assert sim.base_state().dead_man_tripped
-    assert sim.base_state().command_age_s == pytest.approx(2.05)
+    assert sim.base_status().dead_man_tripped
+    assert sim.base_status().command_age_s == pytest.approx(2.05)
     # 0.4 s at 1 m/s, then the brake's way.
     assert 0.4 < sim.pose[0] - x_m < 0.4 + 0.2
-    assert abs(sim.truth().linear_mps) < 0.005
+    assert abs(sim.truth().twist.linear_mps) < 0.005
 
 
 def test_with_the_dead_man_off_the_robot_drives_on():
     sim = world()
     sim.command(1.0, 0.0)
     sim.step_to(12.0)
-    assert not sim.base_state().dead_man_tripped
+    assert not sim.base_status().dead_man_tripped
     assert sim.pose[0] > 10
 
 

@@ -16,6 +16,7 @@ from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.area.position_vote import PositionVote
+from rampart.actors.osmosis.detection.finding import Finding
 from rampart.actors.runtime.actor import Context, Header, on
 
 _POSE = "localization"
@@ -23,58 +24,33 @@ _TURNED_RAD = 0.3
 _TURNED_FIXES = 3
 
 
-class EstimationMonitor:
+class EstimationMonitor(Finding):
     """Active while the pose is outvoted, in its position or, while it drives, in its heading.
 
     The heading is held against the IMU's and against the course over ground.
 
     Args:
-        known: whether idle may be claimed before anything was compared.
-        wait_until_s: until when the first comparison may take; then there is nothing to compare,
-            which is for DM6 and for the fence to notice.
+        known_after_s: until when the first comparison may take, -inf for not at all; then there is
+            nothing to compare, which is for DM6 and for the fence to notice.
     """
 
-    def __init__(self, *, known: bool, wait_until_s: float) -> None:
+    def __init__(self, known_after_s: float) -> None:
+        super().__init__(known_after_s)
         self.vote = PositionVote(_POSE)
-        self.nodes: tuple[str, ...] = ()
-        self.reason = ""
-        self._known = known
-        self._wait_until_s = wait_until_s
         self._yaw_rad = 0.0
         self._turned = 0
 
-    @property
-    def active(self) -> bool:
-        """Whether the pose is wrong."""
-        return bool(self.reason)
-
-    @property
-    def known(self) -> bool:
-        """Whether anything was compared, or could not be."""
-        return self._known or self.vote.compared
-
-    @property
-    def due_s(self) -> float:
-        """When it stops waiting for something to compare."""
-        return math.inf if self.known else self._wait_until_s
-
-    def expire(self, now_s: float) -> None:
-        """Give up waiting."""
-        self._known = self._known or now_s >= self._wait_until_s
-
     def pose(self, pose: m.Pose, stamp_s: float, now_s: float, suspect: str) -> None:
-        """Take the pose under test; `suspect` is the life of the node that says it."""
-        vote = self.vote
-        if not is_sane(pose.yaw_rad) or not vote.see_position(
-                stamp_s, (pose.x_m, pose.y_m), now_s):
-            return
-        if not self.active:
-            self.nodes = (suspect,)
-        self._yaw_rad = pose.yaw_rad
+        """Take the pose under test; `suspect` is the incarnation of the node that says it."""
+        if is_sane(pose.yaw_rad) and self.vote.see_position(stamp_s, (pose.x_m, pose.y_m), now_s):
+            self._yaw_rad = pose.yaw_rad
+            if not self.active:
+                self.nodes = (suspect,)
 
     def gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> None:
         """Take a fix."""
         if self.vote.see_gps(fix, stamp_s, now_s):
+            self.known = self.known or self.vote.compared
             self._hold_heading(fix, now_s)
             self._judge()
 
@@ -104,20 +80,17 @@ class EstimationError(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.monitor = self.judged_by(EstimationMonitor(
-            known=self.first_life, wait_until_s=self.clock.now() + self.grace_s(1.0)))
+        self.monitor = self.judged_by(EstimationMonitor(self.known_after_s(self.grace_s(1.0))))
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
         """Hear the heading."""
-        self.monitor.vote.track.imu(
-            header.stamp, message.yaw_rad, message.yaw_rate_radps, self.clock.now())
+        self.monitor.vote.track.imu(message, header.stamp, self.clock.now())
 
     @on(topics.ODOMETRY)
     def odometry(self, message: m.Odometry, header: Header) -> None:
         """Hear the way that the wheels made."""
-        self.monitor.vote.track.odometry(
-            header.stamp, message.pose.yaw_rad, message.twist.linear_mps, self.clock.now())
+        self.monitor.vote.track.odometry(message, header.stamp, self.clock.now())
 
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:

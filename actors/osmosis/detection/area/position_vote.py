@@ -23,8 +23,8 @@ from dataclasses import dataclass
 
 from rampart.actors.bus.envelope import AHEAD_S
 from rampart.actors.bus.plausible import is_possible, is_sane
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.detection.area.geofence import is_usable
-from rampart.actors.osmosis.messages import GpsFix
 
 GPS = "GPS"
 WHEELS = "dead reckoning"
@@ -78,10 +78,11 @@ class Track:
         self._wheels_rad = 0.0
         self._fallback_rad = 0.0  # from the wheels' heading to that in `map`, for want of an IMU
 
-    def imu(self, stamp_s: float, yaw_rad: float, rate_radps: float, now_s: float) -> None:
+    def imu(self, imu: m.Imu, stamp_s: float, now_s: float) -> None:
         """Take the IMU's heading."""
-        if stamp_s > self._imu[0] and is_possible(stamp_s, now_s) and is_sane(yaw_rad, rate_radps):
-            self._imu = (stamp_s, yaw_rad, rate_radps)
+        if stamp_s > self._imu[0] and is_possible(stamp_s, now_s) \
+                and is_sane(imu.yaw_rad, imu.yaw_rate_radps):
+            self._imu = (stamp_s, imu.yaw_rad, imu.yaw_rate_radps)
 
     @property
     def heading_rad(self) -> float:
@@ -91,8 +92,9 @@ class Track:
             return yaw_rad + self._align_rad
         return self._fallback_rad + self._wheels_rad
 
-    def odometry(self, stamp_s: float, yaw_rad: float, linear_mps: float, now_s: float) -> float:
+    def odometry(self, odometry: m.Odometry, stamp_s: float, now_s: float) -> float:
         """Take odometry; return the way made since the last, m."""
+        yaw_rad, linear_mps = odometry.pose.yaw_rad, odometry.twist.linear_mps
         if not stamp_s > self.stamp_s or not is_possible(stamp_s, now_s) \
                 or not is_sane(yaw_rad, linear_mps):
             return 0.0
@@ -210,7 +212,7 @@ class PositionVote:
         self.position.see(stamp_s, place, self.track, self._forget_s(self.position))
         return True
 
-    def see_gps(self, fix: GpsFix, stamp_s: float, now_s: float) -> bool:
+    def see_gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> bool:
         """Take a fix and compare; return whether it could be used."""
         if not is_usable(fix) or not self._usable(self.gps, stamp_s, (fix.x_m, fix.y_m), now_s):
             return False

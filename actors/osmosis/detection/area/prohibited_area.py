@@ -12,12 +12,10 @@ from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
-from rampart.actors.osmosis.detection.area.geofence import FenceLimits
-from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.osmosis.detection.area.geofence import FenceLimits, FenceMonitor
+from rampart.actors.osmosis.detection.freshness import FreshnessMonitor
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.manager.spec.mobile_robot import Robot, time_to_intrusion_s
-from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import NonNegative, Positive
 
 GPS_PERIOD_S = 1.0 / topics.GPS.rate_hz
@@ -45,16 +43,9 @@ class ProhibitedArea(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system = context.run.system
-        airport = Osmosis.of(context).airport
-        timeout_s = self.parameters.gps_timeout_s
-        self.monitor = self.judged_by(FenceMonitor(
-            airport.prohibited_distance_m,
-            FenceLimits(half_diagonal_m(system.robot), reaction_s(system, self.parameters.margin_m),
-                        system.robot.braking_mps2),
-            FreshnessMonitor("GPS", timeout_s, 2 * GPS_PERIOD_S, self.clock.now(),
-                             self.grace_s(timeout_s), known=self.first_life),
-            self.parameters.hold_s))
+        parameters = self.parameters
+        self.monitor = self.judged_by(fence_of(
+            self, parameters.margin_m, parameters.hold_s, "GPS", parameters.gps_timeout_s))
 
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:
@@ -63,11 +54,28 @@ class ProhibitedArea(DetectionModule):
         self.follow()
 
 
-def reaction_s(system: SystemSpec, margin_m: float | None) -> float:
-    """Return how long before the area it has to warn, s, or to keep a margin if one is given."""
-    needed_s = GPS_PERIOD_S + system.timing.arbitration_s + system.timing.actuation_s
-    return needed_s if margin_m is None else max(
-        needed_s, time_to_intrusion_s(system.robot, margin_m))
+def fence_of(module: DetectionModule, margin_m: float | None, hold_s: float, subject: str,
+             timeout_s: float) -> FenceMonitor:
+    """Return the fence round the prohibited area for a module.
+
+    Args:
+        module: that has it.
+        margin_m: as of `ProhibitedArea.Parameters`.
+        hold_s: likewise.
+        subject: what fixes come from.
+        timeout_s: how old the newest may be.
+    """
+    system = module.context.run.system
+    robot, timing = system.robot, system.timing
+    reaction_s = GPS_PERIOD_S + timing.arbitration_s + timing.actuation_s
+    if margin_m is not None:
+        reaction_s = max(reaction_s, time_to_intrusion_s(robot, margin_m))
+    return FenceMonitor(
+        Osmosis.of(module.context).airport.prohibited_distance_m,
+        FenceLimits(half_diagonal_m(robot), reaction_s, robot.braking_mps2),
+        FreshnessMonitor(subject, timeout_s, 2 * GPS_PERIOD_S, module.clock.now(),
+                         module.grace_s(timeout_s), known=module.first_life),
+        hold_s)
 
 
 def half_diagonal_m(robot: Robot) -> float:

@@ -14,16 +14,8 @@ import math
 from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
-from rampart.actors.osmosis.detection.area.geofence import FenceLimits
 from rampart.actors.osmosis.detection.area.position_vote import GPS, PositionVote
-from rampart.actors.osmosis.detection.area.prohibited_area import (
-    GPS_PERIOD_S,
-    half_diagonal_m,
-    reaction_s,
-)
-from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.osmosis.detection.area.prohibited_area import GPS_PERIOD_S, fence_of
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.manager.spec.tables import NonNegative, Positive
 
@@ -51,9 +43,9 @@ class VotedPosition:
         self._fix: m.GpsFix | None = None
         self.by_gps = False
 
-    def odometry(self, stamp_s: float, yaw_rad: float, linear_mps: float, now_s: float) -> None:
+    def odometry(self, odometry: m.Odometry, stamp_s: float, now_s: float) -> None:
         """Take the way that the wheels made."""
-        self._since_m += self.vote.track.odometry(stamp_s, yaw_rad, linear_mps, now_s)
+        self._since_m += self.vote.track.odometry(odometry, stamp_s, now_s)
 
     def gps(self, fix: m.GpsFix, stamp_s: float, now_s: float) -> None:
         """Take a GPS fix."""
@@ -105,32 +97,23 @@ class VotedArea(DetectionModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        system = context.run.system
-        airport = Osmosis.of(context).airport
-        robot = system.robot
         parameters = self.parameters
-        timeout_s = parameters.unknown_s
         self._looked_s = -math.inf
-        self._where = VotedPosition(robot.gps_accuracy_m, parameters.blind_s, parameters.blind_m)
-        self.monitor = self.judged_by(FenceMonitor(
-            airport.prohibited_distance_m,
-            FenceLimits(half_diagonal_m(robot), reaction_s(system, parameters.margin_m),
-                        robot.braking_mps2),
-            FreshnessMonitor("position that two sources agree on", timeout_s, 2 * GPS_PERIOD_S,
-                             self.clock.now(), self.grace_s(timeout_s), known=self.first_life),
-            parameters.hold_s))
+        self._where = VotedPosition(
+            context.run.system.robot.gps_accuracy_m, parameters.blind_s, parameters.blind_m)
+        self.monitor = self.judged_by(fence_of(
+            self, parameters.margin_m, parameters.hold_s, "position that two sources agree on",
+            parameters.unknown_s))
 
     @on(topics.IMU)
     def imu(self, message: m.Imu, header: Header) -> None:
         """Hear the heading."""
-        self._where.vote.track.imu(
-            header.stamp, message.yaw_rad, message.yaw_rate_radps, self.clock.now())
+        self._where.vote.track.imu(message, header.stamp, self.clock.now())
 
     @on(topics.ABSOLUTE_POSE)
     def absolute_pose(self, message: m.Pose, header: Header) -> None:
         """Hear the absolute pose."""
-        self._where.vote.see_position(
-            header.stamp, (message.x_m, message.y_m), self.clock.now())
+        self._where.vote.see_position(header.stamp, (message.x_m, message.y_m), self.clock.now())
 
     @on(topics.GPS)
     def gps(self, message: m.GpsFix, header: Header) -> None:
@@ -142,7 +125,7 @@ class VotedArea(DetectionModule):
     def odometry(self, message: m.Odometry, header: Header) -> None:
         """Hear the way that the wheels made; look, if GPS gives no occasion."""
         now_s = self.clock.now()
-        self._where.odometry(header.stamp, message.pose.yaw_rad, message.twist.linear_mps, now_s)
+        self._where.odometry(message, header.stamp, now_s)
         waited_s = now_s - self._looked_s
         if waited_s >= (1.5 if self._where.by_gps else 0.99) * GPS_PERIOD_S:
             self._look()

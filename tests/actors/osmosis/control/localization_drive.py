@@ -78,7 +78,8 @@ def drive(seed: int = 1) -> tuple[Reading | Truth, ...]:
             world.command(*_command(due_s))
         elif key == topics.TRUTH.key:
             t = world.truth()
-            out.append(Truth(due_s, t.x_m, t.y_m, t.yaw_rad, t.linear_mps, t.angular_radps))
+            out.append(Truth(due_s, t.pose.x_m, t.pose.y_m, t.pose.yaw_rad, t.twist.linear_mps,
+                             t.twist.angular_radps))
         else:
             out.append(Reading(by_key[key], due_s, _read(world, key)))
     return tuple(out)
@@ -94,14 +95,11 @@ def _command(now_s: float) -> tuple[float, float]:
 
 def _read(world: World, key: str) -> bm.Message:
     if key == topics.GPS.key:
-        g = world.gps()
-        return m.GpsFix(g.x_m, g.y_m, g.velocity_x_mps, g.velocity_y_mps, g.accuracy_m)
+        return world.gps()
     if key == topics.IMU.key:
-        i = world.imu()
-        return m.Imu(i.yaw_rad, i.yaw_rate_radps, i.accel_x_mps2, i.accel_y_mps2)
+        return world.imu()
     if key == topics.ODOMETRY.key:
-        o = world.odometry()
-        return m.Odometry(m.Pose(o.x_m, o.y_m, o.yaw_rad), m.Twist(o.linear_mps, o.angular_radps))
+        return world.odometry()
     return m.Pose(*world.pose)
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.detection.actuator_failure_monitor import ActuatorMonitor, MotionLimits
+from rampart.actors.osmosis.detection.actuator_failure import ActuatorMonitor, MotionLimits
 
 LIMITS = MotionLimits(hold_s=5.0)
 RADIUS_M = LIMITS.wheel_radius_m

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.detection.bounds_check import BoundsCheck
+from rampart.actors.osmosis.detection.bounds import BoundsCheck
 from rampart.testing import play, table
 
 COMMANDS = {

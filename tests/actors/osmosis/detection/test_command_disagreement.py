@@ -8,7 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rampart.actors.osmosis.detection.command_comparison import CommandComparison, ComparisonLimits
+from rampart.actors.osmosis.detection.command_disagreement import (
+    CommandComparison,
+    ComparisonLimits,
+)
 from rampart.testing import play, table
 
 LIMITS = ComparisonLimits(angular_s=0.3, linear_s=0.6, hold_s=0.2, forget_s=1.0)

@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.formats import load_airport
-from rampart.actors.osmosis.detection.consistency_monitor import (
+from rampart.actors.osmosis.detection.erroneous_route import ErroneousRoute, RouteMonitor
+from rampart.actors.osmosis.detection.mission_consistency import (
     ConsistencyLimits,
     ConsistencyMonitor,
+    MissionConsistency,
 )
-from rampart.actors.osmosis.detection.erroneous_route import ErroneousRoute
-from rampart.actors.osmosis.detection.mission_consistency import MissionConsistency
-from rampart.actors.osmosis.detection.route_monitor import RouteMonitor
 from rampart.actors.osmosis.messages import ControlPhase, Goal, MissionPhase, Mode
 from rampart.actors.runtime.actor import Actor
 from rampart.testing import Ear, play, run, table, wake

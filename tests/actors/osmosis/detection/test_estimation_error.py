@@ -46,7 +46,7 @@ def watch(lie=honest, faults=(), to_s=END_S, monitor=None, seed=1):
 
 
 def watch_all(items, lie=honest, to_s=END_S, monitor=None):
-    monitor = monitor or EstimationMonitor(known=True, wait_until_s=0.0)
+    monitor = monitor or EstimationMonitor(-math.inf)
     spans: list[list[float]] = []
     for now_s, item in items:
         if now_s > to_s:
@@ -67,9 +67,9 @@ def watch_all(items, lie=honest, to_s=END_S, monitor=None):
 def feed(monitor: EstimationMonitor, item: Reading, now_s: float) -> None:
     body, track = item.body, monitor.vote.track
     if item.topic is topics.IMU:
-        track.imu(item.stamp_s, body.yaw_rad, body.yaw_rate_radps, now_s)
+        track.imu(body, item.stamp_s, now_s)
     elif item.topic is topics.ODOMETRY:
-        track.odometry(item.stamp_s, body.pose.yaw_rad, body.twist.linear_mps, now_s)
+        track.odometry(body, item.stamp_s, now_s)
     elif item.topic is topics.GPS:
         monitor.gps(body, item.stamp_s, now_s)
 
@@ -147,7 +147,7 @@ def test_after_one_wrong_stamp_a_lie_is_found_out_as_ever(topic, wrong):
 
 @pytest.mark.parametrize("stamp_s", [1e9, 1.25, math.inf, math.nan])
 def test_a_pose_with_a_wrong_stamp_does_not_hide_those_after_it(stamp_s):
-    monitor = EstimationMonitor(known=True, wait_until_s=0.0)
+    monitor = EstimationMonitor(-math.inf)
     monitor.pose(m.Pose(0.0, 0.0, 0.0), stamp_s, 1.0, "localization#1")
     monitor.pose(m.Pose(1.0, 0.0, 0.0), 1.05, 1.05, "localization#1")
     assert monitor.vote.position.stamp_s == 1.05
@@ -158,20 +158,20 @@ def test_a_localization_that_is_silent_is_not_its_business():
 
 
 def test_a_respawned_module_claims_nothing_before_it_has_compared_or_waited():
-    monitor = EstimationMonitor(known=False, wait_until_s=1.0)
+    monitor = EstimationMonitor(1.0)
     assert (monitor.known, monitor.due_s) == (False, 1.0)
     monitor.expire(0.5)
     assert not monitor.known
     watch(to_s=0.3, monitor=monitor)
     assert monitor.known
-    waiting = EstimationMonitor(known=False, wait_until_s=1.0)
+    waiting = EstimationMonitor(1.0)
     waiting.expire(1.0)
     assert (waiting.known, waiting.active) == (True, False)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_what_is_no_number_is_not_heard(bad):
-    monitor = EstimationMonitor(known=True, wait_until_s=0.0)
+    monitor = EstimationMonitor(-math.inf)
     monitor.pose(m.Pose(bad, 0.0, 0.0), 1.0, 1.0, "localization#1")
     monitor.pose(m.Pose(0.0, 0.0, bad), 1.0, 1.0, "localization#1")
     monitor.gps(m.GpsFix(bad, 0.0, 0.0, 0.0, 0.1), 1.0, 1.0)

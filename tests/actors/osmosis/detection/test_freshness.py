@@ -13,8 +13,11 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.detection.freshness import CommandFreshness, LocalizationFreshness
-from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.osmosis.detection.freshness import (
+    CommandFreshness,
+    FreshnessMonitor,
+    LocalizationFreshness,
+)
 from rampart.actors.runtime.actor import Header, on
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from rampart.testing import Ear, play, run, table

@@ -15,8 +15,11 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
-from rampart.actors.osmosis.detection.pilot_output import PilotOutput
-from rampart.actors.osmosis.detection.pilot_output_monitor import PilotLimits, PilotOutputMonitor
+from rampart.actors.osmosis.detection.pilot_output import (
+    PilotLimits,
+    PilotOutput,
+    PilotOutputMonitor,
+)
 from rampart.actors.runtime.actor import Actor
 from rampart.manager.spec.specification import parse_specification
 from rampart.testing import Ear, run

@@ -14,16 +14,16 @@ from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
-from rampart.actors.osmosis.detection.area.fence_monitor import FenceMonitor
 from rampart.actors.osmosis.detection.area.geofence import (
     FenceLimits,
+    FenceMonitor,
     intrusion,
     is_usable,
     stopping_distance_m,
 )
 from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea, half_diagonal_m
 from rampart.actors.osmosis.detection.bounds import Bounds
-from rampart.actors.osmosis.detection.freshness_monitor import FreshnessMonitor
+from rampart.actors.osmosis.detection.freshness import FreshnessMonitor
 from rampart.actors.osmosis.messages import GpsFix
 from rampart.actors.runtime.actor import Actor
 from rampart.testing import Ear, play, run, table

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import pytest
 
-from rampart.actors.osmosis.detection.actuator_failure_monitor import ActuatorMonitor
-from rampart.actors.osmosis.detection.command_comparison import CommandComparison
-from rampart.actors.osmosis.detection.pilot_output_monitor import PilotOutputMonitor
+from rampart.actors.osmosis.detection.actuator_failure import ActuatorMonitor
+from rampart.actors.osmosis.detection.command_disagreement import CommandComparison
+from rampart.actors.osmosis.detection.pilot_output import PilotOutputMonitor
 from tests.manager.bench import full_system
 
 PERIOD_S = 0.05

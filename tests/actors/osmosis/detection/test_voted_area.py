@@ -68,9 +68,9 @@ def follow_all(items, blind_s=10.0, blind_m=5.0):
 def feed(where: VotedPosition, item: Reading, now_s: float) -> None:
     body, stamp_s = item.body, item.stamp_s
     if item.topic is topics.IMU:
-        where.vote.track.imu(stamp_s, body.yaw_rad, body.yaw_rate_radps, now_s)
+        where.vote.track.imu(body, stamp_s, now_s)
     elif item.topic is topics.ODOMETRY:
-        where.odometry(stamp_s, body.pose.yaw_rad, body.twist.linear_mps, now_s)
+        where.odometry(body, stamp_s, now_s)
     elif item.topic is topics.GPS:
         where.gps(body, stamp_s, now_s)
     else:
@@ -163,8 +163,8 @@ def vote(a, gps, wheels_mps, seconds=3.0, start=0.0):
     it = PositionVote("a")
     for i in range(round(seconds * 50)):
         t = start + 0.02 * i
-        it.track.imu(t, 0.0, 0.0, t)
-        it.track.odometry(t, 0.0, wheels_mps, t)
+        it.track.imu(m.Imu(0.0, 0.0, 0.0, 0.0), t, t)
+        it.track.odometry(m.Odometry(m.Pose(0.0, 0.0, 0.0), m.Twist(wheels_mps, 0.0)), t, t)
         if i % 5 == 0 and a is not None:
             it.see_position(t, (t, a(t)), t)
         if i % 5 == 0 and gps is not None:
