@@ -14,6 +14,7 @@ from shapely.geometry import box
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
+from rampart.actors.detection.freshness import CommandFreshness, LocalizationFreshness
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.ftm import messages as fm
@@ -24,7 +25,6 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.model import Airport, StartPose
 from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea
 from rampart.actors.osmosis.detection.bounds import Bounds
-from rampart.actors.osmosis.detection.freshness import CommandFreshness, LocalizationFreshness
 from rampart.actors.osmosis.messages import PilotMode
 from rampart.actors.osmosis.recovery.controlled_stop import ControlledStop
 from rampart.actors.osmosis.recovery.emergency_stop import EmergencyStop

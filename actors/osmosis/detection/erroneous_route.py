@@ -18,13 +18,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from rampart.actors.detection.finding import Finding
 from rampart.actors.detection.lasting import Lasting
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.route_check import RouteCheck
 from rampart.actors.osmosis.application import Osmosis
-from rampart.actors.osmosis.detection.finding import Finding
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.manager.spec.tables import NonNegative
 

@@ -21,11 +21,11 @@ from dataclasses import dataclass
 from itertools import chain, takewhile
 
 from rampart.actors.bus.plausible import is_possible
+from rampart.actors.detection.finding import Finding
 from rampart.actors.detection.lasting import Lasting
 from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.detection.finding import Finding
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import ControlTimeout, NodeName
 from rampart.manager.spec.tables import NonNegative

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 from typing import Any, Literal
 
 import msgspec
@@ -179,7 +178,7 @@ class MissionRecorder(RunRecorder):
             track.append((round(t_s, 2), round(pose.x_m, 3), round(pose.y_m, 3)))
 
     def _light_result(self, light: Light) -> LightResult:
-        known, seen = asdict(light), self._lights.get(light.name)
+        known, seen = msgspec.structs.asdict(light), self._lights.get(light.name)
         return LightResult(**known) if seen is None else LightResult(
             **known, verdict=seen.verdict.value, intensity_cd=seen.intensity_cd, ratio=seen.ratio)
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import msgspec
 
+from rampart.actors.detection.freshness import CommandFreshness
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
-from rampart.actors.osmosis.detection.freshness import CommandFreshness
 from rampart.actors.runtime.actor import Actor
 from rampart.manager.actor import FtmManager
 from rampart.manager.spec.tables import Supervision
@@ -64,7 +64,7 @@ ACTORS = {
     "osmosis_control": (
         "rampart.actors.osmosis.control.following.osmosis_control:OsmosisControl", SickControl),
     "safety_pilot": ("rampart.actors.osmosis.control.pilot.safety_pilot:SafetyPilot", SickPilot),
-    "DM2": ("rampart.actors.osmosis.detection.freshness:CommandFreshness", SickModule),
+    "DM2": ("rampart.actors.detection.freshness:Freshness", SickModule),
     "ftm_manager": ("rampart.manager.actor:FtmManager", SickManager),
 }
 

@@ -12,11 +12,11 @@ from __future__ import annotations
 import math
 
 from rampart.actors.bus.plausible import is_sane
+from rampart.actors.detection.finding import Finding
 from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.detection.area.position_vote import PositionVote
-from rampart.actors.osmosis.detection.finding import Finding
 from rampart.actors.runtime.actor import Context, Header, on
 
 _POSE = "localization"

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 
+from rampart.actors.detection.freshness import FreshnessMonitor
 from rampart.actors.detection.module import DetectionModule, Waiting
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.detection.area.geofence import FenceLimits, FenceMonitor
-from rampart.actors.osmosis.detection.freshness import FreshnessMonitor
 from rampart.actors.runtime.actor import Context, Header, on
 from rampart.manager.spec.mobile_robot import Robot, time_to_intrusion_s
 from rampart.manager.spec.tables import NonNegative, Positive

@@ -7,17 +7,17 @@ import math
 
 import pytest
 
+from rampart.actors.detection.freshness import (
+    CommandFreshness,
+    FreshnessMonitor,
+    LocalizationFreshness,
+)
 from rampart.actors.detection.module import EXCUSE_S, DetectionModule, IllegalTransitionError
 from rampart.actors.detection.stub import StubDetection
 from rampart.actors.ftm import messages as fm
 from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.detection.freshness import (
-    CommandFreshness,
-    FreshnessMonitor,
-    LocalizationFreshness,
-)
 from rampart.actors.runtime.actor import Header, on
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from rampart.testing import Ear, play, run, table

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shapely.geometry import box
 
+from rampart.actors.detection.freshness import FreshnessMonitor
 from rampart.actors.layout.wiring import Member, heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
@@ -23,7 +24,6 @@ from rampart.actors.osmosis.detection.area.geofence import (
 )
 from rampart.actors.osmosis.detection.area.prohibited_area import ProhibitedArea, half_diagonal_m
 from rampart.actors.osmosis.detection.bounds import Bounds
-from rampart.actors.osmosis.detection.freshness import FreshnessMonitor
 from rampart.actors.osmosis.messages import GpsFix
 from rampart.actors.runtime.actor import Actor
 from rampart.testing import Ear, play, run, table

@@ -1,4 +1,4 @@
-"""DM2 and DM6: command not updated, localization not updated (paper, table I).
+"""DM2 and DM6: command not updated, localization not updated (paper, table I); of any topic.
 
 Freshness of a stream of samples, judged by the time at which their content was true.
 
@@ -9,15 +9,13 @@ old sample, and a link that delivers each sample seconds late, are as stale as s
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any
 
 from rampart.actors.bus.plausible import is_possible
+from rampart.actors.detection.finding import Finding
 from rampart.actors.detection.module import DetectionModule, Waiting
-from rampart.actors.osmosis import messages as m
-from rampart.actors.osmosis import topics
-from rampart.actors.osmosis.detection.finding import Finding
-from rampart.actors.runtime.actor import Context, Header, on
-from rampart.actors.runtime.parameters import ControlTimeout, NodeNames
+from rampart.actors.runtime.actor import Context, Header
+from rampart.actors.runtime.parameters import ControlTimeout, Suspects, TopicHeard
 from rampart.manager.spec.tables import NonNegative
 
 
@@ -96,81 +94,41 @@ class FreshnessMonitor(Finding):
 
 
 class Freshness(DetectionModule):
-    """Active while a topic is stale. A subclass per topic, so that each hears only its own.
+    """Active while the newest content of a topic is too old."""
 
-    Class attributes:
-        subject: what is stale, for the reason.
-    """
-
-    class Parameters(Waiting, frozen=True):
+    class Parameters(Waiting, frozen=True, kw_only=True):
         """What is stale, and who is named then.
 
         Attributes:
+            topic: key of the topic.
             timeout_s: greatest admissible age of the content, s.
+            subject: what it is, for the reason; the topic's key if left out.
             hold_s: how long it must be fresh again before the module is idle, s.
             suspects: names of nodes to be respawned when it is active, as a rule the one that
                 publishes the topic; none by default, as in the paper.
-            topic: says again what the class says, for readers of the spec.
         """
 
-        timeout_s: ControlTimeout = 1.0
+        topic: TopicHeard
+        timeout_s: ControlTimeout
+        subject: str = ""
         hold_s: NonNegative = 0.2
-        suspects: NodeNames = ()
+        suspects: Suspects = ()
 
     parameters: Parameters
-    subject = ""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        if not self.subject:
-            raise ValueError(f"{self.name}: actor Freshness hears no topic; name a subclass, "
-                             "CommandFreshness or LocalizationFreshness")
-        timeout_s = self.parameters.timeout_s
+        said = self.parameters
         self.monitor = self.judged_by(FreshnessMonitor(
-            self.subject, timeout_s, self.parameters.hold_s, self.clock.now(),
-            self.grace_s(timeout_s), known=self.first_life))
-        self.monitor.nodes = self._suspects = self.parameters.suspects
+            said.subject or said.topic, said.timeout_s, said.hold_s, self.clock.now(),
+            self.grace_s(said.timeout_s), known=self.first_life))
+        self.monitor.nodes = said.suspects
+        self.hear_topic(said.topic, self.heard)
 
-    def sample(self, header: Header) -> None:
+    def heard(self, _message: Any, header: Header) -> None:
         """Take note of a sample."""
         monitor = self.monitor
         monitor.heard(header.stamp, self.clock.now())
-        if self._suspects and not monitor.active:
-            # The life that was last heard is accused: a later one has done nothing yet.
-            monitor.nodes = tuple(
-                f"{name}#{header.incarnation}" if name == header.source else name
-                for name in self._suspects)
+        if self.parameters.suspects and not monitor.active:
+            monitor.nodes = self.accused(self.parameters.suspects, header)
         self.follow()
-
-
-class CommandFreshness(Freshness):
-    """DM2: Osmosis Control's command is not updated (0.64 s in the authors' code)."""
-
-    class Parameters(Freshness.Parameters, frozen=True):
-        """As of `Freshness`."""
-
-        timeout_s: ControlTimeout = 0.64
-        topic: Literal["control/command"] = "control/command"
-
-    subject = "command"
-
-    @on(topics.COMMAND)
-    def command(self, _message: m.Twist, header: Header) -> None:
-        """Hear a command."""
-        self.sample(header)
-
-
-class LocalizationFreshness(Freshness):
-    """DM6: the pose is not updated (1 s in the authors' code)."""
-
-    class Parameters(Freshness.Parameters, frozen=True):
-        """As of `Freshness`."""
-
-        topic: Literal["localization/pose"] = "localization/pose"
-
-    subject = "localization"
-
-    @on(topics.POSE)
-    def pose(self, _message: m.Pose, header: Header) -> None:
-        """Hear a pose."""
-        self.sample(header)
