@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import msgspec
 
 from rampart.files.plain_text import one_line, printable
+from rampart.files.reading import FileError
 
 _WARNING_CHARS = 4000
 
@@ -24,6 +26,34 @@ class NoEffectError(Exception):
 def unknown(what: str, value: str, known: Iterable[str]) -> UsageError:
     """Return the error for a name that is none; it lists those that are."""
     return UsageError(f"unknown {what} {value!r}; known: {', '.join(known) or 'none'}")
+
+
+@contextlib.contextmanager
+def refusing(*kinds: type[Exception]) -> Iterator[None]:
+    """Have what the engine refuses told to the user as it is.
+
+    Raises:
+        UsageError: instead of an error of these kinds.
+    """
+    try:
+        yield
+    except kinds as error:
+        raise UsageError(str(error)) from None
+
+
+@contextlib.contextmanager
+def using(file: object) -> Iterator[None]:
+    """Have the user told of a file that cannot be read or written, or is not what it should be.
+
+    Raises:
+        UsageError: instead of an error of the file, which it names.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise UsageError(f"{file}: {error.strerror}") from None
+    except FileError as error:
+        raise UsageError(f"{file}: {error}") from None
 
 
 def say(text: str = "") -> None:
@@ -45,6 +75,15 @@ def show_progress(text: str) -> None:
     """Show on a terminal what is being done, in the place of what was; "" wipes it away."""
     if sys.stderr.isatty():
         print(f"\r\x1b[K{text[:100]}", end="", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def progress() -> Iterator[None]:
+    """Wipe away at the end what was shown of the progress meanwhile."""
+    try:
+        yield
+    finally:
+        show_progress("")
 
 
 def print_json(data: Any, *, indent: bool = True) -> None:

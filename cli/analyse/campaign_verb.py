@@ -5,84 +5,79 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from rampart.cli.verbs import add_verb, flag, group, number, option, whole
 from rampart.sim.campaign.defaults import BACKENDS, PATIENCE_S
 from rampart.sim.virtual.network import NETWORKS
 
-_EPILOG = """examples:
-  rampart campaign --paper                       the paper's tables, beside the paper's verdicts
-  rampart campaign --paper --full                ... their rows on the full system
-  rampart campaign --runs 200                    200 random single faults
-  rampart campaign --runs 200 --together 2       ... pairs of faults
-  rampart campaign --fault 'kill:*' --seeds 5    every process killed, five seeds each
-  rampart campaign --fault gps-bias@20+5 --obstacles 0,2 --ftm both
-  rampart campaign --list                        the faults that there are
-  rampart campaign --replay 3f2a --out DIR       repeat one run of DIR and write its report
-  rampart campaign --search 200                  look for the fault with the smallest margin
-The same command goes on where it was interrupted; each run is made once. Results, with a report,
-are in --out.
 
-exit code: 0 no unsafe run with fault tolerance, 1 there was one, or with --full one that failed,
-2 bad usage, or it could not be finished, as on a full disk"""
-
-
-def add(verbs: Any, formatter: Any) -> None:
+def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "campaign", formatter_class=formatter, help="run many missions with faults in them",
-        description="Run missions in virtual time with faults injected, on all cores, and say how\n"
-                    "often the robot succeeded and whether it was always safe.",
-        epilog=_EPILOG)
-    what = parser.add_argument_group("what is run")
-    what.add_argument("--paper", action="store_true", help="tables III, IV and V of the paper")
-    what.add_argument("--full", action="store_true",
-                      help="with --paper: the runs of table V on the full system instead, each of "
-                      "which is to end in success, safe")
-    what.add_argument("--runs", type=int, metavar="N", help="N random faults of all kinds")
-    what.add_argument("--fault", action="append", default=[], metavar="FAULT[@WHEN][+S]",
-                      help="this fault; may be repeated, and be a pattern of names: 'gps-*'")
-    what.add_argument("--together", type=int, default=1, metavar="K",
-                      help="with --runs: K faults in each (default 1)")
-    what.add_argument("--kinds", metavar="K,...", help="with --runs: only these kinds of faults "
-                      "(paper, sensor, topic, process, actuator, world)")
-    what.add_argument("--search", type=int, metavar="N",
-                      help="N runs of an optimiser that looks for the smallest safety margin")
-    what.add_argument("--replay", metavar="RUN", help="repeat a run of --out by its key")
-    what.add_argument("--list", action="store_true", help="list the faults that there are")
-    how = parser.add_argument_group("under which conditions")
-    how.add_argument("--system", metavar="SPEC",
-                     help="file, or name of a shipped system (default: osmosis, the full one; "
-                     "with --paper alone: paper)")
-    how.add_argument("--mission", metavar="NAME", default="A", help="default: A")
-    how.add_argument("--airport", metavar="NAME", default="", help="default: the system's")
-    how.add_argument("--obstacles", metavar="N,...", default="0,2",
+    add_verb(
+        verbs, "campaign", "run many missions with faults in them", run,
+        group("what is run",
+              flag("--paper", "tables III, IV and V of the paper"),
+              flag("--full", "with --paper: the runs of table V on the full system instead, each "
+                   "of which is to end in success, safe"),
+              whole("--runs", "N", "N random faults of all kinds"),
+              option("--fault", action="append", default=[], metavar="FAULT[@WHEN][+S]",
+                     help="this fault; may be repeated, and be a pattern of names: 'gps-*'"),
+              whole("--together", "K", "with --runs: K faults in each (default 1)", 1),
+              option("--kinds", metavar="K,...", help="with --runs: only these kinds of faults "
+                     "(paper, sensor, topic, process, actuator, world)"),
+              whole("--search", "N",
+                    "N runs of an optimiser that looks for the smallest safety margin"),
+              option("--replay", metavar="RUN", help="repeat a run of --out by its key"),
+              flag("--list", "list the faults that there are")),
+        group("under which conditions",
+              option("--system", metavar="SPEC", help="file, or name of a shipped system "
+                     "(default: osmosis, the full one; with --paper alone: paper)"),
+              option("--mission", metavar="NAME", default="A", help="default: A"),
+              option("--airport", metavar="NAME", default="", help="default: the system's"),
+              option("--obstacles", metavar="N,...", default="0,2",
                      help="how many of the airport's; several are crossed, or drawn from with "
-                     "--runs (default: 0,2)")
-    how.add_argument("--ftm", choices=("on", "off", "both"), default="on",
-                     help="fault tolerance, the paper's baseline, or both (default: on)")
-    how.add_argument("--strategy", action="append", default=[], metavar="NAME",
-                     help="of the manager; may be repeated (default: the system's)")
-    how.add_argument("--network", default="measured", metavar="NAME",
-                     help=f"{', '.join(NETWORKS)} (default: measured)")
-    how.add_argument("--seed", type=int, default=1, metavar="N", help="default: 1")
-    how.add_argument("--seeds", type=int, default=1, metavar="N",
-                     help="with --fault: so many runs of each, from --seed on (default: 1)")
-    how.add_argument("--patience", type=float, default=PATIENCE_S, metavar="S",
-                     help=f"simulated seconds without progress that end a run "
-                     f"(default: {PATIENCE_S:g})")
-    where = parser.add_argument_group("where")
-    where.add_argument("--out", metavar="DIR",
-                       help="default: reports/campaign-NAME, by what is run")
-    where.add_argument("--jobs", type=int, default=0, metavar="N",
-                       help="processes (default: one per core)")
-    where.add_argument("--backend", default="loky", choices=BACKENDS,
-                       help="loky is this machine; dask and ray are existing clusters")
-    where.add_argument("--address", default="", metavar="A", help="of the cluster's scheduler")
-    parser.add_argument("--json", action="store_true", help="print the rows as JSON")
-    parser.set_defaults(run=run)
+                     "--runs (default: 0,2)"),
+              option("--ftm", choices=("on", "off", "both"), default="on",
+                     help="fault tolerance, the paper's baseline, or both (default: on)"),
+              option("--strategy", action="append", default=[], metavar="NAME",
+                     help="of the manager; may be repeated (default: the system's)"),
+              option("--network", default="measured", metavar="NAME",
+                     help=f"{', '.join(NETWORKS)} (default: measured)"),
+              whole("--seed", "N", "default: 1", 1),
+              whole("--seeds", "N",
+                    "with --fault: so many runs of each, from --seed on (default: 1)", 1),
+              number("--patience", "S", "simulated seconds without progress that end a run "
+                     f"(default: {PATIENCE_S:g})", PATIENCE_S)),
+        group("where",
+              option("--out", metavar="DIR", help="default: reports/campaign-NAME, by what is run"),
+              whole("--jobs", "N", "processes (default: one per core)", 0),
+              option("--backend", default="loky", choices=BACKENDS,
+                     help="loky is this machine; dask and ray are existing clusters"),
+              option("--address", default="", metavar="A", help="of the cluster's scheduler")),
+        flag("--json", "print the rows as JSON"))
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the campaign, or what else was asked for."""
+    """Run the campaign, or what else was asked for.
+
+    Run missions in virtual time with faults injected, on all cores, and say how
+    often the robot succeeded and whether it was always safe.
+
+    Examples:
+      rampart campaign --paper                       the paper's tables, beside the paper's verdicts
+      rampart campaign --paper --full                ... their rows on the full system
+      rampart campaign --runs 200                    200 random single faults
+      rampart campaign --runs 200 --together 2       ... pairs of faults
+      rampart campaign --fault 'kill:*' --seeds 5    every process killed, five seeds each
+      rampart campaign --fault gps-bias@20+5 --obstacles 0,2 --ftm both
+      rampart campaign --list                        the faults that there are
+      rampart campaign --replay 3f2a --out DIR       repeat one run of DIR and write its report
+      rampart campaign --search 200                  look for the fault with the smallest margin
+    The same command goes on where it was interrupted; each run is made once. Results, with a
+    report, are in --out.
+
+    exit code: 0 no unsafe run with fault tolerance, 1 there was one, or with --full one that
+    failed, 2 bad usage, or it could not be finished, as on a full disk
+    """
     from rampart.cli.analyse.campaigning import campaign  # noqa: PLC0415 physics and all: other verbs need not
 
     return campaign(options)

@@ -10,7 +10,8 @@ from itertools import combinations
 from typing import Any
 
 from rampart.cli import systems
-from rampart.cli.output import UsageError, print_json, print_table, say, say_text
+from rampart.cli.output import UsageError, print_json, print_table, refusing, say, say_text
+from rampart.cli.verbs import JSON, JSON_FORMAT, add_verb, flag, option
 from rampart.manager.model.order import UnknownElementError
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.decision import Decision
@@ -18,42 +19,32 @@ from rampart.manager.strategies.decision_words import decision_in_words
 from rampart.manager.strategies.registry import UnknownStrategyError, decide
 
 
-def add(verbs: Any, formatter: Any) -> None:
+def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    parser = verbs.add_parser(
-        "decide", formatter_class=formatter, help="what the manager decides for active mechanisms",
-        description="Show the decision for a set of active mechanisms, with its certificate: the\n"
-                    "block (rule) that applies, the path of dominance, what was rejected and why.",
-        epilog="examples:\n  rampart decide FTM3 FTM4\n  rampart decide FTM1 FTM6 --json\n"
-               "  rampart decide FTM2 FTM5 --system my_system.toml")
-    parser.add_argument("ftm", nargs="+", metavar="FTM", help="active mechanisms, e.g. FTM3")
-    parser.add_argument("--strategy", metavar="NAME", help="default the spec's")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--system", metavar="SPEC",
-                        help="file, or name of a shipped system; default the shipped one")
-    parser.set_defaults(run=show_decision)
-
-    parser = verbs.add_parser(
-        "table", formatter_class=formatter, help="the decision for every set of active mechanisms",
-        description="Show the decision for every non-empty set of active mechanisms; with several\n"
-                    "strategies, what each of them would run, side by side.",
-        epilog="examples:\n  rampart table\n  rampart table --json | python3 -m json.tool\n"
-               "  rampart table --system my_system.toml --format csv > decisions.csv\n"
-               "  rampart table --strategy safety-first --strategy guarded-repair --differing")
-    parser.add_argument("--strategy", metavar="NAME", action="append",
-                        help="default the spec's; several are compared")
-    parser.add_argument("--differing", action="store_true",
-                        help="only the sets in which the strategies run different recoveries")
-    parser.add_argument("--format", choices=("table", "csv", "json"), default="table",
-                        help="default table")
-    parser.add_argument("--json", action="store_const", dest="format", const="json",
-                        help="the same as --format json")
-    systems.add_arguments(parser)
-    parser.set_defaults(run=show_table)
+    add_verb(verbs, "decide", "what the manager decides for active mechanisms", show_decision,
+             option("ftm", nargs="+", metavar="FTM", help="active mechanisms, e.g. FTM3"),
+             option("--strategy", metavar="NAME", help="default the spec's"), JSON,
+             option("--system", metavar="SPEC",
+                    help="file, or name of a shipped system; default the shipped one"))
+    add_verb(verbs, "table", "the decision for every set of active mechanisms", show_table,
+             option("--strategy", metavar="NAME", action="append",
+                    help="default the spec's; several are compared"),
+             flag("--differing", "only the sets in which the strategies run different recoveries"),
+             option("--format", choices=("table", "csv", "json"), default="table",
+                    help="default table"), JSON_FORMAT, systems.choice())
 
 
 def show_decision(options: argparse.Namespace) -> int:
-    """Print one decision."""
+    """Print one decision.
+
+    Show the decision for a set of active mechanisms, with its certificate: the
+    block (rule) that applies, the path of dominance, what was rejected and why.
+
+    Examples:
+      rampart decide FTM3 FTM4
+      rampart decide FTM1 FTM6 --json
+      rampart decide FTM2 FTM5 --system my_system.toml
+    """
     spec = systems.load(options.system)
     strategy = options.strategy or spec.strategy
     decision = _Arbiter(spec, strategy).decide(options.ftm)
@@ -74,7 +65,17 @@ def show_decision(options: argparse.Namespace) -> int:
 
 
 def show_table(options: argparse.Namespace) -> int:
-    """Print the decision for all non-empty sets."""
+    """Print the decision for all non-empty sets.
+
+    Show the decision for every non-empty set of active mechanisms; with several
+    strategies, what each of them would run, side by side.
+
+    Examples:
+      rampart table
+      rampart table --json | python3 -m json.tool
+      rampart table --system my_system.toml --format csv > decisions.csv
+      rampart table --strategy safety-first --strategy guarded-repair --differing
+    """
     spec = systems.load(options.system)
     strategies = tuple(dict.fromkeys(options.strategy or [spec.strategy]))
     if options.differing and len(strategies) < 2:
@@ -132,10 +133,8 @@ class _Arbiter:
         self._strategy = strategy
 
     def decide(self, active: Any) -> Decision:
-        try:
+        with refusing(UnknownElementError, UnknownStrategyError):
             return decide(active, self._mechanisms, self._tree, self._order, self._strategy)
-        except (UnknownElementError, UnknownStrategyError) as error:
-            raise UsageError(str(error)) from None
 
 
 def _row(decision: Decision) -> dict[str, Any]:

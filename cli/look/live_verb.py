@@ -1,18 +1,26 @@
-"""`rampart live`: the run in somebody else's viewer, while it goes on."""
+"""`rampart live`: the run in somebody else's viewer, while it goes on.
+
+Show the run in a viewer for robots: what its system shows of the robot,
+and a log in words. Waits for a run, and for the next when one ends.
+
+Examples:
+  rampart live foxglove
+"""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
 import contextlib
+from collections.abc import Coroutine
 from typing import TYPE_CHECKING, Any
 
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording.run_documents import known_of
-from rampart.cli.extras import extra
 from rampart.cli.following import LOOK_S, is_over, sessions, stopped_by_signals
 from rampart.cli.output import UsageError, say, warn
 from rampart.cli.session import Session
+from rampart.cli.verbs import add_family, add_verb, extra, served
 
 if TYPE_CHECKING:
     from rampart.cli.look.live_foxglove import FoxgloveViewer
@@ -21,31 +29,26 @@ FOXGLOVE_PORT = 8765
 """Where viewers look unless told otherwise."""
 
 
-def add(verbs: Any, formatter: Any) -> None:
+def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "live", formatter_class=formatter, help="see the run live in Foxglove",
-        description="Show the run in a viewer for robots: what its system shows of the robot,\n"
-                    "and a log in words. Waits for a run, and for the next when one ends.",
-        epilog="examples:\n  rampart live foxglove")
-    viewers = parser.add_subparsers(dest="subverb", required=True, metavar="VIEWER")
+    viewers = add_family(verbs, "live", "see the run live in Foxglove", __doc__, metavar="VIEWER")
+    add_verb(viewers, "foxglove", "serve Foxglove's WebSocket protocol", foxglove,
+             *served(FOXGLOVE_PORT, "look on"))
 
-    foxglove = viewers.add_parser(
-        "foxglove", formatter_class=formatter, help="serve Foxglove's WebSocket protocol",
-        description="Serve viewers that speak Foxglove's WebSocket protocol. They only read:\n"
-                    "nothing that they send reaches the robot. Needs the extra:\n"
-                    "pip install 'rampart[foxglove]'.",
-        epilog="examples:\n  rampart live foxglove\n  rampart live foxglove --port 9000\n"
-               "then open ws://127.0.0.1:8765 in the viewer; set the 3D panel's frame to map")
-    foxglove.add_argument("--port", type=int, default=FOXGLOVE_PORT, metavar="N",
-                          help=f"port to serve on (default {FOXGLOVE_PORT})")
-    foxglove.add_argument("--host", default="127.0.0.1", metavar="ADDRESS",
-                          help="address to serve on (default 127.0.0.1; whoever reaches it may "
-                               "look on)")
-    foxglove.add_argument("--run", dest="of", type=int, metavar="N",
-                          help="base port of the run, if there are several on this machine")
-    foxglove.set_defaults(run=lambda options: asyncio.run(live(
-        options, _foxglove(options))))
+
+def foxglove(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
+    """Serve viewers until interrupted.
+
+    Serve viewers that speak Foxglove's WebSocket protocol. They only read:
+    nothing that they send reaches the robot. Needs the extra:
+    pip install 'rampart[foxglove]'.
+
+    Examples:
+      rampart live foxglove
+      rampart live foxglove --port 9000
+    then open ws://127.0.0.1:8765 in the viewer; set the 3D panel's frame to map
+    """
+    return live(options, _foxglove(options))
 
 
 async def live(options: argparse.Namespace, viewer: FoxgloveViewer) -> int:

@@ -1,4 +1,14 @@
-"""`rampart topic`: what travels on the keys."""
+"""`rampart topic`: what travels on the keys.
+
+List, print and measure topics. A key is given as in `rampart topic list`;
+a family as detection/DM1 for one member or 'detection/*' for all.
+
+Examples:
+  rampart topic list
+  rampart topic echo localization/pose -n 3
+  rampart topic hz control/command
+  rampart topic info plan/route
+"""
 
 from __future__ import annotations
 
@@ -33,6 +43,7 @@ from rampart.cli.output import (
     warn,
 )
 from rampart.cli.session import Session, connect
+from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option
 from rampart.files import streams
 
 _WINDOW = 500
@@ -40,64 +51,32 @@ _SHOWN_BYTES = 24
 _HZ_REPORT_S = 1.0
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    topic = verbs.add_parser(
-        "topic", formatter_class=formatter, help="what travels on the keys",
-        description="List, print and measure topics. A key is given as in `rampart topic list`;\n"
-                    "a family as detection/DM1 for one member or 'detection/*' for all.",
-        epilog="examples:\n  rampart topic list\n  rampart topic echo localization/pose -n 3\n"
-               "  rampart topic hz control/command\n  rampart topic info plan/route")
-    subverbs = topic.add_subparsers(dest="subverb", required=True, metavar="VERB")
-
-    parser = subverbs.add_parser(
-        "list", formatter_class=formatter, help="all topics (needs no run)",
-        description="List all topics with message, QoS and nominal rate.",
-        epilog="examples:\n  rampart topic list\n  rampart topic list --markdown > topics.md")
-    systems.add_arguments(parser)
-    how = parser.add_mutually_exclusive_group()
-    how.add_argument("--json", action="store_true", help="print JSON")
-    how.add_argument("--markdown", action="store_true", help="print topics.md")
-    parser.set_defaults(run=topic_list)
-
-    parser = subverbs.add_parser(
-        "info", formatter_class=formatter, help="the contract of one topic (needs no run)",
-        description="Show type, fields, QoS, publishers and readers of a topic.",
-        epilog="examples:\n  rampart topic info control/command\n"
-               "  rampart topic info detection/DM1")
-    parser.add_argument("key", metavar="KEY")
-    parser.add_argument("--system", metavar="FILE", help="system spec; default the shipped one")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=topic_info)
-
-    parser = subverbs.add_parser(
-        "echo", parents=[common], formatter_class=formatter, help="print messages as they come",
-        description="Print one line per message: stamp (simulated seconds), source#incarnation,\n"
-                    "key, message. A payload that is no message is shown with the reason.",
-        epilog="examples:\n  rampart topic echo localization/pose\n"
-               "  rampart topic echo 'detection/*' --duration 5\n"
-               "  rampart topic echo plan/route -n 1 --json")
-    parser.add_argument("key", metavar="KEY")
-    parser.add_argument("-n", "--count", type=int, metavar="N", help="end after N messages")
-    parser.add_argument("--duration", type=float, metavar="S", help="end after S real seconds")
-    parser.add_argument("--json", action="store_true", help="one JSON object per line")
-    parser.set_defaults(run=lambda options: asyncio.run(topic_echo(options)))
-
-    parser = subverbs.add_parser(
-        "hz", parents=[common], formatter_class=formatter, help="measure the rate of a topic",
-        description="Measure how often messages arrive, in simulated time like the nominal rate,\n"
-                    "each second over a window of the last 500, until interrupted or the run ends.",
-        epilog="examples:\n  rampart topic hz control/command\n"
-               "  rampart topic hz 'heartbeat/*' --duration 3 --json")
-    parser.add_argument("key", metavar="KEY")
-    parser.add_argument("--duration", type=float, metavar="S",
-                        help="end after S real seconds (with --json 3 if not given)")
-    parser.add_argument("--json", action="store_true", help="print JSON at the end")
-    parser.set_defaults(run=lambda options: asyncio.run(topic_hz(options)))
+    topic = add_family(verbs, "topic", "what travels on the keys", __doc__)
+    key = option("key", metavar="KEY")
+    add_verb(topic, "list", "all topics (needs no run)", topic_list, systems.choice(),
+             either(JSON, flag("--markdown", "print topics.md")))
+    add_verb(topic, "info", "the contract of one topic (needs no run)", topic_info, key,
+             option("--system", metavar="FILE", help="system spec; default the shipped one"), JSON)
+    add_verb(topic, "echo", "print messages as they come", topic_echo, PORT, key,
+             option("-n", "--count", type=int, metavar="N", help="end after N messages"),
+             number("--duration", "S", "end after S real seconds"),
+             flag("--json", "one JSON object per line"))
+    add_verb(topic, "hz", "measure the rate of a topic", topic_hz, PORT, key,
+             number("--duration", "S", "end after S real seconds (with --json 3 if not given)"),
+             flag("--json", "print JSON at the end"))
 
 
 def topic_list(options: argparse.Namespace) -> int:
-    """Print all topics."""
+    """Print all topics.
+
+    List all topics with message, QoS and nominal rate.
+
+    Examples:
+      rampart topic list
+      rampart topic list --markdown > topics.md
+    """
     spec = systems.load(options.system)
     if options.markdown:
         say_text(markdown(spec).rstrip("\n"))
@@ -114,7 +93,14 @@ def topic_list(options: argparse.Namespace) -> int:
 
 
 def topic_info(options: argparse.Namespace) -> int:
-    """Print the contract of one topic."""
+    """Print the contract of one topic.
+
+    Show type, fields, QoS, publishers and readers of a topic.
+
+    Examples:
+      rampart topic info control/command
+      rampart topic info detection/DM1
+    """
     spec = systems.load(options.system)
     topic, _ = resolve(options.key, systems.topics_of(spec))
     use = next(u for u in uses(spec) if u.topic is topic)
@@ -136,7 +122,16 @@ def topic_info(options: argparse.Namespace) -> int:
 
 
 async def topic_echo(options: argparse.Namespace) -> int:
-    """Print messages as they come."""
+    """Print messages as they come.
+
+    Print one line per message: stamp (simulated seconds), source#incarnation,
+    key, message. A payload that is no message is shown with the reason.
+
+    Examples:
+      rampart topic echo localization/pose
+      rampart topic echo 'detection/*' --duration 5
+      rampart topic echo plan/route -n 1 --json
+    """
     topic, key = resolve(options.key, topics_for(options.key, options.port))
     _positive("--count", options.count)
     _positive("--duration", options.duration)
@@ -183,7 +178,15 @@ async def topic_echo(options: argparse.Namespace) -> int:
 
 
 async def topic_hz(options: argparse.Namespace) -> int:
-    """Measure rates."""
+    """Measure rates.
+
+    Measure how often messages arrive, in simulated time like the nominal rate,
+    each second over a window of the last 500, until interrupted or the run ends.
+
+    Examples:
+      rampart topic hz control/command
+      rampart topic hz 'heartbeat/*' --duration 3 --json
+    """
     topic, key = resolve(options.key, topics_for(options.key, options.port))
     _positive("--duration", options.duration)
     arrivals: Remembered[str, deque[float]] = Remembered(MANY)

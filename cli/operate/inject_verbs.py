@@ -18,6 +18,7 @@ from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import resolve, topics_for
 from rampart.cli.operate.injecting import run_fault
 from rampart.cli.output import UsageError, print_json, print_table, say
+from rampart.cli.verbs import JSON, PORT, add_verb, flag, group, number, option, whole
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.faults import Faults, faults_of
@@ -25,77 +26,72 @@ from rampart.sim.faults.topic_faults import modes_of, systematic_faults
 
 _DEFAULT_DURATION_S = 5.0
 
-_EPILOG = """examples:
-  rampart inject --list                           what there is
-  rampart inject command-out-of-bounds --duration 3
-  rampart inject prohibited-area --at-once
-  rampart inject laser-stuck --duration inf       permanent: until the node's process ends
-  rampart inject gps-dropout --on 1 --off 4 --duration 30
-                                                  intermittent: 1 s without GPS, 4 s with
-  rampart inject drop:localization/pose           any mode on any topic ...
-  rampart inject corrupt:plan/route --seed 7      ... here one of its numbers: odd seeds, one each
-  rampart inject drop:control/command --share 0.3 three messages in ten are lost
-your own:
-  rampart inject --topic localization/pose --mode delay --delay 0.8
-  rampart inject --topic summit_xl/scan --mode restamp --stamp=-0.2
-                                                  stamped 0.2 s before the truth
-  rampart inject --topic localization/pose --mode corrupt --ramp x_m=0.25
-  rampart inject --topic control/command --mode corrupt --set angular_radps=2.5
-  rampart inject --topic summit_xl/scan --mode corrupt --add ranges_f32=0.4 \\
-                 --noise ranges_f32=0.2
-Fields are those of `rampart topic info TOPIC`; one inside another is written pose.x_m."""
 
-
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "inject", parents=[common], formatter_class=formatter, help="inject a fault",
-        description="Inject a fault of the catalogue, or disturb any topic, for a while. It\n"
-                    "acts in the node that publishes the topic. The verb waits for its end and\n"
-                    "says how many messages were affected; if none was, it says so and exits 1.\n"
-                    "For a permanent fault it waits until the first message was affected.\n"
-                    "Ctrl-C ends the fault at once. Durations are simulated seconds.",
-        epilog=_EPILOG)
-    parser.add_argument("fault", nargs="?", metavar="FAULT",
-                        help="a name from --list, or MODE:TOPIC")
-    parser.add_argument("--list", action="store_true", help="list the catalogue (needs no run)")
-    parser.add_argument("--system", metavar="FILE",
-                        help="for --list: system spec; default the shipped one")
-    parser.add_argument("--duration", type=float, metavar="S",
-                        help="simulated seconds, inf for permanent; default the fault's own, "
-                             f"else {_DEFAULT_DURATION_S:g}")
-    parser.add_argument("--at-once", action="store_true",
-                        help="return as soon as the fault is in force; do not wait for its end")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    when = parser.add_argument_group("which messages")
-    when.add_argument("--share", type=float, metavar="P",
-                      help="probability that a message is affected, up to 1 (default)")
-    when.add_argument("--on", type=float, metavar="S", help="intermittent: in force for S ...")
-    when.add_argument("--off", type=float, metavar="S", help="... and away for S, repeating")
-    when.add_argument("--seed", type=int, metavar="N",
-                      help="of share, noise and what restamp:TOPIC and corrupt:TOPIC draw; "
-                           "default 0")
-    own = parser.add_argument_group("a fault of your own, instead of FAULT")
-    own.add_argument("--topic", metavar="KEY", help="e.g. control/command or detection/DM2")
-    own.add_argument("--mode", metavar="MODE", help=", ".join(MODES))
-    own.add_argument("--delay", type=float, metavar="S", help="for delay: simulated seconds")
-    own.add_argument("--stamp", type=float, metavar="S",
-                     help="for restamp: added to each stamp, simulated seconds; above 0 is ahead")
-    own.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE",
-                     help="for corrupt: overwrite a field; may be repeated, as all below")
-    own.add_argument("--add", action="append", default=[], metavar="FIELD=BIAS",
-                     help="for corrupt: add BIAS to a number, or to each of an array")
-    own.add_argument("--ramp", action="append", default=[], metavar="FIELD=RATE",
-                     help="for corrupt: add RATE per simulated second")
-    own.add_argument("--noise", action="append", default=[], metavar="FIELD=SIGMA",
-                     help="for corrupt: add Gaussian noise of this standard deviation")
-    own.add_argument("--keep-ends", action="append", default=[], metavar="FIELD",
-                     help="for corrupt: keep only first and last element of a list")
-    parser.set_defaults(run=inject)
+    several = {"action": "append", "default": []}
+    add_verb(
+        verbs, "inject", "inject a fault", inject, PORT,
+        option("fault", nargs="?", metavar="FAULT", help="a name from --list, or MODE:TOPIC"),
+        flag("--list", "list the catalogue (needs no run)"),
+        option("--system", metavar="FILE", help="for --list: system spec; default the shipped one"),
+        number("--duration", "S", "simulated seconds, inf for permanent; default the fault's own, "
+               f"else {_DEFAULT_DURATION_S:g}"),
+        flag("--at-once", "return as soon as the fault is in force; do not wait for its end"),
+        JSON,
+        group("which messages",
+              number("--share", "P", "probability that a message is affected, up to 1 (default)"),
+              number("--on", "S", "intermittent: in force for S ..."),
+              number("--off", "S", "... and away for S, repeating"),
+              whole("--seed", "N", "of share, noise and what restamp:TOPIC and corrupt:TOPIC draw; "
+                    "default 0")),
+        group("a fault of your own, instead of FAULT",
+              option("--topic", metavar="KEY", help="e.g. control/command or detection/DM2"),
+              option("--mode", metavar="MODE", help=", ".join(MODES)),
+              number("--delay", "S", "for delay: simulated seconds"),
+              number("--stamp", "S", "for restamp: added to each stamp, simulated seconds; above 0 "
+                     "is ahead"),
+              option("--set", **several, metavar="FIELD=VALUE",
+                     help="for corrupt: overwrite a field; may be repeated, as all below"),
+              option("--add", **several, metavar="FIELD=BIAS",
+                     help="for corrupt: add BIAS to a number, or to each of an array"),
+              option("--ramp", **several, metavar="FIELD=RATE",
+                     help="for corrupt: add RATE per simulated second"),
+              option("--noise", **several, metavar="FIELD=SIGMA",
+                     help="for corrupt: add Gaussian noise of this standard deviation"),
+              option("--keep-ends", **several, metavar="FIELD",
+                     help="for corrupt: keep only first and last element of a list")))
 
 
 def inject(options: argparse.Namespace) -> int:
-    """List the catalogue, or inject a fault."""
+    r"""List the catalogue, or inject a fault.
+
+    Inject a fault of the catalogue, or disturb any topic, for a while. It
+    acts in the node that publishes the topic. The verb waits for its end and
+    says how many messages were affected; if none was, it says so and exits 1.
+    For a permanent fault it waits until the first message was affected.
+    Ctrl-C ends the fault at once. Durations are simulated seconds.
+
+    Examples:
+      rampart inject --list                           what there is
+      rampart inject command-out-of-bounds --duration 3
+      rampart inject prohibited-area --at-once
+      rampart inject laser-stuck --duration inf       permanent: until the node's process ends
+      rampart inject gps-dropout --on 1 --off 4 --duration 30
+                                                      intermittent: 1 s without GPS, 4 s with
+      rampart inject drop:localization/pose           any mode on any topic ...
+      rampart inject corrupt:plan/route --seed 7      ... one of its numbers: odd seeds, one each
+      rampart inject drop:control/command --share 0.3 three messages in ten are lost
+    your own:
+      rampart inject --topic localization/pose --mode delay --delay 0.8
+      rampart inject --topic summit_xl/scan --mode restamp --stamp=-0.2
+                                                      stamped 0.2 s before the truth
+      rampart inject --topic localization/pose --mode corrupt --ramp x_m=0.25
+      rampart inject --topic control/command --mode corrupt --set angular_radps=2.5
+      rampart inject --topic summit_xl/scan --mode corrupt --add ranges_f32=0.4 \
+                     --noise ranges_f32=0.2
+    Fields are those of `rampart topic info TOPIC`; one inside another is written pose.x_m.
+    """
     if options.list:
         _print_catalogue(systems.load(options.system), as_json=options.json)
         return 0

@@ -1,4 +1,11 @@
-"""`rampart status` and `rampart node`: what runs, and how it is."""
+"""`rampart status` and `rampart node`: what runs, and how it is.
+
+Look at the nodes of the run.
+
+Examples:
+  rampart node list
+  rampart node list --json
+"""
 
 from __future__ import annotations
 
@@ -16,38 +23,30 @@ from rampart.cli.output import NoEffectError, UsageError, print_json, print_tabl
 from rampart.cli.robot_lines import RobotLines
 from rampart.cli.run_picture import manager_in_words
 from rampart.cli.session import Session, connect
+from rampart.cli.verbs import JSON, PORT, add_family, add_verb
 
 _STATUS = (ftm_topics.MANAGER_STATUS, ftm_topics.NODES)
 _WAIT_S = 1.5
 """Simulated seconds to collect states; the rarest comes twice a second."""
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    parser = verbs.add_parser(
-        "status", parents=[common], formatter_class=formatter, help="the run at a glance",
-        description="Show the robot, the FTM Manager and the nodes of the run.\n"
-                    "Whatever the system has and does not answer is shown as silent.",
-        epilog="examples:\n  rampart status\n  rampart status --json")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=lambda options: asyncio.run(status(options)))
-
-    node = verbs.add_parser("node", formatter_class=formatter, help="the nodes of the run",
-                            description="Look at the nodes of the run.",
-                            epilog="examples:\n  rampart node list\n  rampart node list --json")
-    subverbs = node.add_subparsers(dest="subverb", required=True, metavar="VERB")
-    parser = subverbs.add_parser(
-        "list", parents=[common], formatter_class=formatter, help="all nodes",
-        description="List the nodes with process id, state, incarnation and restarts.",
-        epilog="examples:\n  rampart node list\n  kill -9 $(rampart node list --json | python3 -c "
-               "'import json,sys; print(next(n[\"pid\"] for n in json.load(sys.stdin) "
-               "if n[\"name\"] == \"localization\"))')")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=lambda options: asyncio.run(node_list(options)))
+    add_verb(verbs, "status", "the run at a glance", status, PORT, JSON)
+    node = add_family(verbs, "node", "the nodes of the run", __doc__)
+    add_verb(node, "list", "all nodes", node_list, PORT, JSON)
 
 
 async def node_list(options: argparse.Namespace) -> int:
-    """Print the supervisor's table."""
+    """Print the supervisor's table.
+
+    List the nodes with process id, state, incarnation and restarts.
+
+    Examples:
+      rampart node list
+      kill -9 $(rampart node list --json | python3 -c 'import json,sys; \
+print(next(n["pid"] for n in json.load(sys.stdin) if n["name"] == "localization"))')
+    """
     async with connect(options.port) as session:
         found = await session.latest((ftm_topics.NODES,), session.real_s(_WAIT_S) + 1.0)
     if not found:
@@ -65,7 +64,15 @@ async def node_list(options: argparse.Namespace) -> int:
 
 
 async def status(options: argparse.Namespace) -> int:
-    """Print the state of the run."""
+    """Print the state of the run.
+
+    Show the robot, the FTM Manager and the nodes of the run.
+    Whatever the system has and does not answer is shown as silent.
+
+    Examples:
+      rampart status
+      rampart status --json
+    """
     async with connect(options.port) as session:
         held, lines = Holdings(session), _lines(session.run)
         found, _ = await asyncio.gather(

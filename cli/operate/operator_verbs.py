@@ -14,6 +14,7 @@ from rampart.cli.following import stopped_by_signals
 from rampart.cli.holdings import Holdings
 from rampart.cli.output import NoEffectError, UsageError, say, unknown
 from rampart.cli.session import Latest, Session, connect
+from rampart.cli.verbs import PORT, add_verb, option
 
 STUB_DETECTION = "rampart.actors.detection.stub:StubDetection"
 
@@ -21,33 +22,28 @@ _RESET_WAIT_S = 3.0
 """Simulated seconds within which the manager releases a recovery whose cause is gone."""
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    parser = verbs.add_parser(
-        "reset", parents=[common], formatter_class=formatter,
-        help="release a latched recovery, e.g. the emergency stop",
-        description="Release a recovery that stays in force until an operator resets it. Nothing\n"
-                    "happens while its cause is still there; the verb then says so and exits 1.\n"
-                    "Also lets go of what somebody holds, such as the brake, who is no recovery\n"
-                    "module of the system; rampart status says who.",
-        epilog="examples:\n  rampart reset RM1\n  rampart reset rampart-4711")
-    parser.add_argument("recovery", metavar="NAME", help="e.g. RM1")
-    parser.set_defaults(run=lambda options: asyncio.run(reset(options)))
-
-    parser = verbs.add_parser(
-        "trigger", parents=[common], formatter_class=formatter,
-        help="make the stand-in of a detection module detect",
-        description="Make a stand-in for a detection module (`detection.stub`) active, for some\n"
-                    "simulated seconds. What real modules detect is injected: rampart inject.",
-        epilog="examples:\n  rampart trigger D_CURTAIN\n  rampart trigger D_VISION --for 5")
-    parser.add_argument("module", metavar="NAME", help="detection module, e.g. D_CURTAIN")
-    parser.add_argument("--for", dest="duration", type=float, default=2.0, metavar="S",
-                        help="simulated seconds (default 2)")
-    parser.set_defaults(run=lambda options: asyncio.run(trigger(options)))
+    add_verb(verbs, "reset", "release a latched recovery, e.g. the emergency stop", reset, PORT,
+             option("recovery", metavar="NAME", help="e.g. RM1"))
+    add_verb(verbs, "trigger", "make the stand-in of a detection module detect", trigger, PORT,
+             option("module", metavar="NAME", help="detection module, e.g. D_CURTAIN"),
+             option("--for", dest="duration", type=float, default=2.0, metavar="S",
+                    help="simulated seconds (default 2)"))
 
 
 async def reset(options: argparse.Namespace) -> int:
-    """Release a latched recovery."""
+    """Release a latched recovery.
+
+    Release a recovery that stays in force until an operator resets it. Nothing
+    happens while its cause is still there; the verb then says so and exits 1.
+    Also lets go of what somebody holds, such as the brake, who is no recovery
+    module of the system; rampart status says who.
+
+    Examples:
+      rampart reset RM1
+      rampart reset rampart-4711
+    """
     async with connect(options.port) as session:
         known = [r.name for r in systems.load(session.run.system_file).recoveries]
         if options.recovery not in known:
@@ -91,7 +87,15 @@ async def _let_go(session: Session, name: str, known: list[str]) -> int:
 
 
 async def trigger(options: argparse.Namespace) -> int:
-    """Make a stand-in detect for a while."""
+    """Make a stand-in detect for a while.
+
+    Make a stand-in for a detection module (`detection.stub`) active, for some
+    simulated seconds. What real modules detect is injected: rampart inject.
+
+    Examples:
+      rampart trigger D_CURTAIN
+      rampart trigger D_VISION --for 5
+    """
     if not 0 < options.duration < 1e6:
         raise UsageError(f"--for {options.duration:g}: must be above 0")
     async with connect(options.port) as session:

@@ -1,4 +1,12 @@
-"""`rampart bag`: what is in a recording, and how to mend a torn one."""
+"""`rampart bag`: what is in a recording, and how to mend a torn one.
+
+Look at recordings: MCAP files of `launch.py --record`, `rampart record`, or
+others.
+
+Examples:
+  rampart bag info run.mcap
+  rampart bag repair torn.mcap whole.mcap
+"""
 
 from __future__ import annotations
 
@@ -10,46 +18,36 @@ from typing import Any
 from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.actors.recording.bag_repair import repair
 from rampart.actors.recording.bag_writer import BagError
-from rampart.cli.output import UsageError, print_json, print_table, say
+from rampart.cli.output import print_json, print_table, refusing, say
+from rampart.cli.verbs import JSON, add_family, add_verb, flag, option
 from rampart.files.reading import plain_line
 
 _WIDTH = 11
 """Of the names in front of the lines."""
 
 
-def add(verbs: Any, formatter: Any) -> None:
+def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    bag = verbs.add_parser(
-        "bag", formatter_class=formatter, help="what is in a recording (needs no run)",
-        description="Look at recordings: MCAP files of `launch.py --record`, `rampart record`, or\n"
-                    "others.",
-        epilog="examples:\n  rampart bag info run.mcap\n  rampart bag repair torn.mcap whole.mcap")
-    subverbs = bag.add_subparsers(dest="subverb", required=True, metavar="VERB")
-    parser = subverbs.add_parser(
-        "info", formatter_class=formatter, help="duration, run, channels, whether it is whole",
-        description="Show duration, size, what was run, and each channel with messages and rate.\n"
-                    "A file that was never closed, or is cut off, is read as far as it goes.",
-        epilog="examples:\n  rampart bag info run.mcap\n  rampart bag info run.mcap --json")
-    parser.add_argument("file", metavar="FILE")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=bag_info)
-    parser = subverbs.add_parser(
-        "repair", formatter_class=formatter, help="write what can be read into a whole file",
-        description="Copy everything that can be read of a torn file into a new one with an\n"
-                    "index, for viewers that insist on it. The old one stays as it is.",
-        epilog="examples:\n  rampart bag repair torn.mcap whole.mcap")
-    parser.add_argument("file", metavar="IN")
-    parser.add_argument("out", metavar="OUT")
-    parser.add_argument("--overwrite", action="store_true", help="OUT may exist")
-    parser.set_defaults(run=bag_repair)
+    bag = add_family(verbs, "bag", "what is in a recording (needs no run)", __doc__)
+    add_verb(bag, "info", "duration, run, channels, whether it is whole", bag_info,
+             option("file", metavar="FILE"), JSON)
+    add_verb(bag, "repair", "write what can be read into a whole file", bag_repair,
+             option("file", metavar="IN"), option("out", metavar="OUT"),
+             flag("--overwrite", "OUT may exist"))
 
 
 def bag_info(options: argparse.Namespace) -> int:
-    """Print what is in a file."""
-    try:
+    """Print what is in a file.
+
+    Show duration, size, what was run, and each channel with messages and rate.
+    A file that was never closed, or is cut off, is read as far as it goes.
+
+    Examples:
+      rampart bag info run.mcap
+      rampart bag info run.mcap --json
+    """
+    with refusing(BagError):
         summary = Summary(BagReader(Path(options.file)))
-    except BagError as error:
-        raise UsageError(str(error)) from None
     if options.json:
         print_json(described(summary))
         return 0
@@ -78,12 +76,17 @@ def bag_info(options: argparse.Namespace) -> int:
 
 
 def bag_repair(options: argparse.Namespace) -> int:
-    """Write a whole file."""
-    try:
+    """Write a whole file.
+
+    Copy everything that can be read of a torn file into a new one with an
+    index, for viewers that insist on it. The old one stays as it is.
+
+    Examples:
+      rampart bag repair torn.mcap whole.mcap
+    """
+    with refusing(BagError):
         reader = BagReader(Path(options.file))
         copied = repair(reader, Path(options.out), overwrite=options.overwrite)
-    except BagError as error:
-        raise UsageError(str(error)) from None
     say(f"{options.out}: {copied} messages; left behind: {reader.damage or 'nothing'}")
     return 0
 

@@ -17,74 +17,56 @@ from rampart.actors.recording.recorder import Recorder
 from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
-from rampart.cli.output import NoEffectError, UsageError, say
+from rampart.cli.output import NoEffectError, UsageError, refusing, say
 from rampart.cli.record.replaying import DEFAULT_PORT, Replay
+from rampart.cli.verbs import PORT, add_verb, flag, number, option, whole
 
 _PORTS = (1024, 65535)
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    parser = verbs.add_parser(
-        "record", parents=[common], formatter_class=formatter, help="record a run that is there",
-        description="Record everything that is sent in a run, from now until ctrl-C, the end of\n"
-                    "the run, or --duration. `launch.py --record FILE` records from the first\n"
-                    "message on. The robot does not wait for the recorder, whatever becomes of it.",
-        epilog="examples:\n  rampart record\n  rampart record crash.mcap --duration 60\n"
-               "  rampart record poses.mcap --topics 'localization/*' 'detection/*'")
-    parser.add_argument("file", metavar="FILE", nargs="?",
-                        help="MCAP file (default: rampart-TIME.mcap)")
-    parser.add_argument("--topics", metavar="GLOB", nargs="+", action="extend", default=[],
-                        help="only keys that match one, as in `rampart topic list`")
-    parser.add_argument("--duration", type=float, metavar="S", help="end after S real seconds")
-    parser.add_argument("--overwrite", action="store_true", help="FILE may exist")
-    parser.set_defaults(run=record)
-
-    parser = verbs.add_parser(
-        "replay", formatter_class=formatter, help="play a recording back",
-        description="Play a recording back onto a bus of its own. Tools find it like a run\n"
-                    "(`rampart topic echo`, `rampart status`), with --port if a robot runs too;\n"
-                    "orders are refused, and nothing of it reaches a robot.",
-        epilog="examples:\n  rampart replay run.mcap --hmi-port 8090\n"
-               "  rampart replay run.mcap --rate 4 --start 60 --loop\n"
-               "  rampart replay run.mcap --topics 'manager/*' --delay 2")
-    parser.add_argument("file", metavar="FILE")
-    parser.add_argument("--rate", type=float, metavar="R", default=1.0,
-                        help="simulated seconds per second (default: 1)")
-    parser.add_argument("--loop", action="store_true",
-                        help="begin anew at the end; each lap is a later life of every node")
-    parser.add_argument("--topics", metavar="GLOB", nargs="+", action="extend", default=[],
-                        help="only keys that match one")
-    parser.add_argument("--start", type=float, metavar="S",
-                        help="begin at simulated second S of the run")
-    parser.add_argument("--delay", type=float, metavar="S", default=0.0,
-                        help="real seconds before the first message, for readers to come")
-    parser.add_argument("--hmi-port", type=int, metavar="PORT", default=0,
-                        help="show the operator's page, on this port of loopback")
-    parser.add_argument("--port", type=int, metavar="N", default=DEFAULT_PORT,
-                        help=f"Zenoh port of the replay (default: {DEFAULT_PORT})")
-    parser.set_defaults(run=lambda options: asyncio.run(replay(options)))
+    topics = {"metavar": "GLOB", "nargs": "+", "action": "extend", "default": []}
+    add_verb(verbs, "record", "record a run that is there", record, PORT,
+             option("file", metavar="FILE", nargs="?",
+                    help="MCAP file (default: rampart-TIME.mcap)"),
+             option("--topics", **topics,
+                    help="only keys that match one, as in `rampart topic list`"),
+             number("--duration", "S", "end after S real seconds"),
+             flag("--overwrite", "FILE may exist"))
+    add_verb(verbs, "replay", "play a recording back", replay, option("file", metavar="FILE"),
+             number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
+             flag("--loop", "begin anew at the end; each lap is a later life of every node"),
+             option("--topics", **topics, help="only keys that match one"),
+             number("--start", "S", "begin at simulated second S of the run"),
+             number("--delay", "S", "real seconds before the first message, for readers to come",
+                    0.0),
+             whole("--hmi-port", "PORT", "show the operator's page, on this port of loopback", 0),
+             whole("--port", "N", f"Zenoh port of the replay (default: {DEFAULT_PORT})",
+                   DEFAULT_PORT))
 
 
 def record(options: argparse.Namespace) -> int:
-    """Record a run."""
+    """Record a run.
+
+    Record everything that is sent in a run, from now until ctrl-C, the end of
+    the run, or --duration. `launch.py --record FILE` records from the first
+    message on. The robot does not wait for the recorder, whatever becomes of it.
+
+    Examples:
+      rampart record
+      rampart record crash.mcap --duration 60
+      rampart record poses.mcap --topics 'localization/*' 'detection/*'
+    """
     if options.duration is not None and not 0 < options.duration < 1e9:
         raise UsageError(f"--duration {options.duration:g}: must be above 0")
-    try:
+    with refusing(NoRunError, BagError):
         run = find_run(options.port)
-    except NoRunError as error:
-        raise UsageError(str(error)) from None
-    wants = _wanted(options.topics, run)
-    path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
-    try:
+        wants = _wanted(options.topics, run)
+        path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
         check_target(path, overwrite=options.overwrite)
-    except BagError as error:
-        raise UsageError(str(error)) from None
-    recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants)
-    try:
+        recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants)
         recorder.open()
-    except BagError as error:
-        raise UsageError(str(error)) from None
     stop = stop_pipe()
     say(f"recording {run.title} in {path}; ctrl-C ends it")
     try:
@@ -98,15 +80,22 @@ def record(options: argparse.Namespace) -> int:
 
 
 async def replay(options: argparse.Namespace) -> int:
-    """Play a recording back."""
+    """Play a recording back.
+
+    Play a recording back onto a bus of its own. Tools find it like a run
+    (`rampart topic echo`, `rampart status`), with --port if a robot runs too;
+    orders are refused, and nothing of it reaches a robot.
+
+    Examples:
+      rampart replay run.mcap --hmi-port 8090
+      rampart replay run.mcap --rate 4 --start 60 --loop
+      rampart replay run.mcap --topics 'manager/*' --delay 2
+    """
     _check(options)
-    try:
+    with refusing(BagError):
         player = Replay(
             Path(options.file), port=options.port, rate=options.rate, loop=options.loop,
-            start_s=options.start, hmi_port=options.hmi_port, said=say,
-            wants=_late(options))
-    except BagError as error:
-        raise UsageError(str(error)) from None
+            start_s=options.start, hmi_port=options.hmi_port, said=say, wants=_late(options))
     stop = asyncio.Event()
     with stopped_by_signals(stop):
         if player.summary.reader.damage:
