@@ -56,6 +56,20 @@ def using(file: object) -> Iterator[None]:
         raise UsageError(f"{file}: {error}") from None
 
 
+def positive(option: str, value: float | None, why: str = "must be above 0",
+             below: float | None = None) -> None:
+    """Refuse a value that is not above 0, or not below another."""
+    if value is not None and not (value > 0 and (below is None or value < below)):
+        raise UsageError(f"{option} {value:g}: {why}")
+
+
+def between(option: str, value: float, least: float, most: float, why: str = "") -> None:
+    """Refuse a value that is not within bounds."""
+    if not least <= value <= most:
+        shown = f"{value:g}" if isinstance(value, float) else value
+        raise UsageError(f"{option} {shown}: must be between {least} and {most}{why}")
+
+
 def say(text: str = "") -> None:
     """Print one line now, also into a pipe; whoever it quotes cannot make it two."""
     print(printable(text), flush=True)

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording.run_documents import known_of
 from rampart.cli.following import LOOK_S, is_over, sessions, stopped_by_signals
-from rampart.cli.output import UsageError, say, warn
-from rampart.cli.session import Session
+from rampart.cli.output import UsageError, between, say, warn
+from rampart.cli.session import Session, pause
 from rampart.cli.verbs import add_family, add_verb, extra, served
 
 if TYPE_CHECKING:
@@ -62,8 +62,7 @@ async def live(options: argparse.Namespace, viewer: FoxgloveViewer) -> int:
                     _watch(session, viewer)
                     say(f"showing {session.run.title} (port {session.run.base_port})")
                     while not stop.is_set() and not is_over(session.run):
-                        with contextlib.suppress(TimeoutError):
-                            await asyncio.wait_for(stop.wait(), LOOK_S)
+                        await pause(stop, LOOK_S)
                     if not stop.is_set():
                         say("the run has ended; waiting for the next one, Ctrl-C ends")
     finally:
@@ -106,8 +105,7 @@ def _foxglove(options: argparse.Namespace) -> FoxgloveViewer:
     extra("foxglove", "foxglove")
     from rampart.cli.look.live_foxglove import FoxgloveViewer  # noqa: PLC0415 of the extra
 
-    if not 0 <= options.port <= 65535:
-        raise UsageError(f"--port {options.port}: must be between 0 and 65535")
+    between("--port", options.port, 0, 65535)
     try:
         viewer = FoxgloveViewer(options.host, options.port)
     except RuntimeError as error:

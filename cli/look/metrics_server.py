@@ -22,9 +22,9 @@ from rampart.actors.supervision.process_usage import read_count
 from rampart.actors.web.server import WebServer
 from rampart.cli.following import LOOK_S, draw, is_over, sessions, stopped_by_signals
 from rampart.cli.look.metrics_families import Collector, Exposition
-from rampart.cli.output import UsageError, say
+from rampart.cli.output import UsageError, between, say
 from rampart.cli.run_picture import RunPicture
-from rampart.cli.session import Session
+from rampart.cli.session import Session, pause
 
 _PROCESSES_EVERY = 4
 """Rounds between two looks for the guards: `ProcessObserver` expects one a second."""
@@ -53,8 +53,7 @@ def listen(host: str, port: int) -> socket.socket:
     Raises:
         UsageError: there is no such address, or it is taken.
     """
-    if not 0 <= port <= 65535:
-        raise UsageError(f"--port {port}: must be between 0 and 65535")
+    between("--port", port, 0, 65535)
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((host, port), family=family)
@@ -88,8 +87,7 @@ class Exporter:
                         guards = observer.look(picture.latest(topics.NODES))["guards"]
                         self._guards = {row["name"]: row["pid"] for row in guards}
                     looks += 1
-                    with contextlib.suppress(TimeoutError):
-                        await asyncio.wait_for(stop.wait(), LOOK_S)
+                    await pause(stop, LOOK_S)
                 self._now = None
 
     def look(self) -> Exposition | None:

@@ -8,7 +8,6 @@ import contextlib
 import math
 import shutil
 import sys
-from collections.abc import Callable
 from typing import Any
 
 from rich.console import Console, Group
@@ -20,7 +19,7 @@ from rampart.cli.following import LOOK_S, draw, is_over, sessions, stopped_by_si
 from rampart.cli.look import top_view
 from rampart.cli.output import print_json, say
 from rampart.cli.run_picture import RunPicture
-from rampart.cli.session import Session
+from rampart.cli.session import Session, pause
 from rampart.cli.terminal import END, keys
 
 _ONCE_S = 2.0
@@ -44,12 +43,11 @@ async def top(options: argparse.Namespace) -> int:
                 if not live:
                     return await _once(watch, options, stop)
                 await _live(watch, stop)
-                if not stop.is_set():
-                    say(f"the run has ended: {session.run.title} (port {session.run.base_port})")
-                    if options.follow:
-                        say("waiting for the next one; Ctrl-C ends")
-                else:
-                    return 0
+                if stop.is_set():
+                    break
+                say(f"the run has ended: {session.run.title} (port {session.run.base_port})")
+                if options.follow:
+                    say("waiting for the next one; Ctrl-C ends")
     return 0
 
 
@@ -85,8 +83,7 @@ class _Watch:
 async def _once(watch: _Watch, options: argparse.Namespace, stop: asyncio.Event) -> int:
     frame = watch.frame()
     for _ in range(math.ceil(watch.session.real_s(_ONCE_S) / LOOK_S)):
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(stop.wait(), LOOK_S)
+        await pause(stop, LOOK_S)
         frame = watch.frame()
     if options.json:
         print_json(top_view.picture_json(frame))
@@ -102,17 +99,12 @@ async def _once(watch: _Watch, options: argparse.Namespace, stop: asyncio.Event)
 async def _live(watch: _Watch, stop: asyncio.Event) -> None:
     """Show a run until it ends or the user has seen enough."""
     console = Console()
-
-    def show(draw_now: Callable[..., None]) -> None:
-        width, height = console.size
-        draw_now(Group(*top_view.lines(watch.frame(), width, height)), refresh=True)
-
     with keys(lambda key: _press(watch, key, stop)), Live(
             console=console, screen=True, auto_refresh=False) as live:
         while not stop.is_set() and not is_over(watch.session.run):
-            show(live.update)
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(stop.wait(), LOOK_S)
+            width, height = console.size
+            live.update(Group(*top_view.lines(watch.frame(), width, height)), refresh=True)
+            await pause(stop, LOOK_S)
 
 
 def _press(watch: _Watch, key: str, stop: asyncio.Event) -> None:

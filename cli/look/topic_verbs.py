@@ -34,7 +34,7 @@ from rampart.cli.following import LOOK_S, is_over
 from rampart.cli.look.topic_catalogue import MAILBOX, fields, markdown, resolve, topics_for, uses
 from rampart.cli.output import (
     NoEffectError,
-    UsageError,
+    positive,
     print_json,
     print_table,
     say,
@@ -42,7 +42,7 @@ from rampart.cli.output import (
     unknown,
     warn,
 )
-from rampart.cli.session import Session, connect
+from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option
 from rampart.files import streams
 
@@ -133,8 +133,8 @@ async def topic_echo(options: argparse.Namespace) -> int:
       rampart topic echo plan/route -n 1 --json
     """
     topic, key = resolve(options.key, topics_for(options.key, options.port))
-    _positive("--count", options.count)
-    _positive("--duration", options.duration)
+    positive("--count", options.count)
+    positive("--duration", options.duration)
     done = asyncio.Event()
     seen = 0
 
@@ -170,8 +170,7 @@ async def topic_echo(options: argparse.Namespace) -> int:
         async for left in _while_it_runs(session, options.duration):
             if done.is_set():
                 break
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(done.wait(), min(LOOK_S, left))
+            await pause(done, min(LOOK_S, left))
     if not seen:
         raise _nothing_came(options.key, options.duration)
     return 0
@@ -188,7 +187,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
       rampart topic hz 'heartbeat/*' --duration 3 --json
     """
     topic, key = resolve(options.key, topics_for(options.key, options.port))
-    _positive("--duration", options.duration)
+    positive("--duration", options.duration)
     arrivals: Remembered[str, deque[float]] = Remembered(MANY)
     duration_s = options.duration
     if options.json and duration_s is None:
@@ -280,11 +279,6 @@ async def _checked(port: int | None, topic: Topic[Any], key: str) -> AsyncIterat
             if member not in session.run.nodes:
                 raise unknown("node", member, session.run.nodes)
         yield session
-
-
-def _positive(option: str, value: float | None) -> None:
-    if value is not None and not value > 0:
-        raise UsageError(f"{option} {value:g}: must be above 0")
 
 
 def _describe(

@@ -4,27 +4,29 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import math
 from typing import Any
 
 import msgspec
 
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.layout.system_topics import published_keys
+from rampart.actors.layout.system_topics import find_topic, published_keys
 from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.runtime.corruption import InjectionError, field_type, is_array
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import resolve, topics_for
 from rampart.cli.operate.injecting import run_fault
-from rampart.cli.output import UsageError, print_json, print_table, say
+from rampart.cli.output import UsageError, positive, print_json, print_table, refusing, say
 from rampart.cli.verbs import JSON, PORT, add_verb, flag, group, number, option, whole
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
-from rampart.sim.faults.faults import Faults, faults_of
+from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.topic_faults import modes_of, systematic_faults
 
 _DEFAULT_DURATION_S = 5.0
+_SECONDS = "must be seconds above 0"
 
 
 def add(verbs: Any) -> None:
@@ -99,8 +101,7 @@ def inject(options: argparse.Namespace) -> int:
         raise UsageError(f"--system {options.system}: goes with --list; a fault is injected into "
                          "the run that there is")
     fault = choose(options)
-    if options.duration is not None and not options.duration > 0:
-        raise UsageError(f"--duration {options.duration:g}: must be seconds above 0, or inf")
+    positive("--duration", options.duration, "must be seconds above 0, or inf")
     return asyncio.run(run_fault(
         fault, options.duration, options.port, at_once=options.at_once, as_json=options.json))
 
@@ -117,10 +118,8 @@ def choose(options: argparse.Namespace) -> Fault:
         raise UsageError(f"--share {options.share:g}: must be above 0, and at most 1")
     if (options.on is None) != (options.off is None):
         raise UsageError("--on S and --off S go together")
-    for name in ("on", "off"):
-        value = getattr(options, name)
-        if value is not None and not 0 < value < float("inf"):
-            raise UsageError(f"--{name} {value:g}: must be seconds above 0")
+    positive("--on", options.on, _SECONDS, math.inf)
+    positive("--off", options.off, _SECONDS, math.inf)
     fault = _own_fault(options) if options.fault is None else _known_fault(options)
     return fault.varied(share=options.share, on_s=options.on, off_s=options.off)
 
@@ -130,53 +129,47 @@ def _known_fault(options: argparse.Namespace) -> Fault:
         if getattr(options, name):
             raise UsageError(f"--{name.replace('_', '-')} goes with --topic, not with a "
                              "FAULT of the catalogue")
-    try:
-        _, colon, key = options.fault.partition(":")
-        known = topics_for(key, options.port) if colon else ()
-        return _faults(options.port).find(options.fault, options.seed or 0, known)
-    except UnknownFaultError as error:
-        raise UsageError(str(error)) from None
+    _, colon, key = options.fault.partition(":")
+    known = topics_for(key, options.port) if colon else ()
+    with refusing(UnknownFaultError):
+        return faults_of(_system(options.port)).find(options.fault, options.seed or 0, known)
 
 
-def _faults(port: int | None) -> Faults:
-    """Return the faults of the run's robot; of the shipped system's, if there is none to read."""
+def _system(port: int | None) -> SystemSpec:
+    """Return the system of the run; the shipped one, if there is none to read."""
     try:
-        spec = systems.load(find_run(port).system_file)
+        return systems.load(find_run(port).system_file)
     except (NoRunError, UsageError):
-        spec = systems.load(None)
-    return faults_of(spec)
+        return systems.load(None)
 
 
 def _own_fault(options: argparse.Namespace) -> Fault:
     topic, key = resolve(options.topic, topics_for(options.topic, options.port))
     if "*" in key:
+        members = [k for k in published_keys(_system(options.port)) if find_topic(k, (topic,))]
         raise UsageError(f"--topic {options.topic}: name one member of the family, "
-                         f"e.g. {topic.key.replace('{name}', 'DM1')}")
+                         f"e.g. {next(iter(members), topic.key)}")
     if options.mode not in MODES:
         raise UsageError(f"--mode {options.mode}: must be one of {', '.join(MODES)}")
     changes = (options.set, options.add, options.ramp, options.noise, options.keep_ends)
-    if any(changes) != (options.mode == "corrupt"):
-        raise UsageError("--mode corrupt goes with --set, --add, --ramp, --noise or --keep-ends, "
-                         "and no other mode does")
-    if (options.delay is not None) != (options.mode == "delay"):
-        raise UsageError("--mode delay goes with --delay S, and no other mode does")
-    if options.delay is not None and not 0 < options.delay < float("inf"):
-        raise UsageError(f"--delay {options.delay:g}: must be seconds above 0")
-    if (options.stamp is not None) != (options.mode == "restamp"):
-        raise UsageError("--mode restamp goes with --stamp S, and no other mode does")
+    for mode, needed, given in (
+            ("corrupt", "--set, --add, --ramp, --noise or --keep-ends", any(changes)),
+            ("delay", "--delay S", options.delay is not None),
+            ("restamp", "--stamp S", options.stamp is not None)):
+        if given != (options.mode == mode):
+            raise UsageError(f"--mode {mode} goes with {needed}, and no other mode does")
+    positive("--delay", options.delay, _SECONDS, math.inf)
     disturbance = Disturbance(
         key.removeprefix(f"{ROOT}/"), options.mode, options.delay or 0.0,
         set_fields=dict(_setting(text, topic) for text in options.set),
         add_fields=dict(_amount("--add", text, topic) for text in options.add),
         ramp_fields=dict(_amount("--ramp", text, topic) for text in options.ramp),
         noise_fields=dict(_amount("--noise", text, topic) for text in options.noise),
-        keep_ends=tuple(options.keep_ends),
-        seed=options.seed or 0, stamp_s=options.stamp or 0.0)
+        keep_ends=tuple(options.keep_ends), seed=options.seed or 0, stamp_s=options.stamp or 0.0)
     reason = flaw(disturbance.order("", _DEFAULT_DURATION_S), topic.type)
     if reason:
         raise UsageError(f"--topic {options.topic}: {reason}")
-    return Fault(f"{options.mode} {disturbance.topic}", "", (disturbance,), (),
-                 _DEFAULT_DURATION_S)
+    return Fault(f"{options.mode} {disturbance.topic}", "", (disturbance,), (), _DEFAULT_DURATION_S)
 
 
 def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
@@ -184,10 +177,8 @@ def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
     name, equals, value = text.partition("=")
     if not equals:
         raise UsageError(f"{option} {text}: must be FIELD=VALUE")
-    try:
+    with refusing(InjectionError):
         return name, value, field_type(topic.type, name)
-    except InjectionError as error:
-        raise UsageError(str(error)) from None
 
 
 def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:

@@ -13,6 +13,8 @@ import argparse
 import asyncio
 from typing import Any
 
+import msgspec
+
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
@@ -22,7 +24,7 @@ from rampart.cli.holdings import Holdings
 from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say
 from rampart.cli.robot_lines import RobotLines
 from rampart.cli.run_picture import manager_in_words
-from rampart.cli.session import Session, connect
+from rampart.cli.session import connect
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb
 
 _STATUS = (ftm_topics.MANAGER_STATUS, ftm_topics.NODES)
@@ -53,13 +55,10 @@ print(next(n["pid"] for n in json.load(sys.stdin) if n["name"] == "localization"
         raise NoEffectError("the supervisor does not answer; it may just be restarting, try again")
     table: fm.NodeTable = found[ftm_topics.NODES.key]
     if options.json:
-        print_json([
-            {"name": n.name, "kind": n.kind, "pid": n.pid, "state": n.state,
-             "incarnation": n.incarnation, "restarts": n.restarts} for n in table.nodes])
+        print_json(table.nodes)
     else:
-        print_table(("name", "kind", "pid", "state", "incarnation", "restarts"),
-                    [(n.name, n.kind, n.pid, n.state.value, n.incarnation, n.restarts)
-                     for n in table.nodes])
+        print_table(fm.NodeInfo.__struct_fields__,
+                    [msgspec.structs.astuple(node) for node in table.nodes])
     return 0
 
 
@@ -74,7 +73,7 @@ async def status(options: argparse.Namespace) -> int:
       rampart status --json
     """
     async with connect(options.port) as session:
-        held, lines = Holdings(session), _lines(session.run)
+        run, held, lines = session.run, Holdings(session), _lines(session.run)
         found, _ = await asyncio.gather(
             session.latest((*lines.status_read, *_STATUS), session.real_s(_WAIT_S)),
             held.settle())
@@ -86,16 +85,17 @@ async def status(options: argparse.Namespace) -> int:
     manager: fm.ManagerStatus | None = found.get(ftm_topics.MANAGER_STATUS.key)
     nodes: fm.NodeTable | None = found.get(ftm_topics.NODES.key)
     if options.json:
-        run = session.run
         print_json({
             "run_id": run.run_id, "title": run.title, "port": run.base_port, "pid": run.pid,
             "rate": run.rate, "system": run.system_file, "time_s": round(time_s, 3),
             **lines.status_data(latest), "manager": manager, "holders": held.holders,
             "nodes": nodes.nodes if nodes else None})
         return 0
-    _print_run(session, time_s)
+    page = f", page {run.page}" if run.page else ""
+    say(f"run       {run.title} (port {run.base_port}, pid {run.pid})")
+    say(f"time      {time_s:.1f} s at rate {run.rate:g}{page}")
     kinds = {n.kind for n in nodes.nodes} if nodes else {"pilot", "manager"}
-    for label, text in lines.status(latest, session.run.plan, kinds):
+    for label, text in lines.status(latest, run.plan, kinds):
         say(f"{label:<9} {text}")
     if manager is not None or "manager" in kinds:
         say(f"manager   {manager_in_words(manager)}")
@@ -111,13 +111,6 @@ def _lines(run: RunInfo) -> RobotLines:
         return systems.lines_of(systems.load(run.system_file))
     except UsageError:  # of a run from elsewhere, say: what the engine tells is there
         return RobotLines()
-
-
-def _print_run(session: Session, time_s: float) -> None:
-    run = session.run
-    say(f"run       {run.title} (port {run.base_port}, pid {run.pid})")
-    page = f", page {run.page}" if run.page else ""
-    say(f"time      {time_s:.1f} s at rate {run.rate:g}{page}")
 
 
 def _nodes(table: fm.NodeTable | None) -> str:

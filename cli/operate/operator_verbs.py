@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 from typing import Any
 
 from rampart.actors.ftm import messages as fm
@@ -12,8 +11,8 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
 from rampart.cli.holdings import Holdings
-from rampart.cli.output import NoEffectError, UsageError, say, unknown
-from rampart.cli.session import Latest, Session, connect
+from rampart.cli.output import NoEffectError, positive, say, unknown
+from rampart.cli.session import Latest, Session, connect, pause
 from rampart.cli.verbs import PORT, add_verb, option
 
 STUB_DETECTION = "rampart.actors.detection.stub:StubDetection"
@@ -96,8 +95,7 @@ async def trigger(options: argparse.Namespace) -> int:
       rampart trigger D_CURTAIN
       rampart trigger D_VISION --for 5
     """
-    if not 0 < options.duration < 1e6:
-        raise UsageError(f"--for {options.duration:g}: must be above 0")
+    positive("--for", options.duration, below=1e6)
     async with connect(options.port) as session:
         spec = systems.load(session.run.system_file)
         stubs = [d.name for d in spec.detections if d.actor == STUB_DETECTION]
@@ -118,8 +116,8 @@ async def trigger(options: argparse.Namespace) -> int:
             raise NoEffectError(f"no effect: {options.module} does not answer")
         say(f"{options.module} detects")
         stop = asyncio.Event()
-        with stopped_by_signals(stop), contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(stop.wait(), options.duration / session.clock.rate)
+        with stopped_by_signals(stop):
+            await pause(stop, options.duration / session.clock.rate)
         if not await bring(fm.DetectionState.IDLE):
             raise NoEffectError(f"{options.module} did not become idle again")
     say(f"{options.module} is idle again")

@@ -17,7 +17,7 @@ from rampart.actors.recording.recorder import Recorder
 from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
-from rampart.cli.output import NoEffectError, UsageError, refusing, say
+from rampart.cli.output import NoEffectError, UsageError, between, positive, refusing, say
 from rampart.cli.record.replaying import DEFAULT_PORT, Replay
 from rampart.cli.verbs import PORT, add_verb, flag, number, option, whole
 
@@ -58,8 +58,7 @@ def record(options: argparse.Namespace) -> int:
       rampart record crash.mcap --duration 60
       rampart record poses.mcap --topics 'localization/*' 'detection/*'
     """
-    if options.duration is not None and not 0 < options.duration < 1e9:
-        raise UsageError(f"--duration {options.duration:g}: must be above 0")
+    positive("--duration", options.duration, below=1e9)
     with refusing(NoRunError, BagError):
         run = find_run(options.port)
         wants = _wanted(options.topics, run)
@@ -158,15 +157,13 @@ def _late(options: argparse.Namespace) -> Callable[[str], bool]:
 
 
 def _check(options: argparse.Namespace) -> None:
-    if not 0.01 <= options.rate <= 1000:
-        raise UsageError(f"--rate {options.rate:g}: must be between 0.01 and 1000")
+    between("--rate", options.rate, 0.01, 1000)
     if not 0 <= options.delay < 1e6:
         raise UsageError(f"--delay {options.delay:g}: must not be negative")
     if options.start is not None and not -1e9 < options.start < 1e9:
         raise UsageError(f"--start {options.start:g}: must be a time of the run in seconds")
-    for name, port in (("--port", options.port), ("--hmi-port", options.hmi_port or _PORTS[0])):
-        if not _PORTS[0] <= port <= _PORTS[1]:
-            raise UsageError(f"{name} {port}: must be between {_PORTS[0]} and {_PORTS[1]}")
+    between("--port", options.port, *_PORTS)
+    between("--hmi-port", options.hmi_port or _PORTS[0], *_PORTS)
     if options.hmi_port == options.port:
         raise UsageError(f"--hmi-port {options.hmi_port}: is the replay's own --port; choose "
                          "another --hmi-port")
