@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -85,19 +85,20 @@ def warn(text: str) -> None:
     print(f"rampart: {one_line(text, _WARNING_CHARS)}", file=sys.stderr, flush=True)
 
 
-def show_progress(text: str) -> None:
-    """Show on a terminal what is being done, in the place of what was; "" wipes it away."""
-    if sys.stderr.isatty():
-        print(f"\r\x1b[K{text[:100]}", end="", file=sys.stderr, flush=True)
-
-
 @contextlib.contextmanager
-def progress() -> Iterator[None]:
-    """Wipe away at the end what was shown of the progress meanwhile."""
+def progress() -> Iterator[Callable[[str], None]]:
+    """Give a function that shows on a terminal what is being done, in the place of what was.
+
+    At the end all is wiped away.
+    """
+    def show(text: str) -> None:
+        if sys.stderr.isatty():
+            print(f"\r\x1b[K{text[:100]}", end="", file=sys.stderr, flush=True)
+
     try:
-        yield
+        yield show
     finally:
-        show_progress("")
+        show("")
 
 
 def print_json(data: Any, *, indent: bool = True) -> None:

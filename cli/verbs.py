@@ -10,7 +10,7 @@ import argparse
 import asyncio
 import importlib
 import inspect
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterable
 from types import ModuleType
 from typing import Any
 
@@ -47,15 +47,16 @@ def whole(name: str, metavar: str, text: str, default: int | None = None) -> Opt
 
 def group(title: str, *options: Option) -> Option:
     """Return options that stand under a title of their own in the help."""
-    return lambda parser: _add_all(parser.add_argument_group(title), options)
+    return lambda parser: add_options(parser.add_argument_group(title), options)
 
 
 def either(*options: Option) -> Option:
     """Return options of which one at most may be given."""
-    return lambda parser: _add_all(parser.add_mutually_exclusive_group(), options)
+    return lambda parser: add_options(parser.add_mutually_exclusive_group(), options)
 
 
-def _add_all(parser: argparse._ActionsContainer, options: tuple[Option, ...]) -> None:
+def add_options(parser: argparse._ActionsContainer, options: Iterable[Option]) -> None:
+    """Add options to a parser, or to a group of one."""
     for add in options:
         add(parser)
 
@@ -99,7 +100,7 @@ def add_verb(verbs: Any, name: str, text: str, run: Run, *options: Option, doc: 
         return done if isinstance(done, int) else asyncio.run(done)
 
     parser = verbs.add_parser(name, help=text, **_help(doc or inspect.getdoc(run) or ""))
-    _add_all(parser, options)
+    add_options(parser, options)
     parser.set_defaults(run=call)
 
 

@@ -18,7 +18,6 @@ from rampart.cli.output import (
     progress,
     refusing,
     say,
-    show_progress,
     using,
 )
 from rampart.cli.session import connect
@@ -79,8 +78,8 @@ def run(options: argparse.Namespace) -> int:
             return _export(spec, options.export)
         return _show_outlook(spec, options.active, as_json=options.json)
     try:
-        with progress():
-            found = CutSets(formula, progress=show_progress)
+        with progress() as show:
+            found = CutSets(formula, progress=show)
         if not options.count:
             return _list(spec, formula, found, options)
     except TooLargeError as error:

@@ -7,15 +7,7 @@ import time
 from typing import Any
 
 from rampart.cli import systems
-from rampart.cli.output import (
-    UsageError,
-    print_json,
-    print_table,
-    progress,
-    refusing,
-    say,
-    show_progress,
-)
+from rampart.cli.output import UsageError, print_json, print_table, progress, refusing, say
 from rampart.cli.verbs import JSON, add_verb, flag, option, whole
 from rampart.manager.analysis.verification import MEANING, Report, TooLargeError, verify
 from rampart.manager.spec.schema import SystemSpec
@@ -54,8 +46,8 @@ def run(options: argparse.Namespace) -> int:
     if options.together < 1:
         raise UsageError(f"--together {options.together}: a number from 1 up is right")
     start = time.monotonic()
-    with progress(), refusing(TooLargeError, UnknownStrategyError):
-        report = verify(spec, options.strategy, options.together, show_progress)
+    with progress() as show, refusing(TooLargeError, UnknownStrategyError):
+        report = verify(spec, options.strategy, options.together, show)
     if options.json:
         print_json(report)
     else:
