@@ -68,10 +68,9 @@ class Run:
         run = RunContext(plan, spec, load_document(plan), application)
         self._directory = Path(options.report) if options.report else (
             reports / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind(run).name}")
+        kept = self._directory.resolve()
         plan = msgspec.structs.replace(
-            plan,
-            error_log=str(self._directory.resolve() / ERROR_LOG),
-            checkpoints=str(self._directory.resolve() / "checkpoints"))
+            plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"))
         self._trial = kind(replace(run, plan=plan),
                            options.patience if kind.judges else options.duration, sys.stderr)
         self._plan = plan
@@ -86,25 +85,22 @@ class Run:
                 raise UsageError(f"--fault {planned.text()}: mission {self._trial.name} has "
                                  f"{self._trial.goals} goals")
 
-    def on_processes(self) -> int:
-        """Run on processes and return the exit code.
+    def run(self) -> int:
+        """Run and return the exit code.
 
         Raises:
             LaunchError: the system cannot be started.
         """
-        return asyncio.run(self._on_processes())
+        with _kept(self._directory):
+            if self._options.virtual:
+                return self._in_virtual_time()
+            return asyncio.run(self._on_processes())
 
     async def _on_processes(self) -> int:
         run = ProcessRun(self._trial, self._scenario)
-        with _kept(self._directory), _recorded(self._options):
+        with _recorded(self._options):
             _interruptible(run)
-            record = await run.run()
-            return self._conclude(record, run.failure)
-
-    def in_virtual_time(self) -> int:
-        """Run in virtual time and return the exit code."""
-        with _kept(self._directory):
-            return self._in_virtual_time()
+            return self._conclude(await run.run(), run.failure)
 
     def _in_virtual_time(self) -> int:
         recording = None
@@ -186,37 +182,30 @@ def _kept(directory: Path) -> Iterator[None]:
     except OSError as error:
         raise UsageError(f"--report {directory}: no directory that can be written "
                          f"({error.strerror})") from None
-    before = _size(log)
+    before = log.stat().st_size if log.exists() else 0
     try:
         yield
     finally:
-        if _size(log) > before:
+        if log.exists() and log.stat().st_size > before:
             _say(f"tracebacks of what failed: {log}")
         if made:
             with contextlib.suppress(OSError):  # there is something in it
                 directory.rmdir()
 
 
-def _size(file: Path) -> int:
-    try:
-        return file.stat().st_size
-    except OSError:
-        return 0
-
-
 @contextlib.contextmanager
 def _recorded(options: argparse.Namespace) -> Iterator[None]:
     """Have what runs meanwhile recorded, if that is asked for, by a process of its own."""
-    recorder = None
-    if options.record:
-        recorder = RecorderProcess(Order(options.port, str(Path(options.record).resolve()),
-                                         os.getpid(), options.overwrite))
-        recorder.start()
+    if not options.record:
+        yield
+        return
+    recorder = RecorderProcess(Order(options.port, str(Path(options.record).resolve()),
+                                     os.getpid(), options.overwrite))
+    recorder.start()
     try:
         yield
     finally:
-        if recorder is not None:
-            recorder.end()
+        recorder.end()
 
 
 def _interruptible(run: ProcessRun) -> None:
@@ -270,8 +259,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
         options, kind = parse(arguments, program)
-        run = Run(options, *plan_of(options, kind), reports)
-        return run.in_virtual_time() if options.virtual else run.on_processes()
+        return Run(options, *plan_of(options, kind), reports).run()
     except (UsageError, LaunchError, BagError, ValueError, OSError) as error:
         _say(str(error))
         return EXIT_USAGE

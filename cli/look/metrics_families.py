@@ -64,15 +64,15 @@ def families(now: Exposition | None) -> Iterator[Metric]:
 
 def gauge(name: str, doc: str, labels: tuple[str, ...], rows: Iterable[Row]) -> Metric:
     """Return a gauge with a row for each value of its labels."""
-    family = GaugeMetricFamily(f"rampart_{name}", doc, labels=labels)
-    for values, value in rows:
-        family.add_metric(values, value)
-    return family
+    return _filled(GaugeMetricFamily(f"rampart_{name}", doc, labels=labels), rows)
 
 
 def counter(name: str, doc: str, labels: tuple[str, ...], rows: Iterable[Row]) -> Metric:
     """Return a counter with a row for each value of its labels."""
-    family = CounterMetricFamily(f"rampart_{name}", doc, labels=labels)
+    return _filled(CounterMetricFamily(f"rampart_{name}", doc, labels=labels), rows)
+
+
+def _filled(family: GaugeMetricFamily | CounterMetricFamily, rows: Iterable[Row]) -> Metric:
     for values, value in rows:
         family.add_metric(values, value)
     return family
@@ -89,15 +89,13 @@ def _nodes(now: Exposition) -> Iterator[Metric]:
     yield counter("node_restarts", "How often a node was restarted in this run.", ("node",), [
         ((n.name,), n.restarts) for n in nodes])
     yield gauge("heartbeat_age_seconds", "Simulated seconds since a node's last heartbeat.",
-                 ("node",), [((name,), max(0.0, now.time_s - beat.heard_s))
-                             for name, beat in beats])
+                ("node",), [((name,), max(0.0, now.time_s - beat.heard_s)) for name, beat in beats])
     yield counter("rejected_payloads", "Payloads that a node refused, in this life.", ("node",), [
         ((name,), beat.message.rejected_payloads) for name, beat in beats])
-    yield counter("overflowed_commands", "Commands that found a node's mailbox full, in this "
-                   "life.", ("node",), [
-                       ((name,), beat.message.overflowed) for name, beat in beats])
-    yield counter("process_events", "What happened to processes.", ("node", "event"), [
-        (key, count) for key, count in sorted(now.picture.process_events_total.items())])
+    yield counter("overflowed_commands", "Commands that found a node's mailbox full, in this life.",
+                  ("node",), [((name,), beat.message.overflowed) for name, beat in beats])
+    yield counter("process_events", "What happened to processes.", ("node", "event"),
+                  sorted(now.picture.process_events_total.items()))
 
 
 def _mechanisms(picture: RunPicture) -> Iterator[Metric]:

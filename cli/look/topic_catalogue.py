@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from enum import Enum
 from typing import Any
 
@@ -11,6 +11,7 @@ import msgspec
 
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES
 from rampart.actors.bus.topic import ROOT, Qos, Topic
+from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import SUPERVISOR_CLASS, application_class
 from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.layout.wiring import load_class, topics_of
@@ -47,10 +48,7 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
     """
     members = [(SUPERVISOR, SUPERVISOR_CLASS), (OBSERVER, application_class(spec).observer),
                *((node.name, node.actor) for node in spec.actors())]
-    wired: list[tuple[str, tuple[Topic[Any], ...], tuple[Topic[Any], ...]]] = []
-    for name, path in members:
-        inputs, outputs = topics_of(_class(name, path))
-        wired.append((name, inputs, outputs))
+    wired = [(name, *topics_of(_class(name, path))) for name, path in members]
     return [TopicUse(topic, _publishers(topic, wired), _readers(topic, wired))
             for topic in systems.topics_of(spec)]
 
@@ -109,6 +107,22 @@ def _match(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str] | No
                  and short in (topic.key, topic.key.replace("{name}", "*"))), None)
 
 
+def check_member(key: str, nodes: Collection[str]) -> None:
+    """Make sure that there is the node that a key names, if the key is one of the engine's.
+
+    The members of a robot's own families need not be nodes.
+
+    Raises:
+        UsageError: there is no such node.
+    """
+    topic = find_topic(key, topics.ALL)
+    if topic is not None and topic.is_family:
+        head, tail = topic.key.split("{name}")
+        member = key[len(head):len(key) - len(tail)]
+        if member not in nodes:
+            raise unknown("node", member, nodes)
+
+
 def fields(kind: type[msgspec.Struct]) -> list[tuple[str, str]]:
     """Return name and type of each field of a message, as text."""
     return [(f.name, _type_name(f.type)) for f in msgspec.structs.fields(kind)]
@@ -145,14 +159,14 @@ def markdown(spec: SystemSpec) -> str:
         t = use.topic
         cells = (
             f"`{t.key}`", f"[{t.type.__name__}](#{t.type.__name__.lower()})", t.qos.value,
-            MAILBOX[t.qos], _rate(t), f"`{t.frame}`" if t.frame else "",
+            MAILBOX[t.qos], rate(t), f"`{t.frame}`" if t.frame else "",
             ", ".join(use.publishers), ", ".join(use.readers))
         lines.append(f"| {' | '.join(cells)} |")
     lines += ["", "## What each key is for", ""]
     lines += [f"- `{use.topic.key}`: {use.topic.doc}" for use in table]
     lines += ["", "## Messages", ""]
     for kind in _messages(use.topic for use in table):
-        lines += [f"### {kind.__name__}", "", _summary(kind), ""]
+        lines += [f"### {kind.__name__}", "", summary(kind), ""]
         lines += [f"- `{name}`: {type_name}" for name, type_name in fields(kind)]
         lines.append("")
     return "\n".join(lines).rstrip() + "\n"
@@ -178,7 +192,8 @@ def _class(name: str, path: str) -> type[Actor]:
         raise UsageError(f"node {name}: {error}") from None
 
 
-def _rate(topic: Topic[Any]) -> str:
+def rate(topic: Topic[Any]) -> str:
+    """Return the nominal rate of a topic in words."""
     return f"{topic.rate_hz:g} Hz" if topic.rate_hz else "on event"
 
 
@@ -210,7 +225,8 @@ def _limits(meta: msgspec.Meta) -> str:
     return f"{{{least}..{most}}}"
 
 
-def _summary(kind: type[Any]) -> str:
+def summary(kind: type[msgspec.Struct]) -> str:
+    """Return what is said of a message, in one line."""
     return " ".join((kind.__doc__ or "").split())
 
 

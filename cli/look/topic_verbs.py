@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import itertools
 import math
 import statistics
@@ -27,11 +26,21 @@ import msgspec
 from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
-from rampart.actors.bus.topic import Topic
-from rampart.actors.ftm import topics
+from rampart.actors.bus.topic import ROOT
 from rampart.cli import systems
 from rampart.cli.following import LOOK_S, is_over
-from rampart.cli.look.topic_catalogue import MAILBOX, fields, markdown, resolve, topics_for, uses
+from rampart.cli.look.topic_catalogue import (
+    MAILBOX,
+    TopicUse,
+    check_member,
+    fields,
+    markdown,
+    rate,
+    resolve,
+    summary,
+    topics_for,
+    uses,
+)
 from rampart.cli.output import (
     NoEffectError,
     positive,
@@ -39,7 +48,6 @@ from rampart.cli.output import (
     print_table,
     say,
     say_text,
-    unknown,
     warn,
 )
 from rampart.cli.session import Session, connect, pause
@@ -83,12 +91,11 @@ def topic_list(options: argparse.Namespace) -> int:
         return 0
     table = uses(spec)
     if options.json:
-        print_json([_describe(use.topic, use.publishers, use.readers) for use in table])
+        print_json([_describe(use) for use in table])
     else:
         print_table(("key", "message", "qos", "rate", "frame"),
-                    [(u.topic.key, u.topic.type.__name__, u.topic.qos.value,
-                      f"{u.topic.rate_hz:g} Hz" if u.topic.rate_hz else "on event", u.topic.frame)
-                     for u in table])
+                    [(t.key, t.type.__name__, t.qos.value, rate(t), t.frame)
+                     for t in (use.topic for use in table)])
     return 0
 
 
@@ -105,16 +112,16 @@ def topic_info(options: argparse.Namespace) -> int:
     topic, _ = resolve(options.key, systems.topics_of(spec))
     use = next(u for u in uses(spec) if u.topic is topic)
     if options.json:
-        print_json({**_describe(topic, use.publishers, use.readers),
+        print_json({**_describe(use),
                     "fields": [{"name": n, "type": t} for n, t in fields(topic.type)]})
         return 0
     say(f"key         {topic.key}")
-    say(f"message     {topic.type.__name__}: {' '.join((topic.type.__doc__ or '').split())}")
+    say(f"message     {topic.type.__name__}: {summary(topic.type)}")
     for name, type_name in fields(topic.type):
         say(f"              {name}: {type_name}")
     say(f"about       {topic.doc}")
     say(f"qos         {topic.qos.value}, at the reader: {MAILBOX[topic.qos]}")
-    say(f"rate        {f'{topic.rate_hz:g} Hz' if topic.rate_hz else 'on event'}")
+    say(f"rate        {rate(topic)}")
     say(f"frame       {topic.frame or 'none'}")
     say(f"publishers  {', '.join(use.publishers) or 'none'}")
     say(f"readers     {', '.join(use.readers) or 'none'}")
@@ -165,7 +172,8 @@ async def topic_echo(options: argparse.Namespace) -> int:
             say(f"garbage {short} {len(payload)} bytes, not a {topic.type.__name__}: {reason}; "
                 f"{payload[:_SHOWN_BYTES]!r}")
 
-    async with _checked(options.port, topic, key) as session:
+    async with connect(options.port) as session:
+        check_member(key.removeprefix(f"{ROOT}/"), session.run.nodes)
         session.listen(topic, key, heard, garbage)
         async for left in _while_it_runs(session, options.duration):
             if done.is_set():
@@ -192,7 +200,8 @@ async def topic_hz(options: argparse.Namespace) -> int:
     duration_s = options.duration
     if options.json and duration_s is None:
         duration_s = 3.0
-    async with _checked(options.port, topic, key) as session:
+    async with connect(options.port) as session:
+        check_member(key.removeprefix(f"{ROOT}/"), session.run.nodes)
 
         def heard(short: str, _header: Header, _body: Any) -> None:
             times = arrivals.get(short)
@@ -268,22 +277,8 @@ def _nothing_came(key: str, duration_s: float | None) -> NoEffectError:
     return NoEffectError(f"nothing came on {key} {when}")
 
 
-@contextlib.asynccontextmanager
-async def _checked(port: int | None, topic: Topic[Any], key: str) -> AsyncIterator[Session]:
-    """Join the run, and make sure that it has the node of which a family's member is asked for."""
-    async with connect(port) as session:
-        # The members of a robot's own families need not be nodes.
-        if topic.is_family and key != topic.pattern and topic in topics.ALL:
-            head, tail = topic.at("\0").split("\0")
-            member = key[len(head):len(key) - len(tail)]
-            if member not in session.run.nodes:
-                raise unknown("node", member, session.run.nodes)
-        yield session
-
-
-def _describe(
-    topic: Topic[Any], publishers: tuple[str, ...], readers: tuple[str, ...]
-) -> dict[str, Any]:
+def _describe(use: TopicUse) -> dict[str, Any]:
+    topic = use.topic
     return {"key": topic.key, "message": topic.type.__name__, "qos": topic.qos.value,
             "rate_hz": topic.rate_hz, "frame": topic.frame, "mailbox": MAILBOX[topic.qos],
-            "publishers": publishers, "readers": readers, "doc": topic.doc}
+            "publishers": use.publishers, "readers": use.readers, "doc": topic.doc}

@@ -11,10 +11,9 @@ import msgspec
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.messages import Injection, InjectionReport
-from rampart.actors.ftm import topics
-from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.runtime.fault_watch import FaultWatch, Order
-from rampart.cli.output import NoEffectError, print_json, say, unknown
+from rampart.cli.look.topic_catalogue import check_member
+from rampart.cli.output import NoEffectError, print_json, say
 from rampart.cli.session import Session, connect
 from rampart.sim.faults.disturbance import Fault
 
@@ -52,7 +51,7 @@ async def run_fault(fault: Fault, duration_s: float | None, port: int | None, *,
                for order in fault.orders(f"{name}-{uuid.uuid4().hex[:6]}", duration_s)]
     async with connect(port) as session:
         for watch in watches:
-            _check_publisher(session, _injection(watch).topic)
+            check_member(watch.orders[0].place, session.run.nodes)
         settled = asyncio.Event()
 
         def hear(_key: str, _header: Header, report: InjectionReport) -> None:
@@ -137,12 +136,3 @@ def _print_result(fault: Fault, watches: list[FaultWatch], *, at_once: bool) -> 
              "nodes": list(w.nodes), "duration_s": order.duration_s,
              "affected": w.affected, "finished": not w.unfinished, "reason": _refused(w)}
             for w in watches for order in [_injection(w)]]})
-
-
-def _check_publisher(session: Session, key: str) -> None:
-    topic = find_topic(key, topics.ALL)
-    if topic is not None and topic.is_family:
-        head, tail = topic.key.split("{name}")
-        member = key[len(head):len(key) - len(tail)]
-        if member not in session.run.nodes:
-            raise unknown("node", member, session.run.nodes)
