@@ -22,7 +22,7 @@ from rampart.actors.web.access import Access, AccessError, is_loopback, new_toke
 from rampart.actors.web.token_file import SecretError, read_secret
 from rampart.cli import application_options
 from rampart.cli.output import UsageError, between, positive
-from rampart.cli.verbs import FORMATTER, LOOPBACK, add_options, flag, number, option, whole
+from rampart.cli.verbs import FORMATTER, add_options, flag, number, option, several, whole, word
 from rampart.manager.spec.specification import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
 from rampart.sim.faults.faults import faults_of
@@ -58,25 +58,23 @@ nobody reads change none of them; with --json, "report_error" says why there is 
 
 _OPTIONS = (
     flag("--wait", "let the operator start the mission from the page"),
-    option("--system", metavar="FILE", default=str(systems.DEFAULT), help="system spec, or name of "
-           f"a shipped one: {systems.names()} (default: osmosis)"),
-    option("--strategy", metavar="NAME", default="",
-           help=f"one of {', '.join(STRATEGIES)} (default: the system's)"),
-    option("--shadow", metavar="NAME", default="", help="a second strategy that decides without "
-           "effect; where it differs, it says so (default: the system's)"),
+    word("--system", "FILE", f"system spec, or name of a shipped one: {systems.names()} (default: "
+         "osmosis)", str(systems.DEFAULT)),
+    word("--strategy", "NAME", f"one of {', '.join(STRATEGIES)} (default: the system's)", ""),
+    word("--shadow", "NAME", "a second strategy that decides without effect; where it differs, it "
+         "says so (default: the system's)", ""),
     flag("--no-ftm", "run the paper's unprotected baseline: last command kept, no dead man, no "
          "respawn"),
     number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
     whole("--seed", "N", "for sensor noise (default: 1)", 1),
     flag("--no-hmi", "no operator's page (its node still runs)"),
     whole("--hmi-port", "PORT", "port of the operator's page (default: 8080)", 8080),
-    option("--hmi-host", metavar="HOST", default=LOOPBACK,
-           help="address of the operator's page (default: 127.0.0.1, this machine only). Any other "
-           "makes it need a token, which is printed with the page's address when the run starts"),
-    option("--hmi-token-file", metavar="FILE", default="",
-           help="a file of yours, of mode 0600, with that token, 16 characters or more, to keep it "
-           f"over several runs; or set {TOKEN_VARIABLE} to it (default: a random one; for yourself "
-           "on this machine none is needed)"),
+    word("--hmi-host", "HOST", "address of the operator's page (default: 127.0.0.1, this machine "
+         "only). Any other makes it need a token, which is printed with the page's address when "
+         "the run starts", "127.0.0.1"),
+    word("--hmi-token-file", "FILE", "a file of yours, of mode 0600, with that token, 16 "
+         f"characters or more, to keep it over several runs; or set {TOKEN_VARIABLE} to it "
+         "(default: a random one; for yourself on this machine none is needed)", ""),
     option("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS),  # refused
     whole("--port", "PORT", "number that tells runs on this machine apart; no port is opened "
           f"(default: {DEFAULT_PORT})", DEFAULT_PORT),
@@ -84,20 +82,20 @@ _OPTIONS = (
            "as failed (default: 60)", 60.0),
     number("--duration", "S", "simulated seconds after which a system without a mission ends "
            "(default: when it is interrupted)"),
-    option("--record", metavar="FILE", help="keep everything that is sent in an MCAP file, for "
-           "`rampart bag info`, `rampart replay` and Foxglove-compatible viewers"),
+    word("--record", "FILE", "keep everything that is sent in an MCAP file, for `rampart bag "
+         "info`, `rampart replay` and Foxglove-compatible viewers"),
     flag("--overwrite", "--record may replace an existing file"),
-    option("--report", metavar="DIR", help="where the report goes, checkpoints, and in "
-           f"{ERROR_LOG} the tracebacks of nodes that failed (default: reports/TIME-MISSION, "
-           "without a mission reports/TIME-SYSTEM)"),
+    word("--report", "DIR", f"where the report goes, checkpoints, and in {ERROR_LOG} the "
+         "tracebacks of nodes that failed (default: reports/TIME-MISSION, without a mission "
+         "reports/TIME-SYSTEM)"),
     flag("--virtual", "run a mission in virtual time: all actors in this process, many times "
          "faster than real; the same --seed gives the same run, to the byte"),
-    option("--network", metavar="NAME", default="measured", help="with --virtual, what lies "
-           f"between the nodes: {', '.join(NETWORKS)} (default: measured)"),
-    option("--fault", metavar="FAULT[@WHEN][+S]", action="append", default=[],
-           help="a fault to inject into a mission (repeatable): one of `rampart inject --list`, "
-           "MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE, slow:NODE, or of the robot's; WHEN is "
-           "simulated seconds or goalN (default: 10), S how long it lasts"),
+    word("--network", "NAME", "with --virtual, what lies between the nodes: "
+         f"{', '.join(NETWORKS)} (default: measured)", "measured"),
+    several("--fault", "FAULT[@WHEN][+S]", "a fault to inject into a mission (repeatable): one of "
+            "`rampart inject --list`, MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE, slow:NODE, "
+            "or of the robot's; WHEN is simulated seconds or goalN (default: 10), S how long it "
+            "lasts"),
     flag("--json", "last line of stdout is one JSON object with the result"))
 
 

@@ -35,6 +35,16 @@ def flag(name: str, text: str) -> Option:
     return option(name, action="store_true", help=text)
 
 
+def word(name: str, metavar: str, text: str, default: str | None = None) -> Option:
+    """Return an option with a text as its value."""
+    return option(name, metavar=metavar, default=default, help=text)
+
+
+def several(name: str, metavar: str, text: str) -> Option:
+    """Return an option that may be repeated; its value is a list of texts."""
+    return option(name, action="append", default=[], metavar=metavar, help=text)
+
+
 def number(name: str, metavar: str, text: str, default: float | None = None) -> Option:
     """Return an option with a number as its value."""
     return option(name, type=float, metavar=metavar, default=default, help=text)
@@ -61,9 +71,8 @@ def add_options(parser: argparse._ActionsContainer, options: Iterable[Option]) -
         add(parser)
 
 
-LOOPBACK = "127.0.0.1"
-
-PORT = whole("--port", "N", "base port of the run, if there are several on this machine")
+_WHICH_RUN = "base port of the run, if there are several on this machine"
+PORT = whole("--port", "N", _WHICH_RUN)
 JSON = flag("--json", "print JSON")
 JSON_FORMAT = option("--json", action="store_const", dest="format", const="json",
                      help="the same as --format json")
@@ -78,10 +87,9 @@ def served(port: int, what: str) -> tuple[Option, ...]:
     """
     return (
         whole("--port", "N", f"port to serve on (default {port})", port),
-        option("--host", default=LOOPBACK, metavar="ADDRESS", help=f"address to serve on (default "
-               f"{LOOPBACK}; whoever reaches it may {what})"),
-        option("--run", dest="of", type=int, metavar="N",
-               help="base port of the run, if there are several on this machine"))
+        word("--host", "ADDRESS", "address to serve on (default 127.0.0.1; whoever reaches it may "
+             f"{what})", "127.0.0.1"),
+        option("--run", dest="of", type=int, metavar="N", help=_WHICH_RUN))
 
 
 def add_verb(verbs: Any, name: str, text: str, run: Run, *options: Option, doc: str = "") -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from rampart.cli.verbs import add_verb, flag, group, number, option, whole
+from rampart.cli.verbs import add_verb, flag, group, number, option, several, whole, word
 from rampart.sim.campaign.defaults import BACKENDS, PATIENCE_S
 from rampart.sim.virtual.network import NETWORKS
 
@@ -19,40 +19,38 @@ def add(verbs: Any) -> None:
               flag("--full", "with --paper: the runs of table V on the full system instead, each "
                    "of which is to end in success, safe"),
               whole("--runs", "N", "N random faults of all kinds"),
-              option("--fault", action="append", default=[], metavar="FAULT[@WHEN][+S]",
-                     help="this fault; may be repeated, and be a pattern of names: 'gps-*'"),
+              several("--fault", "FAULT[@WHEN][+S]",
+                      "this fault; may be repeated, and be a pattern of names: 'gps-*'"),
               whole("--together", "K", "with --runs: K faults in each (default 1)", 1),
-              option("--kinds", metavar="K,...", help="with --runs: only these kinds of faults "
-                     "(paper, sensor, topic, process, actuator, world)"),
+              word("--kinds", "K,...", "with --runs: only these kinds of faults (paper, sensor, "
+                   "topic, process, actuator, world)"),
               whole("--search", "N",
                     "N runs of an optimiser that looks for the smallest safety margin"),
-              option("--replay", metavar="RUN", help="repeat a run of --out by its key"),
+              word("--replay", "RUN", "repeat a run of --out by its key"),
               flag("--list", "list the faults that there are")),
         group("under which conditions",
-              option("--system", metavar="SPEC", help="file, or name of a shipped system "
-                     "(default: osmosis, the full one; with --paper alone: paper)"),
-              option("--mission", metavar="NAME", default="A", help="default: A"),
-              option("--airport", metavar="NAME", default="", help="default: the system's"),
-              option("--obstacles", metavar="N,...", default="0,2",
-                     help="how many of the airport's; several are crossed, or drawn from with "
-                     "--runs (default: 0,2)"),
+              word("--system", "SPEC", "file, or name of a shipped system (default: osmosis, the "
+                   "full one; with --paper alone: paper)"),
+              word("--mission", "NAME", "default: A", "A"),
+              word("--airport", "NAME", "default: the system's", ""),
+              word("--obstacles", "N,...", "how many of the airport's; several are crossed, or "
+                   "drawn from with --runs (default: 0,2)", "0,2"),
               option("--ftm", choices=("on", "off", "both"), default="on",
                      help="fault tolerance, the paper's baseline, or both (default: on)"),
-              option("--strategy", action="append", default=[], metavar="NAME",
-                     help="of the manager; may be repeated (default: the system's)"),
-              option("--network", default="measured", metavar="NAME",
-                     help=f"{', '.join(NETWORKS)} (default: measured)"),
+              several("--strategy", "NAME",
+                      "of the manager; may be repeated (default: the system's)"),
+              word("--network", "NAME", f"{', '.join(NETWORKS)} (default: measured)", "measured"),
               whole("--seed", "N", "default: 1", 1),
               whole("--seeds", "N",
                     "with --fault: so many runs of each, from --seed on (default: 1)", 1),
               number("--patience", "S", "simulated seconds without progress that end a run "
                      f"(default: {PATIENCE_S:g})", PATIENCE_S)),
         group("where",
-              option("--out", metavar="DIR", help="default: reports/campaign-NAME, by what is run"),
+              word("--out", "DIR", "default: reports/campaign-NAME, by what is run"),
               whole("--jobs", "N", "processes (default: one per core)", 0),
               option("--backend", default="loky", choices=BACKENDS,
                      help="loky is this machine; dask and ray are existing clusters"),
-              option("--address", default="", metavar="A", help="of the cluster's scheduler")),
+              word("--address", "A", "of the cluster's scheduler", "")),
         flag("--json", "print the rows as JSON"))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,9 @@ from rampart.cli.output import (
     using,
 )
 from rampart.cli.session import connect
-from rampart.cli.verbs import JSON, PORT, add_verb, flag, option, whole
+from rampart.cli.verbs import JSON, PORT, add_verb, flag, option, whole, word
 from rampart.files.reading import read_bytes
-from rampart.manager.analysis.barriers import Outlook, guard, outlook
+from rampart.manager.analysis.barriers import Guarded, guard, outlook
 from rampart.manager.analysis.cut_sets import CutSets, TooLargeError
 from rampart.manager.analysis.formula import Formula, FormulaError, formula_of
 from rampart.manager.analysis.open_psa import MAX_BYTES, OpenPsaError, read_open_psa, write_open_psa
@@ -38,13 +39,13 @@ def add(verbs: Any) -> None:
     """Add the verb to the parser."""
     add_verb(verbs, "cut-sets", "minimal cut sets of a fault tree, and the barriers on them", run,
              PORT, systems.choice("file", ", or Open-PSA .xml"), flag("--count", "only count"),
-             option("--top", metavar="GATE", default="", help="top gate of an Open-PSA file"),
+             word("--top", "GATE", "top gate of an Open-PSA file", ""),
              whole("--max-order", "K", "no sets with more events"),
              whole("--limit", "N", f"list no more than N sets (default {_LIMIT})", _LIMIT),
              option("--active", nargs="+", default=[], metavar="FTM",
                     help="what is left before the top if these mechanisms are active"),
              flag("--live", "what is left before the top in the running system, now"),
-             option("--export", metavar="FILE", help="write the fault tree as Open-PSA"), JSON)
+             word("--export", "FILE", "write the fault tree as Open-PSA"), JSON)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -124,7 +125,7 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
     say()
     if guarded:
         print_table(("barriers", "events", "mechanisms, nearest to the top first"),
-                    [(len(g.barriers), " ".join(g.events), " ".join(g.barriers)) for g in guarded])
+                    _rows(guarded))
         bare = [g for g in guarded if len(g.barriers) < 2]
         if bare:
             say()
@@ -154,12 +155,7 @@ def _show_outlook(spec: SystemSpec, active: list[str], *, as_json: bool) -> int:
     view = outlook(spec, active)
     if as_json:
         print_json(view)
-    else:
-        _say_outlook(spec, view)
-    return 0
-
-
-def _say_outlook(spec: SystemSpec, view: Outlook) -> None:
+        return 0
     top = spec.build_fault_tree().top
     if not view.occurred:
         say("no mechanism is active: nothing has occurred")
@@ -170,8 +166,12 @@ def _say_outlook(spec: SystemSpec, view: Outlook) -> None:
     say()
     say(f"single events that would now lead to {top}, and the idle barriers left on the way:")
     print_table(("barriers", "event", "mechanisms, nearest to the top first"),
-                [(len(g.barriers), " ".join(g.events), " ".join(g.barriers))
-                 for g in view.next_events])
+                _rows(view.next_events))
+    return 0
+
+
+def _rows(guarded: Iterable[Guarded]) -> list[tuple[int, str, str]]:
+    return [(len(g.barriers), " ".join(g.events), " ".join(g.barriers)) for g in guarded]
 
 
 async def _live(options: argparse.Namespace) -> int:

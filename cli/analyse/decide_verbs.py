@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 from typing import Any
 
 from rampart.cli import systems
 from rampart.cli.output import UsageError, print_json, print_table, refusing, say, say_text
-from rampart.cli.verbs import JSON, JSON_FORMAT, add_verb, flag, option
+from rampart.cli.verbs import JSON, JSON_FORMAT, add_verb, flag, option, word
 from rampart.manager.model.order import UnknownElementError
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.decision import Decision
@@ -23,9 +23,8 @@ def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
     add_verb(verbs, "decide", "what the manager decides for active mechanisms", show_decision,
              option("ftm", nargs="+", metavar="FTM", help="active mechanisms, e.g. FTM3"),
-             option("--strategy", metavar="NAME", help="default the spec's"), JSON,
-             option("--system", metavar="SPEC",
-                    help="file, or name of a shipped system; default the shipped one"))
+             word("--strategy", "NAME", "default the spec's"), JSON,
+             word("--system", "SPEC", "file, or name of a shipped system; default the shipped one"))
     add_verb(verbs, "table", "the decision for every set of active mechanisms", show_table,
              option("--strategy", metavar="NAME", action="append",
                     help="default the spec's; several are compared"),
@@ -47,14 +46,12 @@ def show_decision(options: argparse.Namespace) -> int:
     """
     spec = systems.load(options.system)
     strategy = options.strategy or spec.strategy
-    decision = _Arbiter(spec, strategy).decide(options.ftm)
+    decision = _arbiter(spec, strategy)(options.ftm)
     if options.json:
         print_json({
-            **_row(decision),
-            "path": decision.path,
+            **_row(decision), "path": decision.path,
             "rejected": [{"name": name, "reason": why} for name, why in decision.rejected],
-            "strategy": strategy,
-        })
+            "strategy": strategy})
         return 0
     say(decision_in_words(decision.active, decision.rule, decision.recoveries, strategy))
     for chain in decision.path:
@@ -80,43 +77,38 @@ def show_table(options: argparse.Namespace) -> int:
     strategies = tuple(dict.fromkeys(options.strategy or [spec.strategy]))
     if options.differing and len(strategies) < 2:
         raise UsageError("--differing compares; give --strategy twice or more")
-    arbiters = [_Arbiter(spec, strategy) for strategy in strategies]
+    arbiters = [_arbiter(spec, strategy) for strategy in strategies]
     names = [m.name for m in spec.mechanisms]
     if len(names) > 14:
         raise UsageError(f"{spec.name}: {len(names)} mechanisms have {2 ** len(names) - 1} sets; "
                          "a table is for up to 14, ask `rampart decide` for the sets of interest")
-    rows = [[arbiter.decide(chosen) for arbiter in arbiters]
+    rows = [[arbiter(chosen) for arbiter in arbiters]
             for size in range(1, len(names) + 1) for chosen in combinations(names, size)]
     differing = [row for row in rows if len({frozenset(d.recoveries) for d in row}) > 1]
+    head: tuple[str, ...] = ("active", *strategies)
+    cells: list[tuple[Any, ...]]
     if len(strategies) == 1:
-        _print_decisions([decision for (decision,) in rows], options.format)
-        return 0
-    _print_comparison(differing if options.differing else rows, strategies, options.format)
-    if options.format == "table":
-        say(f"{len(differing)} of {len(rows)} sets differ")
-    return 0
-
-
-def _print_decisions(decisions: Sequence[Decision], form: str) -> None:
-    cells = [(" ".join(d.active), d.rule, " ".join(d.recoveries)) for d in decisions]
-    if form == "json":
-        print_json([_row(d) for d in decisions], indent=False)
-    elif form == "csv":
-        _print_csv(("active", "block", "rm"), cells)
+        alone = [decision for (decision,) in rows]
+        head = ("active", "block", "rm" if options.format == "csv" else "executed")
+        cells = [(" ".join(d.active), d.rule, " ".join(d.recoveries)) for d in alone]
+        data = [_row(d) for d in alone]
     else:
-        print_table(("active", "block", "executed"), cells)
-
-
-def _print_comparison(rows: Sequence[Sequence[Decision]], strategies: Sequence[str],
-                      form: str) -> None:
-    if form == "json":
-        print_json([{"active": row[0].active,
-                     "decisions": {strategy: {"block": d.rule, "rm": d.recoveries}
-                                   for strategy, d in zip(strategies, row, strict=True)}}
-                    for row in rows], indent=False)
-        return
-    cells = [(" ".join(row[0].active), *(" ".join(d.recoveries) for d in row)) for row in rows]
-    (_print_csv if form == "csv" else print_table)(("active", *strategies), cells)
+        shown = differing if options.differing else rows
+        cells = [(" ".join(row[0].active), *(" ".join(d.recoveries) for d in row))
+                 for row in shown]
+        data = [{"active": row[0].active,
+                 "decisions": {strategy: {"block": d.rule, "rm": d.recoveries}
+                               for strategy, d in zip(strategies, row, strict=True)}}
+                for row in shown]
+    if options.format == "json":
+        print_json(data, indent=False)
+    elif options.format == "csv":
+        _print_csv(head, cells)
+    else:
+        print_table(head, cells)
+        if len(strategies) > 1:
+            say(f"{len(differing)} of {len(rows)} sets differ")
+    return 0
 
 
 def _print_csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
@@ -125,16 +117,15 @@ def _print_csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     say_text(text.getvalue().rstrip("\n"))
 
 
-class _Arbiter:
-    def __init__(self, spec: SystemSpec, strategy: str) -> None:
-        self._mechanisms = spec.build_mechanisms()
-        self._tree = spec.build_ftm_tree()
-        self._order = spec.build_order()
-        self._strategy = strategy
+def _arbiter(spec: SystemSpec, strategy: str) -> Callable[[Iterable[str]], Decision]:
+    """Return what decides for a set of active mechanisms."""
+    mechanisms, tree, order = spec.build_mechanisms(), spec.build_ftm_tree(), spec.build_order()
 
-    def decide(self, active: Any) -> Decision:
-        with refusing(UnknownElementError, UnknownStrategyError):
-            return decide(active, self._mechanisms, self._tree, self._order, self._strategy)
+    @refusing(UnknownElementError, UnknownStrategyError)
+    def decided(active: Iterable[str]) -> Decision:
+        return decide(active, mechanisms, tree, order, strategy)
+
+    return decided
 
 
 def _row(decision: Decision) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Iterator, Sequence
-from xml.sax.saxutils import escape
+from xml.sax.saxutils import escape, quoteattr
 
 import msgspec
 
@@ -72,7 +72,7 @@ def to_svg(diagrams: Sequence[Diagram]) -> str:
                  for i, line in enumerate(notes)]
         top = 40 + LINE * len(notes)
         body += [f'<g transform="translate({MARGIN:g} {y:g})" role="group" '
-                 f'aria-label="{_attribute(diagram.title)}">', *head,
+                 f'aria-label={quoteattr(diagram.title)}>', *head,
                  f'<g transform="translate(0 {top:g})">', *picture.body(), "</g>", "</g>"]
         y += top + picture.placing.height + 2 * MARGIN
         width = max(width, picture.placing.width, text_width(diagram.title) * 17 / FONT,
@@ -219,10 +219,6 @@ def _line(x1: float, y1: float, x2: float, y2: float) -> str:
 def _text(text: str, x: float, y: float, kind: str = "") -> str:
     kind = f' class="{kind}"' if kind else ""
     return f'<text{kind} x="{x:g}" y="{y:g}">{escape(text)}</text>'
-
-
-def _attribute(text: str) -> str:
-    return escape(text, {'"': "&quot;"})
 
 
 def _tooltip(box: Box, diagram: Diagram) -> str:

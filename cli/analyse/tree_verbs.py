@@ -15,7 +15,7 @@ from rampart.cli.analyse.tree_dot import to_dot
 from rampart.cli.analyse.tree_svg import to_svg
 from rampart.cli.analyse.tree_text import to_text
 from rampart.cli.output import UsageError, refusing, say, unknown, using
-from rampart.cli.verbs import JSON_FORMAT, add_verb, option
+from rampart.cli.verbs import JSON_FORMAT, add_verb, option, word
 from rampart.manager.drawing.diagram import WHATS, Diagram, Situation, clean, draw
 from rampart.manager.model.order import CycleError, UnknownElementError
 from rampart.manager.spec.schema import SystemSpec
@@ -28,8 +28,7 @@ def to_json(diagrams: Sequence[Diagram]) -> str:
 
 
 FORMATS: dict[str, Callable[[Sequence[Diagram]], str]] = {
-    "text": to_text, "svg": to_svg, "dot": to_dot, "json": to_json,
-}
+    "text": to_text, "svg": to_svg, "dot": to_dot, "json": to_json}
 _ENDINGS = {".svg": "svg", ".dot": "dot", ".gv": "dot", ".json": "json", ".txt": "text"}
 
 
@@ -40,13 +39,13 @@ def add(verbs: Any) -> None:
              option("--what", choices=(*WHATS, "all"), default="all", help="default all"),
              option("--format", choices=tuple(FORMATS),
                     help="default by the ending of --output, else text"), JSON_FORMAT,
-             option("--output", metavar="FILE", help="write there instead of to stdout"),
+             word("--output", "FILE", "write there instead of to stdout"),
              option("--order", metavar="NAME", action="append",
                     help="order of recoveries; several: the next decides what the one before "
                          "leaves open; default the spec's"),
              option("--active", metavar="FTM", nargs="+", default=[],
                     help="active mechanisms; they are lit, and the decision is marked"),
-             option("--strategy", metavar="NAME", help="that decides; default the spec's"))
+             word("--strategy", "NAME", "that decides; default the spec's"))
 
 
 def show_tree(options: argparse.Namespace) -> int:

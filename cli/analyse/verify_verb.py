@@ -8,7 +8,7 @@ from typing import Any
 
 from rampart.cli import systems
 from rampart.cli.output import UsageError, print_json, print_table, progress, refusing, say
-from rampart.cli.verbs import JSON, add_verb, flag, option, whole
+from rampart.cli.verbs import JSON, add_verb, flag, several, whole
 from rampart.manager.analysis.verification import MEANING, Report, TooLargeError, verify
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import UnknownStrategyError
@@ -17,8 +17,7 @@ from rampart.manager.strategies.registry import UnknownStrategyError
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
     add_verb(verbs, "verify", "check every property of the arbitration", run, systems.choice(),
-             option("--strategy", action="append", default=[], metavar="NAME",
-                    help="only this strategy; repeat for several (default: all)"),
+             several("--strategy", "NAME", "only this strategy; repeat for several (default: all)"),
              whole("--together", "K", "explore K recoveries at a time (default 2, which suffices; "
                    "the number of recoveries of the system explores all, in minutes)", 2),
              flag("--strict", "exit 1 if a property fails"), JSON)

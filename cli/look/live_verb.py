@@ -48,7 +48,17 @@ def foxglove(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
       rampart live foxglove --port 9000
     then open ws://127.0.0.1:8765 in the viewer; set the 3D panel's frame to map
     """
-    return live(options, _foxglove(options))
+    extra("foxglove", "foxglove")
+    from rampart.cli.look.live_foxglove import FoxgloveViewer  # noqa: PLC0415 of the extra
+
+    between("--port", options.port, 0, 65535)
+    try:
+        viewer = FoxgloveViewer(options.host, options.port)
+    except RuntimeError as error:
+        raise UsageError(f"cannot serve on {options.host} port {options.port}: {error}; "
+                         "choose another --port or --host") from None
+    say(f"Foxglove viewers: ws://{options.host}:{viewer.port}")
+    return live(options, viewer)
 
 
 async def live(options: argparse.Namespace, viewer: FoxgloveViewer) -> int:
@@ -99,18 +109,3 @@ def _watch(session: Session, viewer: FoxgloveViewer) -> None:
     show(views.start(now_ns()))
     for topic in views.translators:
         see(topic)
-
-
-def _foxglove(options: argparse.Namespace) -> FoxgloveViewer:
-    extra("foxglove", "foxglove")
-    from rampart.cli.look.live_foxglove import FoxgloveViewer  # noqa: PLC0415 of the extra
-
-    between("--port", options.port, 0, 65535)
-    try:
-        viewer = FoxgloveViewer(options.host, options.port)
-    except RuntimeError as error:
-        raise UsageError(f"cannot serve on {options.host} port {options.port}: {error}; "
-                         "choose another --port or --host") from None
-    say(f"Foxglove viewers: ws://{options.host}:{viewer.port}")
-    return viewer
-

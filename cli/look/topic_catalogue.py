@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection, Iterable, Sequence
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -30,8 +29,7 @@ MAILBOX = {
 """How a topic's messages wait at their reader (see `rampart.actors.runtime.mailbox`)."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class TopicUse:
+class TopicUse(NamedTuple):
     """A topic with the nodes that publish and read it."""
 
     topic: Topic[Any]

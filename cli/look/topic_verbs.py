@@ -29,29 +29,11 @@ from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import ROOT
 from rampart.cli import systems
 from rampart.cli.following import LOOK_S, is_over
-from rampart.cli.look.topic_catalogue import (
-    MAILBOX,
-    TopicUse,
-    check_member,
-    fields,
-    markdown,
-    rate,
-    resolve,
-    summary,
-    topics_for,
-    uses,
-)
-from rampart.cli.output import (
-    NoEffectError,
-    positive,
-    print_json,
-    print_table,
-    say,
-    say_text,
-    warn,
-)
+from rampart.cli.look import topic_catalogue as catalogue
+from rampart.cli.look.topic_catalogue import check_member, resolve, topics_for
+from rampart.cli.output import NoEffectError, positive, print_json, print_table, say, say_text, warn
 from rampart.cli.session import Session, connect, pause
-from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option
+from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option, word
 from rampart.files import streams
 
 _WINDOW = 500
@@ -66,7 +48,7 @@ def add(verbs: Any) -> None:
     add_verb(topic, "list", "all topics (needs no run)", topic_list, systems.choice(),
              either(JSON, flag("--markdown", "print topics.md")))
     add_verb(topic, "info", "the contract of one topic (needs no run)", topic_info, key,
-             option("--system", metavar="FILE", help="system spec; default the shipped one"), JSON)
+             word("--system", "FILE", "system spec; default the shipped one"), JSON)
     add_verb(topic, "echo", "print messages as they come", topic_echo, PORT, key,
              option("-n", "--count", type=int, metavar="N", help="end after N messages"),
              number("--duration", "S", "end after S real seconds"),
@@ -87,14 +69,14 @@ def topic_list(options: argparse.Namespace) -> int:
     """
     spec = systems.load(options.system)
     if options.markdown:
-        say_text(markdown(spec).rstrip("\n"))
+        say_text(catalogue.markdown(spec).rstrip("\n"))
         return 0
-    table = uses(spec)
+    table = catalogue.uses(spec)
     if options.json:
         print_json([_describe(use) for use in table])
     else:
         print_table(("key", "message", "qos", "rate", "frame"),
-                    [(t.key, t.type.__name__, t.qos.value, rate(t), t.frame)
+                    [(t.key, t.type.__name__, t.qos.value, catalogue.rate(t), t.frame)
                      for t in (use.topic for use in table)])
     return 0
 
@@ -110,18 +92,18 @@ def topic_info(options: argparse.Namespace) -> int:
     """
     spec = systems.load(options.system)
     topic, _ = resolve(options.key, systems.topics_of(spec))
-    use = next(u for u in uses(spec) if u.topic is topic)
+    use = next(u for u in catalogue.uses(spec) if u.topic is topic)
     if options.json:
         print_json({**_describe(use),
-                    "fields": [{"name": n, "type": t} for n, t in fields(topic.type)]})
+                    "fields": [{"name": n, "type": t} for n, t in catalogue.fields(topic.type)]})
         return 0
     say(f"key         {topic.key}")
-    say(f"message     {topic.type.__name__}: {summary(topic.type)}")
-    for name, type_name in fields(topic.type):
+    say(f"message     {topic.type.__name__}: {catalogue.summary(topic.type)}")
+    for name, type_name in catalogue.fields(topic.type):
         say(f"              {name}: {type_name}")
     say(f"about       {topic.doc}")
-    say(f"qos         {topic.qos.value}, at the reader: {MAILBOX[topic.qos]}")
-    say(f"rate        {rate(topic)}")
+    say(f"qos         {topic.qos.value}, at the reader: {catalogue.MAILBOX[topic.qos]}")
+    say(f"rate        {catalogue.rate(topic)}")
     say(f"frame       {topic.frame or 'none'}")
     say(f"publishers  {', '.join(use.publishers) or 'none'}")
     say(f"readers     {', '.join(use.readers) or 'none'}")
@@ -277,8 +259,8 @@ def _nothing_came(key: str, duration_s: float | None) -> NoEffectError:
     return NoEffectError(f"nothing came on {key} {when}")
 
 
-def _describe(use: TopicUse) -> dict[str, Any]:
+def _describe(use: catalogue.TopicUse) -> dict[str, Any]:
     topic = use.topic
     return {"key": topic.key, "message": topic.type.__name__, "qos": topic.qos.value,
-            "rate_hz": topic.rate_hz, "frame": topic.frame, "mailbox": MAILBOX[topic.qos],
+            "rate_hz": topic.rate_hz, "frame": topic.frame, "mailbox": catalogue.MAILBOX[topic.qos],
             "publishers": use.publishers, "readers": use.readers, "doc": topic.doc}

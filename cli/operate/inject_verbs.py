@@ -19,7 +19,7 @@ from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import resolve, topics_for
 from rampart.cli.operate.injecting import run_fault
 from rampart.cli.output import UsageError, positive, print_json, print_table, refusing, say
-from rampart.cli.verbs import JSON, PORT, add_verb, flag, group, number, option, whole
+from rampart.cli.verbs import JSON, PORT, add_verb, flag, group, number, option, several, word
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
 from rampart.sim.faults.faults import faults_of
@@ -31,12 +31,11 @@ _SECONDS = "must be seconds above 0"
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    several = {"action": "append", "default": []}
     add_verb(
         verbs, "inject", "inject a fault", inject, PORT,
         option("fault", nargs="?", metavar="FAULT", help="a name from --list, or MODE:TOPIC"),
         flag("--list", "list the catalogue (needs no run)"),
-        option("--system", metavar="FILE", help="for --list: system spec; default the shipped one"),
+        word("--system", "FILE", "for --list: system spec; default the shipped one"),
         number("--duration", "S", "simulated seconds, inf for permanent; default the fault's own, "
                f"else {_DEFAULT_DURATION_S:g}"),
         flag("--at-once", "return as soon as the fault is in force; do not wait for its end"),
@@ -45,24 +44,23 @@ def add(verbs: Any) -> None:
               number("--share", "P", "probability that a message is affected, up to 1 (default)"),
               number("--on", "S", "intermittent: in force for S ..."),
               number("--off", "S", "... and away for S, repeating"),
-              whole("--seed", "N", "of share, noise and what restamp:TOPIC and corrupt:TOPIC draw; "
-                    "default 0")),
+              option("--seed", type=int, metavar="N", help="of share, noise and what "
+                     "restamp:TOPIC and corrupt:TOPIC draw; default 0")),
         group("a fault of your own, instead of FAULT",
-              option("--topic", metavar="KEY", help="e.g. control/command or detection/DM2"),
-              option("--mode", metavar="MODE", help=", ".join(MODES)),
+              word("--topic", "KEY", "e.g. control/command or detection/DM2"),
+              word("--mode", "MODE", ", ".join(MODES)),
               number("--delay", "S", "for delay: simulated seconds"),
               number("--stamp", "S", "for restamp: added to each stamp, simulated seconds; above 0 "
                      "is ahead"),
-              option("--set", **several, metavar="FIELD=VALUE",
-                     help="for corrupt: overwrite a field; may be repeated, as all below"),
-              option("--add", **several, metavar="FIELD=BIAS",
-                     help="for corrupt: add BIAS to a number, or to each of an array"),
-              option("--ramp", **several, metavar="FIELD=RATE",
-                     help="for corrupt: add RATE per simulated second"),
-              option("--noise", **several, metavar="FIELD=SIGMA",
-                     help="for corrupt: add Gaussian noise of this standard deviation"),
-              option("--keep-ends", **several, metavar="FIELD",
-                     help="for corrupt: keep only first and last element of a list")))
+              several("--set", "FIELD=VALUE",
+                      "for corrupt: overwrite a field; may be repeated, as all below"),
+              several("--add", "FIELD=BIAS",
+                      "for corrupt: add BIAS to a number, or to each of an array"),
+              several("--ramp", "FIELD=RATE", "for corrupt: add RATE per simulated second"),
+              several("--noise", "FIELD=SIGMA",
+                      "for corrupt: add Gaussian noise of this standard deviation"),
+              several("--keep-ends", "FIELD",
+                      "for corrupt: keep only first and last element of a list")))
 
 
 def inject(options: argparse.Namespace) -> int:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import uuid
-
-import msgspec
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
@@ -14,7 +11,7 @@ from rampart.actors.bus.messages import Injection, InjectionReport
 from rampart.actors.runtime.fault_watch import FaultWatch, Order
 from rampart.cli.look.topic_catalogue import check_member
 from rampart.cli.output import NoEffectError, print_json, say
-from rampart.cli.session import Session, connect
+from rampart.cli.session import Session, connect, pause
 from rampart.sim.faults.disturbance import Fault
 
 _TAKE_HOLD_S = 1.5
@@ -66,12 +63,12 @@ async def run_fault(fault: Fault, duration_s: float | None, port: int | None, *,
                 await _take_hold(session, watch)
                 if not as_json:
                     order = _injection(watch)
+                    time = ("until its process ends" if watch.is_permanent
+                            else f"for {watch.waits_s:g} s")
                     say(f"{fault.name}: {order.mode} {order.topic} in force at "
-                        f"{', '.join(watch.nodes)} {_how_long(watch)}")
+                        f"{', '.join(watch.nodes)} {time}")
             if not at_once:
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(
-                        settled.wait(), session.real_s(max(w.waits_s for w in watches)) + 1.0)
+                await pause(settled, session.real_s(max(w.waits_s for w in watches)) + 1.0)
                 if not settled.is_set():
                     await _end(session, [w for w in watches if w.is_permanent])
         except asyncio.CancelledError:
@@ -83,7 +80,9 @@ async def run_fault(fault: Fault, duration_s: float | None, port: int | None, *,
         for watch in watches:
             _judge(watch)
             if not as_json:
-                say(f"{fault.name}: {_outcome(watch)}")
+                topic = watch.orders[0].place
+                say(f"{fault.name}: affects {topic}, and goes on" if watch.unfinished else
+                    f"{fault.name}: over, {watch.affected} messages on {topic} affected")
     return 0
 
 
@@ -98,8 +97,8 @@ async def _take_hold(session: Session, watch: FaultWatch) -> None:
 async def _end(session: Session, watches: list[FaultWatch]) -> None:
     """End the injections now: an order of the same id with no duration."""
     for watch in watches:
-        over = msgspec.structs.replace(_injection(watch), duration_s=0.0)
-        await session.command(bus_topics.INJECT, over, lambda w=watch: not w.unfinished, 0.5)  # type: ignore[misc]
+        over = watch.orders[0].with_(duration_s=0.0)
+        await session.command(over.topic, over.message, lambda w=watch: not w.unfinished, 0.5)  # type: ignore[misc]
 
 
 def _judge(watch: FaultWatch) -> None:
@@ -114,16 +113,6 @@ def _judge(watch: FaultWatch) -> None:
     if watch.affected == 0:
         raise NoEffectError(f"no effect: {where} published nothing on {topic} within "
                             f"{watch.waits_s:g} s, or nothing that it changed")
-
-
-def _how_long(watch: FaultWatch) -> str:
-    return "until its process ends" if watch.is_permanent else f"for {watch.waits_s:g} s"
-
-
-def _outcome(watch: FaultWatch) -> str:
-    if watch.unfinished:
-        return f"affects {_injection(watch).topic}, and goes on"
-    return f"over, {watch.affected} messages on {_injection(watch).topic} affected"
 
 
 def _print_result(fault: Fault, watches: list[FaultWatch], *, at_once: bool) -> None:

@@ -58,7 +58,8 @@ def bag_info(options: argparse.Namespace) -> int:
             f"rate {run.get('rate', '')}, rampart {run.get('rampart_version', '')}")
         _say(f"began      {run.get('started') or 'in virtual time'}")
     else:
-        _say(f"run        none: not a recording of a run{_profile(reader.profile)}")
+        profile = f", profile {reader.profile!r}" if reader.profile else ""
+        _say(f"run        none: not a recording of a run{profile}")
     first_s = (summary.first_ns or 0) / 1e9 + summary.time_zero_s
     say(f"duration   {summary.duration_s:.1f} s, from {first_s:.1f} s of simulated time"
         if reader.is_recording else f"duration   {summary.duration_s:.1f} s")
@@ -132,7 +133,3 @@ def _closing(summary: Summary) -> str:
         return f"properly{why}" if not reader.damage else f"yes; damaged: {reader.damage}"
     return "no: its writer did not come to the end" + (
         f"; {reader.damage}" if reader.damage else "")
-
-
-def _profile(profile: str) -> str:
-    return f", profile {profile!r}" if profile else ""

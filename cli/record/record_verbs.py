@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.recording.bag_reader import BagReader, Summary
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.process import stop_pipe, told
 from rampart.actors.recording.recorder import Recorder
@@ -92,9 +93,11 @@ async def replay(options: argparse.Namespace) -> int:
     """
     _check(options)
     with refusing(BagError):
-        player = Replay(
-            Path(options.file), port=options.port, rate=options.rate, loop=options.loop,
-            start_s=options.start, hmi_port=options.hmi_port, said=say, wants=_late(options))
+        path = Path(options.file)
+        known = Summary(BagReader(path)).keys if options.topics else ()
+        player = Replay(path, port=options.port, rate=options.rate, loop=options.loop,
+                        start_s=options.start, hmi_port=options.hmi_port, said=say,
+                        wants=matcher(options.topics, known))
     stop = asyncio.Event()
     with stopped_by_signals(stop):
         if player.summary.reader.damage:
@@ -145,15 +148,6 @@ def keys_of(run: RunInfo, known: Iterable[Topic[Any]]) -> list[str]:
     """Return all full keys that may be used in a run, of the known topics."""
     return [key for topic in known
             for key in ([topic.at(n) for n in run.nodes] if topic.is_family else [topic.at()])]
-
-
-def _late(options: argparse.Namespace) -> Callable[[str], bool]:
-    """Return whether a key is wanted, checked against what is in the file."""
-    if not options.topics:
-        return lambda _key: True
-    from rampart.actors.recording.bag_reader import BagReader, Summary  # noqa: PLC0415 only here
-
-    return matcher(options.topics, Summary(BagReader(Path(options.file))).keys)
 
 
 def _check(options: argparse.Namespace) -> None:
