@@ -10,6 +10,7 @@ from typing import Any
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
+from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.run.run_info import RunInfo, find_runs
 from rampart.actors.supervision.process_title import process_state
 from rampart.cli import systems
@@ -19,6 +20,9 @@ from rampart.cli.session import Session, connect, pause
 
 LOOK_S = 0.25
 """Real seconds between two looks whether a run has ended or begun."""
+
+_USAGE_EVERY = 4
+"""Looks between two at /proc: its clock ticks 100 times a second, the observer expects one."""
 
 
 def is_over(run: RunInfo) -> bool:
@@ -99,3 +103,33 @@ def draw(session: Session, picture: RunPicture) -> None:
         warn(f"{error}; topics of its own are not counted")
     for topic in known:
         hear(topic)
+
+
+class Watch:
+    """What is heard in one run, and what its processes use.
+
+    Attributes:
+        session: the connection to the run.
+        picture: what was heard.
+        used: what `ProcessObserver.look` told last; nothing on a replay, where the process numbers
+            may be anybody's today.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.picture = RunPicture()
+        self.used: dict[str, Any] = {"nodes": {}, "guards": ()}
+        self._processes = ProcessObserver(session.run.base_port, session.run.pid)
+        self._looks = 0
+        draw(session, self.picture)
+
+    def look(self) -> float:
+        """Take a sample, and look at the processes if it is time to; return the simulated time."""
+        now_s = self.session.clock.now()
+        self.picture.sample(now_s)
+        table = self.picture.latest(topics.NODES)
+        if table is not None and not self.session.run.replay_of:  # before, whom to look at?
+            if self._looks % _USAGE_EVERY == 0:
+                self.used = self._processes.look(table)
+            self._looks += 1
+        return now_s

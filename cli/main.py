@@ -1,31 +1,8 @@
 """`rampart`: the toolbox's command line.
 
-Exit codes: 0 it worked; 1 it was asked for and had no effect, or nothing answered; 2 bad usage,
-unknown name, no run found, or the answer could not be written.
-"""
+Look at a running system, disturb it, and ask the arbiter.
 
-from __future__ import annotations
-
-import argparse
-import sys
-from collections.abc import Sequence
-from importlib.metadata import entry_points
-
-from rampart.cli.analyse import campaign_verb, cut_set_verbs, decide_verbs, tree_verbs, verify_verb
-from rampart.cli.look import live_verb, metrics_verb, top_verb, topic_verbs
-from rampart.cli.operate import adapt_verb, inject_verbs, node_verbs, operator_verbs
-from rampart.cli.output import NoEffectError, UsageError, warn
-from rampart.cli.record import bag_verbs, record_verbs
-from rampart.cli.verbs import FORMATTER, PORT
-from rampart.files import streams, working_folder
-
-_VERBS = (
-    node_verbs, top_verb, topic_verbs, inject_verbs, operator_verbs, live_verb, metrics_verb,
-    adapt_verb, record_verbs, bag_verbs, campaign_verb, cut_set_verbs, decide_verbs, tree_verbs,
-    verify_verb)
-"""Each adds its verbs, in this order in the help."""
-
-_EPILOG = """examples:
+Examples:
   rampart run --virtual --seed 7                 start a system; `rampart run --help`
   rampart status                                 the run at a glance
   rampart top                                    the run in the terminal, live
@@ -40,7 +17,29 @@ _EPILOG = """examples:
   rampart tree                                   see fault tree, FTMTree and orders
   rampart campaign --paper                       break it a hundred times, and count
   rampart verify                                 prove it, or show where it fails
-`rampart VERB --help` shows more."""
+`rampart VERB --help` shows more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib.metadata import entry_points
+
+from rampart.cli.analyse import campaign_verb, cut_set_verbs, decide_verbs, tree_verbs, verify_verb
+from rampart.cli.look import serving_verbs, topic_verbs
+from rampart.cli.operate import adapt_verb, inject_verbs, node_verbs, operator_verbs
+from rampart.cli.output import NoEffectError, UsageError, warn
+from rampart.cli.record import record_verbs
+from rampart.cli.verbs import FORMATTER, PORT, help_of
+from rampart.files import streams, working_folder
+
+_VERBS = (
+    node_verbs, topic_verbs, inject_verbs, operator_verbs, serving_verbs,
+    adapt_verb, record_verbs, campaign_verb, cut_set_verbs, decide_verbs, tree_verbs,
+    verify_verb)
+"""Each adds its verbs, in this order in the help."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -49,9 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
     A package adds verbs of its own by entry points of the group `rampart.verbs`: functions of the
     verbs' subparsers, the formatter class, and a parent parser with `--port`.
     """
-    parser = argparse.ArgumentParser(
-        prog="rampart", formatter_class=FORMATTER, epilog=_EPILOG,
-        description="Look at a running system, disturb it, and ask the arbiter.")
+    parser = argparse.ArgumentParser(prog="rampart", **help_of(__doc__))
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     verbs.add_parser("run", add_help=False, help="start a system: the same as launch.py")
     for module in _VERBS:
@@ -67,7 +64,11 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one verb and return the exit code."""
+    """Run one verb and return the exit code.
+
+    0 it worked; 1 it was asked for and had no effect, or nothing answered; 2 bad usage, unknown
+    name, no run found, or the answer could not be written.
+    """
     if arguments is None:
         arguments = sys.argv[1:]
     if arguments[:1] == ["run"]:

@@ -149,7 +149,9 @@ class Run:
                 more |= {"report": str(report.html) if report.html else None,
                          "record": str(report.data) if report.data else None,
                          "report_error": report.problem or None}
-            _print_result({**self._trial.summary(record), **more})
+            print(json.dumps({**self._trial.summary(record), **more}), flush=True)
+            if why := streams.lost_result():
+                _say(f"stdout: {why}: the result is lost")
         if not self._trial.judges:
             return EXIT_FAILED if failure else EXIT_SUCCESS
         if record.safety != "safe":
@@ -159,12 +161,6 @@ class Run:
 
 def _say(text: str) -> None:
     print(f"{PROGRAM.get()}: " + " ".join(text.split()), file=sys.stderr, flush=True)
-
-
-def _print_result(result: dict[str, Any]) -> None:
-    print(json.dumps(result), flush=True)
-    if why := streams.lost_result():
-        _say(f"stdout: {why}: the result is lost")
 
 
 @contextlib.contextmanager

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import uuid
 from collections.abc import AsyncIterator, Callable
 from typing import Any, Generic, TypeVar
@@ -93,18 +92,11 @@ class Session:
 
     async def latest(self, topics: tuple[Topic[Any], ...], timeout_s: float) -> dict[str, Any]:
         """Return topic key → newest body, as soon as all were heard, or after real seconds."""
-        found: dict[str, Any] = {}
-        complete = asyncio.Event()
-
-        def keep(topic: Topic[Any], _key: str, _header: Header, body: Any) -> None:
-            found[topic.key] = body
-            if len(found) == len(topics):
-                complete.set()
-
+        heard = {topic.key: Latest[Any]() for topic in topics}
         for topic in topics:
-            self.listen(topic, topic.pattern, functools.partial(keep, topic))
-        await pause(complete, timeout_s)
-        return found
+            self.listen(topic, topic.pattern, heard[topic.key].keep)
+        await asyncio.gather(*(one.first(timeout_s) for one in heard.values()))
+        return {key: one.value for key, one in heard.items() if one.value is not None}
 
     def publish(self, topic: Topic[Any], body: msgspec.Struct) -> None:
         """Send a message once, stamped now; for what is repeated anyway."""

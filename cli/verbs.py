@@ -107,7 +107,7 @@ def add_verb(verbs: Any, name: str, text: str, run: Run, *options: Option, doc: 
         done = run(given)
         return done if isinstance(done, int) else asyncio.run(done)
 
-    parser = verbs.add_parser(name, help=text, **_help(doc or inspect.getdoc(run) or ""))
+    parser = verbs.add_parser(name, help=text, **help_of(doc or run.__doc__ or ""))
     add_options(parser, options)
     parser.set_defaults(run=call)
 
@@ -124,12 +124,13 @@ def add_family(verbs: Any, name: str, text: str, doc: str, *, dest: str = "subve
         dest: where the choice is found in the options.
         metavar: stands for the choice in the help.
     """
-    parser = verbs.add_parser(name, help=text, **_help(inspect.cleandoc(doc)))
+    parser = verbs.add_parser(name, help=text, **help_of(doc))
     return parser.add_subparsers(dest=dest, required=True, metavar=metavar)
 
 
-def _help(doc: str) -> dict[str, Any]:
-    _, _, text = doc.partition("\n\n")
+def help_of(doc: str) -> dict[str, Any]:
+    """Return what a parser is told of the help in a docstring."""
+    _, _, text = inspect.cleandoc(doc).partition("\n\n")
     description, _, examples = text.partition("\n\nExamples:\n")
     return {"formatter_class": FORMATTER, "description": description,
             "epilog": f"examples:\n{examples}"}

@@ -13,7 +13,7 @@ import joblib
 import msgspec
 from tqdm import tqdm
 
-from rampart.cli.output import UsageError, print_json, print_table, say, warn
+from rampart.cli.output import UsageError, print_json, print_table, refusing, say, warn
 from rampart.sim.campaign.job import Job, RunResult, run_job
 from rampart.sim.campaign.search import Space, margin, search, shrink
 from rampart.sim.campaign.store import Store, StoreError
@@ -26,10 +26,8 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
          faults: Faults) -> int:
     """Search among the faults in `groups`, shrink what was found, and keep it."""
     directory = Path(options.out or "reports/campaign-search")
-    try:
+    with refusing(StoreError):
         store = Store(directory)
-    except StoreError as error:
-        raise UsageError(str(error)) from None
     workers = options.jobs or os.cpu_count() or 1
     with joblib.Parallel(n_jobs=workers, batch_size=1) as pool, tqdm(
             total=options.search, unit="run", file=sys.stderr,

@@ -8,15 +8,10 @@ life. A scraper's `rate()` copes with the reset when the next run or life begins
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from prometheus_client.core import (
-    CounterMetricFamily,
-    GaugeMetricFamily,
-    InfoMetricFamily,
-    Metric,
-)
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
@@ -133,18 +128,3 @@ def _processes(processes: Mapping[str, ProcessCount]) -> Iterator[Metric]:
         ((name,), count.cpu_s) for name, count in found])
     yield gauge("process_resident_memory_bytes", "Resident set; most of it is shared.",
                  ("process",), [((name,), count.memory_bytes) for name, count in found])
-
-
-class Collector:
-    """What `prometheus_client` asks at each scrape.
-
-    Args:
-        look: returns what there is now, None without a run.
-    """
-
-    def __init__(self, look: Callable[[], Exposition | None]) -> None:
-        self._look = look
-
-    def collect(self) -> Iterator[Metric]:
-        """Yield the families of this moment."""
-        return families(self._look())

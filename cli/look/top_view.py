@@ -6,11 +6,13 @@ colours only repeat what words say.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 from rich.cells import cell_len, set_cell_size
 from rich.text import Text
 
@@ -152,17 +154,15 @@ def _decisions(frame: Frame, count: int) -> list[Text]:
 # -- the tables ---------------------------------------------------------------------------------
 
 
-def _rows(frame: Frame) -> list[dict[str, Any]]:
+def _rows(frame: Frame) -> list[Mapping[str, Any]]:
     """Return a row for each process: those in trouble first, then as asked for."""
     table: fm.NodeTable | None = frame.picture.latest(ftm_topics.NODES)
-    rows = [{"name": n.name, "kind": n.kind, "pid": n.pid, "state": n.state.value,
-             "incarnation": n.incarnation, "restarts": n.restarts}
-            for n in (table.nodes if table else ())]
-    rows += [dict(guard) for guard in frame.guards]
+    rows: list[Mapping[str, Any]] = [
+        *map(msgspec.structs.asdict, table.nodes if table else ()), *frame.guards]
 
     def place(row: Mapping[str, Any]) -> tuple[bool, float]:
         busy = frame.usage.get(row["name"], {}).get("cpu", 0.0) if frame.by_cpu else 0.0
-        return row["state"] == fm.NodeState.RUNNING.value, -busy
+        return row["state"] == fm.NodeState.RUNNING, -busy
 
     return sorted(rows, key=place)
 
@@ -177,9 +177,8 @@ def _tables(frame: Frame, width: int, height: int) -> list[Text]:
         return left
     right = _rates(frame, width - _PROCESS_WIDTH, height)
     blank = Text(" " * _PROCESS_WIDTH)
-    return [Text.assemble(left[i] if i < len(left) else blank.copy(),
-                          right[i] if i < len(right) else "")
-            for i in range(max(len(left), len(right)))]
+    return [Text.assemble(process or blank, rate or "")
+            for process, rate in itertools.zip_longest(left, right)]
 
 
 def _processes(frame: Frame, width: int, height: int) -> list[Text]:
@@ -195,7 +194,7 @@ def _processes(frame: Frame, width: int, height: int) -> list[Text]:
         name = set_cell_size(printable(row["name"]), 18)
         text = (f"{name} {row['state']:<8} {row['incarnation']:>4} {row['restarts']:>5} "
                 f"{figures}")
-        trouble = row["state"] != fm.NodeState.RUNNING.value
+        trouble = row["state"] != fm.NodeState.RUNNING
         shown.append(Text(set_cell_size(text, width), style="bold red" if trouble else ""))
     if not rows:
         shown.append(Text(set_cell_size("the supervisor has not told yet", width)))

@@ -64,7 +64,7 @@ def add(verbs: Any) -> None:
     ):
         shown = "\n".join(f"  rampart adapt {example}" for example in examples)
         add_verb(actions, action.value, text, change, PORT, JSON, *options,
-                 doc=f"\n\n{text[0].upper()}{text[1:]}.\n\nExamples:\n{shown}")
+                 doc=f"{action}\n\n{text[0].upper()}{text[1:]}.\n\nExamples:\n{shown}")
 
 
 async def change(options: argparse.Namespace) -> int:

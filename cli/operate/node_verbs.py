@@ -1,4 +1,4 @@
-"""`rampart status` and `rampart node`: what runs, and how it is.
+"""`rampart status`, `rampart node` and `rampart top`: what runs, and how it is.
 
 Look at the nodes of the run.
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+from collections.abc import Coroutine
 from typing import Any
 
 import msgspec
@@ -20,12 +21,12 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.run.run_info import RunInfo
 from rampart.cli import systems
-from rampart.cli.holdings import Holdings
+from rampart.cli.operate.operator_verbs import Holdings
 from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say
 from rampart.cli.robot_lines import RobotLines
 from rampart.cli.run_picture import manager_in_words
 from rampart.cli.session import connect
-from rampart.cli.verbs import JSON, PORT, add_family, add_verb
+from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag
 
 _STATUS = (ftm_topics.MANAGER_STATUS, ftm_topics.NODES)
 _WAIT_S = 1.5
@@ -37,6 +38,10 @@ def add(verbs: Any) -> None:
     add_verb(verbs, "status", "the run at a glance", status, PORT, JSON)
     node = add_family(verbs, "node", "the nodes of the run", __doc__)
     add_verb(node, "list", "all nodes", node_list, PORT, JSON)
+    add_verb(verbs, "top", "the run in the terminal, refreshed four times a second", top, PORT,
+             flag("--once", "print one picture and end"),
+             flag("--json", "print one picture as JSON and end"),
+             flag("--follow", "wait for a run if there is none, and for the next when one ends"))
 
 
 async def node_list(options: argparse.Namespace) -> int:
@@ -104,6 +109,25 @@ async def status(options: argparse.Namespace) -> int:
             f"rampart reset {name} lets go")
     say(f"nodes     {_nodes(nodes)}")
     return 0
+
+
+def top(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
+    """Show the run.
+
+    Show the robot, mechanisms, decisions, processes and topic rates
+    of the run. Keys: q or Ctrl-C quits, c sorts by CPU, arrows scroll.
+    Processor time is in percent of one core; memory is resident, most of it shared.
+
+    Examples:
+      rampart top
+      rampart top --follow          stay for the next run
+      rampart top --once | less
+      NO_COLOR=1 rampart top
+      rampart top --json | python3 -m json.tool
+    """
+    from rampart.cli.look import top_screen  # noqa: PLC0415 no other verb should wait for it
+
+    return top_screen.top(options)
 
 
 def _lines(run: RunInfo) -> RobotLines:

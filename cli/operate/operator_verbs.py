@@ -6,11 +6,12 @@ import argparse
 import asyncio
 from typing import Any
 
+from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.limits import Remembered
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
-from rampart.cli.holdings import Holdings
 from rampart.cli.output import NoEffectError, positive, say, unknown
 from rampart.cli.session import Latest, Session, connect, pause
 from rampart.cli.verbs import PORT, add_verb, option
@@ -19,6 +20,12 @@ STUB_DETECTION = "rampart.actors.detection.stub:StubDetection"
 
 _RESET_WAIT_S = 3.0
 """Simulated seconds within which the manager releases a recovery whose cause is gone."""
+
+_HEARD_S = 0.3
+"""Simulated seconds within which it is repeated (nominally each 0.2 s)."""
+
+_NODES = 16
+"""Which can be made to stand: more than there are."""
 
 
 def add(verbs: Any) -> None:
@@ -122,3 +129,35 @@ async def trigger(options: argparse.Namespace) -> int:
             raise NoEffectError(f"{options.module} did not become idle again")
     say(f"{options.module} is idle again")
     return 0
+
+
+class Holdings:
+    """What is held by those who are no recovery modules, by the node that obeys them.
+
+    Listens from the start.
+
+    Args:
+        session: the connection to the run.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._heard: Remembered[str, fm.Holds] = Remembered(_NODES)
+        session.listen(ftm_topics.HOLDS, ftm_topics.HOLDS.pattern, self._keep)
+
+    def _keep(self, _key: str, header: Header, body: fm.Holds) -> None:
+        self._heard[header.source] = body
+
+    async def settle(self) -> None:
+        """Wait until all that is held has been heard."""
+        await asyncio.sleep(self._session.real_s(_HEARD_S))
+
+    def by(self, name: str) -> tuple[str, ...]:
+        """Return what somebody holds."""
+        return tuple(holds.what for holds in self._heard.values() if name in holds.holders)
+
+    @property
+    def holders(self) -> dict[str, tuple[str, ...]]:
+        """Everybody who holds something, with what it is."""
+        names = dict.fromkeys(name for holds in self._heard.values() for name in holds.holders)
+        return {name: self.by(name) for name in names}

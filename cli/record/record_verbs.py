@@ -1,10 +1,19 @@
-"""`rampart record` and `rampart replay`."""
+"""`rampart record`, `rampart replay` and `rampart bag`: recordings, and how to mend a torn one.
+
+Look at recordings: MCAP files of `launch.py --record`, `rampart record`, or
+others.
+
+Examples:
+  rampart bag info run.mcap
+  rampart bag repair torn.mcap whole.mcap
+"""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
 import fnmatch
+import json
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -12,17 +21,30 @@ from typing import Any
 
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording.bag_reader import BagReader, Summary
+from rampart.actors.recording.bag_repair import repair
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.process import stop_pipe, told
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
-from rampart.cli.output import NoEffectError, UsageError, between, positive, refusing, say
+from rampart.cli.output import (
+    NoEffectError,
+    UsageError,
+    between,
+    positive,
+    print_json,
+    print_table,
+    refusing,
+    say,
+)
 from rampart.cli.record.replaying import DEFAULT_PORT, Replay
-from rampart.cli.verbs import PORT, add_verb, flag, number, option, whole
+from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag, number, option, whole
+from rampart.files.reading import plain_line
 
 _PORTS = (1024, 65535)
+_WIDTH = 11
+"""Of the names in front of the lines of `rampart bag info`."""
 
 
 def add(verbs: Any) -> None:
@@ -45,6 +67,12 @@ def add(verbs: Any) -> None:
              whole("--hmi-port", "PORT", "show the operator's page, on this port of loopback", 0),
              whole("--port", "N", f"Zenoh port of the replay (default: {DEFAULT_PORT})",
                    DEFAULT_PORT))
+    bag = add_family(verbs, "bag", "what is in a recording (needs no run)", __doc__)
+    add_verb(bag, "info", "duration, run, channels, whether it is whole", bag_info,
+             option("file", metavar="FILE"), JSON)
+    add_verb(bag, "repair", "write what can be read into a whole file", bag_repair,
+             option("file", metavar="IN"), option("out", metavar="OUT"),
+             flag("--overwrite", "OUT may exist"))
 
 
 def record(options: argparse.Namespace) -> int:
@@ -161,3 +189,102 @@ def _check(options: argparse.Namespace) -> None:
     if options.hmi_port == options.port:
         raise UsageError(f"--hmi-port {options.hmi_port}: is the replay's own --port; choose "
                          "another --hmi-port")
+
+
+def bag_info(options: argparse.Namespace) -> int:
+    """Print what is in a file.
+
+    Show duration, size, what was run, and each channel with messages and rate.
+    A file that was never closed, or is cut off, is read as far as it goes.
+
+    Examples:
+      rampart bag info run.mcap
+      rampart bag info run.mcap --json
+    """
+    with refusing(BagError):
+        summary = Summary(BagReader(Path(options.file)))
+    if options.json:
+        print_json(described(summary))
+        return 0
+    reader, run = summary.reader, summary.run
+    _say(f"file       {options.file}, {reader.size_bytes / 1e6:.1f} MB, {reader.library}")
+    if reader.is_recording:
+        _say(f"run        {run.get('title', '')} ({run.get('run_id', '')}), "
+            f"rate {run.get('rate', '')}, rampart {run.get('rampart_version', '')}")
+        _say(f"began      {run.get('started') or 'in virtual time'}")
+    else:
+        profile = f", profile {reader.profile!r}" if reader.profile else ""
+        _say(f"run        none: not a recording of a run{profile}")
+    first_s = (summary.first_ns or 0) / 1e9 + summary.time_zero_s
+    say(f"duration   {summary.duration_s:.1f} s, from {first_s:.1f} s of simulated time"
+        if reader.is_recording else f"duration   {summary.duration_s:.1f} s")
+    say(f"messages   {summary.messages} on {len(reader.channels)} channels")
+    _say(f"lost       {_lost(summary)}")
+    _say(f"closed     {_closing(summary)}")
+    if summary.files:
+        _say(f"attached   {', '.join(name for name, _, _ in summary.files)}")
+    say()
+    print_table(("channel", "schema", "messages", "rate"), [
+        (plain_line(row["channel"]), plain_line(row["schema"]), row["messages"],
+         f"{row['rate_hz']:.2f} Hz" if row["rate_hz"] is not None else "")
+        for row in summary.table()])
+    return 0
+
+
+def bag_repair(options: argparse.Namespace) -> int:
+    """Write a whole file.
+
+    Copy everything that can be read of a torn file into a new one with an
+    index, for viewers that insist on it. The old one stays as it is.
+
+    Examples:
+      rampart bag repair torn.mcap whole.mcap
+    """
+    with refusing(BagError):
+        reader = BagReader(Path(options.file))
+        copied = repair(reader, Path(options.out), overwrite=options.overwrite)
+    say(f"{options.out}: {copied} messages; left behind: {reader.damage or 'nothing'}")
+    return 0
+
+
+def _say(line: str) -> None:
+    """Print a line in which words of the file are; they steer no terminal."""
+    head, words = line[:_WIDTH], line[_WIDTH:]
+    say(head + plain_line(words))
+
+
+def described(summary: Summary) -> dict[str, Any]:
+    """Return everything as plain data; scripts rely on these names."""
+    reader = summary.reader
+    return {
+        "file": str(reader.path), "size_bytes": reader.size_bytes, "profile": reader.profile,
+        "library": reader.library, "recording": reader.is_recording,
+        "closed": reader.closed, "damage": reader.damage,
+        "duration_s": round(summary.duration_s, 3), "messages": summary.messages,
+        "time_zero_s": summary.time_zero_s, "run": summary.run, "end": summary.end,
+        "lost": _losses(summary), "attachments": [name for name, _, _ in summary.files],
+        "channels": summary.table()}
+
+
+def _losses(summary: Summary) -> dict[str, int] | None:
+    """Return source → messages lost; None if the file does not say."""
+    try:
+        return {str(k): int(v) for k, v in json.loads(summary.end["lost"]).items()}
+    except (KeyError, ValueError, AttributeError, TypeError, RecursionError, OverflowError):
+        return None
+
+
+def _lost(summary: Summary) -> str:
+    losses = _losses(summary)
+    if losses is None:
+        return "unknown"
+    return ", ".join(f"{count} of {name}" for name, count in losses.items()) or "none"
+
+
+def _closing(summary: Summary) -> str:
+    reader = summary.reader
+    if reader.closed:
+        why = f", because {summary.end['ended']}" if "ended" in summary.end else ""
+        return f"properly{why}" if not reader.damage else f"yes; damaged: {reader.damage}"
+    return "no: its writer did not come to the end" + (
+        f"; {reader.damage}" if reader.damage else "")

@@ -126,7 +126,11 @@ class Replay:
                              f"{self._last_s:.1f} simulated seconds")
         claim_port(port)
         if hmi_port:
-            _check_free("--hmi-port", hmi_port)
+            try:
+                socket.create_server(("127.0.0.1", hmi_port)).close()
+            except OSError:
+                raise UsageError(f"--hmi-port {hmi_port}: in use; choose another --hmi-port"
+                                 ) from None
 
     async def run(self, stop: asyncio.Event, delay_s: float = 0.0) -> None:
         """Play to the end, or until `stop` is set; with a page or in a loop there is no end.
@@ -154,13 +158,20 @@ class Replay:
     async def _on_the_bus(self, clock: Clock
                           ) -> AsyncIterator[tuple[ZenohBus, asyncio.Task[None] | None]]:
         """Have a bus that tools find, and the page's task if there is a page."""
-        with _sockets(self._port) as self._sockets, tempfile.TemporaryDirectory(
-                prefix="rampart-replay-") as directory, self._answering(clock, Path(directory)):
+        with contextlib.ExitStack() as stack:
+            try:
+                self._sockets = run_folder.make(self._port, os.getpid())
+            except OSError as error:
+                raise UsageError(f"no folder for a socket: {error}") from None
+            stack.callback(run_folder.remove, self._sockets)
+            folder = Path(stack.enter_context(
+                tempfile.TemporaryDirectory(prefix="rampart-replay-")))
+            stack.enter_context(self._answering(clock, folder))
             bus = ZenohBus("", 0, endpoint(self._sockets, run_info.REPLAY), [],
                            RecorderConnection(self._port))
             with refusing(BusError):
                 await bus.open()
-            page = self._page(bus, clock, Path(directory))
+            page = self._page(bus, clock, folder)
             showing = asyncio.create_task(page.run()) if page else None
             if showing:
                 showing.add_done_callback(self._page_ended)
@@ -321,30 +332,6 @@ def claim_port(port: int) -> None:
     if port in living:
         raise UsageError(f"--port {port}: belongs to a run; a replay must never be taken for a "
                          "living robot, choose another --port")
-
-
-@contextlib.contextmanager
-def _sockets(port: int) -> Iterator[str]:
-    """Have a folder for the sockets of a replay.
-
-    Raises:
-        UsageError: there is no place for one.
-    """
-    try:
-        folder = run_folder.make(port, os.getpid())
-    except OSError as error:
-        raise UsageError(f"no folder for a socket: {error}") from None
-    try:
-        yield folder
-    finally:
-        run_folder.remove(folder)
-
-
-def _check_free(option: str, port: int) -> None:
-    try:
-        socket.create_server(("127.0.0.1", port)).close()
-    except OSError:
-        raise UsageError(f"{option} {port}: in use; choose another {option}") from None
 
 
 async def _until(due: float, stop: asyncio.Event) -> bool:
