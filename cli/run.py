@@ -15,11 +15,9 @@ from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.topic import Topic
 from rampart.actors.layout.layout import Layout, load_application
 from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.recording.bag_writer import BagError
@@ -75,10 +73,9 @@ class Run:
                            options.patience if kind.judges else options.duration, sys.stderr)
         self._plan = plan
         self._scenario = [parse_fault(text) for text in options.fault]
-        known: Sequence[Topic[Any]] = ()
         if self._scenario:
             Layout(plan, spec)  # names file and path of an actor that cannot be had
-            known = system_topics(spec)
+        known = system_topics(spec) if self._scenario else ()
         for i, planned in enumerate(self._scenario):
             action_of(planned, f"f{i}", can_be_hit(spec), known, faults_of(spec))  # not in mid-run
             if planned.goal > self._trial.goals:

@@ -19,6 +19,7 @@ from rampart.cli.output import (
     progress,
     refusing,
     say,
+    say_text,
     using,
 )
 from rampart.cli.session import connect
@@ -76,7 +77,10 @@ def run(options: argparse.Namespace) -> int:
         if spec is None:
             raise UsageError(f"{options.file}: --active and --export need a system spec")
         if options.export:
-            return _export(spec, options.export)
+            with using(f"--export {options.export}"):
+                Path(options.export).write_text(write_open_psa(spec), encoding="utf-8")
+            say(f"{spec.name}: {len(spec.events)} events written to {options.export}")
+            return 0
         return _show_outlook(spec, options.active, as_json=options.json)
     try:
         with progress() as show:
@@ -124,12 +128,10 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
             say(f"  {count} of {size} event{'s' if size != 1 else ''}")
     say()
     if guarded:
-        print_table(("barriers", "events", "mechanisms, nearest to the top first"),
-                    _rows(guarded))
+        _print_barriers("events", guarded)
         bare = [g for g in guarded if len(g.barriers) < 2]
         if bare:
-            say()
-            say("fewer than two barriers:")
+            say_text("\nfewer than two barriers:")
             for g in bare:
                 behind = f"only {g.barriers[0]}" if g.barriers else "none"
                 say(f"  {' and '.join(g.events)}: {behind}")
@@ -137,15 +139,7 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
         for events in sets:
             say("  " + (" ".join(events) or "(the empty set: the top occurs by itself)"))
     if len(sets) < found.count:
-        say()
-        say(f"{len(sets)} shown; --limit N shows more")
-    return 0
-
-
-def _export(spec: SystemSpec, file: str) -> int:
-    with using(f"--export {file}"):
-        Path(file).write_text(write_open_psa(spec), encoding="utf-8")
-    say(f"{spec.name}: {len(spec.events)} events written to {file}")
+        say_text(f"\n{len(sets)} shown; --limit N shows more")
     return 0
 
 
@@ -165,13 +159,13 @@ def _show_outlook(spec: SystemSpec, active: list[str], *, as_json: bool) -> int:
             f"{', '.join(barriers) or 'nothing'}")
     say()
     say(f"single events that would now lead to {top}, and the idle barriers left on the way:")
-    print_table(("barriers", "event", "mechanisms, nearest to the top first"),
-                _rows(view.next_events))
+    _print_barriers("event", view.next_events)
     return 0
 
 
-def _rows(guarded: Iterable[Guarded]) -> list[tuple[int, str, str]]:
-    return [(len(g.barriers), " ".join(g.events), " ".join(g.barriers)) for g in guarded]
+def _print_barriers(events: str, guarded: Iterable[Guarded]) -> None:
+    print_table(("barriers", events, "mechanisms, nearest to the top first"),
+                [(len(g.barriers), " ".join(g.events), " ".join(g.barriers)) for g in guarded])
 
 
 async def _live(options: argparse.Namespace) -> int:

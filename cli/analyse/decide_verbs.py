@@ -86,11 +86,11 @@ def show_table(options: argparse.Namespace) -> int:
             for size in range(1, len(names) + 1) for chosen in combinations(names, size)]
     differing = [row for row in rows if len({frozenset(d.recoveries) for d in row}) > 1]
     head: tuple[str, ...] = ("active", *strategies)
-    cells: list[tuple[Any, ...]]
     if len(strategies) == 1:
         alone = [decision for (decision,) in rows]
         head = ("active", "block", "rm" if options.format == "csv" else "executed")
-        cells = [(" ".join(d.active), d.rule, " ".join(d.recoveries)) for d in alone]
+        cells: list[tuple[Any, ...]] = [
+            (" ".join(d.active), d.rule, " ".join(d.recoveries)) for d in alone]
         data = [_row(d) for d in alone]
     else:
         shown = differing if options.differing else rows

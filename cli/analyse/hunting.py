@@ -13,7 +13,7 @@ import joblib
 import msgspec
 from tqdm import tqdm
 
-from rampart.cli.output import UsageError, print_json, print_table, refusing, say, warn
+from rampart.cli.output import UsageError, print_json, print_table, refusing, say, say_text, warn
 from rampart.sim.campaign.job import Job, RunResult, run_job
 from rampart.sim.campaign.search import Space, margin, search, shrink
 from rampart.sim.campaign.store import Store, StoreError
@@ -65,8 +65,7 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
     else:
         print_table(("margin", "run", "faults"), [
             (f"{margin(result):.3f} m", job.key, job.text()) for job, result in made[:10]])
-        say()
-        say(f"{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} m")
+        say_text(f"\n{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} m")
         for job, path in shrunk:
             say(f"counterexample: {job.text()}, {job.obstacles} obstacles, seed {job.seed}: "
                 f"{path or 'not written'}")

@@ -53,8 +53,7 @@ def families(now: Exposition | None) -> Iterator[Metric]:
     yield from _nodes(now)
     yield from _mechanisms(now.picture)
     yield from now.picture.lines.families(now.picture.latest)
-    yield from _messages(now.picture)
-    yield from _processes(now.processes)
+    yield from _traffic_and_load(now)
 
 
 def gauge(name: str, doc: str, labels: tuple[str, ...], rows: Iterable[Row]) -> Metric:
@@ -115,15 +114,12 @@ def _mechanisms(picture: RunPicture) -> Iterator[Metric]:
                                value={"strategy": manager.strategy})
 
 
-def _messages(picture: RunPicture) -> Iterator[Metric]:
+def _traffic_and_load(now: Exposition) -> Iterator[Metric]:
+    found = sorted(now.processes.items())
     yield counter("messages", "Messages heard, a family's members together.", ("topic",), [
-        ((key,), count) for key, count in sorted(picture.messages.items())])
+        ((key,), count) for key, count in sorted(now.picture.messages.items())])
     yield gauge("message_rate_hertz", "Messages a simulated second, over the last seconds.",
-                 ("topic",), [((key,), hz) for key, hz in picture.rates().items()])
-
-
-def _processes(processes: Mapping[str, ProcessCount]) -> Iterator[Metric]:
-    found = sorted(processes.items())
+                ("topic",), [((key,), hz) for key, hz in now.picture.rates().items()])
     yield counter("process_cpu_seconds", "Processor time, real seconds.", ("process",), [
         ((name,), count.cpu_s) for name, count in found])
     yield gauge("process_resident_memory_bytes", "Resident set; most of it is shared.",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.layout.wiring import load_class, topics_of
 from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR
-from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
+from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 from rampart.cli import systems
 from rampart.cli.output import UsageError, unknown
 from rampart.manager.spec.specification import SystemSpec
@@ -46,9 +46,14 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
     """
     members = [(SUPERVISOR, SUPERVISOR_CLASS), (OBSERVER, application_class(spec).observer),
                *((node.name, node.actor) for node in spec.actors())]
-    wired = [(name, *topics_of(_class(name, path))) for name, path in members]
-    return [TopicUse(topic, _publishers(topic, wired), _readers(topic, wired))
-            for topic in systems.topics_of(spec)]
+    inputs, outputs = {}, {}
+    for name, path in members:
+        try:
+            inputs[name], outputs[name] = topics_of(load_class(path))
+        except ValueError as error:
+            raise UsageError(f"node {name}: {error}") from None
+    return [TopicUse(topic, _who(topic, BASE_OUTPUTS, outputs) or ("tools",),
+                     _who(topic, BASE_INPUTS, inputs)) for topic in systems.topics_of(spec)]
 
 
 def resolve(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str]:
@@ -129,12 +134,10 @@ def fields(kind: type[msgspec.Struct]) -> list[tuple[str, str]]:
 def markdown(spec: SystemSpec) -> str:
     """Return `topics.md`: the contract of every key, for people."""
     lines = [
-        "# Topics",
-        "",
+        "# Topics", "",
         "The contract of every Zenoh key. Written from the topics of the engine and of the "
         f"application and the actors of `systems/{spec.name}.toml` by `rampart topic list "
-        "--markdown`; a test keeps it true.",
-        "",
+        "--markdown`; a test keeps it true.", "",
         f"All keys are below `{ROOT}/`. A payload is a msgpack array `[source, incarnation, "
         "sequence, stamp, body]`: which node, which life of it, how many-th message of that life, "
         "the simulated time in seconds at which the content was true, and the message. Units are "
@@ -142,16 +145,13 @@ def markdown(spec: SystemSpec) -> str:
         "simulated time; 0 means on event. Bounds stand in braces: `{0..9}` of a number, `{<=9}` "
         "of the characters of a text, the bytes of an array or the elements of a sequence. What is "
         f"beyond them, or longer than {MAX_PAYLOAD_BYTES} bytes, is refused by every reader. A "
-        "`float` without bounds may be anything, NaN and infinity included.",
-        "",
+        "`float` without bounds may be anything, NaN and infinity included.", "",
         "- **sensor**: the newest sample counts; at the reader the latest wins.",
         "- **state**: like sensor, and repeated at its rate even without change.",
         "- **command**: each message counts; queued at the reader, bounded, an overflow is "
-        "reported.",
-        "",
+        "reported.", "",
         "| key | message | QoS | mailbox | rate | frame | publishers | readers |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+        "|---|---|---|---|---|---|---|---|"]
     table = uses(spec)
     for use in table:
         t = use.topic
@@ -170,24 +170,11 @@ def markdown(spec: SystemSpec) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _publishers(topic: Topic[Any], wired: list[Any]) -> tuple[str, ...]:
-    if topic in BASE_OUTPUTS:
+def _who(topic: Topic[Any], of_all: Collection[Topic[Any]],
+         of_each: Mapping[str, Collection[Topic[Any]]]) -> tuple[str, ...]:
+    if topic in of_all:
         return ("every node",)
-    found = tuple(name for name, _, outputs in wired if topic in outputs)
-    return found or ("tools",)
-
-
-def _readers(topic: Topic[Any], wired: list[Any]) -> tuple[str, ...]:
-    if topic in BASE_INPUTS:
-        return ("every node",)
-    return tuple(name for name, inputs, _ in wired if topic in inputs)
-
-
-def _class(name: str, path: str) -> type[Actor]:
-    try:
-        return load_class(path)
-    except ValueError as error:
-        raise UsageError(f"node {name}: {error}") from None
+    return tuple(name for name, those in of_each.items() if topic in those)
 
 
 def rate(topic: Topic[Any]) -> str:

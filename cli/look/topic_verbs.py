@@ -179,9 +179,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
     topic, key = resolve(options.key, topics_for(options.key, options.port))
     positive("--duration", options.duration)
     arrivals: Remembered[str, deque[float]] = Remembered(MANY)
-    duration_s = options.duration
-    if options.json and duration_s is None:
-        duration_s = 3.0
+    duration_s = options.duration or (3.0 if options.json else None)
     async with connect(options.port) as session:
         check_member(key.removeprefix(f"{ROOT}/"), session.run.nodes)
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import math
+from collections.abc import Coroutine
 from typing import Any
 
 import msgspec
@@ -63,7 +63,7 @@ def add(verbs: Any) -> None:
                       "for corrupt: keep only first and last element of a list")))
 
 
-def inject(options: argparse.Namespace) -> int:
+def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
     r"""List the catalogue, or inject a fault.
 
     Inject a fault of the catalogue, or disturb any topic, for a while. It
@@ -100,8 +100,7 @@ def inject(options: argparse.Namespace) -> int:
                          "the run that there is")
     fault = choose(options)
     positive("--duration", options.duration, "must be seconds above 0, or inf")
-    return asyncio.run(run_fault(
-        fault, options.duration, options.port, at_once=options.at_once, as_json=options.json))
+    return run_fault(fault, options)
 
 
 def choose(options: argparse.Namespace) -> Fault:
@@ -144,7 +143,8 @@ def _system(port: int | None) -> SystemSpec:
 def _own_fault(options: argparse.Namespace) -> Fault:
     topic, key = resolve(options.topic, topics_for(options.topic, options.port))
     if "*" in key:
-        members = [k for k in published_keys(_system(options.port)) if find_topic(k, (topic,))]
+        with refusing(ValueError):
+            members = [k for k in published_keys(_system(options.port)) if find_topic(k, (topic,))]
         raise UsageError(f"--topic {options.topic}: name one member of the family, "
                          f"e.g. {next(iter(members), topic.key)}")
     if options.mode not in MODES:
@@ -229,8 +229,7 @@ def _modes_by_topic(keys: tuple[str, ...], known: tuple[Topic[Any], ...]) -> dic
     """Return key of each declared topic → its modes in words; a family counts once."""
     rows: dict[str, str] = {}
     for key in keys:
-        modes = modes_of(key, known)
-        if modes:
+        if modes := modes_of(key, known):
             missing = [mode for mode in MODES if mode not in modes]
             rows[resolve(key, known)[0].key] = f"all but {', '.join(missing)}" if missing else "all"
     return {topic.key: rows[topic.key] for topic in known if topic.key in rows}

@@ -28,7 +28,6 @@ from rampart.cli.run_picture import manager_in_words
 from rampart.cli.session import connect
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag
 
-_STATUS = (ftm_topics.MANAGER_STATUS, ftm_topics.NODES)
 _WAIT_S = 1.5
 """Simulated seconds to collect states; the rarest comes twice a second."""
 
@@ -79,9 +78,9 @@ async def status(options: argparse.Namespace) -> int:
     """
     async with connect(options.port) as session:
         run, held, lines = session.run, Holdings(session), _lines(session.run)
+        wanted = (*lines.status_read, ftm_topics.MANAGER_STATUS, ftm_topics.NODES)
         found, _ = await asyncio.gather(
-            session.latest((*lines.status_read, *_STATUS), session.real_s(_WAIT_S)),
-            held.settle())
+            session.latest(wanted, session.real_s(_WAIT_S)), held.settle())
         time_s = session.clock.now()
 
     def latest(topic: Topic[Any]) -> Any:

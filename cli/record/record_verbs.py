@@ -249,8 +249,7 @@ def bag_repair(options: argparse.Namespace) -> int:
 
 def _say(line: str) -> None:
     """Print a line in which words of the file are; they steer no terminal."""
-    head, words = line[:_WIDTH], line[_WIDTH:]
-    say(head + plain_line(words))
+    say(line[:_WIDTH] + plain_line(line[_WIDTH:]))
 
 
 def described(summary: Summary) -> dict[str, Any]:
@@ -258,12 +257,11 @@ def described(summary: Summary) -> dict[str, Any]:
     reader = summary.reader
     return {
         "file": str(reader.path), "size_bytes": reader.size_bytes, "profile": reader.profile,
-        "library": reader.library, "recording": reader.is_recording,
-        "closed": reader.closed, "damage": reader.damage,
-        "duration_s": round(summary.duration_s, 3), "messages": summary.messages,
-        "time_zero_s": summary.time_zero_s, "run": summary.run, "end": summary.end,
-        "lost": _losses(summary), "attachments": [name for name, _, _ in summary.files],
-        "channels": summary.table()}
+        "library": reader.library, "recording": reader.is_recording, "closed": reader.closed,
+        "damage": reader.damage, "duration_s": round(summary.duration_s, 3),
+        "messages": summary.messages, "time_zero_s": summary.time_zero_s, "run": summary.run,
+        "end": summary.end, "lost": _losses(summary),
+        "attachments": [name for name, _, _ in summary.files], "channels": summary.table()}
 
 
 def _losses(summary: Summary) -> dict[str, int] | None:

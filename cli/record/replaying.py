@@ -96,7 +96,7 @@ class Replay:
                  loop: bool = False, start_s: float | None = None,
                  wants: Callable[[str], bool] = lambda _key: True, hmi_port: int = 0,
                  said: Callable[[str], None] = lambda _line: None) -> None:
-        self.summary = Summary(BagReader(path))
+        self.summary = summary = Summary(BagReader(path))
         self._document, self._known = recorded_system(self.summary.files)
         self._forms = Forms(self._known.topics)
         self.played = 0
@@ -110,7 +110,6 @@ class Replay:
         self._said = said
         self._sockets = ""
         self._lives: dict[str, int] = {}
-        summary = self.summary
         if not summary.reader.is_recording:
             raise UsageError(f"{path}: an MCAP file of {summary.reader.library or 'others'}, not a "
                              "recording of a run: nothing in it can be played onto the bus")
