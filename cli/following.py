@@ -10,15 +10,19 @@ from typing import Any
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
+from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.run.run_info import RunInfo, find_runs
 from rampart.actors.supervision.process_title import process_state
 from rampart.cli import systems
 from rampart.cli.output import UsageError, warn
 from rampart.cli.run_picture import DECODED, RunPicture
-from rampart.cli.session import Session, connect
+from rampart.cli.session import Session, connect, pause
 
 LOOK_S = 0.25
 """Real seconds between two looks whether a run has ended or begun."""
+
+_USAGE_EVERY = 4
+"""Looks between two at /proc: its clock ticks 100 times a second, the observer expects one."""
 
 
 def is_over(run: RunInfo) -> bool:
@@ -32,14 +36,12 @@ async def wait_for_run(port: int | None, stop: asyncio.Event) -> bool:
         runs = await asyncio.to_thread(find_runs)
         if any(port in {None, run.base_port} for run in runs):
             return True
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(stop.wait(), LOOK_S)
+        await pause(stop, LOOK_S)
     return False
 
 
-async def sessions(
-    port: int | None, stop: asyncio.Event, *, follow: bool, option: str = "--port"
-) -> AsyncGenerator[Session, None]:
+async def sessions(port: int | None, stop: asyncio.Event, *, follow: bool, option: str = "--port"
+                   ) -> AsyncGenerator[Session, None]:
     """Yield a session of the run and, if `follow`, of each that comes after it.
 
     Whoever iterates ends the loop's body when `is_over` or `stop`.
@@ -84,20 +86,50 @@ def draw(session: Session, picture: RunPicture) -> None:
     """Have everything that a session hears drawn into a picture, with the lines of its robot."""
     clock = session.clock
 
-    def read(topic: Topic[Any]) -> None:
-        session.listen(topic, topic.pattern, lambda _key, header, body: picture.heard(
-            topic, header, body, clock.now()))
-
-    def count(topic: Topic[Any]) -> None:
-        session.overhear(topic, lambda _key, _load: picture.count(topic))
+    def hear(topic: Topic[Any]) -> None:
+        if topic in (*DECODED, *picture.lines.read):
+            session.listen(topic, topic.pattern, lambda _key, header, body: picture.heard(
+                topic, header, body, clock.now()))
+        else:
+            session.overhear(topic, lambda _key, _load: picture.count(topic))
 
     known: tuple[Topic[Any], ...] = topics.ALL
     try:
         spec = systems.load(session.run.system_file)
         picture.lines = systems.lines_of(spec)
         known = systems.declared(spec)
-        known = (*known, *systems.own_topics_of(spec))
+        known += systems.own_topics_of(spec)
     except UsageError as error:  # of a run from elsewhere, say: the common topics are enough
         warn(f"{error}; topics of its own are not counted")
     for topic in known:
-        (read if topic in (*DECODED, *picture.lines.read) else count)(topic)
+        hear(topic)
+
+
+class Watch:
+    """What is heard in one run, and what its processes use.
+
+    Attributes:
+        session: the connection to the run.
+        picture: what was heard.
+        used: what `ProcessObserver.look` told last; nothing on a replay, where the process numbers
+            may be anybody's today.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.picture = RunPicture()
+        self.used: dict[str, Any] = {"nodes": {}, "guards": ()}
+        self._processes = ProcessObserver(session.run.base_port, session.run.pid)
+        self._looks = 0
+        draw(session, self.picture)
+
+    def look(self) -> float:
+        """Take a sample, and look at the processes if it is time to; return the simulated time."""
+        now_s = self.session.clock.now()
+        self.picture.sample(now_s)
+        table = self.picture.latest(topics.NODES)
+        if table is not None and not self.session.run.replay_of:  # before, whom to look at?
+            if self._looks % _USAGE_EVERY == 0:
+                self.used = self._processes.look(table)
+            self._looks += 1
+        return now_s

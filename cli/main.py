@@ -1,29 +1,8 @@
 """`rampart`: the toolbox's command line.
 
-Exit codes: 0 it worked; 1 it was asked for and had no effect, or nothing answered; 2 bad usage,
-unknown name, no run found, or the answer could not be written.
-"""
+Look at a running system, disturb it, and ask the arbiter.
 
-from __future__ import annotations
-
-import argparse
-import sys
-from collections.abc import Sequence
-from importlib.metadata import entry_points
-
-from rampart.cli.analyse import cut_set_verbs, decide_verbs, tree_verbs, verify_verb
-from rampart.cli.look import live_verb, metrics_verb, top_verb, topic_verbs
-from rampart.cli.operate import (
-    adapt_verb,
-    inject_verbs,
-    node_verbs,
-    operator_verbs,
-)
-from rampart.cli.output import NoEffectError, UsageError, warn
-from rampart.cli.record import bag_verbs, record_verbs
-from rampart.files import streams, working_folder
-
-_EPILOG = """examples:
+Examples:
   rampart run --virtual --seed 7                 start a system; `rampart run --help`
   rampart status                                 the run at a glance
   rampart top                                    the run in the terminal, live
@@ -38,7 +17,29 @@ _EPILOG = """examples:
   rampart tree                                   see fault tree, FTMTree and orders
   rampart campaign --paper                       break it a hundred times, and count
   rampart verify                                 prove it, or show where it fails
-`rampart VERB --help` shows more."""
+`rampart VERB --help` shows more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib.metadata import entry_points
+
+from rampart.cli.analyse import cut_set_verbs, decide_verbs, tree_verbs, verify_verb
+from rampart.cli.look import serving_verbs, topic_verbs
+from rampart.cli.operate import adapt_verb, inject_verbs, node_verbs, operator_verbs
+from rampart.cli.output import NoEffectError, UsageError, warn
+from rampart.cli.record import record_verbs
+from rampart.cli.verbs import FORMATTER, PORT, help_of
+from rampart.files import streams, working_folder
+
+_VERBS = (
+    node_verbs, topic_verbs, inject_verbs, operator_verbs, serving_verbs,
+    adapt_verb, record_verbs, cut_set_verbs, decide_verbs, tree_verbs,
+    verify_verb)
+"""Each adds its verbs, in this order in the help."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -47,40 +48,28 @@ def build_parser() -> argparse.ArgumentParser:
     A package adds verbs of its own by entry points of the group `rampart.verbs`: functions of the
     verbs' subparsers, the formatter class, and a parent parser with `--port`.
     """
-    formatter = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        prog="rampart", formatter_class=formatter, epilog=_EPILOG,
-        description="Look at a running system, disturb it, and ask the arbiter.")
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--port", type=int, metavar="N",
-                        help="base port of the run, if there are several on this machine")
+    parser = argparse.ArgumentParser(prog="rampart", **help_of(__doc__))
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     verbs.add_parser("run", add_help=False, help="start a system: the same as launch.py")
-    node_verbs.add(verbs, formatter, common)
-    top_verb.add(verbs, formatter, common)
-    topic_verbs.add(verbs, formatter, common)
-    inject_verbs.add(verbs, formatter, common)
-    operator_verbs.add(verbs, formatter, common)
-    live_verb.add(verbs, formatter)
-    metrics_verb.add(verbs, formatter)
-    adapt_verb.add(verbs, formatter, common)
-    record_verbs.add(verbs, formatter, common)
-    bag_verbs.add(verbs, formatter)
     verbs.add_parser("campaign", add_help=False, help="run many missions with faults in them")
-    cut_set_verbs.add(verbs, formatter, common)
-    decide_verbs.add(verbs, formatter)
-    tree_verbs.add(verbs, formatter)
-    verify_verb.add(verbs, formatter)
+    for module in _VERBS:
+        module.add(verbs)
+    common = argparse.ArgumentParser(add_help=False)
+    PORT(common)
     for found in sorted(entry_points(group="rampart.verbs"), key=lambda verb: verb.name):
         try:
-            found.load()(verbs, formatter, common)
+            found.load()(verbs, FORMATTER, common)
         except Exception as error:  # of somebody else's package: the other verbs are there
             warn(f"verb {found.name} ({found.value}): {type(error).__name__}: {error}")
     return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one verb and return the exit code."""
+    """Run one verb and return the exit code.
+
+    0 it worked; 1 it was asked for and had no effect, or nothing answered; 2 bad usage, unknown
+    name, no run found, or the answer could not be written.
+    """
     if arguments is None:
         arguments = sys.argv[1:]
     if arguments[:1] == ["run"]:
@@ -105,12 +94,9 @@ def _run(arguments: Sequence[str]) -> int:
         else:
             options = build_parser().parse_args(arguments)
         return int(options.run(options))
-    except UsageError as error:
+    except (UsageError, NoEffectError) as error:
         warn(str(error))
-        return 2
-    except NoEffectError as error:
-        warn(str(error))
-        return 1
+        return 2 if isinstance(error, UsageError) else 1
     except KeyboardInterrupt:
         return 130
     except OSError as error:  # of a disk; what the user named wrongly was refused above

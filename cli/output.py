@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import msgspec
 
 from rampart.files.plain_text import one_line, printable
+from rampart.files.reading import FileError
 
 _WARNING_CHARS = 4000
 
@@ -26,6 +28,48 @@ def unknown(what: str, value: str, known: Iterable[str]) -> UsageError:
     return UsageError(f"unknown {what} {value!r}; known: {', '.join(known) or 'none'}")
 
 
+@contextlib.contextmanager
+def refusing(*kinds: type[Exception]) -> Iterator[None]:
+    """Have what the engine refuses told to the user as it is.
+
+    Raises:
+        UsageError: instead of an error of these kinds.
+    """
+    try:
+        yield
+    except kinds as error:
+        raise UsageError(str(error)) from None
+
+
+@contextlib.contextmanager
+def using(file: object) -> Iterator[None]:
+    """Have the user told of a file that cannot be read or written, or is not what it should be.
+
+    Raises:
+        UsageError: instead of an error of the file, which it names.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise UsageError(f"{file}: {error.strerror}") from None
+    except FileError as error:
+        raise UsageError(f"{file}: {error}") from None
+
+
+def positive(option: str, value: float | None, why: str = "must be above 0",
+             below: float | None = None) -> None:
+    """Refuse a value that is not above 0, or not below another."""
+    if value is not None and not (value > 0 and (below is None or value < below)):
+        raise UsageError(f"{option} {value:g}: {why}")
+
+
+def between(option: str, value: float, least: float, most: float, why: str = "") -> None:
+    """Refuse a value that is not within bounds."""
+    if not least <= value <= most:
+        shown = f"{value:g}" if isinstance(value, float) else value
+        raise UsageError(f"{option} {shown}: must be between {least} and {most}{why}")
+
+
 def say(text: str = "") -> None:
     """Print one line now, also into a pipe; whoever it quotes cannot make it two."""
     print(printable(text), flush=True)
@@ -41,10 +85,20 @@ def warn(text: str) -> None:
     print(f"rampart: {one_line(text, _WARNING_CHARS)}", file=sys.stderr, flush=True)
 
 
-def show_progress(text: str) -> None:
-    """Show on a terminal what is being done, in the place of what was; "" wipes it away."""
-    if sys.stderr.isatty():
-        print(f"\r\x1b[K{text[:100]}", end="", file=sys.stderr, flush=True)
+@contextlib.contextmanager
+def progress() -> Iterator[Callable[[str], None]]:
+    """Give a function that shows on a terminal what is being done, in the place of what was.
+
+    At the end all is wiped away.
+    """
+    def show(text: str) -> None:
+        if sys.stderr.isatty():
+            print(f"\r\x1b[K{text[:100]}", end="", file=sys.stderr, flush=True)
+
+    try:
+        yield show
+    finally:
+        show("")
 
 
 def print_json(data: Any, *, indent: bool = True) -> None:

@@ -15,11 +15,9 @@ from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.topic import Topic
 from rampart.actors.layout.layout import Layout, load_application
 from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.recording.bag_writer import BagError
@@ -68,43 +66,38 @@ class Run:
         run = RunContext(plan, spec, load_document(plan), application)
         self._directory = Path(options.report) if options.report else (
             reports / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind(run).name}")
+        kept = self._directory.resolve()
         plan = msgspec.structs.replace(
-            plan,
-            error_log=str(self._directory.resolve() / ERROR_LOG),
-            checkpoints=str(self._directory.resolve() / "checkpoints"))
+            plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"))
         self._trial = kind(replace(run, plan=plan),
                            options.patience if kind.judges else options.duration, sys.stderr)
         self._plan = plan
         self._scenario = [parse_fault(text) for text in options.fault]
-        known: Sequence[Topic[Any]] = ()
         if self._scenario:
             Layout(plan, spec)  # names file and path of an actor that cannot be had
-            known = system_topics(spec)
+        known = system_topics(spec) if self._scenario else ()
         for i, planned in enumerate(self._scenario):
             action_of(planned, f"f{i}", can_be_hit(spec), known, faults_of(spec))  # not in mid-run
             if planned.goal > self._trial.goals:
                 raise UsageError(f"--fault {planned.text()}: mission {self._trial.name} has "
                                  f"{self._trial.goals} goals")
 
-    def on_processes(self) -> int:
-        """Run on processes and return the exit code.
+    def run(self) -> int:
+        """Run and return the exit code.
 
         Raises:
             LaunchError: the system cannot be started.
         """
-        return asyncio.run(self._on_processes())
+        with _kept(self._directory):
+            if self._options.virtual:
+                return self._in_virtual_time()
+            return asyncio.run(self._on_processes())
 
     async def _on_processes(self) -> int:
         run = ProcessRun(self._trial, self._scenario)
-        with _kept(self._directory), _recorded(self._options):
+        with _recorded(self._options):
             _interruptible(run)
-            record = await run.run()
-            return self._conclude(record, run.failure)
-
-    def in_virtual_time(self) -> int:
-        """Run in virtual time and return the exit code."""
-        with _kept(self._directory):
-            return self._in_virtual_time()
+            return self._conclude(await run.run(), run.failure)
 
     def _in_virtual_time(self) -> int:
         recording = None
@@ -153,7 +146,9 @@ class Run:
                 more |= {"report": str(report.html) if report.html else None,
                          "record": str(report.data) if report.data else None,
                          "report_error": report.problem or None}
-            _print_result({**self._trial.summary(record), **more})
+            print(json.dumps({**self._trial.summary(record), **more}), flush=True)
+            if why := streams.lost_result():
+                _say(f"stdout: {why}: the result is lost")
         if not self._trial.judges:
             return EXIT_FAILED if failure else EXIT_SUCCESS
         if record.safety != "safe":
@@ -163,12 +158,6 @@ class Run:
 
 def _say(text: str) -> None:
     print(f"{PROGRAM.get()}: " + " ".join(text.split()), file=sys.stderr, flush=True)
-
-
-def _print_result(result: dict[str, Any]) -> None:
-    print(json.dumps(result), flush=True)
-    if why := streams.lost_result():
-        _say(f"stdout: {why}: the result is lost")
 
 
 @contextlib.contextmanager
@@ -186,37 +175,30 @@ def _kept(directory: Path) -> Iterator[None]:
     except OSError as error:
         raise UsageError(f"--report {directory}: no directory that can be written "
                          f"({error.strerror})") from None
-    before = _size(log)
+    before = log.stat().st_size if log.exists() else 0
     try:
         yield
     finally:
-        if _size(log) > before:
+        if log.exists() and log.stat().st_size > before:
             _say(f"tracebacks of what failed: {log}")
         if made:
             with contextlib.suppress(OSError):  # there is something in it
                 directory.rmdir()
 
 
-def _size(file: Path) -> int:
-    try:
-        return file.stat().st_size
-    except OSError:
-        return 0
-
-
 @contextlib.contextmanager
 def _recorded(options: argparse.Namespace) -> Iterator[None]:
     """Have what runs meanwhile recorded, if that is asked for, by a process of its own."""
-    recorder = None
-    if options.record:
-        recorder = RecorderProcess(Order(options.port, str(Path(options.record).resolve()),
-                                         os.getpid(), options.overwrite))
-        recorder.start()
+    if not options.record:
+        yield
+        return
+    recorder = RecorderProcess(Order(options.port, str(Path(options.record).resolve()),
+                                     os.getpid(), options.overwrite))
+    recorder.start()
     try:
         yield
     finally:
-        if recorder is not None:
-            recorder.end()
+        recorder.end()
 
 
 def _interruptible(run: ProcessRun) -> None:
@@ -270,8 +252,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "launch.py",
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
         options, kind = parse(arguments, program)
-        run = Run(options, *plan_of(options, kind), reports)
-        return run.in_virtual_time() if options.virtual else run.on_processes()
+        return Run(options, *plan_of(options, kind), reports).run()
     except (UsageError, LaunchError, BagError, ValueError, OSError) as error:
         _say(str(error))
         return EXIT_USAGE

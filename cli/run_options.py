@@ -21,7 +21,8 @@ from rampart.actors.run.run_plan import DEFAULT_PORT, RunPlan, load_system
 from rampart.actors.web.access import Access, AccessError, is_loopback, new_token
 from rampart.actors.web.token_file import SecretError, read_secret
 from rampart.cli import application_options
-from rampart.cli.output import UsageError
+from rampart.cli.output import UsageError, between, positive
+from rampart.cli.verbs import FORMATTER, add_options, flag, number, option, several, whole, word
 from rampart.manager.spec.specification import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
 from rampart.sim.faults.faults import faults_of
@@ -55,6 +56,49 @@ nobody reads change none of them; with --json, "report_error" says why there is 
 """
 
 
+_OPTIONS = (
+    flag("--wait", "let the operator start the mission from the page"),
+    word("--system", "FILE", f"system spec, or name of a shipped one: {systems.names()} (default: "
+         "osmosis)", str(systems.DEFAULT)),
+    word("--strategy", "NAME", f"one of {', '.join(STRATEGIES)} (default: the system's)", ""),
+    word("--shadow", "NAME", "a second strategy that decides without effect; where it differs, it "
+         "says so (default: the system's)", ""),
+    flag("--no-ftm", "run the paper's unprotected baseline: last command kept, no dead man, no "
+         "respawn"),
+    number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
+    whole("--seed", "N", "for sensor noise (default: 1)", 1),
+    flag("--no-hmi", "no operator's page (its node still runs)"),
+    whole("--hmi-port", "PORT", "port of the operator's page (default: 8080)", 8080),
+    word("--hmi-host", "HOST", "address of the operator's page (default: 127.0.0.1, this machine "
+         "only). Any other makes it need a token, which is printed with the page's address when "
+         "the run starts", "127.0.0.1"),
+    word("--hmi-token-file", "FILE", "a file of yours, of mode 0600, with that token, 16 "
+         f"characters or more, to keep it over several runs; or set {TOKEN_VARIABLE} to it "
+         "(default: a random one; for yourself on this machine none is needed)", ""),
+    option("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS),  # refused
+    whole("--port", "PORT", "number that tells runs on this machine apart; no port is opened "
+          f"(default: {DEFAULT_PORT})", DEFAULT_PORT),
+    number("--patience", "S", "simulated seconds without progress after which the mission counts "
+           "as failed (default: 60)", 60.0),
+    number("--duration", "S", "simulated seconds after which a system without a mission ends "
+           "(default: when it is interrupted)"),
+    word("--record", "FILE", "keep everything that is sent in an MCAP file, for `rampart bag "
+         "info`, `rampart replay` and Foxglove-compatible viewers"),
+    flag("--overwrite", "--record may replace an existing file"),
+    word("--report", "DIR", f"where the report goes, checkpoints, and in {ERROR_LOG} the "
+         "tracebacks of nodes that failed (default: reports/TIME-MISSION, without a mission "
+         "reports/TIME-SYSTEM)"),
+    flag("--virtual", "run a mission in virtual time: all actors in this process, many times "
+         "faster than real; the same --seed gives the same run, to the byte"),
+    word("--network", "NAME", "with --virtual, what lies between the nodes: "
+         f"{', '.join(NETWORKS)} (default: measured)", "measured"),
+    several("--fault", "FAULT[@WHEN][+S]", "a fault to inject into a mission (repeatable): one of "
+            "`rampart inject --list`, MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE, slow:NODE, "
+            "or of the robot's; WHEN is simulated seconds or goalN (default: 10), S how long it "
+            "lasts"),
+    flag("--json", "last line of stdout is one JSON object with the result"))
+
+
 def parser(program: str = "", kind: type[Application] = Application,
            said: Mapping[str, Any] | None = None) -> argparse.ArgumentParser:
     """Return the parser of the command line.
@@ -67,64 +111,9 @@ def parser(program: str = "", kind: type[Application] = Application,
     examples = "".join(f"  {program} {how:<40} {what}\n" for how, what in (
         *_EXAMPLES, *kind.examples))
     p = argparse.ArgumentParser(
-        prog=program, epilog=f"examples:\n{examples}{_EPILOG}",
-        description="Start a system from its spec, run it, judge it, report on it.",
-        formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--wait", action="store_true",
-                   help="let the operator start the mission from the page")
-    p.add_argument("--system", metavar="FILE", default=str(systems.DEFAULT),
-                   help=f"system spec, or name of a shipped one: {systems.names()} "
-                   "(default: osmosis)")
-    p.add_argument("--strategy", metavar="NAME", default="",
-                   help=f"one of {', '.join(STRATEGIES)} (default: the system's)")
-    p.add_argument("--shadow", metavar="NAME", default="",
-                   help="a second strategy that decides without effect; where it differs, it says "
-                   "so (default: the system's)")
-    p.add_argument("--no-ftm", action="store_true",
-                   help="run the paper's unprotected baseline: last command kept, no dead man, "
-                   "no respawn")
-    p.add_argument("--rate", metavar="R", type=float, default=1.0,
-                   help="simulated seconds per second (default: 1)")
-    p.add_argument("--seed", metavar="N", type=int, default=1, help="for sensor noise (default: 1)")
-    p.add_argument("--no-hmi", action="store_true", help="no operator's page (its node still runs)")
-    p.add_argument("--hmi-port", metavar="PORT", type=int, default=8080,
-                   help="port of the operator's page (default: 8080)")
-    p.add_argument("--hmi-host", metavar="HOST", default="127.0.0.1",
-                   help="address of the operator's page (default: 127.0.0.1, this machine only). "
-                   "Any other makes it need a token, which is printed with the page's address "
-                   "when the run starts")
-    p.add_argument("--hmi-token-file", metavar="FILE", default="",
-                   help="a file of yours, of mode 0600, with that token, 16 characters or more, to "
-                   f"keep it over several runs; or set {TOKEN_VARIABLE} to it (default: a random "
-                   "one; for yourself on this machine none is needed)")
-    p.add_argument("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS)  # refused
-    p.add_argument("--port", metavar="PORT", type=int, default=DEFAULT_PORT,
-                   help="number that tells runs on this machine apart; no port is opened "
-                   f"(default: {DEFAULT_PORT})")
-    p.add_argument("--patience", metavar="S", type=float, default=60.0,
-                   help="simulated seconds without progress after which the mission counts as "
-                   "failed (default: 60)")
-    p.add_argument("--duration", metavar="S", type=float,
-                   help="simulated seconds after which a system without a mission ends (default: "
-                   "when it is interrupted)")
-    p.add_argument("--record", metavar="FILE", help="keep everything that is sent in an MCAP file, "
-                   "for `rampart bag info`, `rampart replay` and Foxglove-compatible viewers")
-    p.add_argument("--overwrite", action="store_true", help="--record may replace an existing file")
-    p.add_argument("--report", metavar="DIR", help="where the report goes, checkpoints, and in "
-                   f"{ERROR_LOG} the tracebacks of nodes that failed (default: "
-                   "reports/TIME-MISSION, without a mission reports/TIME-SYSTEM)")
-    p.add_argument("--virtual", action="store_true",
-                   help="run a mission in virtual time: all actors in this process, many times "
-                   "faster than real; the same --seed gives the same run, to the byte")
-    p.add_argument("--network", metavar="NAME", default="measured",
-                   help=f"with --virtual, what lies between the nodes: {', '.join(NETWORKS)} "
-                   "(default: measured)")
-    p.add_argument("--fault", metavar="FAULT[@WHEN][+S]", action="append", default=[],
-                   help="a fault to inject into a mission (repeatable): one of `rampart inject "
-                   "--list`, MODE:TOPIC, kill:NODE, stop:NODE, wedge:NODE, slow:NODE, or of the "
-                   "robot's; WHEN is simulated seconds or goalN (default: 10), S how long it lasts")
-    p.add_argument("--json", action="store_true",
-                   help="last line of stdout is one JSON object with the result")
+        prog=program, epilog=f"examples:\n{examples}{_EPILOG}", formatter_class=FORMATTER,
+        description="Start a system from its spec, run it, judge it, report on it.")
+    add_options(p, _OPTIONS)
     application_options.add(p, kind, said or {})
     return p
 
@@ -177,26 +166,16 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
         ftm=not options.no_ftm, options=application_options.chosen(options, kind),
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
-        hmi_host=options.hmi_host, hmi_token=token,
-        hmi_token_is_new=token_is_new,
+        hmi_host=options.hmi_host, hmi_token=token, hmi_token_is_new=token_is_new,
         waits=options.wait)
     spec = load_system(plan)
     if not options.no_hmi:
         plan = msgspec.structs.replace(plan, faults=faults_of(spec).offered())
-    return _fitting(options, plan, spec), spec
-
-
-def _fitting(options: argparse.Namespace, plan: RunPlan, spec: SystemSpec) -> RunPlan:
-    """Return the plan without a page that nobody serves.
-
-    Raises:
-        UsageError: an option needs a node that the system has not.
-    """
     if not _has_actor(plan, spec, HMI):
         refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token_file"),
-                f"no node of {spec.name} serves an operator's page")
+               f"no node of {spec.name} serves an operator's page")
         plan = msgspec.structs.replace(plan, hmi_port=0)
-    return plan
+    return plan, spec
 
 
 def _has_actor(plan: RunPlan, spec: SystemSpec, actor: str) -> bool:
@@ -218,28 +197,24 @@ def refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    if not 0.1 <= options.rate <= 20:
-        raise UsageError(f"--rate {options.rate:g}: must be between 0.1 and 20")
-    if options.duration is not None and not 0 < options.duration < 1e9:
-        raise UsageError(f"--duration {options.duration:g}: must be above 0")
-    if not options.patience > 0:
-        raise UsageError(f"--patience {options.patience:g}: must be above 0")
+    between("--rate", options.rate, 0.1, 20)
+    positive("--duration", options.duration, below=1e9)
+    positive("--patience", options.patience)
     if options.record:
         check_target(Path(options.record), overwrite=options.overwrite)
     elif options.overwrite:
         raise UsageError("--overwrite: only with --record FILE")
     for name, port in (("--port", options.port), ("--hmi-port", options.hmi_port)):
-        if not 1024 <= port <= LAST_PORT:
-            raise UsageError(f"{name} {port}: must be between 1024 and {LAST_PORT}, below the "
-                             "ports that the kernel gives to outgoing connections")
+        between(name, port, 1024, LAST_PORT,
+                ", below the ports that the kernel gives to outgoing connections")
     if options.network != "measured" and not options.virtual:
         raise UsageError(f"--network {options.network}: only with --virtual; Zenoh carries the "
                          "messages of real processes")
     if options.virtual and options.network not in NETWORKS:
         raise UsageError(f"--network {options.network}: unknown; known: {', '.join(NETWORKS)}")
-    for option, name in (("--strategy", options.strategy), ("--shadow", options.shadow)):
+    for role, name in (("--strategy", options.strategy), ("--shadow", options.shadow)):
         if name and name not in STRATEGIES:
-            raise UsageError(f"{option} {name}: unknown strategy; known: {', '.join(STRATEGIES)}")
+            raise UsageError(f"{role} {name}: unknown strategy; known: {', '.join(STRATEGIES)}")
 
 
 def _token(options: argparse.Namespace) -> tuple[str, bool]:
@@ -277,3 +252,4 @@ def _token(options: argparse.Namespace) -> tuple[str, bool]:
         raise UsageError(f"--hmi-host {host}: no address of this machine ({why}); 0.0.0.0 stands "
                          "for all it has") from None
     return token, bool(token) and not own
+

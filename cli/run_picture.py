@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 from rampart.actors.bus import messages as bm
@@ -37,6 +38,15 @@ def _count(counter: Counter[Any], key: Any) -> None:
     if key not in counter and len(counter) >= _NAMES:
         key = (_OTHERS,) * len(key) if isinstance(key, tuple) else _OTHERS
     counter[key] += 1
+
+
+def _report(module: str, report: Any, busy: StrEnum, newest: dict[str, Any],
+            total: Counter[str]) -> None:
+    """Keep a module's newest report, and count it if the module has become busy."""
+    before = newest.get(module)
+    if report.state is busy and (before is None or before.state is not busy):
+        _count(total, module)
+    newest[module] = report
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,17 +98,11 @@ class RunPicture:
         if topic is bus_topics.HEARTBEAT:
             self.beats[header.source] = Beat(header.incarnation, now_s, body)
         elif topic is ftm_topics.DETECTION:
-            before = self.detections.get(header.source)
-            if body.state is m.DetectionState.ACTIVE and (
-                    before is None or before.state is not body.state):
-                _count(self.detections_total, header.source)
-            self.detections[header.source] = body
+            _report(header.source, body, m.DetectionState.ACTIVE, self.detections,
+                    self.detections_total)
         elif topic is ftm_topics.RECOVERY:
-            was = self.recoveries.get(header.source)
-            if body.state is m.RecoveryState.ACTIVATED and (
-                    was is None or was.state is not body.state):
-                _count(self.recoveries_total, header.source)
-            self.recoveries[header.source] = body
+            _report(header.source, body, m.RecoveryState.ACTIVATED, self.recoveries,
+                    self.recoveries_total)
         elif topic is ftm_topics.DECISION:
             self.decisions.append((header.stamp, body))
             _count(self.decisions_total, body.strategy)

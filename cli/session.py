@@ -22,7 +22,7 @@ from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.bus.zenoh_bus import ZenohBus
 from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.actors.runtime.clock import Clock
-from rampart.cli.output import UsageError
+from rampart.cli.output import UsageError, refusing
 
 T = TypeVar("T")
 
@@ -31,6 +31,12 @@ RESEND_S = 0.1
 
 OVERHEAD_S = 0.5
 """Real seconds granted for what does not run in simulated time: sockets, scheduling."""
+
+
+async def pause(done: asyncio.Event, real_s: float) -> None:
+    """Wait for real seconds, or until an event is set."""
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(done.wait(), real_s)
 
 
 class Session:
@@ -53,11 +59,8 @@ class Session:
         """Return how many real seconds to wait for something due in simulated seconds."""
         return simulated_s / self.clock.rate + OVERHEAD_S
 
-    def listen(
-        self, topic: Topic[Any], key: str,
-        heard: Callable[[str, Header, Any], None],
-        garbage: Callable[[str, bytes, str], None] | None = None,
-    ) -> None:
+    def listen(self, topic: Topic[Any], key: str, heard: Callable[[str, Header, Any], None],
+               garbage: Callable[[str, bytes, str], None] | None = None) -> None:
         """Have `heard` called with key (below the root), header and body of each message.
 
         Args:
@@ -87,36 +90,20 @@ class Session:
         start = len(f"{ROOT}/")
         self._bus.subscribe(topic, topic.pattern, lambda key, load: arrived(key[start:], load))
 
-    async def latest(
-        self, topics: tuple[Topic[Any], ...], timeout_s: float
-    ) -> dict[str, Any]:
+    async def latest(self, topics: tuple[Topic[Any], ...], timeout_s: float) -> dict[str, Any]:
         """Return topic key → newest body, as soon as all were heard, or after real seconds."""
-        found: dict[str, Any] = {}
-        complete = asyncio.Event()
-
-        def keeper(key: str) -> Callable[[str, Header, Any], None]:
-            def keep(_key: str, _header: Header, body: Any) -> None:
-                found[key] = body
-                if len(found) == len(topics):
-                    complete.set()
-            return keep
-
+        heard = {topic.key: Latest[Any]() for topic in topics}
         for topic in topics:
-            self.listen(topic, topic.pattern, keeper(topic.key))
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(complete.wait(), timeout_s)
-        return found
+            self.listen(topic, topic.pattern, heard[topic.key].keep)
+        await asyncio.gather(*(one.first(timeout_s) for one in heard.values()))
+        return {key: one.value for key, one in heard.items() if one.value is not None}
 
     def publish(self, topic: Topic[Any], body: msgspec.Struct) -> None:
         """Send a message once, stamped now; for what is repeated anyway."""
-        self._sequence += 1
-        self._bus.publish(topic, topic.at(), encode(
-            Header(self.name, 1, self._sequence, self.clock.now()), body))
+        self._bus.publish(topic, topic.at(), self._stamped(body))
 
-    async def command(
-        self, topic: Topic[Any], body: msgspec.Struct, effect: Callable[[], bool],
-        timeout_s: float,
-    ) -> bool:
+    async def command(self, topic: Topic[Any], body: msgspec.Struct,
+                      effect: Callable[[], bool], timeout_s: float) -> bool:
         """Send a command until `effect` holds; return False if it did not within real seconds.
 
         Raises:
@@ -126,9 +113,11 @@ class Session:
         if self.run.replay_of:
             raise UsageError(f"port {self.run.base_port} is a replay of {self.run.replay_of}: "
                              "nobody is there to obey")
-        self._sequence += 1
-        payload = _checked(
-            topic, encode(Header(self.name, 1, self._sequence, self.clock.now()), body))
+        payload = self._stamped(body)
+        try:
+            decode(topic, payload)
+        except UNREADABLE as error:
+            raise UsageError(f"not a {topic.type.__name__} that can be sent: {error}") from None
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout_s
         resend = loop.time()
@@ -141,6 +130,10 @@ class Session:
                 resend = now + RESEND_S
             await asyncio.sleep(0.01)
         return True
+
+    def _stamped(self, body: msgspec.Struct) -> bytes:
+        self._sequence += 1
+        return encode(Header(self.name, 1, self._sequence, self.clock.now()), body)
 
 
 class Latest(Generic[T]):
@@ -157,22 +150,8 @@ class Latest(Generic[T]):
 
     async def first(self, timeout_s: float) -> T | None:
         """Return the newest message, or wait for the first one, at most real seconds."""
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._heard.wait(), timeout_s)
+        await pause(self._heard, timeout_s)
         return self.value
-
-
-def _checked(topic: Topic[Any], payload: bytes) -> bytes:
-    """Return a payload that the topic's readers will take.
-
-    Raises:
-        UsageError: they will not; field and bound are named.
-    """
-    try:
-        decode(topic, payload)
-    except UNREADABLE as error:
-        raise UsageError(f"not a {topic.type.__name__} that can be sent: {error}") from None
-    return payload
 
 
 @contextlib.asynccontextmanager
@@ -182,15 +161,10 @@ async def connect(port: int | None = None) -> AsyncIterator[Session]:
     Raises:
         UsageError: there is no run, or it must be chosen.
     """
-    try:
+    with refusing(NoRunError, BusError):
         run = find_run(port)
-    except NoRunError as error:
-        raise UsageError(str(error)) from None
-    bus = ZenohBus("", 0, None, run.endpoints, RecorderConnection(run.base_port))
-    try:
+        bus = ZenohBus("", 0, None, run.endpoints, RecorderConnection(run.base_port))
         await bus.open()
-    except BusError as error:
-        raise UsageError(str(error)) from None
     try:
         yield Session(run, bus, Clock(run.origin_s, run.rate))
     finally:

@@ -8,28 +8,40 @@ from importlib.metadata import entry_points
 
 from rampart.actors.layout.layout import application_class
 from rampart.cli import application_options, systems
+from rampart.cli.verbs import add_options, flag, group, help_of, number, option, several, whole, word
 from rampart.sim.campaign.defaults import BACKENDS, PATIENCE_S
 from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.virtual.network import NETWORKS
 
-_EPILOG = """examples:
-  rampart campaign --paper                       the paper's tables, beside the paper's verdicts
-  rampart campaign --paper --full                ... their rows on the full system
-  rampart campaign --runs 200                    200 random single faults
-  rampart campaign --runs 200 --together 2       ... pairs of faults
-  rampart campaign --fault 'kill:*' --seeds 5    every process killed, five seeds each
-  rampart campaign --fault gps-bias@20+5 --obstacles 0,2 --ftm both
-  rampart campaign --list                        the faults that there are
-  rampart campaign --replay 3f2a --out DIR       repeat one run of DIR and write its report
-  rampart campaign --search 200                  look for the fault with the smallest margin
-The same command goes on where it was interrupted; each run is made once. Results, with a report,
-are in --out.
+_CHOICE = (
+    whole("--runs", "N", "N random faults of all kinds"),
+    several("--fault", "FAULT[@WHEN][+S]",
+            "this fault; may be repeated, and be a pattern of names: 'kill:*'"),
+    whole("--together", "K", "with --runs: K faults in each (default 1)", 1),
+    word("--kinds", "K,...", "with --runs: only these kinds of faults, of those that --list shows"),
+    whole("--search", "N", "N runs of an optimiser that looks for the smallest safety margin"),
+    word("--replay", "RUN", "repeat a run of --out by its key"),
+    flag("--list", "list the faults that there are"))
 
-exit code: 0 no unsafe run with fault tolerance, 1 there was one, or with --full one that failed,
-2 bad usage, or it could not be finished, as on a full disk"""
+_CONDITIONS = (
+    option("--ftm", choices=("on", "off", "both"), default="on",
+           help="fault tolerance, the unprotected baseline, or both (default: on)"),
+    several("--strategy", "NAME", "of the manager; may be repeated (default: the system's)"),
+    word("--network", "NAME", f"{', '.join(NETWORKS)} (default: measured)", "measured"),
+    whole("--seed", "N", "default: 1", 1),
+    whole("--seeds", "N", "with --fault: so many runs of each, from --seed on (default: 1)", 1),
+    number("--patience", "S", "simulated seconds without progress that end a run "
+           f"(default: {PATIENCE_S:g})", PATIENCE_S))
+
+_PLACE = (
+    word("--out", "DIR", "default: reports/campaign-NAME, by what is run"),
+    whole("--jobs", "N", "processes (default: one per core)", 0),
+    option("--backend", default="loky", choices=BACKENDS,
+           help="loky is this machine; dask and ray are existing clusters"),
+    word("--address", "A", "of the cluster's scheduler", ""))
 
 
-def parser(program: str, system: str | None, campaigns: Sequence[type[NamedCampaign]]
+def parser(program: str, system: str, campaigns: Sequence[type[NamedCampaign]]
            ) -> argparse.ArgumentParser:
     """Return the parser of the verb.
 
@@ -41,55 +53,21 @@ def parser(program: str, system: str | None, campaigns: Sequence[type[NamedCampa
     Raises:
         UsageError: there is no such system.
     """
-    parser = argparse.ArgumentParser(
-        prog=program, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Run missions in virtual time with faults injected, on all cores, and say how\n"
-                    "often the robot succeeded and whether it was always safe.",
-        epilog=_EPILOG)
-    what = parser.add_argument_group("what is run")
-    for campaign in campaigns:
-        campaign.add(what)
-    what.add_argument("--runs", type=int, metavar="N", help="N random faults of all kinds")
-    what.add_argument("--fault", action="append", default=[], metavar="FAULT[@WHEN][+S]",
-                      help="this fault; may be repeated, and be a pattern of names: 'gps-*'")
-    what.add_argument("--together", type=int, default=1, metavar="K",
-                      help="with --runs: K faults in each (default 1)")
-    what.add_argument("--kinds", metavar="K,...",
-                      help="with --runs: only these kinds of faults, of those that --list shows")
-    what.add_argument("--search", type=int, metavar="N",
-                      help="N runs of an optimiser that looks for the smallest safety margin")
-    what.add_argument("--replay", metavar="RUN", help="repeat a run of --out by its key")
-    what.add_argument("--list", action="store_true", help="list the faults that there are")
-    how = parser.add_argument_group("under which conditions")
-    how.add_argument("--system", metavar="SPEC",
-                     help=f"file, or name of a shipped system (default: {systems.DEFAULT.stem}"
-                     f"{''.join(f'; with {c.flag} alone: {c.system}' for c in campaigns)}); its "
-                     "options, below, take several values, which are crossed, or drawn from with "
-                     "--runs")
-    how.add_argument("--ftm", choices=("on", "off", "both"), default="on",
-                     help="fault tolerance, the paper's baseline, or both (default: on)")
-    how.add_argument("--strategy", action="append", default=[], metavar="NAME",
-                     help="of the manager; may be repeated (default: the system's)")
-    how.add_argument("--network", default="measured", metavar="NAME",
-                     help=f"{', '.join(NETWORKS)} (default: measured)")
-    how.add_argument("--seed", type=int, default=1, metavar="N", help="default: 1")
-    how.add_argument("--seeds", type=int, default=1, metavar="N",
-                     help="with --fault: so many runs of each, from --seed on (default: 1)")
-    how.add_argument("--patience", type=float, default=PATIENCE_S, metavar="S",
-                     help=f"simulated seconds without progress that end a run "
-                     f"(default: {PATIENCE_S:g})")
-    where = parser.add_argument_group("where")
-    where.add_argument("--out", metavar="DIR",
-                       help="default: reports/campaign-NAME, by what is run")
-    where.add_argument("--jobs", type=int, default=0, metavar="N",
-                       help="processes (default: one per core)")
-    where.add_argument("--backend", default="loky", choices=BACKENDS,
-                       help="loky is this machine; dask and ray are existing clusters")
-    where.add_argument("--address", default="", metavar="A", help="of the cluster's scheduler")
-    parser.add_argument("--json", action="store_true", help="print the rows as JSON")
+    which = "".join(f"; with {each.flag} alone: {each.system}" for each in campaigns)
+    made = argparse.ArgumentParser(prog=program, **help_of(run.__doc__ or ""))
+    what = made.add_argument_group("what is run")
+    for each in campaigns:
+        each.add(what)
+    add_options(what, _CHOICE)
+    add_options(made, (
+        group("under which conditions",
+              word("--system", "SPEC", "file, or name of a shipped system (default: "
+                   f"{systems.DEFAULT.stem}{which}); its options, below, take several values, "
+                   "which are crossed, or drawn from with --runs"), *_CONDITIONS),
+        group("where", *_PLACE), flag("--json", "print the rows as JSON")))
     spec = systems.load(system)
-    application_options.add(parser, application_class(spec), spec.application, crossed=True)
-    return parser
+    application_options.add(made, application_class(spec), spec.application, crossed=True)
+    return made
 
 
 def parse(arguments: Sequence[str], program: str = "rampart campaign") -> argparse.Namespace:
@@ -115,7 +93,27 @@ def parse(arguments: Sequence[str], program: str = "rampart campaign") -> argpar
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the campaign, or what else was asked for."""
+    """Run the campaign, or what else was asked for.
+
+    Run missions in virtual time with faults injected, on all cores, and say how
+    often the robot succeeded and whether it was always safe.
+
+    Examples:
+      rampart campaign --paper                       the paper's tables, beside the paper's verdicts
+      rampart campaign --paper --full                ... their rows on the full system
+      rampart campaign --runs 200                    200 random single faults
+      rampart campaign --runs 200 --together 2       ... pairs of faults
+      rampart campaign --fault 'kill:*' --seeds 5    every process killed, five seeds each
+      rampart campaign --fault gps-bias@20+5 --obstacles 0,2 --ftm both
+      rampart campaign --list                        the faults that there are
+      rampart campaign --replay 3f2a --out DIR       repeat one run of DIR and write its report
+      rampart campaign --search 200                  look for the fault with the smallest margin
+    The same command goes on where it was interrupted; each run is made once. Results, with a
+    report, are in --out.
+
+    exit code: 0 no unsafe run with fault tolerance, 1 there was one, or with --full one that
+    failed, 2 bad usage, or it could not be finished, as on a full disk
+    """
     from rampart.cli.analyse.campaigning import campaign  # noqa: PLC0415 physics and all: help needs none
 
     return campaign(options)

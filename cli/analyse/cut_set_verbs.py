@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,16 @@ from rampart.cli.output import (
     UsageError,
     print_json,
     print_table,
+    progress,
+    refusing,
     say,
-    show_progress,
+    say_text,
+    using,
 )
 from rampart.cli.session import connect
-from rampart.files.reading import FileError, read_bytes
-from rampart.manager.analysis.barriers import Outlook, guard, outlook
+from rampart.cli.verbs import JSON, PORT, add_verb, flag, option, whole, word
+from rampart.files.reading import read_bytes
+from rampart.manager.analysis.barriers import Guarded, guard, outlook
 from rampart.manager.analysis.cut_sets import CutSets, TooLargeError
 from rampart.manager.analysis.formula import Formula, FormulaError, formula_of
 from rampart.manager.analysis.open_psa import MAX_BYTES, OpenPsaError, read_open_psa, write_open_psa
@@ -31,40 +36,36 @@ _LIMIT = 100
 _WAIT_S = 1.0
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "cut-sets", parents=[common], formatter_class=formatter,
-        help="minimal cut sets of a fault tree, and the barriers on them",
-        description="Find the minimal sets of events that make the top event of a fault tree\n"
-                    "occur. For a system spec also the mechanisms that are barriers on each, and\n"
-                    "what single event is left before the top. Sets are counted without listing\n"
-                    "them, so millions are no problem. docs/fault-trees.md says how.",
-        epilog="examples:\n"
-               "  rampart cut-sets                              the shipped system\n"
-               "  rampart cut-sets cell\n"
-               "  rampart cut-sets plant.xml --count --json     an Open-PSA file\n"
-               "  rampart cut-sets plant.xml --top g12 --max-order 2\n"
-               "  rampart cut-sets --active FTM2                what is left if DM2 is active\n"
-               "  rampart cut-sets --live                       what is left in the run, now\n"
-               "  rampart cut-sets --export osmosis.xml         for other tools")
-    systems.add_arguments(parser, what=", or Open-PSA .xml", dest="file")
-    parser.add_argument("--count", action="store_true", help="only count")
-    parser.add_argument("--top", metavar="GATE", default="", help="top gate of an Open-PSA file")
-    parser.add_argument("--max-order", type=int, metavar="K", help="no sets with more events")
-    parser.add_argument("--limit", type=int, default=_LIMIT, metavar="N",
-                        help=f"list no more than N sets (default {_LIMIT})")
-    parser.add_argument("--active", nargs="+", default=[], metavar="FTM",
-                        help="what is left before the top if these mechanisms are active")
-    parser.add_argument("--live", action="store_true",
-                        help="what is left before the top in the running system, now")
-    parser.add_argument("--export", metavar="FILE", help="write the fault tree as Open-PSA")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=run)
+    add_verb(verbs, "cut-sets", "minimal cut sets of a fault tree, and the barriers on them", run,
+             PORT, systems.choice("file", ", or Open-PSA .xml"), flag("--count", "only count"),
+             word("--top", "GATE", "top gate of an Open-PSA file", ""),
+             whole("--max-order", "K", "no sets with more events"),
+             whole("--limit", "N", f"list no more than N sets (default {_LIMIT})", _LIMIT),
+             option("--active", nargs="+", default=[], metavar="FTM",
+                    help="what is left before the top if these mechanisms are active"),
+             flag("--live", "what is left before the top in the running system, now"),
+             word("--export", "FILE", "write the fault tree as Open-PSA"), JSON)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Do what the options ask for."""
+    """Do what the options ask for.
+
+    Find the minimal sets of events that make the top event of a fault tree
+    occur. For a system spec also the mechanisms that are barriers on each, and
+    what single event is left before the top. Sets are counted without listing
+    them, so millions are no problem. docs/fault-trees.md says how.
+
+    Examples:
+      rampart cut-sets                              the shipped system
+      rampart cut-sets cell
+      rampart cut-sets plant.xml --count --json     an Open-PSA file
+      rampart cut-sets plant.xml --top g12 --max-order 2
+      rampart cut-sets --active FTM2                what is left if DM2 is active
+      rampart cut-sets --live                       what is left in the run, now
+      rampart cut-sets --export osmosis.xml         for other tools
+    """
     for name in ("limit", "max_order"):
         if (getattr(options, name) or 0) < 0:
             raise UsageError(f"--{name.replace('_', '-')} {getattr(options, name)}: must be 0 or "
@@ -76,34 +77,30 @@ def run(options: argparse.Namespace) -> int:
         if spec is None:
             raise UsageError(f"{options.file}: --active and --export need a system spec")
         if options.export:
-            return _export(spec, options.export)
+            with using(f"--export {options.export}"):
+                Path(options.export).write_text(write_open_psa(spec), encoding="utf-8")
+            say(f"{spec.name}: {len(spec.events)} events written to {options.export}")
+            return 0
         return _show_outlook(spec, options.active, as_json=options.json)
     try:
-        found = CutSets(formula, progress=show_progress)
+        with progress() as show:
+            found = CutSets(formula, progress=show)
+        if not options.count:
+            return _list(spec, formula, found, options)
     except TooLargeError as error:
         raise NoEffectError(f"{options.file}: {error}") from None
-    finally:
-        show_progress("")
-    if options.count:
-        if options.json:
-            print_json({"top": formula.top, "minimal_cut_sets": found.count})
-        else:
-            say(f"{formula.top}: {found.count} minimal cut sets")
-        return 0
-    return _list(spec, formula, found, options)
+    if options.json:
+        print_json({"top": formula.top, "minimal_cut_sets": found.count})
+    else:
+        say(f"{formula.top}: {found.count} minimal cut sets")
+    return 0
 
 
 def _load(options: argparse.Namespace) -> tuple[SystemSpec | None, Formula]:
     if options.file and options.file.lower().endswith(".xml"):
-        try:
+        with using(options.file), refusing(OpenPsaError):
             text = read_bytes(Path(options.file), MAX_BYTES)
             return None, read_open_psa(text, options.file, options.top)
-        except OSError as error:
-            raise UsageError(f"{options.file}: {error.strerror}") from None
-        except FileError as error:
-            raise UsageError(f"{options.file}: {error}") from None
-        except OpenPsaError as error:
-            raise UsageError(str(error)) from None
     spec = systems.load(options.file)
     try:
         formula = formula_of(spec.build_fault_tree())
@@ -116,10 +113,7 @@ def _load(options: argparse.Namespace) -> tuple[SystemSpec | None, Formula]:
 
 def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: argparse.Namespace
           ) -> int:
-    try:
-        sets = list(found.sets(options.limit, options.max_order))
-    except TooLargeError as error:
-        raise NoEffectError(f"{options.file}: {error}") from None
+    sets = list(found.sets(options.limit, options.max_order))
     guarded = guard(spec, sets) if spec is not None and not options.top else ()
     if options.json:
         print_json({
@@ -134,12 +128,10 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
             say(f"  {count} of {size} event{'s' if size != 1 else ''}")
     say()
     if guarded:
-        print_table(("barriers", "events", "mechanisms, nearest to the top first"),
-                    [(len(g.barriers), " ".join(g.events), " ".join(g.barriers)) for g in guarded])
+        _print_barriers("events", guarded)
         bare = [g for g in guarded if len(g.barriers) < 2]
         if bare:
-            say()
-            say("fewer than two barriers:")
+            say_text("\nfewer than two barriers:")
             for g in bare:
                 behind = f"only {g.barriers[0]}" if g.barriers else "none"
                 say(f"  {' and '.join(g.events)}: {behind}")
@@ -147,34 +139,17 @@ def _list(spec: SystemSpec | None, formula: Formula, found: CutSets, options: ar
         for events in sets:
             say("  " + (" ".join(events) or "(the empty set: the top occurs by itself)"))
     if len(sets) < found.count:
-        say()
-        say(f"{len(sets)} shown; --limit N shows more")
-    return 0
-
-
-def _export(spec: SystemSpec, file: str) -> int:
-    try:
-        Path(file).write_text(write_open_psa(spec), encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"--export {file}: {error.strerror}") from None
-    say(f"{spec.name}: {len(spec.events)} events written to {file}")
+        say_text(f"\n{len(sets)} shown; --limit N shows more")
     return 0
 
 
 def _show_outlook(spec: SystemSpec, active: list[str], *, as_json: bool) -> int:
-    try:
+    with refusing(UnknownElementError):
         spec.build_mechanisms().sort(active)
-    except UnknownElementError as error:
-        raise UsageError(str(error)) from None
     view = outlook(spec, active)
     if as_json:
         print_json(view)
-    else:
-        _say_outlook(spec, view)
-    return 0
-
-
-def _say_outlook(spec: SystemSpec, view: Outlook) -> None:
+        return 0
     top = spec.build_fault_tree().top
     if not view.occurred:
         say("no mechanism is active: nothing has occurred")
@@ -184,9 +159,13 @@ def _say_outlook(spec: SystemSpec, view: Outlook) -> None:
             f"{', '.join(barriers) or 'nothing'}")
     say()
     say(f"single events that would now lead to {top}, and the idle barriers left on the way:")
-    print_table(("barriers", "event", "mechanisms, nearest to the top first"),
-                [(len(g.barriers), " ".join(g.events), " ".join(g.barriers))
-                 for g in view.next_events])
+    _print_barriers("event", view.next_events)
+    return 0
+
+
+def _print_barriers(events: str, guarded: Iterable[Guarded]) -> None:
+    print_table(("barriers", events, "mechanisms, nearest to the top first"),
+                [(len(g.barriers), " ".join(g.events), " ".join(g.barriers)) for g in guarded])
 
 
 async def _live(options: argparse.Namespace) -> int:

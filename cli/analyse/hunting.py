@@ -13,7 +13,7 @@ import joblib
 import msgspec
 from tqdm import tqdm
 
-from rampart.cli.output import UsageError, print_json, print_table, say, warn
+from rampart.cli.output import UsageError, print_json, print_table, refusing, say, say_text, warn
 from rampart.sim.campaign.job import Job, RunResult, run_job, trial_of_system
 from rampart.sim.campaign.search import Space, margin, search, shrink
 from rampart.sim.campaign.store import Store, StoreError
@@ -26,10 +26,8 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
          faults: Faults) -> int:
     """Search among the faults in `groups`, shrink what was found, and keep it."""
     directory = Path(options.out or "reports/campaign-search")
-    try:
+    with refusing(StoreError):
         store = Store(directory)
-    except StoreError as error:
-        raise UsageError(str(error)) from None
     unit = trial_of_system(options.system).margin_unit
     workers = options.jobs or os.cpu_count() or 1
     with joblib.Parallel(n_jobs=workers, batch_size=1) as pool, tqdm(
@@ -68,8 +66,7 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
     else:
         print_table(("margin", "run", "faults"), [
             (f"{margin(result):.3f} {unit}", job.key, job.text()) for job, result in made[:10]])
-        say()
-        say(f"{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} {unit}")
+        say_text(f"\n{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} {unit}")
         for job, path in shrunk:
             chosen = "".join(f"{name} {value}, " for name, value in job.options.items())
             say(f"counterexample: {job.text()}, {chosen}seed {job.seed}: {path or 'not written'}")

@@ -37,8 +37,7 @@ def quote(text: str) -> str:
 
 
 def _statements(diagram: Diagram) -> Iterator[str]:
-    barred = {box.name for box in diagram.boxes
-              if diagram.what == "fault-tree" and box.mechanism}
+    barred = {box.name for box in diagram.boxes if diagram.what == "fault-tree" and box.mechanism}
     gated = {box.name for box in diagram.boxes if box.gate}
 
     def node(name: str, part: str = "") -> str:

@@ -7,9 +7,10 @@ two bars across the line above its event. What can be pointed at has a `<title>`
 
 from __future__ import annotations
 
+import textwrap
 import unicodedata
 from collections.abc import Iterator, Sequence
-from xml.sax.saxutils import escape
+from xml.sax.saxutils import escape, quoteattr
 
 import msgspec
 
@@ -67,12 +68,11 @@ def to_svg(diagrams: Sequence[Diagram]) -> str:
     for number, diagram in enumerate(diagrams):
         notes = _wrap(diagram.note, 90, 6) if number == 0 else []
         picture = _Picture(diagram)
-        head = [f'<text class="head" x="0" y="16">{escape(diagram.title)}</text>']
-        head += [f'<text class="note" x="0" y="{36 + LINE * i:g}">{escape(line)}</text>'
-                 for i, line in enumerate(notes)]
+        head = [_text(diagram.title, 0, 16, "head"), *(
+            _text(line, 0, 36 + LINE * i, "note") for i, line in enumerate(notes))]
         top = 40 + LINE * len(notes)
         body += [f'<g transform="translate({MARGIN:g} {y:g})" role="group" '
-                 f'aria-label="{_attribute(diagram.title)}">', *head,
+                 f'aria-label={quoteattr(diagram.title)}>', *head,
                  f'<g transform="translate(0 {top:g})">', *picture.body(), "</g>", "</g>"]
         y += top + picture.placing.height + 2 * MARGIN
         width = max(width, picture.placing.width, text_width(diagram.title) * 17 / FONT,
@@ -221,10 +221,6 @@ def _text(text: str, x: float, y: float, kind: str = "") -> str:
     return f'<text{kind} x="{x:g}" y="{y:g}">{escape(text)}</text>'
 
 
-def _attribute(text: str) -> str:
-    return escape(text, {'"': "&quot;"})
-
-
 def _tooltip(box: Box, diagram: Diagram) -> str:
     parts = [box.name, box.title, box.gate_words and f"gate: {box.gate_words}",
              box.barrier_words, box.active and diagram.active_words, box.decided and "decided"]
@@ -251,15 +247,7 @@ def _cut(text: str) -> str:
 
 def _wrap(text: str, width: int, most: int) -> list[str]:
     """Break a text into at most so many lines; a word too long for one is broken as well."""
-    lines: list[str] = []
-    for word in clean(text).split():
-        rest = word
-        if lines and len(lines[-1]) + 1 + len(rest) <= width:
-            lines[-1] += f" {rest}"
-            continue
-        while rest:
-            lines.append(rest[:width])
-            rest = rest[width:]
+    lines = textwrap.wrap(clean(text), width, break_on_hyphens=False)
     if len(lines) > most:
         lines = [*lines[:most - 1], f"{lines[most - 1][:width - 1]}…"]
     return lines

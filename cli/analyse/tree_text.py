@@ -27,10 +27,9 @@ def _lines(diagram: Diagram, *, noted: bool) -> list[str]:
         lines.append(diagram.note)
     boxes = {box.name: box for box in diagram.boxes}
     below: dict[str, list[str]] = {name: [] for name in boxes}
-    lowers = set()
+    lowers = {lower for _, lower in diagram.edges}
     for upper, lower in diagram.edges:
         below[upper].append(lower)
-        lowers.add(lower)
     if not boxes:
         lines.append("(empty)")
     drawn: set[str] = set()

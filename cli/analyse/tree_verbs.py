@@ -14,7 +14,8 @@ from rampart.cli import systems
 from rampart.cli.analyse.tree_dot import to_dot
 from rampart.cli.analyse.tree_svg import to_svg
 from rampart.cli.analyse.tree_text import to_text
-from rampart.cli.output import UsageError, say, unknown
+from rampart.cli.output import UsageError, refusing, say, unknown, using
+from rampart.cli.verbs import JSON_FORMAT, add_verb, option, word
 from rampart.manager.drawing.diagram import WHATS, Diagram, Situation, clean, draw
 from rampart.manager.model.order import CycleError, UnknownElementError
 from rampart.manager.spec.schema import SystemSpec
@@ -27,39 +28,39 @@ def to_json(diagrams: Sequence[Diagram]) -> str:
 
 
 FORMATS: dict[str, Callable[[Sequence[Diagram]], str]] = {
-    "text": to_text, "svg": to_svg, "dot": to_dot, "json": to_json,
-}
+    "text": to_text, "svg": to_svg, "dot": to_dot, "json": to_json}
 _ENDINGS = {".svg": "svg", ".dot": "dot", ".gv": "dot", ".json": "json", ".txt": "text"}
 
 
-def add(verbs: Any, formatter: Any) -> None:
+def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "tree", formatter_class=formatter, help="draw fault tree, FTMTree and order of recoveries",
-        description="Draw the fault tree with the mechanisms as barriers (‖), the FTMTree that\n"
-                    "follows from it, and the order of the recoveries, the safer above.",
-        epilog="examples:\n  rampart tree\n  rampart tree my_system.toml\n"
-               "  rampart tree --what ftm-tree --active FTM3 FTM4\n"
-               "  rampart tree --what fault-tree --output fault_tree.svg\n"
-               "  rampart tree --what order --format dot | dot -Tpdf > order.pdf")
-    systems.add_arguments(parser)
-    parser.add_argument("--what", choices=(*WHATS, "all"), default="all", help="default all")
-    parser.add_argument("--format", choices=tuple(FORMATS),
-                        help="default by the ending of --output, else text")
-    parser.add_argument("--json", action="store_const", dest="format", const="json",
-                        help="the same as --format json")
-    parser.add_argument("--output", metavar="FILE", help="write there instead of to stdout")
-    parser.add_argument("--order", metavar="NAME", action="append",
-                        help="order of recoveries; several: the next decides what the one before "
-                             "leaves open; default the spec's")
-    parser.add_argument("--active", metavar="FTM", nargs="+", default=[],
-                        help="active mechanisms; they are lit, and the decision is marked")
-    parser.add_argument("--strategy", metavar="NAME", help="that decides; default the spec's")
-    parser.set_defaults(run=show_tree)
+    add_verb(verbs, "tree", "draw fault tree, FTMTree and order of recoveries", show_tree,
+             systems.choice(),
+             option("--what", choices=(*WHATS, "all"), default="all", help="default all"),
+             option("--format", choices=tuple(FORMATS),
+                    help="default by the ending of --output, else text"), JSON_FORMAT,
+             word("--output", "FILE", "write there instead of to stdout"),
+             option("--order", metavar="NAME", action="append",
+                    help="order of recoveries; several: the next decides what the one before "
+                         "leaves open; default the spec's"),
+             option("--active", metavar="FTM", nargs="+", default=[],
+                    help="active mechanisms; they are lit, and the decision is marked"),
+             word("--strategy", "NAME", "that decides; default the spec's"))
 
 
 def show_tree(options: argparse.Namespace) -> int:
-    """Print or write the diagrams."""
+    """Print or write the diagrams.
+
+    Draw the fault tree with the mechanisms as barriers (‖), the FTMTree that
+    follows from it, and the order of the recoveries, the safer above.
+
+    Examples:
+      rampart tree
+      rampart tree my_system.toml
+      rampart tree --what ftm-tree --active FTM3 FTM4
+      rampart tree --what fault-tree --output fault_tree.svg
+      rampart tree --what order --format dot | dot -Tpdf > order.pdf
+    """
     ending = Path(options.output).suffix.lower() if options.output else ""
     if ending and not options.format and ending not in _ENDINGS:
         raise UsageError(f"--output {options.output}: unknown ending; one of "
@@ -71,10 +72,8 @@ def show_tree(options: argparse.Namespace) -> int:
     if options.output is None:
         _print(text)
         return 0
-    try:
+    with using(f"--output {options.output}"):
         Path(options.output).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"--output {options.output}: {error.strerror}") from None
     for diagram in diagrams:
         say(f"{options.output}: {diagram.what}, {len(diagram.boxes)} boxes, "
             f"{len(diagram.edges)} lines")
@@ -90,16 +89,15 @@ def _draw(spec: SystemSpec, whats: Sequence[str], options: argparse.Namespace
     strategy = options.strategy or spec.strategy
     try:
         order = spec.build_order(*criteria)
-        situation = Situation()
-        if options.active or options.strategy:
-            decision = decide(options.active, spec.build_mechanisms(), spec.build_ftm_tree(),
-                              order, strategy)
-            situation = Situation(frozenset(decision.active), decision.recoveries, decision.rule,
-                                  strategy)
     except CycleError as error:
         raise UsageError(f"--order {' '.join(criteria)}: together they have a {error}") from None
-    except (UnknownElementError, UnknownStrategyError) as error:
-        raise UsageError(str(error)) from None
+    situation = Situation()
+    if options.active or options.strategy:
+        with refusing(UnknownElementError, UnknownStrategyError):
+            decision = decide(options.active, spec.build_mechanisms(), spec.build_ftm_tree(),
+                              order, strategy)
+        situation = Situation(frozenset(decision.active), decision.recoveries, decision.rule,
+                              strategy)
     return tuple(draw(spec, what, order, criteria, situation) for what in whats)
 
 

@@ -7,50 +7,46 @@ import time
 from typing import Any
 
 from rampart.cli import systems
-from rampart.cli.output import UsageError, print_json, print_table, say, show_progress
+from rampart.cli.output import UsageError, print_json, print_table, progress, refusing, say
+from rampart.cli.verbs import JSON, add_verb, flag, several, whole
 from rampart.manager.analysis.verification import MEANING, Report, TooLargeError, verify
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import UnknownStrategyError
 
 
-def add(verbs: Any, formatter: Any) -> None:
+def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "verify", formatter_class=formatter, help="check every property of the arbitration",
-        description="Check the arbitration of a system exhaustively: what each strategy decides\n"
-                    "for every set of active mechanisms, and every state of the arbiter that\n"
-                    "carries it out, from when it has heard every module. A property holds, or\n"
-                    "the shortest counterexamples are shown. docs/verification.md explains the\n"
-                    "properties, and what is not looked at.",
-        epilog="examples:\n  rampart verify\n"
-               "  rampart verify my_system.toml --strategy safety-first\n"
-               "  rampart verify cell --json\n"
-               "  rampart verify --strict && python launch.py     only if all holds\n\n"
-               "exit code: 0 verified, whatever was found; with --strict 1 if a property of the\n"
-               "system's strategy (or of one given by --strategy) fails; 2 bad usage or bad spec")
-    systems.add_arguments(parser)
-    parser.add_argument("--strategy", action="append", default=[], metavar="NAME",
-                        help="only this strategy; repeat for several (default: all)")
-    parser.add_argument("--together", type=int, default=2, metavar="K",
-                        help="explore K recoveries at a time (default 2, which suffices; the "
-                             "number of recoveries of the system explores all, in minutes)")
-    parser.add_argument("--strict", action="store_true", help="exit 1 if a property fails")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=run)
+    add_verb(verbs, "verify", "check every property of the arbitration", run, systems.choice(),
+             several("--strategy", "NAME", "only this strategy; repeat for several (default: all)"),
+             whole("--together", "K", "explore K recoveries at a time (default 2, which suffices; "
+                   "the number of recoveries of the system explores all, in minutes)", 2),
+             flag("--strict", "exit 1 if a property fails"), JSON)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Verify, and show what was found."""
+    """Verify, and show what was found.
+
+    Check the arbitration of a system exhaustively: what each strategy decides
+    for every set of active mechanisms, and every state of the arbiter that
+    carries it out, from when it has heard every module. A property holds, or
+    the shortest counterexamples are shown. docs/verification.md explains the
+    properties, and what is not looked at.
+
+    Examples:
+      rampart verify
+      rampart verify my_system.toml --strategy safety-first
+      rampart verify cell --json
+      rampart verify --strict && python launch.py     only if all holds
+
+    exit code: 0 verified, whatever was found; with --strict 1 if a property of the
+    system's strategy (or of one given by --strategy) fails; 2 bad usage or bad spec
+    """
     spec = systems.load(options.system)
     if options.together < 1:
         raise UsageError(f"--together {options.together}: a number from 1 up is right")
     start = time.monotonic()
-    try:
-        report = verify(spec, options.strategy, options.together, show_progress)
-    except (TooLargeError, UnknownStrategyError) as error:
-        raise UsageError(str(error)) from None
-    finally:
-        show_progress("")
+    with progress() as show, refusing(TooLargeError, UnknownStrategyError):
+        report = verify(spec, options.strategy, options.together, show)
     if options.json:
         print_json(report)
     else:

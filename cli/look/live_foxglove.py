@@ -1,4 +1,4 @@
-"""Views for viewers that speak Foxglove's WebSocket protocol, over `foxglove-sdk`.
+"""The server of `rampart live`: what viewers see that speak Foxglove's protocol, over its SDK.
 
 The server runs on threads of the SDK. A channel keeps no messages, and most of the scene changes
 hardly ever; so whoever subscribes to a channel is given its last message again, from the event
@@ -7,17 +7,26 @@ loop. Nothing is encoded for a channel that nobody looks at, and clients can onl
 
 from __future__ import annotations
 
+import argparse
 import asyncio
+import contextlib
+import functools
 from collections.abc import Mapping
 from typing import Any
 
 import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
+from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.json_schema import plain_schema
+from rampart.actors.recording.run_documents import known_of
 from rampart.actors.recording.views import encode
 from rampart.actors.run.run_info import RunInfo
+from rampart.cli.following import LOOK_S, is_over, sessions, stopped_by_signals
+from rampart.cli.output import UsageError, between, say, warn
+from rampart.cli.session import Session, pause
 
 
 class FoxgloveViewer(ServerListener):
@@ -73,3 +82,59 @@ class FoxgloveViewer(ServerListener):
     def _again(self, name: str) -> None:
         if name in self._last:
             self.show(name, *self._last[name])
+
+
+async def live(options: argparse.Namespace) -> int:
+    """Show one run after the other until interrupted."""
+    between("--port", options.port, 0, 65535)
+    try:
+        viewer = FoxgloveViewer(options.host, options.port)
+    except RuntimeError as error:
+        raise UsageError(f"cannot serve on {options.host} port {options.port}: {error}; "
+                         "choose another --port or --host") from None
+    say(f"Foxglove viewers: ws://{options.host}:{viewer.port}")
+    stop = asyncio.Event()
+    try:
+        with stopped_by_signals(stop):
+            async with contextlib.aclosing(sessions(
+                    options.of, stop, follow=True, option="--run")) as found:
+                async for session in found:
+                    _watch(session, viewer)
+                    say(f"showing {session.run.title} (port {session.run.base_port})")
+                    while not stop.is_set() and not is_over(session.run):
+                        await pause(stop, LOOK_S)
+                    if not stop.is_set():
+                        say("the run has ended; waiting for the next one, Ctrl-C ends")
+    finally:
+        try:
+            viewer.close()
+        except RuntimeError as error:
+            warn(f"the viewer did not take everything: {' '.join(str(error).split())}")
+    return 0
+
+
+def _watch(session: Session, viewer: FoxgloveViewer) -> None:
+    run = session.run
+    known = known_of({**run.plan, "system_file": run.system_file})
+    if known.application is None:
+        say("no map: the application of the run cannot be loaded here")
+    views = known.views()
+
+    def now_ns() -> int:
+        return max(0, int(session.clock.now() * 1e9))
+
+    def see(topic: Topic[Any], key: str, header: Header, body: Any) -> None:
+        show(views.of(topic, f"{ROOT}/{key}", header, body, now_ns()))
+
+    def show(found: list[tuple[str, Any]]) -> None:
+        at_ns = now_ns()
+        for channel, record in found:
+            viewer.show(channel, record, at_ns)
+
+    try:
+        viewer.begin(run, views.channels)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise UsageError(f"the viewer cannot be started: {' '.join(str(error).split())}") from None
+    show(views.start(now_ns()))
+    for topic in views.translators:
+        session.listen(topic, topic.pattern, functools.partial(see, topic))

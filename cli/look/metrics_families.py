@@ -8,15 +8,10 @@ life. A scraper's `rate()` copes with the reset when the next run or life begins
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from prometheus_client.core import (
-    CounterMetricFamily,
-    GaugeMetricFamily,
-    InfoMetricFamily,
-    Metric,
-)
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
@@ -58,21 +53,20 @@ def families(now: Exposition | None) -> Iterator[Metric]:
     yield from _nodes(now)
     yield from _mechanisms(now.picture)
     yield from now.picture.lines.families(now.picture.latest)
-    yield from _messages(now.picture)
-    yield from _processes(now.processes)
+    yield from _traffic_and_load(now)
 
 
 def gauge(name: str, doc: str, labels: tuple[str, ...], rows: Iterable[Row]) -> Metric:
     """Return a gauge with a row for each value of its labels."""
-    family = GaugeMetricFamily(f"rampart_{name}", doc, labels=labels)
-    for values, value in rows:
-        family.add_metric(values, value)
-    return family
+    return _filled(GaugeMetricFamily(f"rampart_{name}", doc, labels=labels), rows)
 
 
 def counter(name: str, doc: str, labels: tuple[str, ...], rows: Iterable[Row]) -> Metric:
     """Return a counter with a row for each value of its labels."""
-    family = CounterMetricFamily(f"rampart_{name}", doc, labels=labels)
+    return _filled(CounterMetricFamily(f"rampart_{name}", doc, labels=labels), rows)
+
+
+def _filled(family: GaugeMetricFamily | CounterMetricFamily, rows: Iterable[Row]) -> Metric:
     for values, value in rows:
         family.add_metric(values, value)
     return family
@@ -89,15 +83,13 @@ def _nodes(now: Exposition) -> Iterator[Metric]:
     yield counter("node_restarts", "How often a node was restarted in this run.", ("node",), [
         ((n.name,), n.restarts) for n in nodes])
     yield gauge("heartbeat_age_seconds", "Simulated seconds since a node's last heartbeat.",
-                 ("node",), [((name,), max(0.0, now.time_s - beat.heard_s))
-                             for name, beat in beats])
+                ("node",), [((name,), max(0.0, now.time_s - beat.heard_s)) for name, beat in beats])
     yield counter("rejected_payloads", "Payloads that a node refused, in this life.", ("node",), [
         ((name,), beat.message.rejected_payloads) for name, beat in beats])
-    yield counter("overflowed_commands", "Commands that found a node's mailbox full, in this "
-                   "life.", ("node",), [
-                       ((name,), beat.message.overflowed) for name, beat in beats])
-    yield counter("process_events", "What happened to processes.", ("node", "event"), [
-        (key, count) for key, count in sorted(now.picture.process_events_total.items())])
+    yield counter("overflowed_commands", "Commands that found a node's mailbox full, in this life.",
+                  ("node",), [((name,), beat.message.overflowed) for name, beat in beats])
+    yield counter("process_events", "What happened to processes.", ("node", "event"),
+                  sorted(now.picture.process_events_total.items()))
 
 
 def _mechanisms(picture: RunPicture) -> Iterator[Metric]:
@@ -122,31 +114,13 @@ def _mechanisms(picture: RunPicture) -> Iterator[Metric]:
                                value={"strategy": manager.strategy})
 
 
-def _messages(picture: RunPicture) -> Iterator[Metric]:
+def _traffic_and_load(now: Exposition) -> Iterator[Metric]:
+    found = sorted(now.processes.items())
     yield counter("messages", "Messages heard, a family's members together.", ("topic",), [
-        ((key,), count) for key, count in sorted(picture.messages.items())])
+        ((key,), count) for key, count in sorted(now.picture.messages.items())])
     yield gauge("message_rate_hertz", "Messages a simulated second, over the last seconds.",
-                 ("topic",), [((key,), hz) for key, hz in picture.rates().items()])
-
-
-def _processes(processes: Mapping[str, ProcessCount]) -> Iterator[Metric]:
-    found = sorted(processes.items())
+                ("topic",), [((key,), hz) for key, hz in now.picture.rates().items()])
     yield counter("process_cpu_seconds", "Processor time, real seconds.", ("process",), [
         ((name,), count.cpu_s) for name, count in found])
     yield gauge("process_resident_memory_bytes", "Resident set; most of it is shared.",
                  ("process",), [((name,), count.memory_bytes) for name, count in found])
-
-
-class Collector:
-    """What `prometheus_client` asks at each scrape.
-
-    Args:
-        look: returns what there is now, None without a run.
-    """
-
-    def __init__(self, look: Callable[[], Exposition | None]) -> None:
-        self._look = look
-
-    def collect(self) -> Iterator[Metric]:
-        """Yield the families of this moment."""
-        return families(self._look())

@@ -9,7 +9,9 @@ import argparse
 import asyncio
 import contextlib
 import socket
+from collections.abc import Iterator
 
+from prometheus_client.core import Metric
 from prometheus_client.exposition import choose_encoder
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -17,17 +19,12 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from rampart.actors.ftm import topics
-from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.supervision.process_usage import read_count
 from rampart.actors.web.server import WebServer
-from rampart.cli.following import LOOK_S, draw, is_over, sessions, stopped_by_signals
-from rampart.cli.look.metrics_families import Collector, Exposition
-from rampart.cli.output import UsageError, say
-from rampart.cli.run_picture import RunPicture
-from rampart.cli.session import Session
-
-_PROCESSES_EVERY = 4
-"""Rounds between two looks for the guards: `ProcessObserver` expects one a second."""
+from rampart.cli.following import LOOK_S, Watch, is_over, sessions, stopped_by_signals
+from rampart.cli.look.metrics_families import Exposition, families
+from rampart.cli.output import UsageError, between, say
+from rampart.cli.session import pause
 
 
 async def metrics(options: argparse.Namespace) -> int:
@@ -53,8 +50,7 @@ def listen(host: str, port: int) -> socket.socket:
     Raises:
         UsageError: there is no such address, or it is taken.
     """
-    if not 0 <= port <= 65535:
-        raise UsageError(f"--port {port}: must be between 0 and 65535")
+    between("--port", port, 0, 65535)
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((host, port), family=family)
@@ -65,53 +61,44 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 class Exporter:
-    """Follows runs and says what there is now; a `look` for `metrics_families.Collector`."""
+    """Follows runs, and tells `prometheus_client` at each scrape what there is then."""
 
     def __init__(self) -> None:
-        self._now: tuple[Session, RunPicture] | None = None
-        self._guards: dict[str, int] = {}
+        self._watch: Watch | None = None
 
     async def follow(self, port: int | None, stop: asyncio.Event) -> None:
         """Follow one run after the other until `stop`."""
         async with contextlib.aclosing(sessions(port, stop, follow=True, option="--run")) as found:
             async for session in found:
-                picture = RunPicture()
-                draw(session, picture)
-                run = session.run
-                observer = ProcessObserver(run.base_port, run.pid)
-                self._guards = {}
-                self._now = (session, picture)
-                looks = 0
-                while not stop.is_set() and not is_over(run):
-                    picture.sample(session.clock.now())
-                    if looks % _PROCESSES_EVERY == 0 and not run.replay_of:
-                        guards = observer.look(picture.latest(topics.NODES))["guards"]
-                        self._guards = {row["name"]: row["pid"] for row in guards}
-                    looks += 1
-                    with contextlib.suppress(TimeoutError):
-                        await asyncio.wait_for(stop.wait(), LOOK_S)
-                self._now = None
+                self._watch = Watch(session)
+                while not stop.is_set() and not is_over(session.run):
+                    self._watch.look()
+                    await pause(stop, LOOK_S)
+                self._watch = None
 
     def look(self) -> Exposition | None:
         """Return the exposition of this moment, None without a run."""
-        if self._now is None:
+        if self._watch is None:
             return None
-        session, picture = self._now
+        session, picture = self._watch.session, self._watch.picture
         table = picture.latest(topics.NODES)
         # On a replay nobody: the recorded numbers may be anybody's today.
         nodes = table.nodes if table and not session.run.replay_of else ()
-        pids = {node.name: node.pid for node in nodes} | self._guards
+        pids = {node.name: node.pid for node in nodes} | {
+            row["name"]: row["pid"] for row in self._watch.used["guards"]}
         return Exposition(
             session.run, session.clock.now(), picture,
             {name: count for name, pid in pids.items() if (count := read_count(pid)) is not None})
 
+    def collect(self) -> Iterator[Metric]:
+        """Yield the families of this moment."""
+        return families(self.look())
+
 
 def _app(exporter: Exporter) -> Starlette:
-    collector = Collector(exporter.look)
-
     async def figures(request: Request) -> Response:
         encode, kind = choose_encoder(request.headers.get("accept", ""))
-        return Response(encode(collector), headers={"content-type": kind})
+        return Response(encode(exporter), headers={"content-type": kind})
 
     async def front(_request: Request) -> Response:
         return PlainTextResponse("Rampart's figures for Prometheus are at /metrics\n")

@@ -6,11 +6,13 @@ colours only repeat what words say.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 from rich.cells import cell_len, set_cell_size
 from rich.text import Text
 
@@ -71,18 +73,14 @@ def picture_json(frame: Frame) -> dict[str, Any]:
     picture = frame.picture
     return {
         "title": frame.title, "port": frame.port, "rate": frame.rate,
-        "time_s": round(frame.time_s, 3),
-        **picture.lines.data(picture.latest),
+        "time_s": round(frame.time_s, 3), **picture.lines.data(picture.latest),
         "manager": picture.latest(ftm_topics.MANAGER_STATUS),
         "detections": dict(sorted(picture.detections.items())),
         "recoveries": dict(sorted(picture.recoveries.items())),
-        "decisions": [
-            {"time_s": stamp_s, "decision": record.decision, "words": _words(record)}
-            for stamp_s, record in picture.decisions],
-        "processes": [
-            {**row, **frame.usage.get(row["name"], {})} for row in _rows(frame)],
-        "rates_hz": picture.rates(),
-    }
+        "decisions": [{"time_s": stamp_s, "decision": record.decision, "words": _words(record)}
+                      for stamp_s, record in picture.decisions],
+        "processes": [{**row, **frame.usage.get(row["name"], {})} for row in _rows(frame)],
+        "rates_hz": picture.rates()}
 
 
 def _fit(line: Text, width: int) -> Text:
@@ -104,12 +102,13 @@ def _title(frame: Frame, width: int) -> Text:
 
 def _state(frame: Frame, width: int) -> list[Text]:
     picture, now_s = frame.picture, frame.time_s
+    manager: fm.ManagerStatus | None = picture.latest(ftm_topics.MANAGER_STATUS)
+    busy = manager is not None and (manager.active or manager.activated)
     rows = [
         *picture.lines.rows(picture.latest, width),
-        Row("manager", *_manager(picture.latest(ftm_topics.MANAGER_STATUS)),
+        Row("manager", manager_in_words(manager), "yellow" if busy else "",
             ftm_topics.MANAGER_STATUS),
-        Row("detection", *_detections(picture)),
-    ]
+        Row("detection", *_detections(picture))]
     shown = []
     for label, text, style, topic in rows:
         line = Text(f"{label:<{_LABEL}}", style="bold")
@@ -118,11 +117,6 @@ def _state(frame: Frame, width: int) -> list[Text]:
             line.append(f"SILENT for {silent_s:.0f} s; last: ", style="bold yellow")
         shown.append(line.append(printable(text), style=style))
     return shown
-
-
-def _manager(status: fm.ManagerStatus | None) -> tuple[str, str]:
-    busy = status is not None and (status.active or status.activated)
-    return manager_in_words(status), "yellow" if busy else ""
 
 
 def _detections(picture: RunPicture) -> tuple[str, str]:
@@ -152,17 +146,15 @@ def _decisions(frame: Frame, count: int) -> list[Text]:
 # -- the tables ---------------------------------------------------------------------------------
 
 
-def _rows(frame: Frame) -> list[dict[str, Any]]:
+def _rows(frame: Frame) -> list[Mapping[str, Any]]:
     """Return a row for each process: those in trouble first, then as asked for."""
     table: fm.NodeTable | None = frame.picture.latest(ftm_topics.NODES)
-    rows = [{"name": n.name, "kind": n.kind, "pid": n.pid, "state": n.state.value,
-             "incarnation": n.incarnation, "restarts": n.restarts}
-            for n in (table.nodes if table else ())]
-    rows += [dict(guard) for guard in frame.guards]
+    rows: list[Mapping[str, Any]] = [
+        *map(msgspec.structs.asdict, table.nodes if table else ()), *frame.guards]
 
     def place(row: Mapping[str, Any]) -> tuple[bool, float]:
         busy = frame.usage.get(row["name"], {}).get("cpu", 0.0) if frame.by_cpu else 0.0
-        return row["state"] == fm.NodeState.RUNNING.value, -busy
+        return row["state"] == fm.NodeState.RUNNING, -busy
 
     return sorted(rows, key=place)
 
@@ -177,9 +169,8 @@ def _tables(frame: Frame, width: int, height: int) -> list[Text]:
         return left
     right = _rates(frame, width - _PROCESS_WIDTH, height)
     blank = Text(" " * _PROCESS_WIDTH)
-    return [Text.assemble(left[i] if i < len(left) else blank.copy(),
-                          right[i] if i < len(right) else "")
-            for i in range(max(len(left), len(right)))]
+    return [Text.assemble(process or blank, rate or "")
+            for process, rate in itertools.zip_longest(left, right)]
 
 
 def _processes(frame: Frame, width: int, height: int) -> list[Text]:
@@ -193,9 +184,8 @@ def _processes(frame: Frame, width: int, height: int) -> list[Text]:
         figures = (f"{_age(used['age_s']):>6} {used['cpu']:>3.0f}% {used['mb']:>5.0f}"
                    if used else f"{'-':>6} {'-':>4} {'-':>5}")
         name = set_cell_size(printable(row["name"]), 18)
-        text = (f"{name} {row['state']:<8} {row['incarnation']:>4} {row['restarts']:>5} "
-                f"{figures}")
-        trouble = row["state"] != fm.NodeState.RUNNING.value
+        text = f"{name} {row['state']:<8} {row['incarnation']:>4} {row['restarts']:>5} {figures}"
+        trouble = row["state"] != fm.NodeState.RUNNING
         shown.append(Text(set_cell_size(text, width), style="bold red" if trouble else ""))
     if not rows:
         shown.append(Text(set_cell_size("the supervisor has not told yet", width)))
@@ -210,13 +200,11 @@ def _rates(frame: Frame, width: int, height: int) -> list[Text]:
     columns = max(1, width // _RATES_WIDTH)
     column = width // columns
     shown = [Text(set_cell_size("  topic" + "Hz".rjust(column - 7), width), style="bold underline")]
-    room = height - 1
-    per_column = min(room, math.ceil(len(rates) / columns)) if rates else 0
+    per_column = min(height - 1, math.ceil(len(rates) / columns)) if rates else 0
     for i in range(per_column):
-        line = ""
-        for key, hz in rates[i::per_column][:columns]:
-            line += f"  {set_cell_size(_short(key, column - 8), column - 8)}{hz:>6.1f}"
-        shown.append(Text(line))
+        shown.append(Text("".join(
+            f"  {set_cell_size(_short(key, column - 8), column - 8)}{hz:>6.1f}"
+            for key, hz in rates[i::per_column][:columns])))
     return shown
 
 

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES
 from rampart.actors.bus.topic import ROOT, Qos, Topic
+from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import SUPERVISOR_CLASS, application_class
 from rampart.actors.layout.system_topics import find_topic
 from rampart.actors.layout.wiring import load_class, topics_of
 from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR
-from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
+from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 from rampart.cli import systems
 from rampart.cli.output import UsageError, unknown
 from rampart.manager.spec.specification import SystemSpec
@@ -29,8 +29,7 @@ MAILBOX = {
 """How a topic's messages wait at their reader (see `rampart.actors.runtime.mailbox`)."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class TopicUse:
+class TopicUse(NamedTuple):
     """A topic with the nodes that publish and read it."""
 
     topic: Topic[Any]
@@ -47,12 +46,14 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
     """
     members = [(SUPERVISOR, SUPERVISOR_CLASS), (OBSERVER, application_class(spec).observer),
                *((node.name, node.actor) for node in spec.actors())]
-    wired: list[tuple[str, tuple[Topic[Any], ...], tuple[Topic[Any], ...]]] = []
+    inputs, outputs = {}, {}
     for name, path in members:
-        inputs, outputs = topics_of(_class(name, path))
-        wired.append((name, inputs, outputs))
-    return [TopicUse(topic, _publishers(topic, wired), _readers(topic, wired))
-            for topic in systems.topics_of(spec)]
+        try:
+            inputs[name], outputs[name] = topics_of(load_class(path))
+        except ValueError as error:
+            raise UsageError(f"node {name}: {error}") from None
+    return [TopicUse(topic, _who(topic, BASE_OUTPUTS, outputs) or ("tools",),
+                     _who(topic, BASE_INPUTS, inputs)) for topic in systems.topics_of(spec)]
 
 
 def resolve(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str]:
@@ -109,6 +110,22 @@ def _match(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str] | No
                  and short in (topic.key, topic.key.replace("{name}", "*"))), None)
 
 
+def check_member(key: str, nodes: Collection[str]) -> None:
+    """Make sure that there is the node that a key names, if the key is one of the engine's.
+
+    The members of a robot's own families need not be nodes.
+
+    Raises:
+        UsageError: there is no such node.
+    """
+    topic = find_topic(key, topics.ALL)
+    if topic is not None and topic.is_family:
+        head, tail = topic.key.split("{name}")
+        member = key[len(head):len(key) - len(tail)]
+        if member not in nodes:
+            raise unknown("node", member, nodes)
+
+
 def fields(kind: type[msgspec.Struct]) -> list[tuple[str, str]]:
     """Return name and type of each field of a message, as text."""
     return [(f.name, _type_name(f.type)) for f in msgspec.structs.fields(kind)]
@@ -117,12 +134,10 @@ def fields(kind: type[msgspec.Struct]) -> list[tuple[str, str]]:
 def markdown(spec: SystemSpec) -> str:
     """Return `topics.md`: the contract of every key, for people."""
     lines = [
-        "# Topics",
-        "",
+        "# Topics", "",
         "The contract of every Zenoh key. Written from the topics of the engine and of the "
         f"application and the actors of `systems/{spec.name}.toml` by `rampart topic list "
-        "--markdown`; a test keeps it true.",
-        "",
+        "--markdown`; a test keeps it true.", "",
         f"All keys are below `{ROOT}/`. A payload is a msgpack array `[source, incarnation, "
         "sequence, stamp, body]`: which node, which life of it, how many-th message of that life, "
         "the simulated time in seconds at which the content was true, and the message. Units are "
@@ -130,55 +145,40 @@ def markdown(spec: SystemSpec) -> str:
         "simulated time; 0 means on event. Bounds stand in braces: `{0..9}` of a number, `{<=9}` "
         "of the characters of a text, the bytes of an array or the elements of a sequence. What is "
         f"beyond them, or longer than {MAX_PAYLOAD_BYTES} bytes, is refused by every reader. A "
-        "`float` without bounds may be anything, NaN and infinity included.",
-        "",
+        "`float` without bounds may be anything, NaN and infinity included.", "",
         "- **sensor**: the newest sample counts; at the reader the latest wins.",
         "- **state**: like sensor, and repeated at its rate even without change.",
         "- **command**: each message counts; queued at the reader, bounded, an overflow is "
-        "reported.",
-        "",
+        "reported.", "",
         "| key | message | QoS | mailbox | rate | frame | publishers | readers |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+        "|---|---|---|---|---|---|---|---|"]
     table = uses(spec)
     for use in table:
         t = use.topic
         cells = (
             f"`{t.key}`", f"[{t.type.__name__}](#{t.type.__name__.lower()})", t.qos.value,
-            MAILBOX[t.qos], _rate(t), f"`{t.frame}`" if t.frame else "",
+            MAILBOX[t.qos], rate(t), f"`{t.frame}`" if t.frame else "",
             ", ".join(use.publishers), ", ".join(use.readers))
         lines.append(f"| {' | '.join(cells)} |")
     lines += ["", "## What each key is for", ""]
     lines += [f"- `{use.topic.key}`: {use.topic.doc}" for use in table]
     lines += ["", "## Messages", ""]
     for kind in _messages(use.topic for use in table):
-        lines += [f"### {kind.__name__}", "", _summary(kind), ""]
+        lines += [f"### {kind.__name__}", "", summary(kind), ""]
         lines += [f"- `{name}`: {type_name}" for name, type_name in fields(kind)]
         lines.append("")
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _publishers(topic: Topic[Any], wired: list[Any]) -> tuple[str, ...]:
-    if topic in BASE_OUTPUTS:
+def _who(topic: Topic[Any], of_all: Collection[Topic[Any]],
+         of_each: Mapping[str, Collection[Topic[Any]]]) -> tuple[str, ...]:
+    if topic in of_all:
         return ("every node",)
-    found = tuple(name for name, _, outputs in wired if topic in outputs)
-    return found or ("tools",)
+    return tuple(name for name, those in of_each.items() if topic in those)
 
 
-def _readers(topic: Topic[Any], wired: list[Any]) -> tuple[str, ...]:
-    if topic in BASE_INPUTS:
-        return ("every node",)
-    return tuple(name for name, inputs, _ in wired if topic in inputs)
-
-
-def _class(name: str, path: str) -> type[Actor]:
-    try:
-        return load_class(path)
-    except ValueError as error:
-        raise UsageError(f"node {name}: {error}") from None
-
-
-def _rate(topic: Topic[Any]) -> str:
+def rate(topic: Topic[Any]) -> str:
+    """Return the nominal rate of a topic in words."""
     return f"{topic.rate_hz:g} Hz" if topic.rate_hz else "on event"
 
 
@@ -210,7 +210,8 @@ def _limits(meta: msgspec.Meta) -> str:
     return f"{{{least}..{most}}}"
 
 
-def _summary(kind: type[Any]) -> str:
+def summary(kind: type[msgspec.Struct]) -> str:
+    """Return what is said of a message, in one line."""
     return " ".join((kind.__doc__ or "").split())
 
 

@@ -1,10 +1,19 @@
-"""`rampart topic`: what travels on the keys."""
+"""`rampart topic`: what travels on the keys.
+
+List, print and measure topics. A key is given as in `rampart topic list`;
+a family as detection/DM1 for one member or 'detection/*' for all.
+
+Examples:
+  rampart topic list
+  rampart topic echo localization/pose -n 3
+  rampart topic hz control/command
+  rampart topic info plan/route
+"""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import itertools
 import math
 import statistics
@@ -17,22 +26,14 @@ import msgspec
 from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
-from rampart.actors.bus.topic import Topic
-from rampart.actors.ftm import topics
+from rampart.actors.bus.topic import ROOT
 from rampart.cli import systems
 from rampart.cli.following import LOOK_S, is_over
-from rampart.cli.look.topic_catalogue import MAILBOX, fields, markdown, resolve, topics_for, uses
-from rampart.cli.output import (
-    NoEffectError,
-    UsageError,
-    print_json,
-    print_table,
-    say,
-    say_text,
-    unknown,
-    warn,
-)
-from rampart.cli.session import Session, connect
+from rampart.cli.look import topic_catalogue as catalogue
+from rampart.cli.look.topic_catalogue import check_member, resolve, topics_for
+from rampart.cli.output import NoEffectError, positive, print_json, print_table, say, say_text, warn
+from rampart.cli.session import Session, connect, pause
+from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option, word
 from rampart.files import streams
 
 _WINDOW = 500
@@ -40,95 +41,69 @@ _SHOWN_BYTES = 24
 _HZ_REPORT_S = 1.0
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    topic = verbs.add_parser(
-        "topic", formatter_class=formatter, help="what travels on the keys",
-        description="List, print and measure topics. A key is given as in `rampart topic list`;\n"
-                    "a family as detection/DM1 for one member or 'detection/*' for all.",
-        epilog="examples:\n  rampart topic list\n  rampart topic echo localization/pose -n 3\n"
-               "  rampart topic hz control/command\n  rampart topic info plan/route")
-    subverbs = topic.add_subparsers(dest="subverb", required=True, metavar="VERB")
-
-    parser = subverbs.add_parser(
-        "list", formatter_class=formatter, help="all topics (needs no run)",
-        description="List all topics with message, QoS and nominal rate.",
-        epilog="examples:\n  rampart topic list\n  rampart topic list --markdown > topics.md")
-    systems.add_arguments(parser)
-    how = parser.add_mutually_exclusive_group()
-    how.add_argument("--json", action="store_true", help="print JSON")
-    how.add_argument("--markdown", action="store_true", help="print topics.md")
-    parser.set_defaults(run=topic_list)
-
-    parser = subverbs.add_parser(
-        "info", formatter_class=formatter, help="the contract of one topic (needs no run)",
-        description="Show type, fields, QoS, publishers and readers of a topic.",
-        epilog="examples:\n  rampart topic info control/command\n"
-               "  rampart topic info detection/DM1")
-    parser.add_argument("key", metavar="KEY")
-    parser.add_argument("--system", metavar="FILE", help="system spec; default the shipped one")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=topic_info)
-
-    parser = subverbs.add_parser(
-        "echo", parents=[common], formatter_class=formatter, help="print messages as they come",
-        description="Print one line per message: stamp (simulated seconds), source#incarnation,\n"
-                    "key, message. A payload that is no message is shown with the reason.",
-        epilog="examples:\n  rampart topic echo localization/pose\n"
-               "  rampart topic echo 'detection/*' --duration 5\n"
-               "  rampart topic echo plan/route -n 1 --json")
-    parser.add_argument("key", metavar="KEY")
-    parser.add_argument("-n", "--count", type=int, metavar="N", help="end after N messages")
-    parser.add_argument("--duration", type=float, metavar="S", help="end after S real seconds")
-    parser.add_argument("--json", action="store_true", help="one JSON object per line")
-    parser.set_defaults(run=lambda options: asyncio.run(topic_echo(options)))
-
-    parser = subverbs.add_parser(
-        "hz", parents=[common], formatter_class=formatter, help="measure the rate of a topic",
-        description="Measure how often messages arrive, in simulated time like the nominal rate,\n"
-                    "each second over a window of the last 500, until interrupted or the run ends.",
-        epilog="examples:\n  rampart topic hz control/command\n"
-               "  rampart topic hz 'heartbeat/*' --duration 3 --json")
-    parser.add_argument("key", metavar="KEY")
-    parser.add_argument("--duration", type=float, metavar="S",
-                        help="end after S real seconds (with --json 3 if not given)")
-    parser.add_argument("--json", action="store_true", help="print JSON at the end")
-    parser.set_defaults(run=lambda options: asyncio.run(topic_hz(options)))
+    topic = add_family(verbs, "topic", "what travels on the keys", __doc__)
+    key = option("key", metavar="KEY")
+    add_verb(topic, "list", "all topics (needs no run)", topic_list, systems.choice(),
+             either(JSON, flag("--markdown", "print topics.md")))
+    add_verb(topic, "info", "the contract of one topic (needs no run)", topic_info, key,
+             word("--system", "FILE", "system spec; default the shipped one"), JSON)
+    add_verb(topic, "echo", "print messages as they come", topic_echo, PORT, key,
+             option("-n", "--count", type=int, metavar="N", help="end after N messages"),
+             number("--duration", "S", "end after S real seconds"),
+             flag("--json", "one JSON object per line"))
+    add_verb(topic, "hz", "measure the rate of a topic", topic_hz, PORT, key,
+             number("--duration", "S", "end after S real seconds (with --json 3 if not given)"),
+             flag("--json", "print JSON at the end"))
 
 
 def topic_list(options: argparse.Namespace) -> int:
-    """Print all topics."""
+    """Print all topics.
+
+    List all topics with message, QoS and nominal rate.
+
+    Examples:
+      rampart topic list
+      rampart topic list --markdown > topics.md
+    """
     spec = systems.load(options.system)
     if options.markdown:
-        say_text(markdown(spec).rstrip("\n"))
+        say_text(catalogue.markdown(spec).rstrip("\n"))
         return 0
-    table = uses(spec)
+    table = catalogue.uses(spec)
     if options.json:
-        print_json([_describe(use.topic, use.publishers, use.readers) for use in table])
+        print_json([_describe(use) for use in table])
     else:
         print_table(("key", "message", "qos", "rate", "frame"),
-                    [(u.topic.key, u.topic.type.__name__, u.topic.qos.value,
-                      f"{u.topic.rate_hz:g} Hz" if u.topic.rate_hz else "on event", u.topic.frame)
-                     for u in table])
+                    [(t.key, t.type.__name__, t.qos.value, catalogue.rate(t), t.frame)
+                     for t in (use.topic for use in table)])
     return 0
 
 
 def topic_info(options: argparse.Namespace) -> int:
-    """Print the contract of one topic."""
+    """Print the contract of one topic.
+
+    Show type, fields, QoS, publishers and readers of a topic.
+
+    Examples:
+      rampart topic info control/command
+      rampart topic info detection/DM1
+    """
     spec = systems.load(options.system)
     topic, _ = resolve(options.key, systems.topics_of(spec))
-    use = next(u for u in uses(spec) if u.topic is topic)
+    use = next(u for u in catalogue.uses(spec) if u.topic is topic)
     if options.json:
-        print_json({**_describe(topic, use.publishers, use.readers),
-                    "fields": [{"name": n, "type": t} for n, t in fields(topic.type)]})
+        print_json({**_describe(use),
+                    "fields": [{"name": n, "type": t} for n, t in catalogue.fields(topic.type)]})
         return 0
     say(f"key         {topic.key}")
-    say(f"message     {topic.type.__name__}: {' '.join((topic.type.__doc__ or '').split())}")
-    for name, type_name in fields(topic.type):
+    say(f"message     {topic.type.__name__}: {catalogue.summary(topic.type)}")
+    for name, type_name in catalogue.fields(topic.type):
         say(f"              {name}: {type_name}")
     say(f"about       {topic.doc}")
-    say(f"qos         {topic.qos.value}, at the reader: {MAILBOX[topic.qos]}")
-    say(f"rate        {f'{topic.rate_hz:g} Hz' if topic.rate_hz else 'on event'}")
+    say(f"qos         {topic.qos.value}, at the reader: {catalogue.MAILBOX[topic.qos]}")
+    say(f"rate        {catalogue.rate(topic)}")
     say(f"frame       {topic.frame or 'none'}")
     say(f"publishers  {', '.join(use.publishers) or 'none'}")
     say(f"readers     {', '.join(use.readers) or 'none'}")
@@ -136,10 +111,19 @@ def topic_info(options: argparse.Namespace) -> int:
 
 
 async def topic_echo(options: argparse.Namespace) -> int:
-    """Print messages as they come."""
+    """Print messages as they come.
+
+    Print one line per message: stamp (simulated seconds), source#incarnation,
+    key, message. A payload that is no message is shown with the reason.
+
+    Examples:
+      rampart topic echo localization/pose
+      rampart topic echo 'detection/*' --duration 5
+      rampart topic echo plan/route -n 1 --json
+    """
     topic, key = resolve(options.key, topics_for(options.key, options.port))
-    _positive("--count", options.count)
-    _positive("--duration", options.duration)
+    positive("--count", options.count)
+    positive("--duration", options.duration)
     done = asyncio.Event()
     seen = 0
 
@@ -170,27 +154,34 @@ async def topic_echo(options: argparse.Namespace) -> int:
             say(f"garbage {short} {len(payload)} bytes, not a {topic.type.__name__}: {reason}; "
                 f"{payload[:_SHOWN_BYTES]!r}")
 
-    async with _checked(options.port, topic, key) as session:
+    async with connect(options.port) as session:
+        check_member(key.removeprefix(f"{ROOT}/"), session.run.nodes)
         session.listen(topic, key, heard, garbage)
         async for left in _while_it_runs(session, options.duration):
             if done.is_set():
                 break
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(done.wait(), min(LOOK_S, left))
+            await pause(done, min(LOOK_S, left))
     if not seen:
         raise _nothing_came(options.key, options.duration)
     return 0
 
 
 async def topic_hz(options: argparse.Namespace) -> int:
-    """Measure rates."""
+    """Measure rates.
+
+    Measure how often messages arrive, in simulated time like the nominal rate,
+    each second over a window of the last 500, until interrupted or the run ends.
+
+    Examples:
+      rampart topic hz control/command
+      rampart topic hz 'heartbeat/*' --duration 3 --json
+    """
     topic, key = resolve(options.key, topics_for(options.key, options.port))
-    _positive("--duration", options.duration)
+    positive("--duration", options.duration)
     arrivals: Remembered[str, deque[float]] = Remembered(MANY)
-    duration_s = options.duration
-    if options.json and duration_s is None:
-        duration_s = 3.0
-    async with _checked(options.port, topic, key) as session:
+    duration_s = options.duration or (3.0 if options.json else None)
+    async with connect(options.port) as session:
+        check_member(key.removeprefix(f"{ROOT}/"), session.run.nodes)
 
         def heard(short: str, _header: Header, _body: Any) -> None:
             times = arrivals.get(short)
@@ -266,27 +257,8 @@ def _nothing_came(key: str, duration_s: float | None) -> NoEffectError:
     return NoEffectError(f"nothing came on {key} {when}")
 
 
-@contextlib.asynccontextmanager
-async def _checked(port: int | None, topic: Topic[Any], key: str) -> AsyncIterator[Session]:
-    """Join the run, and make sure that it has the node of which a family's member is asked for."""
-    async with connect(port) as session:
-        # The members of a robot's own families need not be nodes.
-        if topic.is_family and key != topic.pattern and topic in topics.ALL:
-            head, tail = topic.at("\0").split("\0")
-            member = key[len(head):len(key) - len(tail)]
-            if member not in session.run.nodes:
-                raise unknown("node", member, session.run.nodes)
-        yield session
-
-
-def _positive(option: str, value: float | None) -> None:
-    if value is not None and not value > 0:
-        raise UsageError(f"{option} {value:g}: must be above 0")
-
-
-def _describe(
-    topic: Topic[Any], publishers: tuple[str, ...], readers: tuple[str, ...]
-) -> dict[str, Any]:
+def _describe(use: catalogue.TopicUse) -> dict[str, Any]:
+    topic = use.topic
     return {"key": topic.key, "message": topic.type.__name__, "qos": topic.qos.value,
-            "rate_hz": topic.rate_hz, "frame": topic.frame, "mailbox": MAILBOX[topic.qos],
-            "publishers": publishers, "readers": readers, "doc": topic.doc}
+            "rate_hz": topic.rate_hz, "frame": topic.frame, "mailbox": catalogue.MAILBOX[topic.qos],
+            "publishers": use.publishers, "readers": use.readers, "doc": topic.doc}

@@ -1,9 +1,26 @@
-"""`rampart adapt`: change mechanisms and strategy of a running system."""
+"""`rampart adapt`: change mechanisms and strategy of a running system.
+
+Change a detection module, a recovery module, a mechanism or the strategy of
+a running system. The changed system is checked like a fresh spec: names,
+trees, orders, time budgets. It is applied whole or refused with the reason,
+never in the middle of a recovery. The spec file stays as it is.
+
+Examples:
+  rampart adapt set strategy guarded-repair
+  rampart adapt set shadow mission-first
+  rampart adapt disable FTM7
+  rampart adapt enable FTM7
+  rampart adapt retune RM3 deadline_s=2.5
+  rampart adapt retune DM1 margin_m=0.7        a parameter of the module
+  rampart adapt retune FTM2 detect='DM2 or DM6'
+  rampart adapt replace FTM7 ftm7.toml         the new table, without the name
+
+exit code: 0 changed; 1 refused, or nobody answered; 2 bad usage
+"""
 
 from __future__ import annotations
 
 import argparse
-import asyncio
 import uuid
 from pathlib import Path
 from typing import Any
@@ -13,71 +30,41 @@ import msgspec
 from rampart.actors.bus.envelope import Header
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.cli.output import NoEffectError, UsageError, print_json, say
+from rampart.cli.output import NoEffectError, UsageError, print_json, refusing, say, using
 from rampart.cli.session import connect
+from rampart.cli.verbs import JSON, PORT, add_family, add_verb, option
 from rampart.files import toml
-from rampart.files.reading import FileError, read_text
+from rampart.files.reading import read_text
 from rampart.manager.spec.adaptation import SETTINGS, Action, ChangeError, parse_value
 
 _WAIT_S = 2.0
 """Real seconds for the manager to answer; it answers at once, or is being respawned."""
 
 
-_EXAMPLES = {
-    Action.ENABLE: "  rampart adapt enable FTM7",
-    Action.DISABLE: "  rampart adapt disable FTM7\n  rampart adapt disable DM7   and what uses it",
-    Action.RETUNE: "  rampart adapt retune RM3 deadline_s=2.5\n"
-                   "  rampart adapt retune DM1 margin_m=0.7\n"
-                   "  rampart adapt retune FTM2 detect='DM2 or DM6'",
-    Action.REPLACE: "  rampart adapt replace FTM7 ftm7.toml",
-    Action.SET: "  rampart adapt set strategy guarded-repair\n"
-                "  rampart adapt set order safer autonomy",
-}
-
-
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "adapt", formatter_class=formatter, help="change mechanisms or strategy while it runs",
-        description="Change a detection module, a recovery module, a mechanism or the strategy of\n"
-                    "a running system. The changed system is checked like a fresh spec: names,\n"
-                    "trees, orders, time budgets. It is applied whole or refused with the reason,\n"
-                    "never in the middle of a recovery. The spec file stays as it is.",
-        epilog="examples:\n"
-               "  rampart adapt set strategy guarded-repair\n"
-               "  rampart adapt set shadow mission-first\n"
-               "  rampart adapt disable FTM7\n"
-               "  rampart adapt enable FTM7\n"
-               "  rampart adapt retune RM3 deadline_s=2.5\n"
-               "  rampart adapt retune DM1 margin_m=0.7        a parameter of the module\n"
-               "  rampart adapt retune FTM2 detect='DM2 or DM6'\n"
-               "  rampart adapt replace FTM7 ftm7.toml         the new table, without the name\n\n"
-               "exit code: 0 changed; 1 refused, or nobody answered; 2 bad usage")
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    for action in (Action.ENABLE, Action.DISABLE):
-        one = _action(actions, formatter, common, action, f"{action} a module or a mechanism")
-        one.add_argument("name", metavar="NAME")
-    one = _action(actions, formatter, common, Action.RETUNE, "change fields or parameters")
-    one.add_argument("name", metavar="NAME")
-    one.add_argument("values", nargs="+", metavar="FIELD=VALUE", help="value as in TOML")
-    one = _action(actions, formatter, common, Action.REPLACE, "replace a whole table")
-    one.add_argument("name", metavar="NAME")
-    one.add_argument("file", metavar="FILE", help="TOML with the fields of the new table")
-    one = _action(actions, formatter, common, Action.SET, f"set {', '.join(SETTINGS)}")
-    one.add_argument("name", choices=SETTINGS)
-    one.add_argument("values", nargs="+", metavar="VALUE",
-                     help="name of a strategy or order; several orders: the first comes first")
-
-
-def _action(actions: Any, formatter: Any, common: argparse.ArgumentParser, action: Action,
-            text: str) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = actions.add_parser(
-        action.value, parents=[common], formatter_class=formatter, help=text,
-        description=text[0].upper() + text[1:] + ".",
-        epilog=f"examples:\n{_EXAMPLES[action]}")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=lambda options: asyncio.run(change(options)))
-    return parser
+    actions = add_family(verbs, "adapt", "change mechanisms or strategy while it runs", __doc__,
+                         dest="action", metavar="ACTION")
+    name = option("name", metavar="NAME")
+    for action, text, examples, *options in (
+        (Action.ENABLE, "enable a module or a mechanism", ("enable FTM7",), name),
+        (Action.DISABLE, "disable a module or a mechanism",
+         ("disable FTM7", "disable DM7   and what uses it"), name),
+        (Action.RETUNE, "change fields or parameters",
+         ("retune RM3 deadline_s=2.5", "retune DM1 margin_m=0.7",
+          "retune FTM2 detect='DM2 or DM6'"),
+         name, option("values", nargs="+", metavar="FIELD=VALUE", help="value as in TOML")),
+        (Action.REPLACE, "replace a whole table", ("replace FTM7 ftm7.toml",), name,
+         option("file", metavar="FILE", help="TOML with the fields of the new table")),
+        (Action.SET, f"set {', '.join(SETTINGS)}",
+         ("set strategy guarded-repair", "set order safer autonomy"),
+         option("name", choices=SETTINGS),
+         option("values", nargs="+", metavar="VALUE",
+                help="name of a strategy or order; several orders: the first comes first")),
+    ):
+        shown = "\n".join(f"  rampart adapt {example}" for example in examples)
+        add_verb(actions, action.value, text, change, PORT, JSON, *options,
+                 doc=f"{action}\n\n{text[0].upper()}{text[1:]}.\n\nExamples:\n{shown}")
 
 
 async def change(options: argparse.Namespace) -> int:
@@ -113,24 +100,19 @@ def _values(options: argparse.Namespace) -> dict[str, Any]:
     Raises:
         UsageError: they cannot be read.
     """
-    try:
-        match options.action:
-            case Action.RETUNE:
-                pairs = [text.partition("=") for text in options.values]
-                for key, sign, text in pairs:
-                    if not sign or not key.strip() or not text.strip():
-                        raise UsageError(f"{key}{sign}{text}: expected FIELD=VALUE")
+    match options.action:
+        case Action.RETUNE:
+            pairs = [text.partition("=") for text in options.values]
+            for key, sign, text in pairs:
+                if not sign or not key.strip() or not text.strip():
+                    raise UsageError(f"{key}{sign}{text}: expected FIELD=VALUE")
+            with refusing(ChangeError):
                 return {key.strip(): parse_value(text.strip()) for key, _, text in pairs}
-            case Action.SET:
-                names = [name for text in options.values for name in text.split(",") if name]
-                return {"value": names if options.name == "order" and len(names) > 1
-                        else " ".join(options.values)}
-            case Action.REPLACE:
+        case Action.SET:
+            names = [name for text in options.values for name in text.split(",") if name]
+            return {"value": names if options.name == "order" and len(names) > 1
+                    else " ".join(options.values)}
+        case Action.REPLACE:
+            with using(options.file):
                 return toml.parse(read_text(Path(options.file), toml.MAX_SIZE))
-    except ChangeError as error:
-        raise UsageError(str(error)) from None
-    except OSError as error:
-        raise UsageError(f"{options.file}: {error.strerror}") from None
-    except FileError as error:
-        raise UsageError(f"{options.file}: {error}") from None
     return {}

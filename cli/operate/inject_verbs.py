@@ -3,99 +3,95 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
+import math
+from collections.abc import Coroutine
 from typing import Any
 
 import msgspec
 
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.layout.system_topics import published_keys
+from rampart.actors.layout.system_topics import find_topic, published_keys
 from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.runtime.corruption import InjectionError, field_type, is_array
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import resolve, topics_for
 from rampart.cli.operate.injecting import run_fault
-from rampart.cli.output import UsageError, print_json, print_table, say
+from rampart.cli.output import UsageError, positive, print_json, print_table, refusing, say
+from rampart.cli.verbs import JSON, PORT, add_verb, flag, group, number, option, several, word
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
-from rampart.sim.faults.faults import Faults, faults_of
+from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.topic_faults import modes_of, systematic_faults
 
 _DEFAULT_DURATION_S = 5.0
-
-_EPILOG = """examples:
-  rampart inject --list                           what there is
-  rampart inject command-out-of-bounds --duration 3
-  rampart inject prohibited-area --at-once
-  rampart inject laser-stuck --duration inf       permanent: until the node's process ends
-  rampart inject gps-dropout --on 1 --off 4 --duration 30
-                                                  intermittent: 1 s without GPS, 4 s with
-  rampart inject drop:localization/pose           any mode on any topic ...
-  rampart inject corrupt:plan/route --seed 7      ... here one of its numbers: odd seeds, one each
-  rampart inject drop:control/command --share 0.3 three messages in ten are lost
-your own:
-  rampart inject --topic localization/pose --mode delay --delay 0.8
-  rampart inject --topic summit_xl/scan --mode restamp --stamp=-0.2
-                                                  stamped 0.2 s before the truth
-  rampart inject --topic localization/pose --mode corrupt --ramp x_m=0.25
-  rampart inject --topic control/command --mode corrupt --set angular_radps=2.5
-  rampart inject --topic summit_xl/scan --mode corrupt --add ranges_f32=0.4 \\
-                 --noise ranges_f32=0.2
-Fields are those of `rampart topic info TOPIC`; one inside another is written pose.x_m."""
+_SECONDS = "must be seconds above 0"
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any) -> None:
     """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "inject", parents=[common], formatter_class=formatter, help="inject a fault",
-        description="Inject a fault of the catalogue, or disturb any topic, for a while. It\n"
-                    "acts in the node that publishes the topic. The verb waits for its end and\n"
-                    "says how many messages were affected; if none was, it says so and exits 1.\n"
-                    "For a permanent fault it waits until the first message was affected.\n"
-                    "Ctrl-C ends the fault at once. Durations are simulated seconds.",
-        epilog=_EPILOG)
-    parser.add_argument("fault", nargs="?", metavar="FAULT",
-                        help="a name from --list, or MODE:TOPIC")
-    parser.add_argument("--list", action="store_true", help="list the catalogue (needs no run)")
-    parser.add_argument("--system", metavar="FILE",
-                        help="for --list: system spec; default the shipped one")
-    parser.add_argument("--duration", type=float, metavar="S",
-                        help="simulated seconds, inf for permanent; default the fault's own, "
-                             f"else {_DEFAULT_DURATION_S:g}")
-    parser.add_argument("--at-once", action="store_true",
-                        help="return as soon as the fault is in force; do not wait for its end")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    when = parser.add_argument_group("which messages")
-    when.add_argument("--share", type=float, metavar="P",
-                      help="probability that a message is affected, up to 1 (default)")
-    when.add_argument("--on", type=float, metavar="S", help="intermittent: in force for S ...")
-    when.add_argument("--off", type=float, metavar="S", help="... and away for S, repeating")
-    when.add_argument("--seed", type=int, metavar="N",
-                      help="of share, noise and what restamp:TOPIC and corrupt:TOPIC draw; "
-                           "default 0")
-    own = parser.add_argument_group("a fault of your own, instead of FAULT")
-    own.add_argument("--topic", metavar="KEY", help="e.g. control/command or detection/DM2")
-    own.add_argument("--mode", metavar="MODE", help=", ".join(MODES))
-    own.add_argument("--delay", type=float, metavar="S", help="for delay: simulated seconds")
-    own.add_argument("--stamp", type=float, metavar="S",
-                     help="for restamp: added to each stamp, simulated seconds; above 0 is ahead")
-    own.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE",
-                     help="for corrupt: overwrite a field; may be repeated, as all below")
-    own.add_argument("--add", action="append", default=[], metavar="FIELD=BIAS",
-                     help="for corrupt: add BIAS to a number, or to each of an array")
-    own.add_argument("--ramp", action="append", default=[], metavar="FIELD=RATE",
-                     help="for corrupt: add RATE per simulated second")
-    own.add_argument("--noise", action="append", default=[], metavar="FIELD=SIGMA",
-                     help="for corrupt: add Gaussian noise of this standard deviation")
-    own.add_argument("--keep-ends", action="append", default=[], metavar="FIELD",
-                     help="for corrupt: keep only first and last element of a list")
-    parser.set_defaults(run=inject)
+    add_verb(
+        verbs, "inject", "inject a fault", inject, PORT,
+        option("fault", nargs="?", metavar="FAULT", help="a name from --list, or MODE:TOPIC"),
+        flag("--list", "list the catalogue (needs no run)"),
+        word("--system", "FILE", "for --list: system spec; default the shipped one"),
+        number("--duration", "S", "simulated seconds, inf for permanent; default the fault's own, "
+               f"else {_DEFAULT_DURATION_S:g}"),
+        flag("--at-once", "return as soon as the fault is in force; do not wait for its end"),
+        JSON,
+        group("which messages",
+              number("--share", "P", "probability that a message is affected, up to 1 (default)"),
+              number("--on", "S", "intermittent: in force for S ..."),
+              number("--off", "S", "... and away for S, repeating"),
+              option("--seed", type=int, metavar="N", help="of share, noise and what "
+                     "restamp:TOPIC and corrupt:TOPIC draw; default 0")),
+        group("a fault of your own, instead of FAULT",
+              word("--topic", "KEY", "e.g. control/command or detection/DM2"),
+              word("--mode", "MODE", ", ".join(MODES)),
+              number("--delay", "S", "for delay: simulated seconds"),
+              number("--stamp", "S", "for restamp: added to each stamp, simulated seconds; above 0 "
+                     "is ahead"),
+              several("--set", "FIELD=VALUE",
+                      "for corrupt: overwrite a field; may be repeated, as all below"),
+              several("--add", "FIELD=BIAS",
+                      "for corrupt: add BIAS to a number, or to each of an array"),
+              several("--ramp", "FIELD=RATE", "for corrupt: add RATE per simulated second"),
+              several("--noise", "FIELD=SIGMA",
+                      "for corrupt: add Gaussian noise of this standard deviation"),
+              several("--keep-ends", "FIELD",
+                      "for corrupt: keep only first and last element of a list")))
 
 
-def inject(options: argparse.Namespace) -> int:
-    """List the catalogue, or inject a fault."""
+def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
+    r"""List the catalogue, or inject a fault.
+
+    Inject a fault of the catalogue, or disturb any topic, for a while. It
+    acts in the node that publishes the topic. The verb waits for its end and
+    says how many messages were affected; if none was, it says so and exits 1.
+    For a permanent fault it waits until the first message was affected.
+    Ctrl-C ends the fault at once. Durations are simulated seconds.
+
+    Examples:
+      rampart inject --list                           what there is
+      rampart inject command-out-of-bounds --duration 3
+      rampart inject prohibited-area --at-once
+      rampart inject laser-stuck --duration inf       permanent: until the node's process ends
+      rampart inject gps-dropout --on 1 --off 4 --duration 30
+                                                      intermittent: 1 s without GPS, 4 s with
+      rampart inject drop:localization/pose           any mode on any topic ...
+      rampart inject corrupt:plan/route --seed 7      ... one of its numbers: odd seeds, one each
+      rampart inject drop:control/command --share 0.3 three messages in ten are lost
+    your own:
+      rampart inject --topic localization/pose --mode delay --delay 0.8
+      rampart inject --topic summit_xl/scan --mode restamp --stamp=-0.2
+                                                      stamped 0.2 s before the truth
+      rampart inject --topic localization/pose --mode corrupt --ramp x_m=0.25
+      rampart inject --topic control/command --mode corrupt --set angular_radps=2.5
+      rampart inject --topic summit_xl/scan --mode corrupt --add ranges_f32=0.4 \
+                     --noise ranges_f32=0.2
+    Fields are those of `rampart topic info TOPIC`; one inside another is written pose.x_m.
+    """
     if options.list:
         _print_catalogue(systems.load(options.system), as_json=options.json)
         return 0
@@ -103,10 +99,8 @@ def inject(options: argparse.Namespace) -> int:
         raise UsageError(f"--system {options.system}: goes with --list; a fault is injected into "
                          "the run that there is")
     fault = choose(options)
-    if options.duration is not None and not options.duration > 0:
-        raise UsageError(f"--duration {options.duration:g}: must be seconds above 0, or inf")
-    return asyncio.run(run_fault(
-        fault, options.duration, options.port, at_once=options.at_once, as_json=options.json))
+    positive("--duration", options.duration, "must be seconds above 0, or inf")
+    return run_fault(fault, options)
 
 
 def choose(options: argparse.Namespace) -> Fault:
@@ -121,10 +115,8 @@ def choose(options: argparse.Namespace) -> Fault:
         raise UsageError(f"--share {options.share:g}: must be above 0, and at most 1")
     if (options.on is None) != (options.off is None):
         raise UsageError("--on S and --off S go together")
-    for name in ("on", "off"):
-        value = getattr(options, name)
-        if value is not None and not 0 < value < float("inf"):
-            raise UsageError(f"--{name} {value:g}: must be seconds above 0")
+    positive("--on", options.on, _SECONDS, math.inf)
+    positive("--off", options.off, _SECONDS, math.inf)
     fault = _own_fault(options) if options.fault is None else _known_fault(options)
     return fault.varied(share=options.share, on_s=options.on, off_s=options.off)
 
@@ -134,53 +126,48 @@ def _known_fault(options: argparse.Namespace) -> Fault:
         if getattr(options, name):
             raise UsageError(f"--{name.replace('_', '-')} goes with --topic, not with a "
                              "FAULT of the catalogue")
-    try:
-        _, colon, key = options.fault.partition(":")
-        known = topics_for(key, options.port) if colon else ()
-        return _faults(options.port).find(options.fault, options.seed or 0, known)
-    except UnknownFaultError as error:
-        raise UsageError(str(error)) from None
+    _, colon, key = options.fault.partition(":")
+    known = topics_for(key, options.port) if colon else ()
+    with refusing(UnknownFaultError):
+        return faults_of(_system(options.port)).find(options.fault, options.seed or 0, known)
 
 
-def _faults(port: int | None) -> Faults:
-    """Return the faults of the run's robot; of the shipped system's, if there is none to read."""
+def _system(port: int | None) -> SystemSpec:
+    """Return the system of the run; the shipped one, if there is none to read."""
     try:
-        spec = systems.load(find_run(port).system_file)
+        return systems.load(find_run(port).system_file)
     except (NoRunError, UsageError):
-        spec = systems.load(None)
-    return faults_of(spec)
+        return systems.load(None)
 
 
 def _own_fault(options: argparse.Namespace) -> Fault:
     topic, key = resolve(options.topic, topics_for(options.topic, options.port))
     if "*" in key:
+        with refusing(ValueError):
+            members = [k for k in published_keys(_system(options.port)) if find_topic(k, (topic,))]
         raise UsageError(f"--topic {options.topic}: name one member of the family, "
-                         f"e.g. {topic.key.replace('{name}', 'DM1')}")
+                         f"e.g. {next(iter(members), topic.key)}")
     if options.mode not in MODES:
         raise UsageError(f"--mode {options.mode}: must be one of {', '.join(MODES)}")
     changes = (options.set, options.add, options.ramp, options.noise, options.keep_ends)
-    if any(changes) != (options.mode == "corrupt"):
-        raise UsageError("--mode corrupt goes with --set, --add, --ramp, --noise or --keep-ends, "
-                         "and no other mode does")
-    if (options.delay is not None) != (options.mode == "delay"):
-        raise UsageError("--mode delay goes with --delay S, and no other mode does")
-    if options.delay is not None and not 0 < options.delay < float("inf"):
-        raise UsageError(f"--delay {options.delay:g}: must be seconds above 0")
-    if (options.stamp is not None) != (options.mode == "restamp"):
-        raise UsageError("--mode restamp goes with --stamp S, and no other mode does")
+    for mode, needed, given in (
+            ("corrupt", "--set, --add, --ramp, --noise or --keep-ends", any(changes)),
+            ("delay", "--delay S", options.delay is not None),
+            ("restamp", "--stamp S", options.stamp is not None)):
+        if given != (options.mode == mode):
+            raise UsageError(f"--mode {mode} goes with {needed}, and no other mode does")
+    positive("--delay", options.delay, _SECONDS, math.inf)
     disturbance = Disturbance(
         key.removeprefix(f"{ROOT}/"), options.mode, options.delay or 0.0,
         set_fields=dict(_setting(text, topic) for text in options.set),
         add_fields=dict(_amount("--add", text, topic) for text in options.add),
         ramp_fields=dict(_amount("--ramp", text, topic) for text in options.ramp),
         noise_fields=dict(_amount("--noise", text, topic) for text in options.noise),
-        keep_ends=tuple(options.keep_ends),
-        seed=options.seed or 0, stamp_s=options.stamp or 0.0)
+        keep_ends=tuple(options.keep_ends), seed=options.seed or 0, stamp_s=options.stamp or 0.0)
     reason = flaw(disturbance.order("", _DEFAULT_DURATION_S), topic.type)
     if reason:
         raise UsageError(f"--topic {options.topic}: {reason}")
-    return Fault(f"{options.mode} {disturbance.topic}", "", (disturbance,), (),
-                 _DEFAULT_DURATION_S)
+    return Fault(f"{options.mode} {disturbance.topic}", "", (disturbance,), (), _DEFAULT_DURATION_S)
 
 
 def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
@@ -188,10 +175,8 @@ def _split(option: str, text: str, topic: Topic[Any]) -> tuple[str, str, Any]:
     name, equals, value = text.partition("=")
     if not equals:
         raise UsageError(f"{option} {text}: must be FIELD=VALUE")
-    try:
+    with refusing(InjectionError):
         return name, value, field_type(topic.type, name)
-    except InjectionError as error:
-        raise UsageError(str(error)) from None
 
 
 def _setting(text: str, topic: Topic[Any]) -> tuple[str, Any]:
@@ -244,8 +229,7 @@ def _modes_by_topic(keys: tuple[str, ...], known: tuple[Topic[Any], ...]) -> dic
     """Return key of each declared topic → its modes in words; a family counts once."""
     rows: dict[str, str] = {}
     for key in keys:
-        modes = modes_of(key, known)
-        if modes:
+        if modes := modes_of(key, known):
             missing = [mode for mode in MODES if mode not in modes]
             rows[resolve(key, known)[0].key] = f"all but {', '.join(missing)}" if missing else "all"
     return {topic.key: rows[topic.key] for topic in known if topic.key in rows}

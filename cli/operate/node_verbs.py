@@ -1,76 +1,86 @@
-"""`rampart status` and `rampart node`: what runs, and how it is."""
+"""`rampart status`, `rampart node` and `rampart top`: what runs, and how it is.
+
+Look at the nodes of the run.
+
+Examples:
+  rampart node list
+  rampart node list --json
+"""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+from collections.abc import Coroutine
 from typing import Any
+
+import msgspec
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.run.run_info import RunInfo
 from rampart.cli import systems
-from rampart.cli.holdings import Holdings
+from rampart.cli.operate.operator_verbs import Holdings
 from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say
 from rampart.cli.robot_lines import RobotLines
 from rampart.cli.run_picture import manager_in_words
-from rampart.cli.session import Session, connect
+from rampart.cli.session import connect
+from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag
 
-_STATUS = (ftm_topics.MANAGER_STATUS, ftm_topics.NODES)
 _WAIT_S = 1.5
 """Simulated seconds to collect states; the rarest comes twice a second."""
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    parser = verbs.add_parser(
-        "status", parents=[common], formatter_class=formatter, help="the run at a glance",
-        description="Show the robot, the FTM Manager and the nodes of the run.\n"
-                    "Whatever the system has and does not answer is shown as silent.",
-        epilog="examples:\n  rampart status\n  rampart status --json")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=lambda options: asyncio.run(status(options)))
-
-    node = verbs.add_parser("node", formatter_class=formatter, help="the nodes of the run",
-                            description="Look at the nodes of the run.",
-                            epilog="examples:\n  rampart node list\n  rampart node list --json")
-    subverbs = node.add_subparsers(dest="subverb", required=True, metavar="VERB")
-    parser = subverbs.add_parser(
-        "list", parents=[common], formatter_class=formatter, help="all nodes",
-        description="List the nodes with process id, state, incarnation and restarts.",
-        epilog="examples:\n  rampart node list\n  kill -9 $(rampart node list --json | python3 -c "
-               "'import json,sys; print(next(n[\"pid\"] for n in json.load(sys.stdin) "
-               "if n[\"name\"] == \"localization\"))')")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=lambda options: asyncio.run(node_list(options)))
+    add_verb(verbs, "status", "the run at a glance", status, PORT, JSON)
+    node = add_family(verbs, "node", "the nodes of the run", __doc__)
+    add_verb(node, "list", "all nodes", node_list, PORT, JSON)
+    add_verb(verbs, "top", "the run in the terminal, refreshed four times a second", top, PORT,
+             flag("--once", "print one picture and end"),
+             flag("--json", "print one picture as JSON and end"),
+             flag("--follow", "wait for a run if there is none, and for the next when one ends"))
 
 
 async def node_list(options: argparse.Namespace) -> int:
-    """Print the supervisor's table."""
+    """Print the supervisor's table.
+
+    List the nodes with process id, state, incarnation and restarts.
+
+    Examples:
+      rampart node list
+      kill -9 $(rampart node list --json | python3 -c 'import json,sys; \
+print(next(n["pid"] for n in json.load(sys.stdin) if n["name"] == "localization"))')
+    """
     async with connect(options.port) as session:
         found = await session.latest((ftm_topics.NODES,), session.real_s(_WAIT_S) + 1.0)
     if not found:
         raise NoEffectError("the supervisor does not answer; it may just be restarting, try again")
     table: fm.NodeTable = found[ftm_topics.NODES.key]
     if options.json:
-        print_json([
-            {"name": n.name, "kind": n.kind, "pid": n.pid, "state": n.state,
-             "incarnation": n.incarnation, "restarts": n.restarts} for n in table.nodes])
+        print_json(table.nodes)
     else:
-        print_table(("name", "kind", "pid", "state", "incarnation", "restarts"),
-                    [(n.name, n.kind, n.pid, n.state.value, n.incarnation, n.restarts)
-                     for n in table.nodes])
+        print_table(fm.NodeInfo.__struct_fields__,
+                    [msgspec.structs.astuple(node) for node in table.nodes])
     return 0
 
 
 async def status(options: argparse.Namespace) -> int:
-    """Print the state of the run."""
+    """Print the state of the run.
+
+    Show the robot, the FTM Manager and the nodes of the run.
+    Whatever the system has and does not answer is shown as silent.
+
+    Examples:
+      rampart status
+      rampart status --json
+    """
     async with connect(options.port) as session:
-        held, lines = Holdings(session), _lines(session.run)
+        run, held, lines = session.run, Holdings(session), _lines(session.run)
+        wanted = (*lines.status_read, ftm_topics.MANAGER_STATUS, ftm_topics.NODES)
         found, _ = await asyncio.gather(
-            session.latest((*lines.status_read, *_STATUS), session.real_s(_WAIT_S)),
-            held.settle())
+            session.latest(wanted, session.real_s(_WAIT_S)), held.settle())
         time_s = session.clock.now()
 
     def latest(topic: Topic[Any]) -> Any:
@@ -79,16 +89,17 @@ async def status(options: argparse.Namespace) -> int:
     manager: fm.ManagerStatus | None = found.get(ftm_topics.MANAGER_STATUS.key)
     nodes: fm.NodeTable | None = found.get(ftm_topics.NODES.key)
     if options.json:
-        run = session.run
         print_json({
             "run_id": run.run_id, "title": run.title, "port": run.base_port, "pid": run.pid,
             "rate": run.rate, "system": run.system_file, "time_s": round(time_s, 3),
             **lines.status_data(latest), "manager": manager, "holders": held.holders,
             "nodes": nodes.nodes if nodes else None})
         return 0
-    _print_run(session, time_s)
+    page = f", page {run.page}" if run.page else ""
+    say(f"run       {run.title} (port {run.base_port}, pid {run.pid})")
+    say(f"time      {time_s:.1f} s at rate {run.rate:g}{page}")
     kinds = {n.kind for n in nodes.nodes} if nodes else {"pilot", "manager"}
-    for label, text in lines.status(latest, session.run.plan, kinds):
+    for label, text in lines.status(latest, run.plan, kinds):
         say(f"{label:<9} {text}")
     if manager is not None or "manager" in kinds:
         say(f"manager   {manager_in_words(manager)}")
@@ -99,18 +110,30 @@ async def status(options: argparse.Namespace) -> int:
     return 0
 
 
+def top(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
+    """Show the run.
+
+    Show the robot, mechanisms, decisions, processes and topic rates
+    of the run. Keys: q or Ctrl-C quits, c sorts by CPU, arrows scroll.
+    Processor time is in percent of one core; memory is resident, most of it shared.
+
+    Examples:
+      rampart top
+      rampart top --follow          stay for the next run
+      rampart top --once | less
+      NO_COLOR=1 rampart top
+      rampart top --json | python3 -m json.tool
+    """
+    from rampart.cli.look import top_screen  # noqa: PLC0415 no other verb should wait for it
+
+    return top_screen.top(options)
+
+
 def _lines(run: RunInfo) -> RobotLines:
     try:
         return systems.lines_of(systems.load(run.system_file))
     except UsageError:  # of a run from elsewhere, say: what the engine tells is there
         return RobotLines()
-
-
-def _print_run(session: Session, time_s: float) -> None:
-    run = session.run
-    say(f"run       {run.title} (port {run.base_port}, pid {run.pid})")
-    page = f", page {run.page}" if run.page else ""
-    say(f"time      {time_s:.1f} s at rate {run.rate:g}{page}")
 
 
 def _nodes(table: fm.NodeTable | None) -> str:

@@ -4,50 +4,52 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 from typing import Any
 
+from rampart.actors.bus.envelope import Header
+from rampart.actors.bus.limits import Remembered
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
-from rampart.cli.holdings import Holdings
-from rampart.cli.output import NoEffectError, UsageError, say, unknown
-from rampart.cli.session import Latest, Session, connect
+from rampart.cli.output import NoEffectError, positive, say, unknown
+from rampart.cli.session import Latest, Session, connect, pause
+from rampart.cli.verbs import PORT, add_verb, option
 
 STUB_DETECTION = "rampart.actors.detection.stub:StubDetection"
 
 _RESET_WAIT_S = 3.0
 """Simulated seconds within which the manager releases a recovery whose cause is gone."""
 
+_HEARD_S = 0.3
+"""Simulated seconds within which it is repeated (nominally each 0.2 s)."""
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+_NODES = 16
+"""Which can be made to stand: more than there are."""
+
+
+def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    parser = verbs.add_parser(
-        "reset", parents=[common], formatter_class=formatter,
-        help="release a latched recovery, e.g. the emergency stop",
-        description="Release a recovery that stays in force until an operator resets it. Nothing\n"
-                    "happens while its cause is still there; the verb then says so and exits 1.\n"
-                    "Also lets go of what somebody holds, such as the brake, who is no recovery\n"
-                    "module of the system; rampart status says who.",
-        epilog="examples:\n  rampart reset RM1\n  rampart reset rampart-4711")
-    parser.add_argument("recovery", metavar="NAME", help="e.g. RM1")
-    parser.set_defaults(run=lambda options: asyncio.run(reset(options)))
-
-    parser = verbs.add_parser(
-        "trigger", parents=[common], formatter_class=formatter,
-        help="make the stand-in of a detection module detect",
-        description="Make a stand-in for a detection module (`detection.stub`) active, for some\n"
-                    "simulated seconds. What real modules detect is injected: rampart inject.",
-        epilog="examples:\n  rampart trigger D_CURTAIN\n  rampart trigger D_VISION --for 5")
-    parser.add_argument("module", metavar="NAME", help="detection module, e.g. D_CURTAIN")
-    parser.add_argument("--for", dest="duration", type=float, default=2.0, metavar="S",
-                        help="simulated seconds (default 2)")
-    parser.set_defaults(run=lambda options: asyncio.run(trigger(options)))
+    add_verb(verbs, "reset", "release a latched recovery, e.g. the emergency stop", reset, PORT,
+             option("recovery", metavar="NAME", help="e.g. RM1"))
+    add_verb(verbs, "trigger", "make the stand-in of a detection module detect", trigger, PORT,
+             option("module", metavar="NAME", help="detection module, e.g. D_CURTAIN"),
+             option("--for", dest="duration", type=float, default=2.0, metavar="S",
+                    help="simulated seconds (default 2)"))
 
 
 async def reset(options: argparse.Namespace) -> int:
-    """Release a latched recovery."""
+    """Release a latched recovery.
+
+    Release a recovery that stays in force until an operator resets it. Nothing
+    happens while its cause is still there; the verb then says so and exits 1.
+    Also lets go of what somebody holds, such as the brake, who is no recovery
+    module of the system; rampart status says who.
+
+    Examples:
+      rampart reset RM1
+      rampart reset rampart-4711
+    """
     async with connect(options.port) as session:
         known = [r.name for r in systems.load(session.run.system_file).recoveries]
         if options.recovery not in known:
@@ -91,9 +93,16 @@ async def _let_go(session: Session, name: str, known: list[str]) -> int:
 
 
 async def trigger(options: argparse.Namespace) -> int:
-    """Make a stand-in detect for a while."""
-    if not 0 < options.duration < 1e6:
-        raise UsageError(f"--for {options.duration:g}: must be above 0")
+    """Make a stand-in detect for a while.
+
+    Make a stand-in for a detection module (`detection.stub`) active, for some
+    simulated seconds. What real modules detect is injected: rampart inject.
+
+    Examples:
+      rampart trigger D_CURTAIN
+      rampart trigger D_VISION --for 5
+    """
+    positive("--for", options.duration, below=1e6)
     async with connect(options.port) as session:
         spec = systems.load(session.run.system_file)
         stubs = [d.name for d in spec.detections if d.actor == STUB_DETECTION]
@@ -114,9 +123,41 @@ async def trigger(options: argparse.Namespace) -> int:
             raise NoEffectError(f"no effect: {options.module} does not answer")
         say(f"{options.module} detects")
         stop = asyncio.Event()
-        with stopped_by_signals(stop), contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(stop.wait(), options.duration / session.clock.rate)
+        with stopped_by_signals(stop):
+            await pause(stop, options.duration / session.clock.rate)
         if not await bring(fm.DetectionState.IDLE):
             raise NoEffectError(f"{options.module} did not become idle again")
     say(f"{options.module} is idle again")
     return 0
+
+
+class Holdings:
+    """What is held by those who are no recovery modules, by the node that obeys them.
+
+    Listens from the start.
+
+    Args:
+        session: the connection to the run.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._heard: Remembered[str, fm.Holds] = Remembered(_NODES)
+        session.listen(ftm_topics.HOLDS, ftm_topics.HOLDS.pattern, self._keep)
+
+    def _keep(self, _key: str, header: Header, body: fm.Holds) -> None:
+        self._heard[header.source] = body
+
+    async def settle(self) -> None:
+        """Wait until all that is held has been heard."""
+        await asyncio.sleep(self._session.real_s(_HEARD_S))
+
+    def by(self, name: str) -> tuple[str, ...]:
+        """Return what somebody holds."""
+        return tuple(holds.what for holds in self._heard.values() if name in holds.holders)
+
+    @property
+    def holders(self) -> dict[str, tuple[str, ...]]:
+        """Everybody who holds something, with what it is."""
+        names = dict.fromkeys(name for holds in self._heard.values() for name in holds.holders)
+        return {name: self.by(name) for name in names}

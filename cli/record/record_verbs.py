@@ -1,90 +1,100 @@
-"""`rampart record` and `rampart replay`."""
+"""`rampart record`, `rampart replay` and `rampart bag`: recordings, and how to mend a torn one.
+
+Look at recordings: MCAP files of `launch.py --record`, `rampart record`, or
+others.
+
+Examples:
+  rampart bag info run.mcap
+  rampart bag repair torn.mcap whole.mcap
+"""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
 import fnmatch
+import json
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from rampart.actors.bus.topic import ROOT, Topic
+from rampart.actors.recording.bag_reader import BagReader, Summary
+from rampart.actors.recording.bag_repair import repair
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.process import stop_pipe, told
 from rampart.actors.recording.recorder import Recorder
 from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.cli import systems
 from rampart.cli.following import stopped_by_signals
-from rampart.cli.output import NoEffectError, UsageError, say
+from rampart.cli.output import (
+    NoEffectError,
+    UsageError,
+    between,
+    positive,
+    print_json,
+    print_table,
+    refusing,
+    say,
+)
 from rampart.cli.record.replaying import DEFAULT_PORT, Replay
+from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag, number, option, whole
+from rampart.files.reading import plain_line
 
 _PORTS = (1024, 65535)
+_WIDTH = 11
+"""Of the names in front of the lines of `rampart bag info`."""
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any) -> None:
     """Add the verbs to the parser."""
-    parser = verbs.add_parser(
-        "record", parents=[common], formatter_class=formatter, help="record a run that is there",
-        description="Record everything that is sent in a run, from now until ctrl-C, the end of\n"
-                    "the run, or --duration. `launch.py --record FILE` records from the first\n"
-                    "message on. The robot does not wait for the recorder, whatever becomes of it.",
-        epilog="examples:\n  rampart record\n  rampart record crash.mcap --duration 60\n"
-               "  rampart record poses.mcap --topics 'localization/*' 'detection/*'")
-    parser.add_argument("file", metavar="FILE", nargs="?",
-                        help="MCAP file (default: rampart-TIME.mcap)")
-    parser.add_argument("--topics", metavar="GLOB", nargs="+", action="extend", default=[],
-                        help="only keys that match one, as in `rampart topic list`")
-    parser.add_argument("--duration", type=float, metavar="S", help="end after S real seconds")
-    parser.add_argument("--overwrite", action="store_true", help="FILE may exist")
-    parser.set_defaults(run=record)
-
-    parser = verbs.add_parser(
-        "replay", formatter_class=formatter, help="play a recording back",
-        description="Play a recording back onto a bus of its own. Tools find it like a run\n"
-                    "(`rampart topic echo`, `rampart status`), with --port if a robot runs too;\n"
-                    "orders are refused, and nothing of it reaches a robot.",
-        epilog="examples:\n  rampart replay run.mcap --hmi-port 8090\n"
-               "  rampart replay run.mcap --rate 4 --start 60 --loop\n"
-               "  rampart replay run.mcap --topics 'manager/*' --delay 2")
-    parser.add_argument("file", metavar="FILE")
-    parser.add_argument("--rate", type=float, metavar="R", default=1.0,
-                        help="simulated seconds per second (default: 1)")
-    parser.add_argument("--loop", action="store_true",
-                        help="begin anew at the end; each lap is a later life of every node")
-    parser.add_argument("--topics", metavar="GLOB", nargs="+", action="extend", default=[],
-                        help="only keys that match one")
-    parser.add_argument("--start", type=float, metavar="S",
-                        help="begin at simulated second S of the run")
-    parser.add_argument("--delay", type=float, metavar="S", default=0.0,
-                        help="real seconds before the first message, for readers to come")
-    parser.add_argument("--hmi-port", type=int, metavar="PORT", default=0,
-                        help="show the operator's page, on this port of loopback")
-    parser.add_argument("--port", type=int, metavar="N", default=DEFAULT_PORT,
-                        help=f"Zenoh port of the replay (default: {DEFAULT_PORT})")
-    parser.set_defaults(run=lambda options: asyncio.run(replay(options)))
+    topics = {"metavar": "GLOB", "nargs": "+", "action": "extend", "default": []}
+    add_verb(verbs, "record", "record a run that is there", record, PORT,
+             option("file", metavar="FILE", nargs="?",
+                    help="MCAP file (default: rampart-TIME.mcap)"),
+             option("--topics", **topics,
+                    help="only keys that match one, as in `rampart topic list`"),
+             number("--duration", "S", "end after S real seconds"),
+             flag("--overwrite", "FILE may exist"))
+    add_verb(verbs, "replay", "play a recording back", replay, option("file", metavar="FILE"),
+             number("--rate", "R", "simulated seconds per second (default: 1)", 1.0),
+             flag("--loop", "begin anew at the end; each lap is a later life of every node"),
+             option("--topics", **topics, help="only keys that match one"),
+             number("--start", "S", "begin at simulated second S of the run"),
+             number("--delay", "S", "real seconds before the first message, for readers to come",
+                    0.0),
+             whole("--hmi-port", "PORT", "show the operator's page, on this port of loopback", 0),
+             whole("--port", "N", f"Zenoh port of the replay (default: {DEFAULT_PORT})",
+                   DEFAULT_PORT))
+    bag = add_family(verbs, "bag", "what is in a recording (needs no run)", __doc__)
+    add_verb(bag, "info", "duration, run, channels, whether it is whole", bag_info,
+             option("file", metavar="FILE"), JSON)
+    add_verb(bag, "repair", "write what can be read into a whole file", bag_repair,
+             option("file", metavar="IN"), option("out", metavar="OUT"),
+             flag("--overwrite", "OUT may exist"))
 
 
 def record(options: argparse.Namespace) -> int:
-    """Record a run."""
-    if options.duration is not None and not 0 < options.duration < 1e9:
-        raise UsageError(f"--duration {options.duration:g}: must be above 0")
-    try:
+    """Record a run.
+
+    Record everything that is sent in a run, from now until ctrl-C, the end of
+    the run, or --duration. `launch.py --record FILE` records from the first
+    message on. The robot does not wait for the recorder, whatever becomes of it.
+
+    Examples:
+      rampart record
+      rampart record crash.mcap --duration 60
+      rampart record poses.mcap --topics 'localization/*' 'detection/*'
+    """
+    positive("--duration", options.duration, below=1e9)
+    with refusing(NoRunError, BagError):
         run = find_run(options.port)
-    except NoRunError as error:
-        raise UsageError(str(error)) from None
-    wants = _wanted(options.topics, run)
-    path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
-    try:
+        wants = _wanted(options.topics, run)
+        path = Path(options.file or time.strftime("rampart-%Y%m%d-%H%M%S.mcap"))
         check_target(path, overwrite=options.overwrite)
-    except BagError as error:
-        raise UsageError(str(error)) from None
-    recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants)
-    try:
+        recorder = Recorder(run.base_port, path, overwrite=options.overwrite, wants=wants)
         recorder.open()
-    except BagError as error:
-        raise UsageError(str(error)) from None
     stop = stop_pipe()
     say(f"recording {run.title} in {path}; ctrl-C ends it")
     try:
@@ -98,15 +108,24 @@ def record(options: argparse.Namespace) -> int:
 
 
 async def replay(options: argparse.Namespace) -> int:
-    """Play a recording back."""
+    """Play a recording back.
+
+    Play a recording back onto a bus of its own. Tools find it like a run
+    (`rampart topic echo`, `rampart status`), with --port if a robot runs too;
+    orders are refused, and nothing of it reaches a robot.
+
+    Examples:
+      rampart replay run.mcap --hmi-port 8090
+      rampart replay run.mcap --rate 4 --start 60 --loop
+      rampart replay run.mcap --topics 'manager/*' --delay 2
+    """
     _check(options)
-    try:
-        player = Replay(
-            Path(options.file), port=options.port, rate=options.rate, loop=options.loop,
-            start_s=options.start, hmi_port=options.hmi_port, said=say,
-            wants=_late(options))
-    except BagError as error:
-        raise UsageError(str(error)) from None
+    with refusing(BagError):
+        path = Path(options.file)
+        known = Summary(BagReader(path)).keys if options.topics else ()
+        player = Replay(path, port=options.port, rate=options.rate, loop=options.loop,
+                        start_s=options.start, hmi_port=options.hmi_port, said=say,
+                        wants=matcher(options.topics, known))
     stop = asyncio.Event()
     with stopped_by_signals(stop):
         if player.summary.reader.damage:
@@ -159,25 +178,111 @@ def keys_of(run: RunInfo, known: Iterable[Topic[Any]]) -> list[str]:
             for key in ([topic.at(n) for n in run.nodes] if topic.is_family else [topic.at()])]
 
 
-def _late(options: argparse.Namespace) -> Callable[[str], bool]:
-    """Return whether a key is wanted, checked against what is in the file."""
-    if not options.topics:
-        return lambda _key: True
-    from rampart.actors.recording.bag_reader import BagReader, Summary  # noqa: PLC0415 only here
-
-    return matcher(options.topics, Summary(BagReader(Path(options.file))).keys)
-
-
 def _check(options: argparse.Namespace) -> None:
-    if not 0.01 <= options.rate <= 1000:
-        raise UsageError(f"--rate {options.rate:g}: must be between 0.01 and 1000")
+    between("--rate", options.rate, 0.01, 1000)
     if not 0 <= options.delay < 1e6:
         raise UsageError(f"--delay {options.delay:g}: must not be negative")
     if options.start is not None and not -1e9 < options.start < 1e9:
         raise UsageError(f"--start {options.start:g}: must be a time of the run in seconds")
-    for name, port in (("--port", options.port), ("--hmi-port", options.hmi_port or _PORTS[0])):
-        if not _PORTS[0] <= port <= _PORTS[1]:
-            raise UsageError(f"{name} {port}: must be between {_PORTS[0]} and {_PORTS[1]}")
+    between("--port", options.port, *_PORTS)
+    between("--hmi-port", options.hmi_port or _PORTS[0], *_PORTS)
     if options.hmi_port == options.port:
         raise UsageError(f"--hmi-port {options.hmi_port}: is the replay's own --port; choose "
                          "another --hmi-port")
+
+
+def bag_info(options: argparse.Namespace) -> int:
+    """Print what is in a file.
+
+    Show duration, size, what was run, and each channel with messages and rate.
+    A file that was never closed, or is cut off, is read as far as it goes.
+
+    Examples:
+      rampart bag info run.mcap
+      rampart bag info run.mcap --json
+    """
+    with refusing(BagError):
+        summary = Summary(BagReader(Path(options.file)))
+    if options.json:
+        print_json(described(summary))
+        return 0
+    reader, run = summary.reader, summary.run
+    _say(f"file       {options.file}, {reader.size_bytes / 1e6:.1f} MB, {reader.library}")
+    if reader.is_recording:
+        _say(f"run        {run.get('title', '')} ({run.get('run_id', '')}), "
+            f"rate {run.get('rate', '')}, rampart {run.get('rampart_version', '')}")
+        _say(f"began      {run.get('started') or 'in virtual time'}")
+    else:
+        profile = f", profile {reader.profile!r}" if reader.profile else ""
+        _say(f"run        none: not a recording of a run{profile}")
+    first_s = (summary.first_ns or 0) / 1e9 + summary.time_zero_s
+    say(f"duration   {summary.duration_s:.1f} s, from {first_s:.1f} s of simulated time"
+        if reader.is_recording else f"duration   {summary.duration_s:.1f} s")
+    say(f"messages   {summary.messages} on {len(reader.channels)} channels")
+    _say(f"lost       {_lost(summary)}")
+    _say(f"closed     {_closing(summary)}")
+    if summary.files:
+        _say(f"attached   {', '.join(name for name, _, _ in summary.files)}")
+    say()
+    print_table(("channel", "schema", "messages", "rate"), [
+        (plain_line(row["channel"]), plain_line(row["schema"]), row["messages"],
+         f"{row['rate_hz']:.2f} Hz" if row["rate_hz"] is not None else "")
+        for row in summary.table()])
+    return 0
+
+
+def bag_repair(options: argparse.Namespace) -> int:
+    """Write a whole file.
+
+    Copy everything that can be read of a torn file into a new one with an
+    index, for viewers that insist on it. The old one stays as it is.
+
+    Examples:
+      rampart bag repair torn.mcap whole.mcap
+    """
+    with refusing(BagError):
+        reader = BagReader(Path(options.file))
+        copied = repair(reader, Path(options.out), overwrite=options.overwrite)
+    say(f"{options.out}: {copied} messages; left behind: {reader.damage or 'nothing'}")
+    return 0
+
+
+def _say(line: str) -> None:
+    """Print a line in which words of the file are; they steer no terminal."""
+    say(line[:_WIDTH] + plain_line(line[_WIDTH:]))
+
+
+def described(summary: Summary) -> dict[str, Any]:
+    """Return everything as plain data; scripts rely on these names."""
+    reader = summary.reader
+    return {
+        "file": str(reader.path), "size_bytes": reader.size_bytes, "profile": reader.profile,
+        "library": reader.library, "recording": reader.is_recording, "closed": reader.closed,
+        "damage": reader.damage, "duration_s": round(summary.duration_s, 3),
+        "messages": summary.messages, "time_zero_s": summary.time_zero_s, "run": summary.run,
+        "end": summary.end, "lost": _losses(summary),
+        "attachments": [name for name, _, _ in summary.files], "channels": summary.table()}
+
+
+def _losses(summary: Summary) -> dict[str, int] | None:
+    """Return source → messages lost; None if the file does not say."""
+    try:
+        return {str(k): int(v) for k, v in json.loads(summary.end["lost"]).items()}
+    except (KeyError, ValueError, AttributeError, TypeError, RecursionError, OverflowError):
+        return None
+
+
+def _lost(summary: Summary) -> str:
+    losses = _losses(summary)
+    if losses is None:
+        return "unknown"
+    return ", ".join(f"{count} of {name}" for name, count in losses.items()) or "none"
+
+
+def _closing(summary: Summary) -> str:
+    reader = summary.reader
+    if reader.closed:
+        why = f", because {summary.end['ended']}" if "ended" in summary.end else ""
+        return f"properly{why}" if not reader.damage else f"yes; damaged: {reader.damage}"
+    return "no: its writer did not come to the end" + (
+        f"; {reader.damage}" if reader.damage else "")

@@ -32,6 +32,7 @@ from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
 from rampart.actors.layout.layout import application_class
 from rampart.actors.layout.wiring import load_class
 from rampart.actors.operator.hmi import Hmi
+from rampart.actors.operator.requests import RefusedError, Request
 from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
 from rampart.actors.recording.message_form import Forms, header_of, renumbered
 from rampart.actors.recording.run_documents import NOT_CHOSEN, SYSTEM, File, Known, restore
@@ -42,11 +43,14 @@ from rampart.actors.runtime.actor import Context
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.process_title import find_processes
 from rampart.cli import systems
-from rampart.cli.output import UsageError
-from rampart.cli.record.replay_page import NAME, replay_page
+from rampart.cli.output import UsageError, refusing
+from rampart.cli.session import pause
 from rampart.manager.spec.specification import Kind, SystemSpec, check_document, read_document
 
 DEFAULT_PORT = 7400
+PAGE = "replay_page"
+"""Name of the operator's page of a replay: not that of the page of which there is a recording."""
+
 GAP_S = 0.1
 """Simulated seconds between two laps."""
 
@@ -56,6 +60,16 @@ _Due = tuple[int, float, str, bytes]
 
 _YIELD_EVERY = 50
 _LINGER_S = 0.3
+
+
+class ReplayPage(Hmi):
+    """The operator's page on a replay: it shows everything, and nothing can be asked of it."""
+
+    def _fulfil(self, request: Request, page: int) -> str | dict[str, Any]:  # noqa: ARG002
+        raise RefusedError("this is a replay: there is no robot to obey")
+
+    def _look(self) -> None:
+        """Measure nothing: the recorded process numbers may be anybody's today."""
 
 
 class Replay:
@@ -80,7 +94,7 @@ class Replay:
                  loop: bool = False, start_s: float | None = None,
                  wants: Callable[[str], bool] = lambda _key: True, hmi_port: int = 0,
                  said: Callable[[str], None] = lambda _line: None) -> None:
-        self.summary = Summary(BagReader(path))
+        self.summary = summary = Summary(BagReader(path))
         self._document, self._known = recorded_system(self.summary.files)
         self._forms = Forms(self._known.topics)
         self.played = 0
@@ -94,7 +108,6 @@ class Replay:
         self._said = said
         self._sockets = ""
         self._lives: dict[str, int] = {}
-        summary = self.summary
         if not summary.reader.is_recording:
             raise UsageError(f"{path}: an MCAP file of {summary.reader.library or 'others'}, not a "
                              "recording of a run: nothing in it can be played onto the bus")
@@ -110,7 +123,11 @@ class Replay:
                              f"{self._last_s:.1f} simulated seconds")
         claim_port(port)
         if hmi_port:
-            _check_free("--hmi-port", hmi_port)
+            try:
+                socket.create_server(("127.0.0.1", hmi_port)).close()
+            except OSError:
+                raise UsageError(f"--hmi-port {hmi_port}: in use; choose another --hmi-port"
+                                 ) from None
 
     async def run(self, stop: asyncio.Event, delay_s: float = 0.0) -> None:
         """Play to the end, or until `stop` is set; with a page or in a loop there is no end.
@@ -123,40 +140,45 @@ class Replay:
             UsageError: the number is taken, or there is no place for a socket.
         """
         async with contextlib.aclosing(self._messages(stop)) as messages:
-            first = await anext(messages, None)  # may lie deep in the file: no clock runs yet
-            await self._perform(first, messages, stop, delay_s)
-
-    async def _perform(self, first: _Due | None, messages: AsyncIterator[_Due],
-                       stop: asyncio.Event, delay_s: float) -> None:
-        with _sockets(self._port) as self._sockets, tempfile.TemporaryDirectory(
-                prefix="rampart-replay-") as directory:
-            folder = Path(directory)
+            due = await anext(messages, None)  # may lie deep in the file: no clock runs yet
             clock = Clock(time.monotonic() + delay_s - self._start_s / self._rate, self._rate)
+            async with self._on_the_bus(clock) as (bus, page):
+                while due and await _until(clock.source_time(due[1]), stop):
+                    self._send(bus, *due)
+                    due = await anext(messages, None)
+                if page and not page.done() and not stop.is_set():
+                    self._said("the recording is over; the page stays, ctrl-C ends it")
+                    await stop.wait()
+                await asyncio.sleep(_LINGER_S)  # what was sent last is still under way
+
+    @contextlib.asynccontextmanager
+    async def _on_the_bus(self, clock: Clock
+                          ) -> AsyncIterator[tuple[ZenohBus, asyncio.Task[None] | None]]:
+        """Have a bus that tools find, and the page's task if there is a page."""
+        with contextlib.ExitStack() as stack:
+            try:
+                self._sockets = run_folder.make(self._port, os.getpid())
+            except OSError as error:
+                raise UsageError(f"no folder for a socket: {error}") from None
+            stack.callback(run_folder.remove, self._sockets)
+            folder = Path(stack.enter_context(
+                tempfile.TemporaryDirectory(prefix="rampart-replay-")))
+            stack.enter_context(self._answering(clock, folder))
             bus = ZenohBus("", 0, endpoint(self._sockets, run_info.REPLAY), [],
                            RecorderConnection(self._port))
-            with self._answering(clock, folder):
-                try:
-                    await bus.open()
-                except BusError as error:
-                    raise UsageError(str(error)) from None
-                page = self._page(bus, clock, folder)
-                showing = asyncio.create_task(page.run()) if page else None
-                if showing:
-                    showing.add_done_callback(self._page_ended)
-                try:
-                    due = first
-                    while due and await _until(clock.source_time(due[1]), stop):
-                        self._send(bus, *due)
-                        due = await anext(messages, None)
-                    if showing and not showing.done() and not stop.is_set():
-                        self._said("the recording is over; the page stays, ctrl-C ends it")
-                        await stop.wait()
-                    await asyncio.sleep(_LINGER_S)  # what was sent last is still under way
-                finally:
-                    if page and showing:
-                        page.stop()
-                        await asyncio.gather(showing, return_exceptions=True)
-                    await bus.close()
+            with refusing(BusError):
+                await bus.open()
+            page = self._page(bus, clock, folder)
+            showing = asyncio.create_task(page.run()) if page else None
+            if showing:
+                showing.add_done_callback(self._page_ended)
+            try:
+                yield bus, showing
+            finally:
+                if page and showing:
+                    page.stop()
+                    await asyncio.gather(showing, return_exceptions=True)
+                await bus.close()
 
     # -- playing --------------------------------------------------------------------------------
 
@@ -261,8 +283,9 @@ class Replay:
         with contextlib.suppress(ValueError, OSError):  # a page without a map shows the rest
             restore(self.summary.files, folder)
             run = replace(run, application=self._known.kind.restored(folder))
-        kind = replay_page(page_of(self._known.system))
-        return kind(Context(NAME, 1, clock, SharedBus(bus), run=run))
+        kind = page_of(self._known.system)
+        page: type[Hmi] = ReplayPage if kind is Hmi else type("ReplayPage", (ReplayPage, kind), {})
+        return page(Context(PAGE, 1, clock, SharedBus(bus), run=run))
 
 
 def recorded_system(files: Sequence[File]) -> tuple[dict[str, Any], Known]:
@@ -308,36 +331,9 @@ def claim_port(port: int) -> None:
                          "living robot, choose another --port")
 
 
-@contextlib.contextmanager
-def _sockets(port: int) -> Iterator[str]:
-    """Have a folder for the sockets of a replay.
-
-    Raises:
-        UsageError: there is no place for one.
-    """
-    try:
-        folder = run_folder.make(port, os.getpid())
-    except OSError as error:
-        raise UsageError(f"no folder for a socket: {error}") from None
-    try:
-        yield folder
-    finally:
-        run_folder.remove(folder)
-
-
-def _check_free(option: str, port: int) -> None:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            raise UsageError(f"{option} {port}: in use; choose another {option}") from None
-
-
 async def _until(due: float, stop: asyncio.Event) -> bool:
     """Wait until a reading of the monotonic clock; False if it is to stop."""
     left_s = due - time.monotonic()
     if left_s > 0.001:
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(stop.wait(), left_s)
+        await pause(stop, left_s)
     return not stop.is_set()

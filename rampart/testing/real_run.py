@@ -52,8 +52,7 @@ class RealRun:
     def __enter__(self) -> Self:
         with self._stdout.open("w") as out, self._stderr.open("w") as err:
             self.process = subprocess.Popen(  # noqa: S603 the command is ours
-                self._command, stdout=out, stderr=err, cwd=self.directory,
-                stdin=subprocess.DEVNULL)
+                self._command, stdout=out, stderr=err, cwd=self.directory, stdin=subprocess.DEVNULL)
         return self
 
     def __exit__(self, *_: object) -> None:

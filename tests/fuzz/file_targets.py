@@ -23,7 +23,7 @@ from rampart.actors.recording.bag_repair import repair
 from rampart.actors.recording.bag_writer import BagError, BagWriter
 from rampart.actors.recording.message_form import Forms, header_of, renumbered
 from rampart.actors.recording.run_documents import restore
-from rampart.cli.record.bag_verbs import described
+from rampart.cli.record.record_verbs import described
 from rampart.cli.record.replaying import recorded_system
 from rampart.files import toml
 from rampart.files.reading import FileError

@@ -22,7 +22,8 @@ from rampart.actors.runtime.clock import Clock
 from rampart.actors.supervision.process_usage import ProcessCount
 from rampart.actors.web.guests import ROOM
 from rampart.actors.web.server import WebServer
-from rampart.cli.look.live_verb import _watch
+from rampart.cli import following
+from rampart.cli.look.live_foxglove import _watch
 from rampart.cli.main import main
 from tests import ROOT
 from tests.cli.look.test_top_view import busy
@@ -57,9 +58,9 @@ def test_an_address_that_is_none_is_named(arguments, capsys):
 
 def exposed(now):
     exposition = pytest.importorskip("prometheus_client.exposition")
-    from rampart.cli.look.metrics_families import Collector
+    from rampart.cli.look.metrics_families import families
 
-    return exposition.generate_latest(Collector(lambda: now)).decode()
+    return exposition.generate_latest(SimpleNamespace(collect=lambda: families(now))).decode()
 
 
 def test_without_a_run_prometheus_is_told_so():
@@ -137,22 +138,22 @@ async def test_guards_are_looked_for_whether_or_not_somebody_asks_and_never_on_a
 
         def look(self, table):
             looks.append(table)
-            return {"guards": [{"name": f"guard_{len(looks)}", "pid": os.getpid()}]}
+            return {"nodes": {}, "guards": [{"name": f"guard_{len(looks)}", "pid": os.getpid()}]}
 
     monkeypatch.setattr(metrics_server, "sessions", one)
-    monkeypatch.setattr(metrics_server, "ProcessObserver", Observer)
+    monkeypatch.setattr(following, "ProcessObserver", Observer)
     monkeypatch.setattr(metrics_server, "LOOK_S", 0.001)
-    monkeypatch.setattr(metrics_server, "draw", lambda _session, picture: picture.heard(
+    monkeypatch.setattr(following, "draw", lambda _session, picture: picture.heard(
         ftm_topics.NODES, Header("supervisor", 1, 1, 0.0), mine, 0.0))
     exporter, stop = metrics_server.Exporter(), asyncio.Event()
-    following = asyncio.create_task(exporter.follow(None, stop))
+    task = asyncio.create_task(exporter.follow(None, stop))
     await asyncio.sleep(0.2)
     seen = len(looks)
     assert (seen > 2) != bool(replay_of), "nobody has asked yet"
     assert set(exporter.look().processes) == (set() if replay_of else {"hmi", f"guard_{seen}"})
     assert len(looks) == seen
     stop.set()
-    await following
+    await task
 
 
 async def test_prometheus_is_answered_however_many_connections_idle_at_its_port():

@@ -18,6 +18,7 @@ from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.run.run_info import RunInfo
 from rampart.actors.runtime.clock import Clock
+from rampart.cli import following
 from rampart.cli.following import draw
 from rampart.cli.look import top_screen
 from rampart.cli.look.top_view import Frame, lines, picture_json
@@ -198,10 +199,10 @@ def test_no_state_is_told_by_colour_alone(state):
 @pytest.mark.parametrize("replay_of", ["", "run.mcap"])
 def test_on_a_replay_nobodys_processes_are_measured(monkeypatch, replay_of):
     mine = fm.NodeTable((fm.NodeInfo("hmi", "operator", os.getpid(), fm.NodeState.RUNNING, 1, 0),))
-    monkeypatch.setattr(top_screen, "draw", lambda _session, picture: told(
+    monkeypatch.setattr(following, "draw", lambda _session, picture: told(
         picture, ftm_topics.NODES, mine))
     run = RunInfo(os.getpid(), 7450, 1.0, 0.0, "", "", (), "run", 0, "AB",
                   replay_of=replay_of)
-    shown = top_screen._Watch(SimpleNamespace(run=run, clock=Clock(0.0))).frame()
+    shown = top_screen._Screen(SimpleNamespace(run=run, clock=Clock(0.0))).frame()
     assert list(shown.usage) == ([] if replay_of else ["hmi", "launch.py"])
     assert [row["name"] for row in shown.guards] == ([] if replay_of else ["launch.py"])

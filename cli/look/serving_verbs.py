@@ -1,0 +1,69 @@
+"""`rampart live` and `rampart metrics`: the run in somebody else's viewer, while it goes on.
+
+Show the run in a viewer for robots: what its system shows of the robot,
+and a log in words. Waits for a run, and for the next when one ends.
+
+Examples:
+  rampart live foxglove
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Coroutine
+from typing import Any
+
+from rampart.cli.verbs import add_family, add_verb, extra, served
+
+FOXGLOVE_PORT = 8765
+"""Where viewers look unless told otherwise."""
+
+METRICS_PORT = 9464
+"""The port that OpenTelemetry's Prometheus exporter has by convention, too."""
+
+
+def add(verbs: Any) -> None:
+    """Add the verbs to the parser."""
+    viewers = add_family(verbs, "live", "see the run live in Foxglove", __doc__, metavar="VIEWER")
+    add_verb(viewers, "foxglove", "serve Foxglove's WebSocket protocol", foxglove,
+             *served(FOXGLOVE_PORT, "look on"))
+    add_verb(verbs, "metrics", "serve the run's figures to Prometheus", metrics,
+             *served(METRICS_PORT, "read the figures"))
+
+
+def foxglove(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
+    """Serve viewers until interrupted.
+
+    Serve viewers that speak Foxglove's WebSocket protocol. They only read:
+    nothing that they send reaches the robot. Needs the extra:
+    pip install 'rampart[foxglove]'.
+
+    Examples:
+      rampart live foxglove
+      rampart live foxglove --port 9000
+    then open ws://127.0.0.1:8765 in the viewer; set the 3D panel's frame to map
+    """
+    extra("foxglove", "foxglove")
+    from rampart.cli.look import live_foxglove  # noqa: PLC0415 of the extra
+
+    return live_foxglove.live(options)
+
+
+def metrics(options: argparse.Namespace) -> Coroutine[Any, Any, int]:
+    """Serve figures until interrupted.
+
+    Serve http://HOST:PORT/metrics in Prometheus' text format, or in OpenMetrics
+    for who asks for it: nodes, heartbeats, detections, recoveries, decisions,
+    message counts and rates, processes, what the robot adds. Waits for a run,
+    and for the next when one ends; meanwhile rampart_up is 0.
+    Needs the extra: pip install 'rampart[prometheus]'.
+
+    Examples:
+      rampart metrics
+      rampart metrics --port 9100 --host 0.0.0.0
+      curl -s http://127.0.0.1:9464/metrics | grep node_up
+    """
+    extra("prometheus", "prometheus_client.exposition")
+    from rampart.cli.look import metrics_server  # noqa: PLC0415 of the extra
+
+    return metrics_server.metrics(options)
