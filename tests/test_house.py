@@ -47,7 +47,7 @@ STILL_ROBOTIC = {
     "cli.analyse.campaigning", "sim.campaign.report", "sim.campaign.worst_runs"}
 
 STILL_NAMED = {
-    "cli.operate.inject_verbs", "manager.spec.mobile_robot", "sim.campaign.grouping",
+    "cli.operate.inject_verbs", "sim.campaign.grouping",
     "sim.campaign.job", "sim.campaign.report", "sim.campaign.worst_runs"}
 
 STILL_TOO_LONG = {
