@@ -143,10 +143,11 @@ class Transitions:
         """Yield everything that may happen next, in words, with the state that follows."""
         active = {t.name for t in now.state.detections if t.active}
         for asked in self.asked:
-            if {f"D_{n}" for n in asked} != active:
-                yield f"asked for: {', '.join(sorted(asked)) or 'nothing'}", self._detect(now, {
-                    f"D_{n}": n in asked for n in self.names if (f"D_{n}" in active) != (n in asked)
-                })
+            changes = {f"D_{n}": n in asked for n in self.names
+                       if (n in asked) != (f"D_{n}" in active)}
+            if changes:
+                yield (f"asked for: {', '.join(sorted(asked)) or 'nothing'}",
+                       self._detect(now, changes))
         for index, name in enumerate(self.names):
             if f"D_{name}" in active and self.contracts[name].kind.repairs:
                 yield f"{name}'s cause comes back", self._detect(now, {f"D_{name}": True})

@@ -8,7 +8,8 @@ the empty set alone. Variables are numbered from the top.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 EMPTY, UNIT = 0, 1
@@ -148,18 +149,20 @@ class Families:
                 stack.pop()
                 yield node
 
-    def sizes(self, family: int, weight: Callable[[int], Sequence[int]]) -> list[int]:
+    def sizes(self, family: int, weights: Sequence[Mapping[int, int]]) -> Counter[int]:
         """Return how many sets of each size a family has.
 
         Args:
             family: The family.
-            weight: For a variable, how many sets of each size it stands for: (0, 1) if it stands
-                for itself.
+            weights: For each variable, how many sets of each size it stands for: one of size 1
+                if it stands for itself.
         """
-        found: dict[int, list[int]] = {EMPTY: [], UNIT: [1]}
+        found = {EMPTY: Counter[int](), UNIT: Counter({0: 1})}
         for node in self.upwards(family):
-            found[node] = _add(_times(weight(self.variable[node]), found[self.high[node]]),
-                               found[self.low[node]])
+            found[node] = counts = found[self.low[node]].copy()
+            for size, count in weights[self.variable[node]].items():
+                for more, times in found[self.high[node]].items():
+                    counts[size + more] += count * times
         return found[family]
 
 
@@ -172,22 +175,3 @@ def deep_recursion(levels: int) -> Iterator[None]:
         yield
     finally:
         sys.setrecursionlimit(before)
-
-
-def _times(a: Sequence[int], b: Sequence[int]) -> list[int]:
-    if not a or not b:
-        return []
-    if list(a) == [0, 1]:
-        return [0, *b]
-    product = [0] * (len(a) + len(b) - 1)
-    for i, x in enumerate(a):
-        if x:
-            for j, y in enumerate(b):
-                product[i + j] += x * y
-    return product
-
-
-def _add(a: list[int], b: list[int]) -> list[int]:
-    if len(a) < len(b):
-        a, b = b, a
-    return [x + (b[i] if i < len(b) else 0) for i, x in enumerate(a)]
