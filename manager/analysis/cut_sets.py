@@ -123,7 +123,7 @@ class CutSets:
                                 "can be counted, --count")
         for found in islice(chain.from_iterable(
                 self._of_size(self.formula.top, size) for size in range(len(self.sizes))
-                if max_order is None or size <= max_order), limit):
+                if max_order is None or size <= max_order), limit and max(0, limit)):
             yield tuple(sorted(found))
 
     def _weight(self, name: str) -> Mapping[int, int]:

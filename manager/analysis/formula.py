@@ -7,7 +7,7 @@ holds when the number of its inputs that hold lies between two bounds, or when i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import msgspec
 
@@ -75,14 +75,12 @@ class Formula:
         self.is_monotone = all(gates[name].is_monotone for name in self.sequence)
 
     def _only_top(self) -> str:
-        used = {entry for gate in self.gates.values() for entry in gate.inputs}
-        tops = [name for name in self.gates if name not in used]
+        tops = self.gates.keys() - {entry for gate in self.gates.values() for entry in gate.inputs}
         if len(tops) != 1:
-            found = ", ".join(sorted(tops)[:8]) + (", ..." if len(tops) > 8 else "")
             raise FormulaError(
-                f"{len(tops)} gates are no input of another: {found or 'none'}; say which is the "
+                f"{len(tops)} gates are no input of another: {first_few(tops)}; say which is the "
                 "top" if tops else "no gates; a top is needed")
-        return tops[0]
+        return tops.pop()
 
     def holds(self, occurred: frozenset[str]) -> bool:
         """Tell whether the top occurs when exactly these basic events do."""
@@ -92,6 +90,11 @@ class Formula:
             count = sum(value[entry] for entry in gate.inputs)
             value[name] = (gate.low <= count <= gate.high) != gate.negated
         return value[self.top]
+
+
+def first_few(names: Collection[str]) -> str:
+    """Return the first eight names of some, for a message."""
+    return ", ".join(sorted(names)[:8]) + (", ..." if len(names) > 8 else "")
 
 
 def search(top: str, inputs: Callable[[str], Sequence[str]]
