@@ -22,7 +22,7 @@ def refusal(state: State, recovery: str, decision: Decision) -> str:
 
     Args:
         state: Of the arbiter.
-        recovery: Name, as somebody typed it.
+        recovery: Name, as it was typed.
         decision: What would run if nothing were latched.
     """
     if recovery not in state.latched:

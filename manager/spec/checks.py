@@ -51,9 +51,10 @@ def modules(spec: SystemSpec) -> Iterator[tuple[str, str, str, str]]:
     """Yield path, name, process and respawner of all nodes, detection and recovery modules."""
     for path, node in numbered("node", spec.nodes):
         yield path, node.name, node.process, node.respawn
-    for path, module in chain(numbered("detection", spec.detections),
-                              numbered("recovery", spec.recoveries)):
-        yield path, module.name, module.process, SUPERVISOR
+    for path, detection in numbered("detection", spec.detections):
+        yield path, detection.name, detection.process, SUPERVISOR
+    for path, recovery in numbered("recovery", spec.recoveries):
+        yield path, recovery.name, recovery.process, SUPERVISOR
 
 
 def _names(spec: SystemSpec) -> Iterator[Finding]:

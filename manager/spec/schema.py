@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 
@@ -320,3 +320,11 @@ class SystemSpec(Table, frozen=True):
     def build_safety_order(self) -> PartialOrder:
         """Build the order that says which recovery is safer: the first criterion alone."""
         return self.build_order(self.criteria[0])
+
+
+TABLES: dict[str, type[Table]] = {"": SystemSpec, "gate": AtLeast, "against": Within}
+"""All tables of a spec by their names in the file; "" is the whole."""
+for _field in msgspec.structs.fields(SystemSpec):
+    for _type in (_field.type, *get_args(_field.type)):
+        if isinstance(_type, type) and issubclass(_type, Table):
+            TABLES[_field.encode_name] = _type
