@@ -269,22 +269,11 @@ def _at_least(manager: BDDManager, inputs: list[BDDFunction], required: int) -> 
 def _as_numbers(function: BDDFunction) -> Diagram:
     """Copy a diagram into plain numbers; the top has the last one."""
     diagram = Diagram()
-    known: dict[BDDFunction, int] = {}
-    stack = [function]
-    while stack:
-        f = stack[-1]
-        if f in known:
-            stack.pop()
-            continue
-        cofactors = f.cofactors()
-        if cofactors is None:
-            known[f] = UNIT if f.valid() else EMPTY
-            continue
-        missing = [c for c in cofactors if c not in known]
-        if missing:
-            stack.extend(missing)
-        else:
-            known[f] = diagram.add(f.node_level() or 0, known[cofactors[0]], known[cofactors[1]])
+    inner, constants = search(function, lambda f: f.cofactors() or ())
+    known = {f: UNIT if f.valid() else EMPTY for f in constants}
+    for f in inner:
+        high, low = f.cofactors() or (f, f)
+        known[f] = diagram.add(f.node_level() or 0, known[high], known[low])
     if known[function] in {EMPTY, UNIT}:
         diagram.add(0, known[function], known[function])  # a constant, as the last number
     return diagram

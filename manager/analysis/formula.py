@@ -7,12 +7,15 @@ holds when the number of its inputs that hold lies between two bounds, or when i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from typing import TypeVar
 
 import msgspec
 
 from rampart.manager.model.fault_tree import FaultTree
 from rampart.manager.model.order import find_cycle
+
+Node = TypeVar("Node", bound=Hashable)
 
 GENERATED = ".."
 """Stands in the names of gates and events that are made up; no name in a file can hold it."""
@@ -97,16 +100,16 @@ def first_few(names: Collection[str]) -> str:
     return ", ".join(sorted(names)[:8]) + (", ..." if len(names) > 8 else "")
 
 
-def search(top: str, inputs: Callable[[str], Sequence[str]]
-           ) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def search(top: Node, inputs: Callable[[Node], Sequence[Node]]
+           ) -> tuple[tuple[Node, ...], tuple[Node, ...]]:
     """Search depth first, from the left.
 
     Returns:
         What has inputs, each after these; and what has none, as it is met.
     """
-    gates: list[str] = []
-    leaves: list[str] = []
-    met: set[str] = set()
+    gates: list[Node] = []
+    leaves: list[Node] = []
+    met: set[Node] = set()
     stack = [(top, False)]
     while stack:
         name, leaving = stack.pop()

@@ -12,6 +12,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
+from rampart.manager.analysis.formula import search
+
 EMPTY, UNIT = 0, 1
 
 
@@ -132,22 +134,10 @@ class Families:
         self._outside[key] = result
         return result
 
-    def upwards(self, family: int) -> Iterator[int]:
-        """Yield the nodes of a family, those below before those above."""
-        done = {EMPTY, UNIT}
-        stack = [family]
-        while stack:
-            node = stack[-1]
-            if node in done:
-                stack.pop()
-                continue
-            open_ = [n for n in (self.high[node], self.low[node]) if n not in done]
-            if open_:
-                stack.extend(open_)
-            else:
-                done.add(node)
-                stack.pop()
-                yield node
+    def upwards(self, family: int) -> tuple[int, ...]:
+        """Return the nodes of a family, those below before those above."""
+        return search(family, lambda node: (
+            (self.high[node], self.low[node]) if node > UNIT else ()))[0]
 
     def sizes(self, family: int, weights: Sequence[Mapping[int, int]]) -> Counter[int]:
         """Return how many sets of each size a family has.

@@ -51,12 +51,9 @@ class Memory(msgspec.Struct, frozen=True):
 
 def remember(state: State) -> Memory:
     """Return what of a state must not be forgotten."""
-    return Memory(
-        state.number,
-        tuple(Latch(track.command, tuple(sorted(track.cause)))
-              for track in state.recoveries if track.latched),
-        tuple((track.name, track.bucket_s, track.bucket_at_s)
-              for track in state.detections if track.bucket_s > 0))
+    latches = (Latch(t.command, tuple(sorted(t.cause))) for t in state.recoveries if t.latched)
+    buckets = ((t.name, t.bucket_s, t.bucket_at_s) for t in state.detections if t.bucket_s > 0)
+    return Memory(state.number, tuple(latches), tuple(buckets))
 
 
 def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:

@@ -71,8 +71,8 @@ class MissionFirst:
         tree, recover = arrangement.tree, arrangement.mechanisms.recover
         path, rejected = [], []
         for name in decision.active:
-            upper = next((m for m in decision.mechanisms if m == name or tree.is_above(m, name)),
-                         None)
+            upper = next((m for m in decision.mechanisms
+                          if m == name or tree.is_above(m, name)), None)
             if upper is not None:
                 path.append(" > ".join(tree.chain(upper, name)))
             for recovery in recover[name]:
