@@ -242,6 +242,7 @@ def judge(name: str, strategy: str, cases: int, found: Sequence[Trace]) -> Prope
     return Property(name, strategy, not found, cases, len(found), tuple(found[:KEPT]))
 
 
-def subsets(names: Collection[str]) -> Iterator[tuple[str, ...]]:
-    """Yield all sets of some names, the empty one first and smaller ones before larger."""
-    return chain.from_iterable(combinations(names, size) for size in range(len(names) + 1))
+def subsets(names: Collection[str], most: int | None = None) -> Iterator[tuple[str, ...]]:
+    """Yield all sets of some names, of `most` at most, smaller ones before larger."""
+    sizes = range(1 + (len(names) if most is None else most))
+    return chain.from_iterable(combinations(names, size) for size in sizes)

@@ -16,7 +16,7 @@ The way, for trees with hundreds of events and millions of cut sets:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import reduce
 from itertools import chain, islice
 from operator import and_, or_
@@ -196,17 +196,17 @@ class _Inside:
         self._house = constants
         self._top = top
         self._modules = modules
-        self._sequence, leaves = self._search(lambda inputs: inputs)
-        self.leaves = tuple(name for name in leaves if name not in constants)
+        self._sequence, self.leaves = self._search(lambda inputs: inputs)
         self._users = Counter(entry for name in self._sequence for entry in gates[name].inputs)
 
     def _search(self, way: _Way) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Search with the inputs of each gate in a sequence of choice."""
-        return search(self._top, lambda name: () if name != self._top and (
+        """Search with the inputs of each gate in a sequence of choice; return gates and leaves."""
+        gates, leaves = search(self._top, lambda name: () if name != self._top and (
             name in self._modules or name not in self._gates) else way(self._gates[name].inputs))
+        return gates, tuple(name for name in leaves if name not in self._house)
 
-    def orders(self) -> Iterator[tuple[str, ...]]:
-        """Yield variable orders to try."""
+    def orders(self) -> Iterable[tuple[str, ...]]:
+        """Return variable orders to try."""
         below: dict[str, int] = {}
         for name in self._sequence:
             below[name] = 1 + sum(below.get(entry, 1) for entry in self._gates[name].inputs)
@@ -217,8 +217,7 @@ class _Inside:
             lambda inputs: sorted(inputs, key=lambda n: below.get(n, 1)),
             lambda inputs: sorted(inputs, key=lambda n: -below.get(n, 1)),
             lambda inputs: inputs[::-1])
-        yield from dict.fromkeys(
-            tuple(n for n in self._search(way)[1] if n not in self._house) for way in ways)
+        return dict.fromkeys(self._search(way)[1] for way in ways)
 
     def diagram(self, order: tuple[str, ...], bound: int) -> Diagram | None:
         """Return the module's decision diagram, or None if it grows beyond a bound."""

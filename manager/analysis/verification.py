@@ -8,7 +8,7 @@ matters, and what was found about the paper's strategy is in `docs/verification.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from itertools import combinations, permutations
+from itertools import combinations, permutations, product
 
 import msgspec
 
@@ -24,6 +24,7 @@ from rampart.manager.analysis.transitions import Transitions, Violation, explore
 from rampart.manager.spec.budget import patience_s
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.arrangement import Arrangement, arrange
+from rampart.manager.strategies.decision import Decision
 from rampart.manager.strategies.escalation import escalate
 from rampart.manager.strategies.registry import STRATEGIES, find_strategy
 
@@ -156,14 +157,12 @@ class _Explorer:
         asked = _askable(sets)
         names = self.arrangement.mechanisms.recoveries
         exclusive = sets.strategy.exclusive and not self.arrangement.compound
-        for name in names:
-            for deaths in (True, False):
-                yield self._explore((name,), asked, exclusive=exclusive, with_modules=True,
-                                    deaths=deaths)
+        for name, deaths in product(names, (True, False)):
+            yield self._explore((name,), asked, exclusive=exclusive, with_modules=True,
+                                deaths=deaths)
         size = min(self.together, len(names))
-        if size > 1:
-            for chosen in combinations(names, size):
-                yield self._explore(chosen, asked, exclusive=exclusive)
+        for chosen in combinations(names, size) if size > 1 else ():
+            yield self._explore(chosen, asked, exclusive=exclusive)
 
     def _explore(self, names: tuple[str, ...], asked: frozenset[frozenset[str]], *,
                  exclusive: bool, with_modules: bool = False, deaths: bool = True
@@ -175,12 +174,11 @@ class _Explorer:
         shape = _shape(names, here, self._urgent, self.arrangement)
         key = (shape, exclusive, with_modules, deaths)
         if key not in self._known:
-            count, found = explore(Transitions(
-                [mechanisms.contracts[n] for n in names], order, here,
-                self._urgent.intersection(names), exclusive=exclusive, with_modules=with_modules,
-                deaths=deaths))
-            self._known[key] = count, found
-            self.states += count
+            contracts = [mechanisms.contracts[n] for n in names]
+            self._known[key] = explore(Transitions(
+                contracts, order, here, self._urgent.intersection(names), exclusive=exclusive,
+                with_modules=with_modules, deaths=deaths))
+            self.states += self._known[key][0]
         count, found = self._known[key]
         return " and ".join(names), count, list(found.values())
 
@@ -188,28 +186,24 @@ class _Explorer:
 def _askable(sets: ActiveSets) -> frozenset[frozenset[str]]:
     """Return the sets of recoveries that a strategy can ask for, after escalations as well."""
     arrangement = sets.arrangement
-    names = arrangement.mechanisms.recoveries
     decisions = {(c.decision.recoveries, c.decision.mechanisms): c.decision for c in sets.cases}
     found = set()
     for decision in decisions.values():
-        reachable = _reachable(decision.recoveries, decision.mechanisms, arrangement)
-        concerned = [n for n in names if n in reachable]
+        reachable = _reachable(decision, arrangement)
+        concerned = [n for n in arrangement.mechanisms.recoveries if n in reachable]
         most = len(concerned) if len(concerned) <= _ALL_FAILURES_OF else _FAILURES_AT_ONCE
-        for size in range(most + 1):
-            for failed in combinations(concerned, size):
-                if size and not set(failed).intersection(decision.recoveries):
-                    continue  # of what runs nothing has failed
+        for failed in subsets(concerned, most):
+            if not failed or set(failed).intersection(decision.recoveries):  # of what runs
                 found.add(frozenset(escalate(
                     decision, dict.fromkeys(failed, "failed"), arrangement).recoveries))
     return frozenset(found)
 
 
-def _reachable(recoveries: tuple[str, ...], mechanisms: tuple[str, ...], arrangement: Arrangement
-               ) -> set[str]:
-    """Return what escalation can lead to from some recoveries."""
+def _reachable(decision: Decision, arrangement: Arrangement) -> set[str]:
+    """Return what escalation can lead to from a decision."""
     tree, contracts = arrangement.tree, arrangement.mechanisms.contracts
-    found = set(recoveries)
-    for mechanism in mechanisms:
+    found = set(decision.recoveries)
+    for mechanism in decision.mechanisms:
         found.update(*arrangement.mechanisms.alternatives(mechanism),
                      arrangement.demanded(tree.chain(tree.root, mechanism)))
     for name in list(found):
@@ -229,13 +223,11 @@ def _shape(names: tuple[str, ...], asked: frozenset[frozenset[str]], urgent: fro
 
 def _profile(names: tuple[str, ...], asked: frozenset[frozenset[str]], urgent: frozenset[str],
              arrangement: Arrangement) -> object:
-    contracts, order = arrangement.mechanisms.contracts, arrangement.order
+    mechanisms, order = arrangement.mechanisms, arrangement.order
     number = {name: i for i, name in enumerate(names)}
     alone = tuple(
         (c.kind.repairs, c.interruptible, c.latched, number.get(c.escalate_to, -1), n in urgent)
-        for n in names for c in [contracts[n]])
-    pairs = tuple(
-        (order.is_above(a, b), bool(contracts[a].claims & contracts[b].claims),
-         bool(contracts[a].disables & contracts[b].needs))
-        for a, b in permutations(names, 2))
+        for n in names for c in [mechanisms.contracts[n]])
+    pairs = tuple((order.is_above(a, b), mechanisms.overlap(a, b), bool(mechanisms.harms(a, b)))
+                  for a, b in permutations(names, 2))
     return alone, pairs, tuple(sorted(tuple(sorted(number[n] for n in one)) for one in asked))

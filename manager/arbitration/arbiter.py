@@ -110,11 +110,10 @@ class Arbiter:
             number: Decisions are numbered from here on. Give each incarnation of the manager a
                 higher range, so that no two decisions of a run have the same number.
         """
-        return State(
-            tuple(DetectionTrack(name, heard_s=now) for name in self.mechanisms.detections),
-            tuple(RecoveryTrack(Command(name, False, number))
-                  for name in self.mechanisms.recoveries),
-            number, NOTHING_ACTIVE, now)
+        detections = (DetectionTrack(name, heard_s=now) for name in self.mechanisms.detections)
+        recoveries = (RecoveryTrack(Command(name, False, number))
+                      for name in self.mechanisms.recoveries)
+        return State(tuple(detections), tuple(recoveries), number, NOTHING_ACTIVE, now)
 
     def step(self, state: State, event: Input, now: float) -> tuple[State, tuple[Output, ...]]:
         """Take one input.
@@ -204,9 +203,9 @@ class Arbiter:
     def _pass_time(self, state: State, now: float) -> State:
         timeout_s = self.rules.silence_timeout_s
         detections = tuple(
-            track if track.is_calm(now, timeout_s)
-            else detection_track.pass_time(track, self._rules_of(state, track.name), now)
-            for track in state.detections)
+            t if t.is_calm(now, timeout_s)
+            else detection_track.pass_time(t, self._rules_of(state, t.name), now)
+            for t in state.detections)
         believed = {track.name: track for track in detections}
         active = self._active(detections)
         contracts, users = self.mechanisms.contracts, self.mechanisms.users
@@ -228,9 +227,8 @@ class Arbiter:
     def _choose(self, state: State) -> tuple[Decision, Decision, Decision]:
         """Return the strategy's decision, that after escalation, and that after latching too."""
         chosen = decision = self.decider.choose(self._active(state.detections), state.late)
-        failures = {t.name: t.failure for t in state.recoveries if t.failure}
-        if self._needy and chosen.active:
-            failures = {**self._unmet(state), **failures}
+        failures = self._unmet(state) if self._needy and chosen.active else {}
+        failures |= {t.name: t.failure for t in state.recoveries if t.failure}
         if failures:
             decision = escalate(decision, failures, self.arrangement)
         kept = [t for t in state.recoveries if t.latched or t.adopted]
@@ -371,8 +369,7 @@ def build_arbiter(spec: SystemSpec, strategy: str = "", *, first_start: bool = T
     silence_s = timing.detection_silence_timeout_s
     arrangement = arrange(
         spec.build_mechanisms(patience_s(spec)), spec.build_ftm_tree(), spec.build_order())
-    return Arbiter(
-        arrangement, find_strategy(strategy or spec.strategy),
-        DetectionRules(silence_s, timing.startup_grace_s if first_start else silence_s,
-                       timing.release_hold_s, timing.release_hold_max_s),
-        find_strategy(spec.shadow) if spec.shadow else None)
+    rules = DetectionRules(silence_s, timing.startup_grace_s if first_start else silence_s,
+                           timing.release_hold_s, timing.release_hold_max_s)
+    return Arbiter(arrangement, find_strategy(strategy or spec.strategy), rules,
+                   find_strategy(spec.shadow) if spec.shadow else None)

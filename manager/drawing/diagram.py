@@ -158,8 +158,7 @@ def _fault_tree(spec: SystemSpec, situation: Situation) -> _Parts:
     boxes = {}
     for event in spec.events:
         gate = event.gate if isinstance(event.gate, str) else "at-least" if event.of else ""
-        boxes[event.name] = Box(
-            event.name, clean(event.title), gate, event.required, len(event.of))
+        boxes[event.name] = Box(event.name, clean(event.title), gate, event.required, len(event.of))
     for mechanism in spec.mechanisms:
         boxes[mechanism.event] = _bar(boxes[mechanism.event], mechanism, spec, situation)
     return tuple(boxes.values()), tuple((e.name, lower) for e in spec.events for lower in e.of)

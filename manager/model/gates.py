@@ -142,16 +142,6 @@ def recovery_gate(text: str) -> Gate:
     if len(names) > MAX_NAMES:
         raise GateError(f"{len(names)} recovery modules; at most {MAX_NAMES} are right")
 
-    def check(part: Gate) -> None:
-        if part.negated:
-            raise GateError(f"'not {part.name}' cannot be run; names, 'and' and 'or' are right")
-        if not part.name and 1 < part.required < len(part.inputs):
-            raise GateError(f"'{part.required} of' does not say which; names, 'and' and 'or' "
-                            "are right")
-        for inner in part.inputs:
-            check(inner)
-
-    check(gate)
     ways = _count_ways(gate)
     if ways > MAX_WAYS:
         raise GateError(f"{ways} alternatives; at most {MAX_WAYS} are right")
@@ -182,9 +172,17 @@ def _truth_table(gate: Gate, names: tuple[str, ...]) -> int:
 
 
 def _count_ways(gate: Gate) -> int:
-    """Return how many alternatives there are, without making them: there may be millions."""
+    """Return how many alternatives there are, without making them: there may be millions.
+
+    Raises:
+        GateError: There is more in it than names, `and` and `or`.
+    """
+    if gate.negated:
+        raise GateError(f"'not {gate.name}' cannot be run; names, 'and' and 'or' are right")
     if gate.name:
         return 1
+    if 1 < gate.required < len(gate.inputs):
+        raise GateError(f"'{gate.required} of' does not say which; names, 'and' and 'or' are right")
     counts = [_count_ways(i) for i in gate.inputs]
     return sum(counts) if gate.required == 1 else math.prod(counts)
 

@@ -116,11 +116,9 @@ def find_wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
                 continue
             for above, below in product(recover[lower], recover[upper]):
                 if order.is_above(above, below):
-                    yield Finding(
-                        f"$.orders.{safer}.{above}",
-                        f"contradicts the FTMTree: {above} of {lower} is above {below} of {upper}, "
-                        f"but {upper} is above {lower}",
-                        (list(spec.orders[safer].get(above, ())),))
+                    yield Finding(f"$.orders.{safer}.{above}", f"contradicts the FTMTree: {above} "
+                                  f"of {lower} is above {below} of {upper}, but {upper} is above "
+                                  f"{lower}", (list(spec.orders[safer].get(above, ())),))
     for path, recovery in numbered("recovery", spec.recoveries):
         if recovery.escalate_to and order.is_above(recovery.name, recovery.escalate_to):
             yield Finding(f"{path}.escalate_to", f"{recovery.name} is above it in the order "

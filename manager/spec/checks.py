@@ -74,8 +74,7 @@ def _names(spec: SystemSpec) -> Iterator[Finding]:
     for path, event in numbered("event", spec.events):
         first = events.setdefault(event.name, path)
         if first != path:
-            yield Finding(f"{path}.name", f"duplicate name, already at {first}.name",
-                          (event.name,))
+            yield Finding(f"{path}.name", f"duplicate name, already at {first}.name", (event.name,))
 
 
 def _nodes(spec: SystemSpec) -> Iterator[Finding]:
@@ -185,8 +184,7 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
         if recovery.escalate_to and recovery.escalate_to not in names:
             yield unknown(f"{path}.escalate_to", recovery.escalate_to, "recovery module", names)
         if "nodes" in recovery.parameters:
-            yield from _node_names(
-                f"{path}.parameters.nodes", recovery.parameters["nodes"], nodes)
+            yield from _node_names(f"{path}.parameters.nodes", recovery.parameters["nodes"], nodes)
     cycle = find_cycle({r.name: [r.escalate_to] if r.escalate_to else [] for r in spec.recoveries})
     if cycle:
         yield Finding(f"$.recovery[{names.index(cycle[0])}].escalate_to",

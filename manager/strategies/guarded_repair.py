@@ -99,10 +99,11 @@ class GuardedRepair:
         mask = order.mask(taken)
         waiting = {name for name in candidates if arrangement.repairs & order.bit[name]
                    and not arrangement.can_join(name, mask)}
+        rejected = (
+            (name, "waits, another recovery claims the same" if name in waiting else why)
+            for name, why in turned_down(order, taken, candidates))
         return msgspec.structs.replace(
-            decision, path=dominance(order, taken, candidates) or taken,
-            rejected=tuple((name, "waits, another recovery claims the same" if name in waiting
-                            else why) for name, why in turned_down(order, taken, candidates)))
+            decision, path=dominance(order, taken, candidates) or taken, rejected=tuple(rejected))
 
 
 def _numbers(mask: int) -> list[int]:
