@@ -237,23 +237,22 @@ class _Reader:
             here = f"{path}/{body.tag}" if len(path) < _PATH_SHOWN else f"{path[:_PATH_SHOWN]}..."
             if body.tag in REFERENCES:
                 self._gates[own] = Connective((self._refer(body, place, here),), 1, 1)
-                continue
-            if body.tag == "constant":
+            elif body.tag == "constant":
                 self._house[f"{own}{GENERATED}constant"] = self._truth(body, path)
                 self._gates[own] = Connective((f"{own}{GENERATED}constant",), 1, 1)
-                continue
-            if body.tag not in CONNECTIVES:
+            elif body.tag in CONNECTIVES:
+                inputs = []
+                for child in body:
+                    if child.tag in REFERENCES:
+                        inputs.append(self._refer(child, place, here))
+                    elif child.tag not in _ASIDE:
+                        nested = f"{name}{GENERATED}{next(numbers)}"
+                        pending.append((nested, child, here))
+                        inputs.append(nested)
+                self._gates[own] = self._connective(own, body, inputs, here)
+            else:
                 raise self._error(
                     here[:200], f"unknown connective; known: {', '.join(CONNECTIVES)}")
-            inputs = []
-            for child in body:
-                if child.tag in REFERENCES:
-                    inputs.append(self._refer(child, place, here))
-                elif child.tag not in _ASIDE:
-                    nested = f"{name}{GENERATED}{next(numbers)}"
-                    pending.append((nested, child, here))
-                    inputs.append(nested)
-            self._gates[own] = self._connective(own, body, inputs, here)
 
     def _refer(self, element: ET.Element, place: _Path, path: str) -> str:
         name = element.get("name", "")
@@ -321,15 +320,14 @@ def write_open_psa(spec: SystemSpec) -> str:
     barriers = {mechanism.event: mechanism.name for mechanism in spec.mechanisms}
     gates = {event.name for event in spec.events if event.required}
     for event in spec.events:
-        inner = event.name in gates
-        element = ET.SubElement(tree if inner else data,
-                                "define-gate" if inner else "define-basic-event", name=event.name)
+        element = (ET.SubElement(tree, "define-gate", name=event.name) if event.required else
+                   ET.SubElement(data, "define-basic-event", name=event.name))
         if event.title:
             ET.SubElement(element, "label").text = event.title
         if event.name in barriers:
             attributes = ET.SubElement(element, "attributes")
             ET.SubElement(attributes, "attribute", name="barrier", value=barriers[event.name])
-        if inner:
+        if event.required:
             kind = {1: "or", len(event.of): "and"}.get(event.required, "atleast")
             gate = ET.SubElement(
                 element, kind, {"min": str(event.required)} if kind == "atleast" else {})

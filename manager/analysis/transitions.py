@@ -42,6 +42,8 @@ from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision, Late
 
 Steps = Iterator[tuple[str, "Situation"]]
+Violations = dict[str, tuple[str, ...]]
+"""Properties that fail, each with the shortest way there."""
 
 _OVER = -1e9
 _OLD, _CURRENT = 5, 10
@@ -67,13 +69,6 @@ class Situation(msgspec.Struct, frozen=True):
 
     state: State
     modules: tuple[Module, ...]
-
-
-class Violation(msgspec.Struct, frozen=True):
-    """A property that fails, and the shortest way there."""
-
-    name: str
-    trace: tuple[str, ...]
 
 
 class AsTold:
@@ -113,9 +108,8 @@ class Transitions:
                  asked: Iterable[frozenset[str]], urgent: Iterable[str] = (), *,
                  exclusive: bool, with_modules: bool = False, deaths: bool = True) -> None:
         inside = {c.name: c for c in contracts}
-        self.contracts = {name: replace(
-            c, needs=frozenset(), escalate_to=c.escalate_to if c.escalate_to in inside else "")
-            for name, c in inside.items()}
+        self.contracts = {n: replace(c, needs=frozenset(), escalate_to=(
+            c.escalate_to if c.escalate_to in inside else "")) for n, c in inside.items()}
         self.names = tuple(self.contracts)
         self.asked = sorted({frozenset(), *asked}, key=lambda s: (len(s), sorted(s)))
         self.urgent = frozenset(urgent)
@@ -304,7 +298,7 @@ class Transitions:
         return ""
 
 
-def explore(system: Transitions) -> tuple[int, dict[str, Violation]]:
+def explore(system: Transitions) -> tuple[int, Violations]:
     """Visit every reachable state, breadth first.
 
     Returns:
@@ -312,7 +306,7 @@ def explore(system: Transitions) -> tuple[int, dict[str, Violation]]:
     """
     start = system.initial()
     came_from: dict[Situation, tuple[Situation, str] | None] = {start: None}
-    found: dict[str, Violation] = {}
+    found: Violations = {}
     waiting = deque([start])
 
     def trace(end: Situation, last: str) -> tuple[str, ...]:
@@ -326,12 +320,11 @@ def explore(system: Transitions) -> tuple[int, dict[str, Violation]]:
         now = waiting.popleft()
         for name, problem in system.faults(now):
             if name not in found:
-                found[name] = Violation(name, trace(now, problem))
+                found[name] = trace(now, problem)
         for event, after in system.successors(now):
             victim = system.cut_off(now, after)
             if victim and "none-cut-off" not in found:
-                found["none-cut-off"] = Violation("none-cut-off", (
-                    *trace(now, event), f"{victim} is released half-way"))
+                found["none-cut-off"] = (*trace(now, event), f"{victim} is released half-way")
             if after not in came_from:
                 came_from[after] = (now, event)
                 waiting.append(after)

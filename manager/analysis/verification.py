@@ -17,10 +17,11 @@ from rampart.manager.analysis.active_sets import (
     MAX_MECHANISMS,
     ActiveSets,
     Property,
+    Trace,
     order_agrees_with_tree,
     subsets,
 )
-from rampart.manager.analysis.transitions import Transitions, Violation, explore
+from rampart.manager.analysis.transitions import Transitions, Violations, explore
 from rampart.manager.spec.budget import patience_s
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.arrangement import Arrangement, arrange
@@ -115,11 +116,11 @@ def verify(spec: SystemSpec, strategies: Iterable[str] = (), together: int = 2,
         permissiveness[name] = sets.stops_for_good
         stuck[name] = sets.stuck_behind_last_resort
         statically = {p.name: p for p in sets.check()}
-        states, violations = 0, list[Violation]()
+        states, violations = 0, list[tuple[str, Trace]]()
         for what, visited, found in explorer.run(sets):
             progress(f"{name}: {what}, {visited} states")
             states += visited
-            violations += found
+            violations += found.items()
         properties += _merge(name, statically, states, violations)
     return Report(spec.name, spec.strategy, count, explorer.states, permissiveness, stuck,
                   tuple(properties))
@@ -130,12 +131,12 @@ _OF_STATES = ("one-decision", "no-conflicting-claims", "emergency-stop-at-once",
 
 
 def _merge(strategy: str, statically: dict[str, Property], states: int,
-           violations: list[Violation]) -> Iterator[Property]:
+           violations: list[tuple[str, Trace]]) -> Iterator[Property]:
     """Yield one verdict a property, where it was checked on sets and on states on both."""
     for name in MEANING:
         if name in _OF_STATES:
             base = statically.get(name, Property(name, strategy, True, 0, 0, ()))
-            found = sorted((v.trace for v in violations if v.name == name), key=len)
+            found = sorted((trace for failed, trace in violations if failed == name), key=len)
             yield Property(name, strategy, base.holds and not found, base.cases + states,
                            base.count + len(found), (*base.counterexamples, *found)[:KEPT])
         elif name in statically:
@@ -149,10 +150,10 @@ class _Explorer:
         self.arrangement = arrangement
         self.together = together
         self.states = 0
-        self._known: dict[object, tuple[int, dict[str, Violation]]] = {}
+        self._known: dict[object, tuple[int, Violations]] = {}
         self._urgent = frozenset(arrangement.mechanisms.recover[arrangement.tree.root])
 
-    def run(self, sets: ActiveSets) -> Iterator[tuple[str, int, list[Violation]]]:
+    def run(self, sets: ActiveSets) -> Iterator[tuple[str, int, Violations]]:
         """Yield, for each choice of recoveries, which they are, the states, the violations."""
         asked = _askable(sets)
         names = self.arrangement.mechanisms.recoveries
@@ -166,7 +167,7 @@ class _Explorer:
 
     def _explore(self, names: tuple[str, ...], asked: frozenset[frozenset[str]], *,
                  exclusive: bool, with_modules: bool = False, deaths: bool = True
-                 ) -> tuple[str, int, list[Violation]]:
+                 ) -> tuple[str, int, Violations]:
         mechanisms, order = self.arrangement.mechanisms, self.arrangement.order
         # One that is not among them may make one of them wait: as if it were not asked for yet.
         here = frozenset(
@@ -179,8 +180,7 @@ class _Explorer:
                 contracts, order, here, self._urgent.intersection(names), exclusive=exclusive,
                 with_modules=with_modules, deaths=deaths))
             self.states += self._known[key][0]
-        count, found = self._known[key]
-        return " and ".join(names), count, list(found.values())
+        return " and ".join(names), *self._known[key]
 
 
 def _askable(sets: ActiveSets) -> frozenset[frozenset[str]]:

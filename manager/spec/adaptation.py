@@ -75,21 +75,20 @@ def adapt(document: Document, change: Change, file: str) -> tuple[Document, Syst
         SpecificationError: The changed system would make no sense.
     """
     after = copy.deepcopy(document)
-    if change.action is Action.SET:
-        _set(after, change)
-    else:
-        table, row = _find(after, change.name)
-        match change.action:
-            case Action.ENABLE | Action.DISABLE:
-                row["enabled"] = change.action is Action.ENABLE
-            case Action.RETUNE:
-                _retune(table, row, change)
-            case Action.REPLACE:
-                if change.values.get("name", change.name) != change.name:
-                    raise ChangeError(f"name = {change.values['name']!r}: a replacement keeps the "
-                                      f"name, {change.name!r}")
-                row.clear()
-                row.update({"name": change.name, **change.values})
+    match change.action:
+        case Action.SET:
+            _set(after, change)
+        case Action.ENABLE | Action.DISABLE:
+            _find(after, change.name)[1]["enabled"] = change.action is Action.ENABLE
+        case Action.RETUNE:
+            _retune(*_find(after, change.name), change)
+        case Action.REPLACE:
+            row = _find(after, change.name)[1]
+            if change.values.get("name", change.name) != change.name:
+                raise ChangeError(f"name = {change.values['name']!r}: a replacement keeps the "
+                                  f"name, {change.name!r}")
+            row.clear()
+            row.update({"name": change.name, **change.values})
     return after, check_document(after, file)
 
 

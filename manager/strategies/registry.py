@@ -34,6 +34,17 @@ class UnknownStrategyError(ValueError):
     """No strategy has this name."""
 
 
+def register(strategy: Strategy) -> None:
+    """Make a strategy known under its name.
+
+    Raises:
+        ValueError: The name is taken.
+    """
+    if strategy.name in STRATEGIES:
+        raise ValueError(f"strategy {strategy.name!r} is registered twice")
+    STRATEGIES[strategy.name] = strategy
+
+
 def find_strategy(name: str) -> Strategy:
     """Return the strategy of that name.
 
