@@ -93,8 +93,7 @@ class Families:
         if u == UNIT:
             return u
         key = (u, v)
-        found = self._without.get(key)
-        if found is not None:
+        if (found := self._without.get(key)) is not None:
             return found
         x, y = self.variable[u], self.variable[v]
         if x == y:
@@ -119,8 +118,7 @@ class Families:
         if u == UNIT:
             return u  # a monotone function that is not constant does not hold for the empty set
         key = u << 32 | f
-        found = self._outside.get(key)
-        if found is not None:
+        if (found := self._outside.get(key)) is not None:
             return found
         x, y = self.variable[u], diagram.level[f]
         if x == y:

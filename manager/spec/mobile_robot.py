@@ -154,14 +154,14 @@ def derive_timeouts(robot: Robot | None, timing: Timing) -> Timing:
         return timing
     drift = time_to_drift_s(robot)
     noticed_s = SHARE * (drift - timing.arbitration_s - timing.actuation_s)
+    cycle_s, obstacle = timing.control_period_s, time_to_obstacle_s(robot)
     derived = {
         "command_timeout_s": noticed_s,
         "localization_timeout_s": noticed_s,
         "detection_silence_timeout_s": noticed_s,
-        "manager_timeout_s": SHARE * (drift - timing.control_period_s - timing.actuation_s),
-        "scan_timeout_s": SHARE * (
-            time_to_obstacle_s(robot) - timing.control_period_s - timing.actuation_s),
-        "dead_man_timeout_s": SHARE * (time_to_obstacle_s(robot) - timing.actuation_s),
+        "manager_timeout_s": SHARE * (drift - cycle_s - timing.actuation_s),
+        "scan_timeout_s": SHARE * (obstacle - cycle_s - timing.actuation_s),
+        "dead_man_timeout_s": SHARE * (obstacle - timing.actuation_s),
     }
     timing = msgspec.structs.replace(timing, **{
         field: _to_millisecond(value) for field, value in derived.items()

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from enum import Enum
 from itertools import chain
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
@@ -28,15 +28,8 @@ from rampart.files.reading import FileError
 from rampart.manager.model.mechanisms import RecoveryKind
 from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
 from rampart.manager.spec.mobile_robot import Hazard, derive_timeouts
-from rampart.manager.spec.schema import (
-    NODE_KINDS,
-    TABLES,
-    DetectionSpec,
-    NodeSpec,
-    RecoverySpec,
-    SystemSpec,
-)
-from rampart.manager.spec.tables import Finding, SpecificationError
+from rampart.manager.spec.schema import NODE_KINDS, TABLES, SystemSpec
+from rampart.manager.spec.tables import Finding, SpecificationError, numbered
 
 ENUMS: dict[tuple[str, str], Iterable[Enum]] = {
     ("node", "kind"): NODE_KINDS, ("recovery", "kind"): RecoveryKind,
@@ -49,8 +42,6 @@ limits of a float, and a thousand million seconds are thirty years.
 
 LARGEST_INTEGER = 2 ** 63 - 1
 """In parameters, which go to an actor as they are, by way of MessagePack."""
-
-Row = TypeVar("Row", NodeSpec, DetectionSpec, RecoverySpec)
 
 MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
             "orders": 16}
@@ -196,19 +187,23 @@ def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
                                                  f"{', '.join(times)}", value)
         return times[value]
 
-    def resolved(table: str, rows: Sequence[Row]) -> tuple[Row, ...]:
-        return tuple(replace(row, parameters={
-            key: resolve(value, f"$.{table}[{index}].parameters.{key}") if key.endswith("_s")
-            else value for key, value in row.parameters.items()}) for index, row in enumerate(rows))
+    def resolved(path: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: resolve(value, f"{path}.parameters.{key}") if key.endswith("_s") else value
+                for key, value in parameters.items()}
 
     detections = []
-    for index, row in enumerate(resolved("detection", spec.detections)):
-        within_s = resolve(row.within_s, f"$.detection[{index}].within_s")
+    for path, row in numbered("detection", spec.detections):
+        parameters = resolved(path, row.parameters)
+        within_s = resolve(row.within_s, f"{path}.within_s")
         if math.isnan(within_s):
-            within_s = row.parameters.get("timeout_s", within_s)
-        detections.append(replace(row, within_s=within_s))
-    return replace(spec, nodes=resolved("node", spec.nodes), detections=tuple(detections),
-                   recoveries=resolved("recovery", spec.recoveries))
+            within_s = parameters.get("timeout_s", within_s)
+        detections.append(replace(row, within_s=within_s, parameters=parameters))
+    nodes = (replace(row, parameters=resolved(path, row.parameters))
+             for path, row in numbered("node", spec.nodes))
+    recoveries = (replace(row, parameters=resolved(path, row.parameters))
+                  for path, row in numbered("recovery", spec.recoveries))
+    return replace(spec, nodes=tuple(nodes), detections=tuple(detections),
+                   recoveries=tuple(recoveries))
 
 
 def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> Finding:
