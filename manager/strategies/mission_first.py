@@ -75,10 +75,12 @@ class MissionFirst:
                           if m == name or tree.is_above(m, name)), None)
             if upper is not None:
                 path.append(" > ".join(tree.chain(upper, name)))
-            deeper = next((m for m in decision.mechanisms if tree.is_above(name, m)), None)
-            why = (f"{deeper} is deeper and comes first" if deeper else
-                   f"{name} is late, {upper} is above it" if upper else
-                   "conflicts with another recovery")
-            rejected += [(recovery, why) for recovery in recover[name]
-                         if recovery not in decision.recoveries]
+            for recovery in recover[name]:
+                if recovery in decision.recoveries:
+                    continue
+                deeper = next((m for m in decision.mechanisms if tree.is_above(name, m)), None)
+                rejected.append((recovery, (
+                    f"{deeper} is deeper and comes first" if deeper else
+                    f"{name} is late, {upper} is above it" if upper else
+                    "conflicts with another recovery")))
         return msgspec.structs.replace(decision, path=tuple(path), rejected=tuple(rejected))
