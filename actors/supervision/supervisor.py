@@ -57,7 +57,7 @@ from rampart.actors.supervision.supervised_process import (
     SupervisedProcess,
 )
 from rampart.manager.spec.adaptation import changed_actors
-from rampart.manager.spec.specification import Kind
+from rampart.manager.spec.schema import Kind
 
 STOP_GRACE_S = 0.5
 """Wall seconds between SIGTERM and SIGKILL at the end of a run."""
