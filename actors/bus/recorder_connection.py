@@ -80,13 +80,11 @@ class RecorderConnection:
     def take(self, key: str, payload: bytes) -> None:
         """Hand over a message that is being sent. Never waits and never raises."""
         now_s = self._clock()
-        if self._socket is None:
-            if now_s < self._next_look_s:
-                return
+        if self._socket is None and now_s >= self._next_look_s:
             self._next_look_s = now_s + RETRY_S
             self._look()
-            if self._socket is None:
-                return
+        if self._socket is None:
+            return
         data = frame(now_s, key, payload)
         if len(data) > MAX_FRAME_BYTES:
             return

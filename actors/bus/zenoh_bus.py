@@ -58,11 +58,10 @@ _FIRST_LOOKS = 5
 _PROTOCOL = "unixsock-stream"
 _STOPPED = (b"T", b"t")
 _ALIVE = f"{ROOT}/alive"
-_PRIORITY = {
-    Qos.SENSOR: zenoh.Priority.DATA,
-    Qos.STATE: zenoh.Priority.INTERACTIVE_HIGH,
-    Qos.COMMAND: zenoh.Priority.INTERACTIVE_HIGH,
-}
+_DELIVERY = {
+    Qos.SENSOR: (zenoh.Priority.DATA, zenoh.CongestionControl.DROP),
+    Qos.STATE: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.DROP),
+    Qos.COMMAND: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK)}
 
 
 def endpoint(folder: str, name: str) -> str:
@@ -90,8 +89,7 @@ def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
         "transport/link/tx/lease": LEASE_MS,
         "downsampling": [{"messages": ["put"], "flows": ["ingress"], "rules": [
-            {"key_expr": HELLO.pattern, "freq": _HELLOS_PER_S}]}],
-    }
+            {"key_expr": HELLO.pattern, "freq": _HELLOS_PER_S}]}]}
     if listen:
         settings["id"] = _mark(listen) + secrets.token_hex(8)
     for key, value in settings.items():
@@ -129,10 +127,8 @@ class ZenohBus:
 
     bursts = True
 
-    def __init__(
-        self, node: str, incarnation: int, listen: str | None, dial: Iterable[str],
-        recorder: RecorderConnection | None = None,
-    ) -> None:
+    def __init__(self, node: str, incarnation: int, listen: str | None, dial: Iterable[str],
+                 recorder: RecorderConnection | None = None) -> None:
         self._node = node
         self._incarnation = incarnation
         self._listen = listen
@@ -156,10 +152,10 @@ class ZenohBus:
             self._session = zenoh.open(session_config(self._listen, self._dial))
         except zenoh.ZError as error:
             text = " ".join(str(error).split())
-            if "acquire lock" in text:
-                raise BusError(f"{self._listen} is in use by another process "
-                               f"(node {self._node})") from None
-            raise BusError(f"cannot open {self._listen} (node {self._node}): {text}") from None
+            node = f"(node {self._node})"
+            raise BusError(f"{self._listen} is in use by another process {node}"
+                           if "acquire lock" in text
+                           else f"cannot open {self._listen} {node}: {text}") from None
         await self._linked(self._session)
         if self._node:
             self._held.append(self._session.liveliness().declare_token(
@@ -184,14 +180,9 @@ class ZenohBus:
         """Send to all present subscribers of the key."""
         publisher = self._publishers.get(key)
         if publisher is None:
+            priority, congestion_control = _DELIVERY[topic.qos]
             publisher = self._publishers[key] = self._require().declare_publisher(
-                key,
-                priority=_PRIORITY[topic.qos],
-                express=True,
-                congestion_control=zenoh.CongestionControl.BLOCK
-                if topic.qos is Qos.COMMAND
-                else zenoh.CongestionControl.DROP,
-            )
+                key, priority=priority, express=True, congestion_control=congestion_control)
         publisher.put(payload)
         if self._recorder is not None:
             self._recorder.take(key, payload)
@@ -248,15 +239,9 @@ class ZenohBus:
 
     def _drain(self) -> None:
         self._woken = False
-        while self._arrived:
+        while self._session is not None and self._arrived:
             try:
-                call = self._arrived.popleft()
-            except IndexError:
-                return
-            if self._session is None:
-                continue
-            try:
-                call()
+                self._arrived.popleft()()
             except Exception as error:  # what else has arrived is not to wait for the next message
                 asyncio.get_running_loop().call_exception_handler({
                     "message": f"{self._node or 'tool'}: a message could not be handed over",

@@ -20,9 +20,9 @@ from typing import Any
 from rampart.actors.bus import messages as m
 from rampart.actors.bus import topics
 from rampart.actors.bus.plausible import is_possible
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.detection.module import DetectionModule, Waiting
-from rampart.actors.runtime.actor import Context, Header, Members, on
+from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import HeartbeatTimeout, NodeNames
 
 

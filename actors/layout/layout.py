@@ -70,9 +70,9 @@ class Layout:
         world = {"seed": plan.seed, **(application or Application()).world_parameters(),
                  "dead_man": spec.layers.dead_man,
                  "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
-        self.members: dict[str, Member] = {m.name: m for m in (*own, *(
-            load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
-            for n in spec.actors()))}
+        own += [load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
+                for n in spec.actors()]
+        self.members = {member.name: member for member in own}
         self._partners = partners(self.members.values())
 
     def listen(self, node: str) -> str:
@@ -84,9 +84,8 @@ class Layout:
         return [endpoint(self.plan.folder, p) for p in self._partners[node]]
 
 
-def adapted_system(
-    layout: Layout, run: RunContext, adapted: AdaptedSystem
-) -> tuple[Layout, RunContext]:
+def adapted_system(layout: Layout, run: RunContext,
+                   adapted: AdaptedSystem) -> tuple[Layout, RunContext]:
     """Return layout and context of the system as it was changed while running.
 
     Raises:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import msgspec
 
 import rampart
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import read_parameters
@@ -44,54 +44,41 @@ class Member:
     parameters: Actor.Parameters
 
 
-def published(member: Member) -> dict[str, tuple[str, ...] | None]:
+def published(member: Member) -> dict[str, Members]:
     """Return topic key → names of the family members published (None: any, or not a family)."""
-    return {
-        t.key: member.actor.output_names(t, member.name, member.parameters) if t.is_family else None
-        for t in (*member.actor.outputs, *BASE_OUTPUTS)
-    }
+    actor = member.actor
+    return {t.key: actor.output_names(t, member.name, member.parameters) if t.is_family else None
+            for t in (*actor.outputs, *BASE_OUTPUTS)}
 
 
-def heard(member: Member) -> dict[str, tuple[str, ...] | None]:
-    """Return topic key → names of the family members heard (None: all, or not a family)."""
-    return {
-        t.key: member.actor.names(t, member.name, member.parameters) if t.is_family else None
-        for t in member.actor.inputs()
-        if t not in BASE_INPUTS  # tools dial for themselves; hellos use the links there are
-    }
+def heard(member: Member) -> dict[str, Members]:
+    """Return topic key → names of the family members heard (None: all, or not a family).
+
+    Without what every actor hears: tools dial for themselves, and hellos use the links there are.
+    """
+    actor = member.actor
+    return {t.key: actor.names(t, member.name, member.parameters) if t.is_family else None
+            for t in topics_of(actor)[0]}
 
 
-def partners(members: Iterable[Member]) -> dict[str, tuple[str, ...]]:
+def partners(members: Collection[Member]) -> dict[str, tuple[str, ...]]:
     """Return for each node the nodes it shares a key or a watch with, in the given order."""
-    everyone = list(members)
-    out = {m.name: published(m) for m in everyone}
-    into = {m.name: heard(m) for m in everyone}
-    watched = {m.name: m.actor.watches(m.name, m.parameters) for m in everyone}
+    out = {m.name: published(m) for m in members}
+    into = {m.name: heard(m) for m in members}
+    watched = {m.name: m.actor.watches(m.name, m.parameters) for m in members}
 
     def feeds(a: str, b: str) -> bool:
-        return any(
+        return b in watched[a] or any(
             key in into[b] and (names is None or (wanted := into[b][key]) is None
-                                or bool(set(names) & set(wanted)))
-            for key, names in out[a].items()
-        )
+                                or not set(names).isdisjoint(wanted))
+            for key, names in out[a].items())
 
-    return {
-        a.name: tuple(
-            b.name for b in everyone
-            if b.name != a.name and (
-                feeds(a.name, b.name) or feeds(b.name, a.name)
-                or b.name in watched[a.name] or a.name in watched[b.name])
-        )
-        for a in everyone
-    }
+    return {a: tuple(b for b in out if b != a and (feeds(a, b) or feeds(b, a))) for a in out}
 
 
 def topics_of(actor: type[Actor]) -> tuple[tuple[Topic[Any], ...], tuple[Topic[Any], ...]]:
     """Return (inputs, outputs) of an actor class without what every actor has."""
-    return (
-        tuple(t for t in actor.inputs() if t not in BASE_INPUTS),
-        tuple(actor.outputs),
-    )
+    return tuple(t for t in actor.inputs() if t not in BASE_INPUTS), tuple(actor.outputs)
 
 
 def load_member(node: NodeSpec, spec: SystemSpec, file: str,

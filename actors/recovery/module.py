@@ -19,7 +19,7 @@ import math
 from typing import Any, ClassVar
 
 from rampart.actors.bus.bounds import clip
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import (
     RecoveryCommand,
@@ -27,7 +27,7 @@ from rampart.actors.ftm.messages import (
     RecoveryReport,
     RecoveryState,
 )
-from rampart.actors.runtime.actor import Actor, Context, Header, Members, every, on
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
 
 _P = RecoveryPhase

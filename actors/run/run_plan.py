@@ -124,8 +124,6 @@ def load_document(plan: RunPlan) -> dict[str, Any]:
 
 def tailor(plan: RunPlan, spec: SystemSpec) -> SystemSpec:
     """Return a spec with the baseline's layers off where the plan says so."""
-    if not plan.ftm:
-        spec = msgspec.structs.replace(spec, layers=Layers(
-            dead_man=False, safety_pilot_checks=False, manager_watch=False,
-            supervisor_respawn=False, ftm=False, checkpoints=False))
-    return spec
+    return spec if plan.ftm else msgspec.structs.replace(spec, layers=Layers(
+        dead_man=False, safety_pilot_checks=False, manager_watch=False,
+        supervisor_respawn=False, ftm=False, checkpoints=False))

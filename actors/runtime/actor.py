@@ -32,20 +32,13 @@ from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
 from rampart.actors.runtime.clock import Clock
-from rampart.actors.runtime.declaration import (
-    BASE_INPUTS,
-    BASE_OUTPUTS,
-    Declared,
-    Members,
-    every,
-    on,
-)
+from rampart.actors.runtime.declaration import BASE_INPUTS, BASE_OUTPUTS, Declared, every, on
 from rampart.actors.runtime.injection import InjectedFaults
 from rampart.actors.runtime.mailbox import IDLE, Dispatcher
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.actors.runtime.timer import Timer, Timers
 
-__all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "Members", "every", "on"]
+__all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every", "on"]
 
 _REPEATED_SOON_HZ = 7.0
 """A state that is repeated this often anyway is not repeated for a newcomer."""
@@ -281,7 +274,7 @@ class Actor(Declared):
     def _receiver(self, topic: Topic[Any],
                   handler: Callable[[Any, Header], None]) -> Callable[[str, bytes], None]:
         command, name, members = topic.qos is Qos.COMMAND, handler.__name__, self.context.members
-        dispatcher, mailbox = self._dispatcher, self._dispatcher.mailbox
+        dispatcher = self._dispatcher
 
         def take(key: str, message: Envelope[Any]) -> None:
             item = partial(handler, message.body, message)
@@ -289,10 +282,7 @@ class Actor(Declared):
                 dispatcher.work(item)
                 return
             reserved = not members or message.source in members
-            if command:
-                mailbox.put(item, reserved=reserved)
-            else:
-                mailbox.put_message(f"{key} {name}", item, reserved=reserved)
+            dispatcher.put_message(None if command else f"{key} {name}", item, reserved=reserved)
 
         return self._guard.receiver(topic, take, self._reject)
 
@@ -301,7 +291,7 @@ class Actor(Declared):
         self.report_diagnostic("payload rejected", reason, key)
 
     def _peer_changed(self, node: str, incarnation: int, alive: bool) -> None:
-        self._dispatcher.mailbox.put_message(
+        self._dispatcher.put_message(
             f"peer {node} {incarnation} {alive}", lambda: self.on_peer(node, incarnation, alive))
 
     def _overflowed(self, _item: Any) -> None:
@@ -327,7 +317,7 @@ class Actor(Declared):
         context = self.context
         self.publish(HEARTBEAT, Heartbeat(
             context.pid, self._dispatcher.progress, context.heartbeat_period_s, self._rejected,
-            self._dispatcher.mailbox.overflowed))
+            self._dispatcher.overflowed))
         left_out = self._reports.left_out(self.clock.now())
         if left_out:
             self.report_diagnostic(

@@ -31,11 +31,11 @@ from typing import Any
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.messages import Heartbeat
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import Layout, adapted_system
-from rampart.actors.runtime.actor import Context, Header, Members, every, on
+from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
 from rampart.actors.supervision.patience import Patience
 from rampart.actors.supervision.processes import (
