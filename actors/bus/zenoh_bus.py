@@ -23,7 +23,6 @@ import secrets
 import socket
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -33,7 +32,7 @@ from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import socket_path
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import HELLO
-from rampart.actors.bus.unix_peer import peer
+from rampart.actors.bus.unix_peer import peer, process_state
 
 LEASE_MS = 2000
 """A link that is silent for so long is closed; a stopped process is found sooner by heartbeat."""
@@ -56,7 +55,6 @@ _FIRST_LOOKS = 5
 """So many looks, a millisecond each, before a partner that is missing is looked at more closely."""
 
 _PROTOCOL = "unixsock-stream"
-_STOPPED = (b"T", b"t")
 _ALIVE = f"{ROOT}/alive"
 _DELIVERY = {
     Qos.SENSOR: (zenoh.Priority.DATA, zenoh.CongestionControl.DROP),
@@ -108,10 +106,9 @@ def _answers(where: str) -> bool:
         probe.setblocking(False)
         try:
             probe.connect(where.removeprefix(f"{_PROTOCOL}/"))
-            status = Path(f"/proc/{peer(probe)[0]}/stat").read_bytes()
-        except OSError:  # nobody, or so many wait to be let in that nobody is
+            return process_state(peer(probe)[0]) not in "TtX"
+        except OSError:  # none, or so many wait to be let in that none is
             return False
-    return status.rpartition(b") ")[2][:1] not in _STOPPED
 
 
 class ZenohBus:

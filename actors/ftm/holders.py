@@ -38,8 +38,7 @@ class Holders(Generic[V], dict[str, V]):
     @property
     def unknown(self) -> tuple[str, ...]:
         """The holders that are no recovery modules of the system."""
-        return () if self._known is None else tuple(
-            name for name in self if name not in self._known)
+        return tuple(filter(self.is_unknown, self))
 
     def is_unknown(self, name: str) -> bool:
         """Whether a name is that of no recovery module of the system."""

@@ -117,9 +117,8 @@ def load_document(plan: RunPlan) -> dict[str, Any]:
         text = read_text(Path(plan.system_file), toml.MAX_SIZE)
     except FileError as error:
         raise SpecificationError(plan.system_file, "$", str(error)) from None
-    document = read_document(text, plan.system_file)
     chosen = {"strategy": plan.strategy, "shadow": plan.shadow}
-    return {**document, **{key: name for key, name in chosen.items() if name}}
+    return read_document(text, plan.system_file) | {k: name for k, name in chosen.items() if name}
 
 
 def tailor(plan: RunPlan, spec: SystemSpec) -> SystemSpec:

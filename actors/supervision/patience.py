@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from rampart.actors.supervision.process_title import process_state
+from rampart.actors.bus.unix_peer import process_state
 
 
 class Usage(NamedTuple):

@@ -16,6 +16,8 @@ from pathlib import Path
 
 import setproctitle
 
+from rampart.actors.bus.unix_peer import process_state
+
 _TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
 
 
@@ -66,15 +68,6 @@ def find_process(pid: int) -> RunProcess | None:
         return None  # it ended while we looked
     process = parse_title(pid, raw.rstrip(b"\0").decode(errors="replace"))
     return process if process and process_state(pid) not in "ZX" else None
-
-
-def process_state(pid: int) -> str:
-    """Return the state letter of /proc/PID/stat, or "X" if there is no such process."""
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return "X"
-    return stat.rpartition(")")[2].split()[0]
 
 
 def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> bool:

@@ -16,9 +16,10 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
+from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.supervision.patience import AT_LEISURE, Usage, usage
-from rampart.actors.supervision.process_title import find_processes, process_state
+from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
 __all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerUnavailableError"]

@@ -57,9 +57,9 @@ class Ping(msgspec.Struct, frozen=True, tag="ping"):
 
 
 class Adapt(msgspec.Struct, frozen=True, tag="adapt"):
-    """Fork from now on by a changed system: an encoded `AdaptedSystem`."""
+    """Fork from now on by a changed system."""
 
-    adapted: str
+    adapted: AdaptedSystem
 
 
 class SetOrigin(msgspec.Struct, frozen=True, tag="origin"):
@@ -174,8 +174,7 @@ class Spawner:
         if isinstance(request, SetOrigin):
             self._layout.plan = replace(self._layout.plan, origin_s=request.origin_s)
         elif isinstance(request, Adapt):
-            adapted = msgspec.json.decode(request.adapted, type=AdaptedSystem)
-            self._layout, self._run = adapted_system(self._layout, self._run, adapted)
+            self._layout, self._run = adapted_system(self._layout, self._run, request.adapted)
 
     def _fork(self, request: ForkRequest, connection: socket.socket) -> None:
         for name in request.names:

@@ -225,7 +225,7 @@ class SpawnerClient:
 
     def adapt(self, adapted: AdaptedSystem) -> None:
         """Have the spawners fork by a changed system from now on, those still to come included."""
-        self._adapt = Adapt(msgspec.json.encode(adapted).decode())
+        self._adapt = Adapt(adapted)
 
         for name in NAMES:
             asked = self._reach([name], [])

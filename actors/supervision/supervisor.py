@@ -129,8 +129,7 @@ class Supervisor(Relay):
                            Patience(2 * _CHECK_S / self._plan.rate))
             for name, unit in self._layout.units.items()}
         for node, incarnation in run.known_incarnations.items():
-            process = self._process_of(node)
-            if process is not None:
+            if (process := self._process_of(node)) is not None:
                 process.incarnation = process.highest = incarnation
         self._version = (0, run.adapted.version if run.adapted else 0)
         if run.adapted is not None:
@@ -153,9 +152,8 @@ class Supervisor(Relay):
         """Adopt what runs, start what does not, in the order of the spec."""
         living = self._machine.living()
         for process in self._processes.values():
-            if self._adopt_living(process, living):
-                continue
-            if self.context.incarnation == 1 or self._owns(process):
+            if not self._adopt_living(process, living) and (
+                    self._incarnation == 1 or self._owns(process)):
                 self._on(process, Event.START)
         self._publish_table()
 
@@ -187,10 +185,9 @@ class Supervisor(Relay):
                 header.incarnation == process.incarnation and process.pid != message.pid
                 and process.is_dead):
             self._look_for(process)
-        if (header.incarnation, message.pid) != (process.incarnation, process.pid):
-            return
-        if process.waits:  # said before it was killed
-            return
+        if process.waits or (
+                header.incarnation, message.pid) != (process.incarnation, process.pid):
+            return  # said before it was killed, or by another one
         process.heard_s[header.source] = self._loop.time()
         process.requested_by = ""
         self._on(process, Event.HEARD)
