@@ -13,13 +13,8 @@ from rampart.actors.layout.wiring import Member, import_class, load_class, load_
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan, load_document, tailor
-from rampart.manager.spec.specification import (
-    Kind,
-    NodeSpec,
-    SystemSpec,
-    check_document,
-    check_modules,
-)
+from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
+from rampart.manager.spec.specification import check_document, check_modules
 
 SUPERVISOR_CLASS = "rampart.actors.supervision.supervisor:Supervisor"
 

@@ -15,13 +15,9 @@ from rampart.actors.ftm.messages import NamedFault
 from rampart.actors.web.access import page_url
 from rampart.files import toml
 from rampart.files.reading import FileError, read_text
-from rampart.manager.spec.specification import (
-    Layers,
-    SpecificationError,
-    SystemSpec,
-    check_document,
-    read_document,
-)
+from rampart.manager.spec.schema import Layers, SystemSpec
+from rampart.manager.spec.specification import check_document, read_document
+from rampart.manager.spec.tables import SpecificationError
 
 SUPERVISOR = "supervisor"
 OBSERVER = "observer"

@@ -36,10 +36,11 @@ class Living(NamedTuple):
 class ProcessHandle:
     """One process, held so that its number cannot come to mean another one.
 
-    This class itself is the hold on none: see `NO_PROCESS` and `NOT_HELD`.
+    This class itself is the hold on none: either there is no process, or (`is_gone` False) there
+    was no descriptor left to hold it by.
     """
 
-    def __init__(self, *, is_gone: bool) -> None:
+    def __init__(self, *, is_gone: bool = True) -> None:
         self._is_gone = is_gone
 
     def kill(self) -> None:
@@ -62,13 +63,6 @@ class ProcessHandle:
 
     def close(self) -> None:
         """Let go of it."""
-
-
-NO_PROCESS = ProcessHandle(is_gone=True)
-"""In the place of a handle where there is no process."""
-
-NOT_HELD = ProcessHandle(is_gone=False)
-"""In the place of a handle on a process for which no descriptor was left."""
 
 
 class Processes(Protocol):
@@ -99,7 +93,7 @@ class Processes(Protocol):
         """Start processes by a changed system from now on."""
 
     def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:
-        """End processes: asked to, in the sequence given, and killed if they linger."""
+        """End the processes held: asked to, in the sequence given, and killed if they linger."""
 
     def close(self) -> None:
         """Let go of everything."""

@@ -25,7 +25,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
@@ -38,14 +38,7 @@ from rampart.actors.layout.layout import Layout, adapted_system
 from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
 from rampart.actors.supervision.patience import Patience
-from rampart.actors.supervision.processes import (
-    NO_PROCESS,
-    NOT_HELD,
-    Living,
-    OsProcesses,
-    Processes,
-    ProcessHandle,
-)
+from rampart.actors.supervision.processes import Living, OsProcesses, Processes, ProcessHandle
 from rampart.actors.supervision.relay import Relay
 from rampart.actors.supervision.spawner_client import SpawnerBusyError, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import (
@@ -84,7 +77,7 @@ class _Process(SupervisedProcess):
         next_step: Towards its fork, while that is under way; there is never more than one.
     """
 
-    handle: ProcessHandle = NO_PROCESS
+    handle: ProcessHandle = field(default_factory=ProcessHandle)
     next_step: Timer | None = None
 
     def take(self, pid: int, incarnation: int) -> None:
@@ -94,7 +87,7 @@ class _Process(SupervisedProcess):
 
     def let_go(self) -> None:
         self.handle.close()
-        self.handle = NO_PROCESS
+        self.handle = ProcessHandle()
 
     def kill(self) -> None:
         """End it at once, and do not hear of that."""
@@ -166,8 +159,7 @@ class Supervisor(Relay):
         for process in reversed(self._processes.values()):
             if not self._dispatcher.stopping:
                 process.let_go()
-            elif process.handle not in (NO_PROCESS, NOT_HELD) and (
-                    process.shown is not fm.NodeState.CRASHED):
+            elif process.shown is not fm.NodeState.CRASHED:
                 process.handle.ignore()
                 handles.append(process.handle)
         self._machine.end(handles, STOP_GRACE_S)
@@ -374,7 +366,7 @@ class Supervisor(Relay):
     def _hold(self, process: _Process, pid: int) -> None:
         if process.pid != pid:  # it was replaced while this waited
             return
-        process.handle = NOT_HELD
+        process.handle = ProcessHandle(is_gone=False)
         try:
             process.handle = self._machine.hold(pid, lambda: self._dispatcher.put(
                 f"exit {pid}", lambda: self._ended(process, pid)))
