@@ -1,11 +1,11 @@
 """The bus over Zenoh: a partial mesh of peers on unix sockets, no router, no rendezvous.
 
 Every actor listens on a socket of its own in the folder of the run, which only the run's user can
-enter, and at its start dials the actors that it shares a topic with. Who starts later dials who is
-there already, so a respawned actor is connected to all its partners by the time `open` returns, and
-no process is a single point of failure.
+enter, and at its start dials the actors that it shares a topic with. The later node dials those
+that are there already, so a respawned actor is connected to all its partners by the time `open`
+returns, and no process is a single point of failure.
 
-**Nobody's start waits for a partner that does not answer.** Zenoh dials all partners in the
+**No start waits for a partner that does not answer.** Zenoh dials all partners in the
 background and goes on trying; `open` waits until those that are there are linked, and not for one
 that is dead or stopped, nor for one that is slower than `PATIENCE_S`. Such a link comes later, so a
 stopped process that goes on finds its partners again.

@@ -75,7 +75,7 @@ def find_runs() -> list[RunInfo]:
 def find_run(port: int | None = None) -> RunInfo:
     """Return the one run there is, or the one on a base port.
 
-    A replay counts only where there is no run: whoever says nothing means the robot.
+    A replay counts only where there is no run: without a port the robot is meant.
 
     Raises:
         NoRunError: there is none, or there are several and no port was given.

@@ -43,8 +43,8 @@ class RunPlan(msgspec.Struct, frozen=True):
         origin_s: reading of the monotonic clock at simulated time 0; set when all is loaded.
         checkpoints: directory for the nodes' checkpoints; "" keeps none, whatever the spec says.
         hmi_host: address at which the operator's page is served.
-        hmi_token: what everybody has to show there; "" for nothing, on loopback.
-        hmi_token_is_new: it was made for this run, so that nobody has it yet who needs it.
+        hmi_token: what every browser has to show there; "" for nothing, on loopback.
+        hmi_token_is_new: it was made for this run, so the operator has yet to be told.
         faults: what the page offers to inject by name.
         waits: True has the mission wait until the operator starts it from the page.
         virtual: whether time is virtual: nothing outside of the process is used.

@@ -77,7 +77,7 @@ class Processes(Protocol):
         Raises:
             SpawnerBusyError: It is under way; to be called again with the same names and
                 incarnation.
-            SpawnerUnavailableError: Nobody could do it now; likewise.
+            SpawnerUnavailableError: No spawner could do it now; likewise.
             OSError: Likewise, for want of memory or descriptors.
         """
 

@@ -3,16 +3,16 @@
 A spawner that is stopped, hung or starved must cost its caller no time and lead to no second
 process of one incarnation. Both follow from how a request ends:
 
-* The new process itself answers, and runs only if its answer was accepted. Who withdraws a request
-  shuts its end of the connection first and looks for an answer then. The kernel decides which of
-  the two came first: either the answer is there, and with it the process, or it is refused, and the
-  process ends at once, however late a spawner comes to fork it.
+* The new process itself answers, and runs only if its answer was accepted. A caller that withdraws
+  a request shuts its end of the connection first and looks for an answer then. The kernel decides
+  which of the two came first: either the answer is there, and with it the process, or it is
+  refused, and the process ends at once, however late a spawner comes to fork it.
 * So a request may wait while its caller goes on: `fork` is called again, and finds the answer.
 
 Nothing is killed here. Whether a spawner hangs or only waits for a processor is judged by the
-launcher (`guard`), who can replace it. Answers are not believed blindly: both ends check the other
-one's user, and the process is the one that sent the answer, as the kernel says, if /proc shows it
-under the title that was asked for.
+launcher (`guard`), which can replace it. Answers are not believed blindly: both ends check the
+other one's user, and the process is the one that sent the answer, as the kernel says, if /proc
+shows it under the title that was asked for.
 """
 
 from __future__ import annotations

@@ -153,7 +153,7 @@ class Supervisor(Relay):
     def on_stop(self) -> None:
         """End all processes in reverse order: SIGTERM, then SIGKILL for those that linger.
 
-        After a failure nobody is ended: the next supervisor adopts them.
+        After a failure none is ended: the next supervisor adopts them.
         """
         handles = []
         for process in reversed(self._processes.values()):
@@ -239,7 +239,7 @@ class Supervisor(Relay):
     @every(_CHECK_S)
     def check(self) -> None:
         """Look for processes whose loops are silent."""
-        # A supervisor that was stopped, starved or waiting for a hung spawner heard nobody. What
+        # A supervisor that was stopped, starved or waiting for a hung spawner heard no node. What
         # was said is still on its way here, and silence counts only while this loop turned.
         now, period_s = self._loop.time(), _CHECK_S / self._plan.rate
         stall_s = now - self._checked_s - period_s
