@@ -47,11 +47,7 @@ STILL_ROBOTIC: set[str] = set()
 
 STILL_NAMED: set[str] = set()
 
-<<<<<<< HEAD
 STILL_TOO_LONG: set[str] = set()
-=======
-STILL_TOO_LONG = {"sim.osmosis.world"}
->>>>>>> 9c97358fdbe90c877fcd485bfdcfb011fae1d94b
 
 STILL_CIRCULAR: set[tuple[str, str]] = set()
 
