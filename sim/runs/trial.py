@@ -35,7 +35,7 @@ from rampart.sim.runs.console import Console
 from rampart.sim.runs.judge import Judge, Verdict
 from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord, RunRecorder, Safety
-from rampart.sim.runs.report import Written
+from rampart.sim.runs.report import Written, margin_text, render, try_report
 
 LAUNCHER = "launch.py"
 
@@ -164,6 +164,7 @@ class Trial:
         return {
             "mission": record.mission, "safety": record.safety, "reasons": record.reasons,
             "duration_s": round(record.duration_s, 2), "restarts": record.restarts,
+            "given_up": record.given_up,
             "decisions": msgspec.to_builtins(record.decisions),
             "faults": [{**msgspec.to_builtins(fault), "effective": fault.effective}
                        for fault in record.faults]}
@@ -188,9 +189,14 @@ class Trial:
         return result
 
     def report(self, record: RunRecord, directory: Path) -> Written:
-        """Write as much of a report as can be written; by default there is none."""
-        del record, directory
-        return Written(None, None, "")
+        """Write as much of a report as can be written."""
+        return try_report(record, lambda run: render(run, self.title, self._margins(run)),
+                          directory)
+
+    def _margins(self, record: RunRecord) -> list[tuple[str, str]]:
+        found = self.judgement(record).margins
+        return [(label, margin_text(found.get(name), self.margin_unit, self.exact_below))
+                for name, label in self.margins.items()]
 
 
 class JudgedTrial(Trial):
