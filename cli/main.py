@@ -27,7 +27,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 
-from rampart.cli.analyse import campaign_verb, cut_set_verbs, decide_verbs, tree_verbs, verify_verb
+from rampart.cli.analyse import cut_set_verbs, decide_verbs, tree_verbs, verify_verb
 from rampart.cli.look import serving_verbs, topic_verbs
 from rampart.cli.operate import adapt_verb, inject_verbs, node_verbs, operator_verbs
 from rampart.cli.output import NoEffectError, UsageError, warn
@@ -35,11 +35,10 @@ from rampart.cli.record import record_verbs
 from rampart.cli.verbs import FORMATTER, PORT, help_of
 from rampart.files import streams, working_folder
 
-_VERBS = (
-    node_verbs, topic_verbs, inject_verbs, operator_verbs, serving_verbs,
-    adapt_verb, record_verbs, campaign_verb, cut_set_verbs, decide_verbs, tree_verbs,
-    verify_verb)
-"""Each adds its verbs, in this order in the help."""
+_OF_A_RUN = (node_verbs, topic_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
+             record_verbs)
+_OF_A_SYSTEM = (cut_set_verbs, decide_verbs, tree_verbs, verify_verb)
+# Each adds its verbs, in this order in the help.
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -51,7 +50,10 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="rampart", **help_of(__doc__))
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     verbs.add_parser("run", add_help=False, help="start a system: the same as launch.py")
-    for module in _VERBS:
+    for module in _OF_A_RUN:
+        module.add(verbs)
+    verbs.add_parser("campaign", add_help=False, help="run many missions with faults in them")
+    for module in _OF_A_SYSTEM:
         module.add(verbs)
     common = argparse.ArgumentParser(add_help=False)
     PORT(common)
@@ -83,10 +85,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
-def _run(arguments: Sequence[str] | None) -> int:
-    options = build_parser().parse_args(arguments)
+def _run(arguments: Sequence[str]) -> int:
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
+        if arguments[:1] == ["campaign"]:
+            from rampart.cli.analyse import campaign_verb  # noqa: PLC0415 other verbs need no campaigns
+
+            options = campaign_verb.parse(arguments[1:])
+        else:
+            options = build_parser().parse_args(arguments)
         return int(options.run(options))
     except (UsageError, NoEffectError) as error:
         warn(str(error))

@@ -8,7 +8,7 @@ import socket
 import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Any
 
 import msgspec
 
@@ -20,6 +20,7 @@ from rampart.actors.run.application import Application
 from rampart.actors.run.run_plan import DEFAULT_PORT, RunPlan, load_system
 from rampart.actors.web.access import Access, AccessError, is_loopback, new_token
 from rampart.actors.web.token_file import SecretError, read_secret
+from rampart.cli import application_options
 from rampart.cli.output import UsageError, between, positive
 from rampart.cli.verbs import FORMATTER, add_options, flag, number, option, several, whole, word
 from rampart.manager.spec.specification import SystemSpec
@@ -113,7 +114,7 @@ def parser(program: str = "", kind: type[Application] = Application,
         prog=program, epilog=f"examples:\n{examples}{_EPILOG}", formatter_class=FORMATTER,
         description="Start a system from its spec, run it, judge it, report on it.")
     add_options(p, _OPTIONS)
-    _add_own(p, kind, said or {})
+    application_options.add(p, kind, said or {})
     return p
 
 
@@ -163,7 +164,7 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
     plan = RunPlan(
         run_id=uuid.uuid4().hex[:12], base_port=options.port, rate=options.rate,
         seed=options.seed, system_file=str(system_file.resolve()), strategy=options.strategy,
-        ftm=not options.no_ftm, options=_chosen(options, kind),
+        ftm=not options.no_ftm, options=application_options.chosen(options, kind),
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
         hmi_host=options.hmi_host, hmi_token=token, hmi_token_is_new=token_is_new,
         waits=options.wait)
@@ -251,60 +252,3 @@ def _token(options: argparse.Namespace) -> tuple[str, bool]:
         raise UsageError(f"--hmi-host {host}: no address of this machine ({why}); 0.0.0.0 stands "
                          "for all it has") from None
     return token, bool(token) and not own
-
-
-def _add_own(parser: argparse.ArgumentParser, kind: type[Application], said: Mapping[str, Any]
-             ) -> None:
-    """Add an option for each field of an application's options.
-
-    Args:
-        parser: of the command.
-        kind: the application.
-        said: what the system's spec chooses, for the help.
-    """
-    fields = msgspec.structs.fields(kind.Options)
-    if not fields:
-        return
-    group = parser.add_argument_group(f"options of this system ({kind.__name__})")
-    for field in fields:
-        plain, meta = _parts(kind, field.name)
-        extra = meta.extra or {}
-        default = said.get(field.name, field.default)
-        shown = "" if default in ("", msgspec.NODEFAULT) else f" (default: {default})"
-        more = {"nargs": "?", "const": extra["alone"]} if "alone" in extra else {}
-        group.add_argument(
-            f"--{field.name.replace('_', '-')}", dest=f"application_{field.name}", default=None,
-            metavar=extra.get("metavar", field.name.upper()),
-            type=plain if plain in {int, float} else str,
-            help=(meta.description or "") + shown, **more)
-
-
-def _chosen(options: argparse.Namespace, kind: type[Application]) -> dict[str, Any]:
-    """Return what was given on the command line; files as paths that every process finds.
-
-    Raises:
-        UsageError: a value is not what its field takes.
-    """
-    found: dict[str, Any] = {}
-    for field in msgspec.structs.fields(kind.Options):
-        value = getattr(options, f"application_{field.name}", None)
-        if value is None:
-            continue
-        try:
-            msgspec.convert(value, field.type)
-        except msgspec.ValidationError as error:
-            raise UsageError(f"--{field.name.replace('_', '-')} {value}: {error}") from None
-        extra = _parts(kind, field.name)[1].extra or {}
-        if extra.get("file") and Path(value).exists():
-            value = str(Path(value).resolve())
-        found[field.name] = value
-    return found
-
-
-def _parts(kind: type[Application], name: str) -> tuple[Any, msgspec.Meta]:
-    """Return the plain type of a field and what is said of it."""
-    hint = get_type_hints(kind.Options, include_extras=True)[name]
-    if get_origin(hint) is not Annotated:
-        return hint, msgspec.Meta()
-    plain, *said = get_args(hint)
-    return plain, next((s for s in said if isinstance(s, msgspec.Meta)), msgspec.Meta())
