@@ -28,17 +28,7 @@ from importlib.metadata import entry_points
 
 from rampart.actors.layout.layout import application_class
 from rampart.cli import application_options, systems
-from rampart.cli.verbs import (
-    add_options,
-    flag,
-    group,
-    help_of,
-    number,
-    option,
-    several,
-    whole,
-    word,
-)
+from rampart.cli.verbs import add_options, flag, group, help_of, option, several, whole, word
 from rampart.sim.campaign.defaults import BACKENDS, PATIENCE_S
 from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.virtual.network import NETWORKS
@@ -82,8 +72,9 @@ def parser(program: str, system: str | None, campaigns: Sequence[type[NamedCampa
               whole("--seed", "N", "default: 1", 1),
               whole("--seeds", "N",
                     "with --fault: so many runs of each, from --seed on (default: 1)", 1),
-              number("--patience", "S", "simulated seconds without progress that end a run "
-                     f"(default: {PATIENCE_S:g})", PATIENCE_S)),
+              option("--patience", type=float, default=PATIENCE_S, metavar="S",
+                     help="simulated seconds without progress that end a run (default: "
+                     f"{PATIENCE_S:g})")),
         group("where",
               word("--out", "DIR", "default: reports/campaign-NAME, by what is run"),
               whole("--jobs", "N", "processes (default: one per core)", 0),
