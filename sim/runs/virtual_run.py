@@ -30,7 +30,7 @@ from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.runs.observer import Sink, observer_class
 from rampart.sim.runs.record import RunRecord
-from rampart.sim.runs.trial import Trial
+from rampart.sim.runs.trial import Judgement, Trial
 from rampart.sim.virtual.network import NETWORKS, NetworkModel, SeededNetwork
 from rampart.sim.virtual.virtual_bus import Hub, Tap, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
@@ -50,7 +50,7 @@ class VirtualResult:
 
     Attributes:
         record: The story of the run.
-        figures: What only a judge knows, see `Trial.figures`.
+        judgement: What only a judge knows.
         why: Why it ended.
         trace: SHA-256 over everything that was sent, in hexadecimal.
         messages: How many were sent.
@@ -60,7 +60,7 @@ class VirtualResult:
     """
 
     record: RunRecord
-    figures: dict[str, Any]
+    judgement: Judgement
     why: str
     trace: str
     messages: int
@@ -199,7 +199,7 @@ class VirtualRun:
         record = self.trial.conclude(
             now_s, why or "ended", injector.outcomes() if injector else ())
         return VirtualResult(
-            record, self.trial.figures(record), why or "ended", trace.digest(), trace.messages,
+            record, self.trial.judgement(record), why or "ended", trace.digest(), trace.messages,
             time.perf_counter() - begun_s,
             tuple((name, f"{type(error).__name__}: {error}") for name, error in machine.failures),
             "".join(f"--- {name}\n{''.join(traceback.format_exception(error))}"

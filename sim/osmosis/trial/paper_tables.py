@@ -135,7 +135,7 @@ class Decided(msgspec.Struct, frozen=True):
 
 def paper_jobs(mission: str = "A", seed: int = 1, system: str = PAPER_SYSTEM) -> list[Job]:
     """Return all runs of tables IV and V; `system` is a shipped one by name, or a path."""
-    return [Job(row=name, system=system, mission=mission, obstacles=obstacles,
+    return [Job(row=name, system=system, options={"mission": mission, "obstacles": obstacles},
                 strategy=PAPER_STRATEGY, ftm=condition != CONDITIONS[0],
                 retuned=AS_THE_PAPER if condition == CONDITIONS[1] else {},
                 faults=(fault,) if fault else (), seed=seed + i)
@@ -162,13 +162,17 @@ def cells(runs: Iterable[Run]) -> list[Cell]:
     """Return tables IV and V, and what became of table V's runs under other conditions."""
     found: dict[tuple[str, str, int], list[Run]] = {}
     for run in runs:
-        found.setdefault((condition_of(run.job), run.job.row, run.job.obstacles), []).append(run)
+        found.setdefault((condition_of(run.job), run.job.row, _obstacles(run.job)), []).append(run)
     table = []
     for condition, name, obstacles in product((*CONDITIONS, FULL), FAULTS, OBSTACLES):
         if there := found.get((condition, name, obstacles)):
             verdicts = WITHOUT_FTM if condition == CONDITIONS[0] else WITH_FTM
             table.append(_cell(condition, verdicts[name][OBSTACLES.index(obstacles)], there))
     return table
+
+
+def _obstacles(job: Job) -> int:
+    return int(job.options.get("obstacles", 0))
 
 
 def _cell(condition: str, paper: str, runs: Sequence[Run]) -> Cell:
@@ -179,7 +183,7 @@ def _cell(condition: str, paper: str, runs: Sequence[Run]) -> Cell:
                  for d in bad.result.decisions[:6]]
     return Cell(
         table="IV" if condition == CONDITIONS[0] else "V", fault=bad.job.row,
-        obstacles=bad.job.obstacles, condition=condition, paper=paper,
+        obstacles=_obstacles(bad.job), condition=condition, paper=paper,
         expected=GOOD if condition == FULL else paper,
         ours=verdict(bad) if counted else NO_EFFECT, runs=len(runs),
         ineffective=len(runs) - len(counted), success=sum(r.result.success for r in counted),
