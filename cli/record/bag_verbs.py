@@ -7,8 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rampart.actors.recording.bag_reader import BagReader, Summary
-from rampart.actors.recording.bag_repair import repair
+from rampart.actors.recording.bag_reader import BagReader, Summary, repair
 from rampart.actors.recording.bag_writer import BagError
 from rampart.cli.output import UsageError, print_json, print_table, say
 from rampart.files.reading import plain_line

@@ -86,8 +86,8 @@ class Console:
         if isinstance(message, fm.ProcessEvent):
             if message.event not in _QUIET_EVENTS and message.detail != "already":
                 detail = f" ({message.detail})" if message.detail else ""
-                self.line(at, f"{message.node} {message.event}, incarnation "
-                          f"{message.incarnation}{detail}")
+                which = f"incarnation {message.incarnation}"
+                self.line(at, f"{message.node} {message.event}, {which}{detail}")
         elif isinstance(message, fm.DetectionReport):
             self._take_detection(message, header)
         elif isinstance(message, fm.ManagerStatus):
@@ -112,8 +112,7 @@ class Console:
 
     def _tell_left_out(self, at_s: float) -> None:
         now_s = self._clock()
-        count = self._reports.left_out(now_s) + self._others.left_out(now_s)
-        if count:
+        if count := self._reports.left_out(now_s) + self._others.left_out(now_s):
             self.say(f"[{at_s:7.2f} s] {count} more lines were left out")
 
     def conclusion(self, record: RunRecord, report: Path | None) -> None:
@@ -131,12 +130,10 @@ class Console:
             self.line(header.stamp, f"{header.source}: {what}")
 
     def _take_silence(self, silent: tuple[str, ...], at: float) -> None:
-        for name in silent:
-            if name not in self._silent:
-                self.line(at, f"{name} silent: it counts as active")
-        for name in self._silent:
-            if name not in silent:
-                self.line(at, f"{name}: no longer silent")
+        for name in (n for n in silent if n not in self._silent):
+            self.line(at, f"{name} silent: it counts as active")
+        for name in (n for n in self._silent if n not in silent):
+            self.line(at, f"{name}: no longer silent")
         self._silent = silent
 
     def show_live(self, text: str, at_s: float) -> None:
