@@ -61,10 +61,9 @@ def find_network(name: str) -> NetworkModel:
     Raises:
         ValueError: There is none.
     """
-    try:
-        return NETWORKS[name]
-    except KeyError:
-        raise ValueError(f"unknown network {name!r}; known: {', '.join(NETWORKS)}") from None
+    if name not in NETWORKS:
+        raise ValueError(f"unknown network {name!r}; known: {', '.join(NETWORKS)}")
+    return NETWORKS[name]
 
 
 class SeededNetwork:
@@ -92,14 +91,11 @@ class SeededNetwork:
         """Return the one link between two nodes; None if everything arrives at once."""
         if source in self._local or reader in self._local:
             return None
-        ends = (source, reader)
-        link = self._links.get(ends)
-        if link is None:
-            model = self.model
+        ends, model = (source, reader), self.model
+        if ends not in self._links:
             plain = not (model.extra_s or model.loss or model.duplication or model.reordering)
-            link = self._links[ends] = (
-                self._in_order() if plain and model.delay else self._troubled())
-        return link
+            self._links[ends] = self._in_order() if plain and model.delay else self._troubled()
+        return self._links[ends]
 
     def _in_order(self) -> Link:
         """Return a link that delays messages and does no more: most runs have only these."""
