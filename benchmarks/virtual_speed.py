@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("runs", nargs="?", type=int, default=RUNS, metavar="RUNS",
                         help=f"of each system (default: {RUNS})")
     runs = parser.parse_args().runs
-    jobs = {name: Job(row="none", system=name, mission="A", seed=1) for name in SYSTEMS}
+    jobs = {name: Job(row="none", system=name, options={"mission": "A"}) for name in SYSTEMS}
     speeds: dict[str, list[float]] = {name: [] for name in SYSTEMS}
     for job in jobs.values():
         run_virtually(job)  # imports, compiles, loads the map

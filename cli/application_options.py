@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -13,29 +14,35 @@ from rampart.actors.run.application import Application
 from rampart.cli.output import UsageError
 
 
-def add(parser: argparse.ArgumentParser, kind: type[Application], said: Mapping[str, Any]) -> None:
+def add(parser: argparse.ArgumentParser, kind: type[Application], said: Mapping[str, Any], *,
+        crossed: bool = False) -> None:
     """Add an option for each field of an application's options.
 
     Args:
         parser: of the command.
         kind: the application.
         said: what the system's spec chooses, for the help.
+        crossed: the command makes many runs in virtual time, and takes several values of each.
     """
-    fields = msgspec.structs.fields(kind.Options)
+    fields = [field for field in msgspec.structs.fields(kind.Options)
+              if not (crossed and _parts(kind, field.name)[1].get("real"))]
     if not fields:
         return
     group = parser.add_argument_group(f"options of this system ({kind.__name__})")
     for field in fields:
-        plain, meta = _parts(kind, field.name)
-        extra = meta.extra or {}
+        plain, extra = _parts(kind, field.name)
         default = said.get(field.name, field.default)
+        if crossed:
+            default = extra.get("campaign", default)
         shown = "" if default in ("", msgspec.NODEFAULT) else f" (default: {default})"
         more = {"nargs": "?", "const": extra["alone"]} if "alone" in extra else {}
+        metavar = extra.get("metavar", field.name.upper())
         group.add_argument(
-            f"--{field.name.replace('_', '-')}", dest=f"application_{field.name}", default=None,
-            metavar=extra.get("metavar", field.name.upper()),
-            type=plain if plain in {int, float} else str,
-            help=(meta.description or "") + shown, **more)
+            f"--{field.name.replace('_', '-')}", dest=f"application_{field.name}",
+            default=extra.get("campaign") if crossed else None,
+            metavar=f"{metavar},..." if crossed else metavar,
+            type=str if crossed else plain if plain in {int, float} else str,
+            help=extra.get("description", "") + shown, **more)
 
 
 def chosen(options: argparse.Namespace, kind: type[Application]) -> dict[str, Any]:
@@ -44,26 +51,50 @@ def chosen(options: argparse.Namespace, kind: type[Application]) -> dict[str, An
     Raises:
         UsageError: a value is not what its field takes.
     """
-    found: dict[str, Any] = {}
+    return {field.name: _value(kind, field, value)
+            for field in msgspec.structs.fields(kind.Options)
+            if (value := getattr(options, f"application_{field.name}", None)) is not None}
+
+
+def alternatives(options: argparse.Namespace, kind: type[Application]) -> list[dict[str, Any]]:
+    """Return every combination of the values that were given, separated by commas, or by default.
+
+    Raises:
+        UsageError: a value is not what its field takes.
+    """
+    found: dict[str, list[Any]] = {}
     for field in msgspec.structs.fields(kind.Options):
-        value = getattr(options, f"application_{field.name}", None)
-        if value is None:
-            continue
-        try:
-            msgspec.convert(value, field.type)
-        except msgspec.ValidationError as error:
-            raise UsageError(f"--{field.name.replace('_', '-')} {value}: {error}") from None
-        extra = _parts(kind, field.name)[1].extra or {}
-        if extra.get("file") and Path(value).exists():
-            value = str(Path(value).resolve())
-        found[field.name] = value
-    return found
+        given = getattr(options, f"application_{field.name}", None)
+        if given is not None:
+            found[field.name] = [_value(kind, field, _number(kind, field, value))
+                                 for value in given.split(",")]
+    return [dict(zip(found, values, strict=True)) for values in product(*found.values())]
 
 
-def _parts(kind: type[Application], name: str) -> tuple[Any, msgspec.Meta]:
-    """Return the plain type of a field and what is said of it."""
+def _number(kind: type[Application], field: msgspec.structs.FieldInfo, value: str) -> Any:
+    plain = _parts(kind, field.name)[0]
+    try:
+        return plain(value) if plain in {int, float} else value
+    except ValueError:
+        raise UsageError(f"--{field.name.replace('_', '-')} {value}: must be a number; several are "
+                         "separated by commas") from None
+
+
+def _value(kind: type[Application], field: msgspec.structs.FieldInfo, value: Any) -> Any:
+    try:
+        msgspec.convert(value, field.type)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"--{field.name.replace('_', '-')} {value}: {error}") from None
+    if _parts(kind, field.name)[1].get("file") and Path(value).exists():
+        return str(Path(value).resolve())
+    return value
+
+
+def _parts(kind: type[Application], name: str) -> tuple[Any, dict[str, Any]]:
+    """Return the plain type of a field and what its `Meta` says of it, `description` included."""
     hint = get_type_hints(kind.Options, include_extras=True)[name]
     if get_origin(hint) is not Annotated:
-        return hint, msgspec.Meta()
+        return hint, {}
     plain, *said = get_args(hint)
-    return plain, next((s for s in said if isinstance(s, msgspec.Meta)), msgspec.Meta())
+    meta = next((s for s in said if isinstance(s, msgspec.Meta)), msgspec.Meta())
+    return plain, {"description": meta.description or "", **(meta.extra or {})}

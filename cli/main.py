@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 
-from rampart.cli.analyse import campaign_verb, cut_set_verbs, decide_verbs, tree_verbs, verify_verb
+from rampart.cli.analyse import cut_set_verbs, decide_verbs, tree_verbs, verify_verb
 from rampart.cli.look import live_verb, metrics_verb, top_verb, topic_verbs
 from rampart.cli.operate import (
     adapt_verb,
@@ -66,7 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
     adapt_verb.add(verbs, formatter, common)
     record_verbs.add(verbs, formatter, common)
     bag_verbs.add(verbs, formatter)
-    campaign_verb.add(verbs, formatter)
+    verbs.add_parser("campaign", add_help=False, help="run many missions with faults in them")
     cut_set_verbs.add(verbs, formatter, common)
     decide_verbs.add(verbs, formatter)
     tree_verbs.add(verbs, formatter)
@@ -95,10 +95,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
-def _run(arguments: Sequence[str] | None) -> int:
-    options = build_parser().parse_args(arguments)
+def _run(arguments: Sequence[str]) -> int:
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
+        if arguments[:1] == ["campaign"]:
+            from rampart.cli.analyse import campaign_verb  # noqa: PLC0415 other verbs need no campaigns
+
+            options = campaign_verb.parse(arguments[1:])
+        else:
+            options = build_parser().parse_args(arguments)
         return int(options.run(options))
     except UsageError as error:
         warn(str(error))

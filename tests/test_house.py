@@ -43,15 +43,11 @@ LARGEST_ROOM = 15
 
 STILL_UPWARD: set[tuple[str, str]] = set()
 
-STILL_ROBOTIC = {
-    "cli.analyse.campaigning", "sim.campaign.report", "sim.campaign.worst_runs"}
+STILL_ROBOTIC: set[str] = set()
 
-STILL_NAMED = {
-    "cli.operate.inject_verbs", "manager.spec.mobile_robot", "sim.campaign.grouping",
-    "sim.campaign.job", "sim.campaign.report", "sim.campaign.worst_runs"}
+STILL_NAMED = {"cli.operate.inject_verbs", "manager.spec.mobile_robot"}
 
-STILL_TOO_LONG = {
-    "actors.osmosis.messages", "cli.analyse.campaigning", "sim.osmosis.world"}
+STILL_TOO_LONG = {"actors.osmosis.messages", "sim.osmosis.world"}
 
 STILL_CIRCULAR: set[tuple[str, str]] = set()
 

@@ -40,14 +40,14 @@ class Osmosis(Application):
             extra={"metavar": "NAME|FILE", "file": True})]
         mission: Annotated[str, msgspec.Meta(
             description="mission of the airport, or a file with lines x=…,y=…,taxi=…",
-            extra={"metavar": "NAME|FILE", "file": True})]
+            extra={"metavar": "NAME|FILE", "file": True, "campaign": "A"})]
         obstacles: Annotated[int, msgspec.Meta(
             ge=0, description="how many of the airport's obstacles stand on the way",
-            extra={"metavar": "N"})] = 0
+            extra={"metavar": "N", "campaign": "0,2"})] = 0
         joystick: Annotated[str, msgspec.Meta(
             description="drive with a joystick or gamepad of this machine, e.g. /dev/input/js0 "
             "(without DEVICE: the first one); hold its left shoulder button to drive",
-            extra={"metavar": "DEVICE", "alone": "auto"})] = ""
+            extra={"metavar": "DEVICE", "alone": "auto", "real": True})] = ""
 
     topics = topics.ROBOT
     views = "rampart.actors.osmosis.recording.views:OsmosisViews"
@@ -120,6 +120,18 @@ class Osmosis(Application):
         if not found:
             raise ValueError("no airport in the recording")
         return cls.on_map(load_airport(found[0]))
+
+    @classmethod
+    def said(cls, name: str, value: Any) -> str:
+        """Return an option's value in words; obstacles are counted."""
+        if name == "obstacles":
+            return f"{value or 'no'} obstacle{'' if value == 1 else 's'}"
+        return super().said(name, value)
+
+    @classmethod
+    def simpler(cls, options: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """Return the options without obstacles, if there are any."""
+        return [{**options, "obstacles": 0}] if options.get("obstacles") else []
 
     def check(self, spec: SystemSpec, *, virtual: bool) -> str:
         """Refuse a joystick that nobody can drive with; one that is not plugged in is waited for.

@@ -50,7 +50,13 @@ class Application:
     """
 
     class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-        """What a run can be told; fields are options of the command line, with their help."""
+        """What a run can be told; fields are options of the command line, with their help.
+
+        The `extra` of a field's `msgspec.Meta` may say: `metavar`; `file`, that a value may be a
+        path; `alone`, the value of an option that is given without one; `campaign`, what a campaign
+        takes for it when the user says nothing, values separated by commas; `real`, that it is of
+        no use in virtual time.
+        """
 
     topics: ClassVar[tuple[Topic[Any], ...]] = ()
     views: ClassVar[str] = "rampart.actors.recording.views:Views"
@@ -96,6 +102,21 @@ class Application:
         """
         del spec, virtual
         return ""
+
+    @classmethod
+    def said(cls, name: str, value: Any) -> str:
+        """Return an option's value in words, as the report of a campaign names its conditions."""
+        return f"{name} {value}"
+
+    @classmethod
+    def simpler(cls, options: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """Return simpler options than these: what a search tries to find a smaller counterexample.
+
+        Args:
+            options: of an unsafe run.
+        """
+        del options
+        return []
 
     @classmethod
     def of(cls, context: HasRun) -> Self:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from collections.abc import Sequence
+from importlib.metadata import entry_points
 
+from rampart.actors.layout.layout import application_class
+from rampart.cli import application_options, systems
 from rampart.sim.campaign.defaults import BACKENDS, PATIENCE_S
+from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.virtual.network import NETWORKS
 
 _EPILOG = """examples:
@@ -25,38 +29,43 @@ exit code: 0 no unsafe run with fault tolerance, 1 there was one, or with --full
 2 bad usage, or it could not be finished, as on a full disk"""
 
 
-def add(verbs: Any, formatter: Any) -> None:
-    """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "campaign", formatter_class=formatter, help="run many missions with faults in them",
+def parser(program: str, system: str | None, campaigns: Sequence[type[NamedCampaign]]
+           ) -> argparse.ArgumentParser:
+    """Return the parser of the verb.
+
+    Args:
+        program: as it is typed.
+        system: whose options it takes.
+        campaigns: that have names, and options of their own.
+
+    Raises:
+        UsageError: there is no such system.
+    """
+    parser = argparse.ArgumentParser(
+        prog=program, formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Run missions in virtual time with faults injected, on all cores, and say how\n"
                     "often the robot succeeded and whether it was always safe.",
         epilog=_EPILOG)
     what = parser.add_argument_group("what is run")
-    what.add_argument("--paper", action="store_true", help="tables III, IV and V of the paper")
-    what.add_argument("--full", action="store_true",
-                      help="with --paper: the runs of table V on the full system instead, each of "
-                      "which is to end in success, safe")
+    for campaign in campaigns:
+        campaign.add(what)
     what.add_argument("--runs", type=int, metavar="N", help="N random faults of all kinds")
     what.add_argument("--fault", action="append", default=[], metavar="FAULT[@WHEN][+S]",
                       help="this fault; may be repeated, and be a pattern of names: 'gps-*'")
     what.add_argument("--together", type=int, default=1, metavar="K",
                       help="with --runs: K faults in each (default 1)")
-    what.add_argument("--kinds", metavar="K,...", help="with --runs: only these kinds of faults "
-                      "(paper, sensor, topic, process, actuator, world)")
+    what.add_argument("--kinds", metavar="K,...",
+                      help="with --runs: only these kinds of faults, of those that --list shows")
     what.add_argument("--search", type=int, metavar="N",
                       help="N runs of an optimiser that looks for the smallest safety margin")
     what.add_argument("--replay", metavar="RUN", help="repeat a run of --out by its key")
     what.add_argument("--list", action="store_true", help="list the faults that there are")
     how = parser.add_argument_group("under which conditions")
     how.add_argument("--system", metavar="SPEC",
-                     help="file, or name of a shipped system (default: osmosis, the full one; "
-                     "with --paper alone: paper)")
-    how.add_argument("--mission", metavar="NAME", default="A", help="default: A")
-    how.add_argument("--airport", metavar="NAME", default="", help="default: the system's")
-    how.add_argument("--obstacles", metavar="N,...", default="0,2",
-                     help="how many of the airport's; several are crossed, or drawn from with "
-                     "--runs (default: 0,2)")
+                     help=f"file, or name of a shipped system (default: {systems.DEFAULT.stem}"
+                     f"{''.join(f'; with {c.flag} alone: {c.system}' for c in campaigns)}); its "
+                     "options, below, take several values, which are crossed, or drawn from with "
+                     "--runs")
     how.add_argument("--ftm", choices=("on", "off", "both"), default="on",
                      help="fault tolerance, the paper's baseline, or both (default: on)")
     how.add_argument("--strategy", action="append", default=[], metavar="NAME",
@@ -78,11 +87,35 @@ def add(verbs: Any, formatter: Any) -> None:
                        help="loky is this machine; dask and ray are existing clusters")
     where.add_argument("--address", default="", metavar="A", help="of the cluster's scheduler")
     parser.add_argument("--json", action="store_true", help="print the rows as JSON")
-    parser.set_defaults(run=run)
+    spec = systems.load(system)
+    application_options.add(parser, application_class(spec), spec.application, crossed=True)
+    return parser
+
+
+def parse(arguments: Sequence[str], program: str = "rampart campaign") -> argparse.Namespace:
+    """Return the options, with the campaign that has a name if one was chosen as `named`.
+
+    Raises:
+        UsageError: there is no such system, or the options make no sense together.
+    """
+    campaigns = [found.load() for found in sorted(
+        entry_points(group="rampart.campaigns"), key=lambda campaign: campaign.name)]
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    what = first.add_argument_group()
+    for each in campaigns:
+        each.add(what)
+    first.add_argument("--system")
+    said = first.parse_known_args(arguments)[0]
+    named = [chosen for each in campaigns if (chosen := each.chosen(said))]
+    default = named[0].system if named else systems.DEFAULT.stem
+    options = parser(program, said.system or default, campaigns).parse_args(arguments)
+    options.system = options.system or default
+    options.named, options.run, options.flags = named, run, [each.flag for each in campaigns]
+    return options
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the campaign, or what else was asked for."""
-    from rampart.cli.analyse.campaigning import campaign  # noqa: PLC0415 physics and all: other verbs need not
+    from rampart.cli.analyse.campaigning import campaign  # noqa: PLC0415 physics and all: help needs none
 
     return campaign(options)

@@ -14,7 +14,7 @@ import msgspec
 from tqdm import tqdm
 
 from rampart.cli.output import UsageError, print_json, print_table, say, warn
-from rampart.sim.campaign.job import Job, RunResult, run_job
+from rampart.sim.campaign.job import Job, RunResult, run_job, trial_of_system
 from rampart.sim.campaign.search import Space, margin, search, shrink
 from rampart.sim.campaign.store import Store, StoreError
 from rampart.sim.faults.faults import Faults
@@ -30,6 +30,7 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
         store = Store(directory)
     except StoreError as error:
         raise UsageError(str(error)) from None
+    unit = trial_of_system(options.system).margin_unit
     workers = options.jobs or os.cpu_count() or 1
     with joblib.Parallel(n_jobs=workers, batch_size=1) as pool, tqdm(
             total=options.search, unit="run", file=sys.stderr,
@@ -48,7 +49,7 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
                 raise UsageError(f"{error}; what was finished is in {directory}") from None
             if margin(result) < smallest:
                 smallest = margin(result)
-                bar.write(f"{smallest:8.3f} m  {job.key}  {job.text()}", file=sys.stderr)
+                bar.write(f"{smallest:8.3f} {unit}  {job.key}  {job.text()}", file=sys.stderr)
             bar.update()
 
         try:
@@ -61,17 +62,17 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
     store.close()
     shrunk = [_shrunk(job, directory) for job in unsafe[:_SHRUNK_AT_MOST]]
     if options.json:
-        print_json({"runs": len(made), "unsafe": len(unsafe), "smallest_margin_m": smallest,
+        print_json({"runs": len(made), "unsafe": len(unsafe), f"smallest_margin_{unit}": smallest,
                     "counterexamples": [{"file": str(path) if path else None, "job": job}
                                         for job, path in shrunk]})
     else:
         print_table(("margin", "run", "faults"), [
-            (f"{margin(result):.3f} m", job.key, job.text()) for job, result in made[:10]])
+            (f"{margin(result):.3f} {unit}", job.key, job.text()) for job, result in made[:10]])
         say()
-        say(f"{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} m")
+        say(f"{len(made)} runs, {len(unsafe)} unsafe, smallest margin {smallest:.3f} {unit}")
         for job, path in shrunk:
-            say(f"counterexample: {job.text()}, {job.obstacles} obstacles, seed {job.seed}: "
-                f"{path or 'not written'}")
+            chosen = "".join(f"{name} {value}, " for name, value in job.options.items())
+            say(f"counterexample: {job.text()}, {chosen}seed {job.seed}: {path or 'not written'}")
     return 1 if unsafe else 0
 
 

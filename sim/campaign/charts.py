@@ -12,7 +12,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from rampart.sim.campaign.wording import MINUS, count, seconds
+from rampart.sim.campaign.wording import MINUS, count, margin_text, seconds
 
 WIDTH = 520.0
 """Of the drawing, in its own units; text is 14 of them high."""
@@ -25,7 +25,8 @@ _PER_DECADE = 8
 _LEAST_S = 1e-3
 """Messages take about as long; below it is one bar."""
 
-_MARGIN_STEP_M, _MARGIN_TICK_M = 0.05, 0.5
+_MARGIN_BINS, _MARGIN_TICKS = 20, 2
+"""Between 0 and the end of an axis of margins."""
 
 
 @dataclass(frozen=True)
@@ -118,16 +119,32 @@ def time_axis(values: Sequence[float]) -> Axis:
     return Axis(edges, tuple(ticks), math.log10, seconds)
 
 
-def margin_axis(low_m: float, high_m: float) -> Axis:
-    """Return an axis of metres with one more bin at either end for what is beyond."""
-    bins = round((high_m - low_m) / _MARGIN_STEP_M)
-    edges = tuple(round(low_m + i * _MARGIN_STEP_M, 6) for i in range(-1, bins + 2))
-    halves = round((high_m - low_m) / _MARGIN_TICK_M)
-    inner = [round(low_m + i * _MARGIN_TICK_M, 6) for i in range(1, halves)]
+def margin_axis(values: Sequence[float], high: float | None, unit: str) -> Axis:
+    """Return an axis of margins with one more bin at either end for what is beyond.
+
+    Args:
+        values: that are to be shown.
+        high: up to where; None for a round number that no value exceeds.
+        unit: of both.
+    """
+    if high is None:
+        largest = max(*values, 1e-3)
+        decade = 10.0 ** math.floor(math.log10(largest))
+        high = next(n * decade for n in (1, 2, 5, 10) if n * decade >= largest)
+    least = min(values)
+    low = 0.0 if least >= 0 else -high / 2 if least >= -high / 2 else -high
+    step, tick = high / _MARGIN_BINS, high / _MARGIN_TICKS
+    bins, halves = round((high - low) / step), round((high - low) / tick)
+    edges = tuple(round(low + i * step, 6) for i in range(-1, bins + 2))
+    inner = [round(low + i * tick, 6) for i in range(1, halves)]
+
+    def label(value: float) -> str:
+        return f"{value:g} {unit}".replace("-", MINUS)
+
     return Axis(
-        edges, ((edges[0], f"< {_metres(low_m)}"), *((m, _metres(m)) for m in inner),
-                (edges[-1], f"≥ {_metres(high_m)}")),
-        lambda value: value, lambda value: f"{value:.2f} m".replace("-", MINUS), open_ended=True)
+        edges, ((edges[0], f"< {label(low)}"), *((m, label(m)) for m in inner),
+                (edges[-1], f"≥ {label(high)}")),
+        lambda value: value, lambda value: margin_text(value, unit, None), open_ended=True)
 
 
 def chart(title: str, words: str, axis: Axis,
@@ -175,7 +192,3 @@ def _lane(top: float, axis: Axis, label: str, values: Sequence[Value], note: str
 
 def _round_time(value_s: float) -> str:
     return f"{value_s * 1e3:.0f} ms" if value_s < 0.9995 else f"{value_s:.0f} s"
-
-
-def _metres(value: float) -> str:
-    return f"{value:g} m".replace("-", MINUS)

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from rampart.sim.campaign import charts
-from rampart.sim.campaign.defaults import EXACT_BELOW_M
 from rampart.sim.campaign.grouping import by_kind
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.wording import count
+from rampart.sim.runs.trial import Trial
 
 
-def distributions(runs: Sequence[Run]) -> list[charts.Chart]:
-    """Return the charts of some runs; those without anything to show are left out."""
+def distributions(runs: Sequence[Run], trial: type[Trial]) -> list[charts.Chart]:
+    """Return the charts of some runs; those without anything to show are left out.
+
+    Args:
+        runs: of one system.
+        trial: of that system.
+    """
     counted = [run for run in runs if run.result.counts]
     faulty = [run for run in counted if run.job.ftm and run.job.faults]
     made = []
@@ -36,15 +42,16 @@ def distributions(runs: Sequence[Run]) -> list[charts.Chart]:
             axis = charts.time_axis([each.value for _, values, _ in lanes for each in values])
             made.append(charts.chart(title, words + more, axis, lanes))
     for ftm, title in ((True, "Smallest margin with FTM"), (False, "Smallest margin without FTM")):
-        margins = {kind: [charts.Value(run.result.margin_m, not run.result.safe) for run in there]
+        margins = {kind: [charts.Value(run.result.margin, not run.result.safe) for run in there]
                  for kind, there in by_kind(r for r in counted if r.job.ftm == ftm).items()}
         every = [each.value for there in margins.values() for each in there]
-        if every:
-            low_m = 0.0 if min(every) >= 0 else -0.5 if min(every) >= -0.5 else -1.0
+        if any(map(math.isfinite, every)):
+            exact = ("" if trial.exact_below is None else
+                     f" Measured exactly below {trial.exact_below:g} {trial.margin_unit} only.")
             made.append(charts.chart(
-                title, "The smaller of the clearances to an obstacle and to the prohibited area; "
-                "below 0 is inside it. The simulator measures exactly below "
-                f"{EXACT_BELOW_M:g} m only.", charts.margin_axis(low_m, EXACT_BELOW_M),
+                title, f"The smallest of: {', '.join(trial.margins.values())}.{exact}",
+                charts.margin_axis([v for v in every if math.isfinite(v)], trial.exact_below,
+                                   trial.margin_unit),
                 [(kind, there, count(len(there), "run"))
                  for kind, there in margins.items()]))
     return made

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import msgspec
 
-from rampart.sim.campaign.job import Job, faults_of_system, trial_of_system
+from rampart.sim.campaign.job import (
+    Job,
+    application_of_system,
+    faults_of_system,
+    trial_of_system,
+)
 from rampart.sim.campaign.store import Run
 
 
@@ -39,34 +44,45 @@ def by_kind(runs: Iterable[Run]) -> dict[str, list[Run]]:
 
 
 def conditions(runs: Sequence[Run]) -> list[Condition]:
-    """Return the runs by condition: the unprotected first, then by strategy and obstacles."""
-    varying = {name for name, say in _SAID.items()
-               if len({say(run.job) for run in runs} - {""}) > 1} | {"obstacles"}
-    groups: dict[tuple[object, ...], list[Run]] = {}
-    for run in runs:
-        job = run.job
-        key = (job.ftm, *(_SAID[name](job) for name in _SAID if name != "obstacles"),
-               job.obstacles)
+    """Return the runs by condition: the unprotected first, then by mechanisms and strategy."""
+    said = _values(runs)
+    varying = [name for name, values in said.items() if len(set(values) - {""}) > 1]
+    groups: dict[tuple[str, ...], list[Run]] = {}
+    for number, run in enumerate(runs):
+        key = ("with FTM" if run.job.ftm else "without FTM",
+               *(said[name][number] for name in varying))
         groups.setdefault(key, []).append(run)
-    return [Condition(_text(found[0].job, varying), found[0].job.ftm, found)
-            for _, found in sorted(groups.items(), key=lambda item: repr(item[0]))]
+    found = [Condition(", ".join(filter(None, key)), there[0].job.ftm, there)
+             for key, there in groups.items()]
+    return sorted(found, key=lambda condition: (condition.ftm, condition.text))
 
 
 def in_common(runs: Sequence[Run]) -> list[str]:
     """Return in words what is the same in all runs."""
-    found = [{say(run.job) for run in runs} - {""} for name, say in _SAID.items()
-             if name != "obstacles"]
+    found = [set(values) - {""} for values in _values(runs).values()]
     return [next(iter(values)) for values in found if len(values) == 1]
 
 
-def _text(job: Job, varying: Iterable[str]) -> str:
-    parts = ["with FTM" if job.ftm else "without FTM"]
-    parts += [say(job) for name, say in _SAID.items() if name in varying]
-    return ", ".join(part for part in parts if part)
+def varying_options(runs: Iterable[Run]) -> list[str]:
+    """Return the options of the application that are not the same in all runs."""
+    options = [run.job.options for run in runs]
+    return [name for name in dict.fromkeys(name for each in options for name in each)
+            if any(each.get(name) != options[0].get(name) for each in options)]
 
 
-def _strategy(job: Job) -> str:
-    return (job.strategy or "the system's strategy") if job.ftm else ""
+def _values(runs: Sequence[Run]) -> dict[str, list[str]]:
+    """Return what makes up a condition besides FTM: what is said of each run, "" for nothing."""
+    jobs = [run.job for run in runs]
+    return {
+        "mechanisms": [_mechanisms(job) for job in jobs],
+        "strategy": [(job.strategy or "the system's strategy") if job.ftm else "" for job in jobs],
+        "system": [f"system {job.system}" for job in jobs],
+        **{name: [application_of_system(job.system).said(name, job.options[name])
+                  if name in job.options else "" for job in jobs]
+           for name in dict.fromkeys(name for job in jobs for name in job.options)},
+        "network": [f"{job.network} network" for job in jobs],
+        "patience": [f"given up after {job.patience_s:g} s without progress" for job in jobs],
+    }
 
 
 def _mechanisms(job: Job) -> str:
@@ -76,16 +92,3 @@ def _mechanisms(job: Job) -> str:
         if job.retuned == retuned:
             return name
     return "retuned " + msgspec.json.encode(job.retuned, order="deterministic").decode()
-
-
-_SAID: dict[str, Callable[[Job], str]] = {
-    "mechanisms": _mechanisms,
-    "strategy": _strategy,
-    "system": lambda job: f"system {job.system}",
-    "airport": lambda job: f"airport {job.airport}" if job.airport else "",
-    "mission": lambda job: f"mission {job.mission}" if job.mission else "",
-    "network": lambda job: f"{job.network} network",
-    "patience": lambda job: f"given up after {job.patience_s:g} s without progress",
-    "obstacles": lambda job: f"{job.obstacles or 'no'} obstacle{'' if job.obstacles == 1 else 's'}",
-}
-"""What makes up a condition besides FTM, and how it is said of a job; empty if it says nothing."""

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from rampart import systems
-from rampart.actors.layout.layout import load_application
+from rampart.actors.layout.layout import application_class, load_application
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system, tailor
@@ -41,9 +41,7 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         system: Shipped system by name, or path of a spec.
         retuned: Changes to recoveries, detections and mechanisms before the run: name → fields.
         strategy: Of the manager; empty for the spec's.
-        airport: Name or path; empty for the spec's.
-        mission: Name or path; empty for the spec's.
-        obstacles: How many of the airport's stand on the way.
+        options: Of the system's application; those left out are the spec's.
         ftm: False for the unprotected baseline.
         network: What lies between the nodes.
         faults: What goes wrong.
@@ -52,12 +50,10 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """
 
     row: str
-    system: str = "osmosis"
+    system: str = systems.DEFAULT.stem
     retuned: dict[str, dict[str, Any]] = {}
     strategy: str = ""
-    airport: str = ""
-    mission: str = ""
-    obstacles: int = 0
+    options: dict[str, Any] = {}
     ftm: bool = True
     network: str = "measured"
     faults: tuple[PlannedFault, ...] = ()
@@ -70,15 +66,25 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         return hashlib.sha256(msgspec.msgpack.encode(
             msgspec.structs.replace(self, row=""), order="deterministic")).hexdigest()[:12]
 
-    @property
-    def options(self) -> dict[str, Any]:
-        """What it chooses of the application's options."""
-        chosen = {"airport": self.airport, "mission": self.mission, "obstacles": self.obstacles}
-        return {name: value for name, value in chosen.items() if value}
-
     def text(self) -> str:
         """Return what goes wrong in it, in words."""
         return ", ".join(fault.text() for fault in self.faults) or "no fault"
+
+
+def job_of(stored: dict[str, Any]) -> Job:
+    """Return a job as it was kept in a campaign's store or in a counterexample's file.
+
+    In version 0.6 the options of the application were fields of the job.
+
+    Raises:
+        msgspec.ValidationError: it is none.
+    """
+    options = {name: stored[name] for name in stored if name not in Job.__struct_fields__}
+    if not options:
+        return msgspec.convert(stored, Job)
+    return msgspec.convert(
+        {name: value for name, value in stored.items() if name not in options}
+        | {"options": {name: value for name, value in options.items() if value}}, Job)
 
 
 class DecisionTaken(msgspec.Struct, frozen=True, array_like=True):
@@ -90,17 +96,15 @@ class DecisionTaken(msgspec.Struct, frozen=True, array_like=True):
 
 
 class RunResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What is kept of a run. Times are simulated seconds, distances metres.
+    """What is kept of a run. Times are simulated seconds.
 
     Attributes:
-        success: Every point of the mission in order and in its mode.
-        safe: Never in a prohibited area, never a collision, and ground truth to know it by.
+        success: The judge found its task done.
+        safe: The judge found it safe all the time, and had the ground truth to know it by.
         reasons: Why not.
         duration_s: Length of the run.
-        collisions: By ground truth.
-        prohibited_s: Time in the prohibited area.
-        obstacle_m: Smallest clearance to an obstacle or building, exact below 1 m.
-        prohibited_m: Smallest clearance to the prohibited area, negative inside, exact below 1 m.
+        margins: See `Judgement`, as the next two.
+        severity: How unsafe it was.
         unsafe_s: When it first became unsafe.
         injected_s: When the first fault that had an effect was injected.
         detected_after_s: From then to the first detection.
@@ -118,10 +122,8 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
     safe: bool
     reasons: tuple[str, ...]
     duration_s: float
-    collisions: int
-    prohibited_s: float
-    obstacle_m: float | None
-    prohibited_m: float | None
+    margins: dict[str, float | None]
+    severity: float
     unsafe_s: float | None
     injected_s: float | None
     detected_after_s: float | None
@@ -153,22 +155,23 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
         return self.effective or not (self.safe and self.success)
 
     @property
-    def margin_m(self) -> float:
-        """The smaller of the two clearances; how far from unsafe the run was."""
-        return min(math.inf if m is None else m for m in (self.obstacle_m, self.prohibited_m))
+    def margin(self) -> float:
+        """The smallest of the margins: how far from unsafe the run was."""
+        return min((m for m in self.margins.values() if m is not None), default=math.inf)
 
 
 def run_job(job: Job) -> RunResult:
     """Run a job in virtual time and return what is kept of it."""
     begun_s = time.perf_counter()
     result, injected_s = run_virtually(job), None
-    record = result.record
+    record, judged = result.record, result.judgement
     effective = [o.injected_s for o in record.faults if o.effective and o.injected_s is not None]
     if effective:
         injected_s = min(effective)
     return RunResult(
         success=record.mission == "success", safe=record.safety == "safe", reasons=record.reasons,
-        duration_s=round(record.duration_s, 2), **result.figures,
+        duration_s=round(record.duration_s, 2), margins=judged.margins, severity=judged.severity,
+        unsafe_s=judged.unsafe_s,
         injected_s=injected_s, **latencies(record, injected_s),
         decisions=tuple(DecisionTaken(round(d.t_s, 3), d.active, d.recoveries)
                         for d in record.decisions),
@@ -178,7 +181,12 @@ def run_job(job: Job) -> RunResult:
 
 
 def run_virtually(job: Job) -> VirtualResult:
-    """Run a job in virtual time and return all that is known of it.
+    """Run a job in virtual time and return all that is known of it; raises as `virtual_run`."""
+    return virtual_run(job).run()
+
+
+def virtual_run(job: Job) -> VirtualRun:
+    """Return a job's run in virtual time, not yet begun.
 
     Raises:
         ValueError: The job makes no sense: no such system, mission, fault.
@@ -196,8 +204,7 @@ def run_virtually(job: Job) -> VirtualResult:
     trial = trial_class(spec)(RunContext(plan, spec, document, application), job.patience_s)
     if not trial.judges:
         raise ValueError(f"{file}: nobody judges its runs")
-    return VirtualRun(trial, network=find_network(job.network), scenario=job.faults,
-                      nodes=nodes).run()
+    return VirtualRun(trial, network=find_network(job.network), scenario=job.faults, nodes=nodes)
 
 
 def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
@@ -234,6 +241,13 @@ def faults_of_system(system: str) -> Faults:
     """
     file, document = _document(system)
     return faults_of(check_document(document, file))
+
+
+@lru_cache(maxsize=8)
+def application_of_system(system: str) -> type[Application]:
+    """Return the application of a system; arguments and errors as of `faults_of_system`."""
+    file, document = _document(system)
+    return application_class(check_document(document, file))
 
 
 @lru_cache(maxsize=8)

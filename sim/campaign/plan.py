@@ -7,6 +7,8 @@ import random
 from collections.abc import Iterable, Sequence
 from itertools import product
 
+import msgspec
+
 from rampart.actors.bus.topic import ROOT
 from rampart.actors.layout.system_topics import published_keys, system_topics
 from rampart.manager.spec.schema import SystemSpec
@@ -55,7 +57,7 @@ def cross(jobs: Sequence[Job], faults: Iterable[PlannedFault | None], seeds: Ite
     """Return every job with every fault and every seed; None is a run without a fault.
 
     Args:
-        jobs: What they have in common: mission, obstacles, strategy, with or without FTM.
+        jobs: What they have in common: options, strategy, with or without FTM.
         faults: One per run.
         seeds: Of the runs.
     """
@@ -112,6 +114,4 @@ def _random_fault(dice: random.Random, groups: dict[str, tuple[str, ...]], kinds
 
 def _with(job: Job, faults: tuple[PlannedFault, ...], seed: int) -> Job:
     names = " + ".join(fault.fault for fault in faults) or "none"
-    return Job(row=names, system=job.system, retuned=job.retuned, strategy=job.strategy,
-               airport=job.airport, mission=job.mission, obstacles=job.obstacles, ftm=job.ftm,
-               network=job.network, faults=faults, seed=seed, patience_s=job.patience_s)
+    return msgspec.structs.replace(job, row=names, faults=faults, seed=seed)

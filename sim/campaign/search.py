@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from rampart.sim.campaign.job import Job, RunResult, run_job
+from rampart.sim.campaign.job import Job, RunResult, application_of_system, run_job
 from rampart.sim.campaign.plan import EARLIEST_S
 from rampart.sim.faults.scenario import PlannedFault
 
@@ -62,13 +62,10 @@ class Space:
 
 
 def margin(result: RunResult) -> float:
-    """Return what the optimiser makes small: the margin, metres; below 0 it was unsafe.
-
-    A run that was unsafe for longer, or more often, is further below.
-    """
+    """Return what the optimiser makes small: the margin; of an unsafe run less its severity."""
     if result.safe:
-        return result.margin_m
-    return -result.prohibited_s - result.collisions
+        return result.margin
+    return -result.severity
 
 
 def search(space: Space, budget: int, run: Run, *, seed: int, at_once: int = 1,
@@ -111,8 +108,8 @@ def shrink(job: Job, run: Callable[[Job], RunResult] = run_job,
            tried: Callable[[Job, bool], None] = lambda _job, _unsafe: None) -> Job:
     """Return a smaller run that is unsafe still.
 
-    Takes away in turn, as long as the run stays unsafe: whole faults, the airport's obstacles,
-    the pattern of a fault, half of its duration, digits of its time, the seed.
+    Takes away in turn, as long as the run stays unsafe: whole faults, what its options can do
+    without, the pattern of a fault, half of its duration, digits of its time, the seed.
 
     Args:
         job: An unsafe run.
@@ -150,8 +147,8 @@ def _smaller(job: Job) -> list[Job]:
     for i in range(len(job.faults)):
         if len(job.faults) > 1:
             change(faults=(*job.faults[:i], *job.faults[i + 1:]))
-    if job.obstacles:
-        change(obstacles=0)
+    for options in application_of_system(job.system).simpler(job.options):
+        change(options=options)
     for i, fault in enumerate(job.faults):
         for simpler in _simpler(fault):
             change(faults=(*job.faults[:i], simpler, *job.faults[i + 1:]))

@@ -51,7 +51,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     fault: str
-    obstacles: int
+    options: dict[str, Any]
     ftm: bool
     strategy: str
     retuned: dict[str, dict[str, Any]]
@@ -66,8 +66,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     false_alarms: int
     detected_after_s: Spread | None
     recovered_after_s: Spread | None
-    obstacle_m: Spread | None
-    prohibited_m: Spread | None
+    margins: dict[str, Spread | None]
 
 
 def rate(count: int, of: int) -> Rate:
@@ -102,7 +101,7 @@ def verdict(run: Run) -> str:
 
 def badness(run: Run) -> tuple[bool, bool, float]:
     """Return how bad a run was, to sort by: unsafe, failed, and how little room was left."""
-    return (not run.result.safe, not run.result.success, -run.result.margin_m)
+    return (not run.result.safe, not run.result.success, -run.result.margin)
 
 
 def worst(runs: Iterable[Run]) -> Run:
@@ -113,20 +112,19 @@ def worst(runs: Iterable[Run]) -> Run:
 def table(runs: Iterable[Run]) -> list[Row]:
     """Return one row per fault and condition, in order of first appearance.
 
-    The condition: obstacles, FTM, strategy, and what was retuned.
+    The condition: options, FTM, strategy, and what was retuned.
     """
     rows: dict[tuple[object, ...], list[Run]] = {}
     for run in runs:
         job = run.job
-        retuned = msgspec.json.encode(job.retuned, order="deterministic")
-        rows.setdefault(
-            (job.row, job.obstacles, job.ftm, job.strategy, retuned), []).append(run)
+        condition = msgspec.json.encode((job.options, job.retuned), order="deterministic")
+        rows.setdefault((job.row, job.ftm, job.strategy, condition), []).append(run)
     return [_row(found[0].job, found) for found in rows.values()]
 
 
 def total(runs: Sequence[Run], name: str) -> Row:
     """Return all runs as one row; there must be one at least."""
-    return _row(Job(row=name, obstacles=-1), runs)
+    return _row(Job(row=name), runs)
 
 
 def _row(condition: Job, runs: Sequence[Run]) -> Row:
@@ -134,7 +132,7 @@ def _row(condition: Job, runs: Sequence[Run]) -> Row:
     results = [run.result for run in counted]
     bad = worst(counted or runs)
     return Row(
-        fault=condition.row, obstacles=condition.obstacles, ftm=condition.ftm,
+        fault=condition.row, options=condition.options, ftm=condition.ftm,
         strategy=condition.strategy, retuned=condition.retuned, runs=len(runs),
         ineffective=len(runs) - len(counted),
         success=rate(sum(r.success for r in results), len(results)),
@@ -146,13 +144,14 @@ def _row(condition: Job, runs: Sequence[Run]) -> Row:
         false_alarms=sum(r.false_alarms for r in results),
         detected_after_s=spread(r.detected_after_s for r in results),
         recovered_after_s=spread(r.recovered_after_s for r in results),
-        obstacle_m=spread(r.obstacle_m for r in results),
-        prohibited_m=spread(r.prohibited_m for r in results))
+        margins={name: spread(r.margins.get(name) for r in results)
+                 for name in dict.fromkeys(name for r in results for name in r.margins)})
 
 
 def as_json(row: Row) -> dict[str, object]:
-    """Return a row as scripts get it: counts, and everything else under names of its own."""
+    """Return a row as scripts get it: options and margins among the figures, rates as counts."""
     more = msgspec.to_builtins(row)
-    return {**more, "success": row.success.count, "safe": row.safe.count,
+    options, margins = more.pop("options"), more.pop("margins")
+    return {**options, **margins, **more, "success": row.success.count, "safe": row.safe.count,
             "success_interval": [row.success.low, row.success.high],
             "safe_interval": [row.safe.low, row.safe.high]}

@@ -6,12 +6,12 @@ import contextlib
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
 from rampart.files.reading import shown
-from rampart.sim.campaign.job import Job, RunResult
+from rampart.sim.campaign.job import Job, RunResult, job_of, trial_of_system
 
 FILE_NAME = "runs.sqlite"
 
@@ -21,7 +21,7 @@ create table if not exists runs (
     key text primary key, job blob not null, result blob not null,
     finished_at text not null default current_timestamp);
 """
-_FORMAT = "1"
+_FORMAT, _FORMAT_06 = "2", "1"
 
 MAX_VALUE_BYTES = 16 << 20
 """Of a job or a result; those of the paper's campaign have some kilobytes."""
@@ -45,10 +45,11 @@ class Store:
     method raises `StoreError` when the file cannot be read or written.
 
     Args:
-        directory: Of the campaign; it is made if need be.
+        directory: Of the campaign; it is made if need be. A store of version 0.6 is read as it is;
+            its runs are not taken for those of today's jobs, whose keys are others.
 
     Raises:
-        StoreError: There is a file that is no store, or one of another version.
+        StoreError: There is a file that is no store, or one of a later version.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -74,7 +75,8 @@ class Store:
             raise StoreError(f"{self.path}: no store of campaign results: {error}") from None
         if foreign is not None:  # what it computes nobody bounds
             raise StoreError(f"{self.path}: no store of campaign results: it has a view or trigger")
-        if found != _FORMAT:
+        self._format = found
+        if found not in {_FORMAT, _FORMAT_06}:
             raise StoreError(f"{self.path}: format {shown(found)}, this program reads {_FORMAT}; "
                              "choose another --out")
 
@@ -94,6 +96,9 @@ class Store:
             StoreError: it cannot be written.
         """
         with self._using(), self._database:
+            if self._format != _FORMAT:  # from now on version 0.6 cannot read it
+                self._database.execute("update about set value = ? where name = 'format'",
+                                       (_FORMAT,))
             self._database.execute(
                 "insert or ignore into runs (key, job, result) values (?, ?, ?)",
                 (job.key, msgspec.msgpack.encode(job), msgspec.msgpack.encode(result)))
@@ -135,10 +140,13 @@ class Store:
                              "choose another --out") from None
 
 
-_NO_RUN = (ValueError, TypeError, RecursionError)
+_NO_RUN = (ValueError, TypeError, LookupError, RecursionError)
 """What decoding raises that meets other bytes, or no bytes at all."""
 
 
 def _run(job: bytes, result: bytes) -> Run:
-    return Run(msgspec.msgpack.decode(job, type=Job),
-               msgspec.msgpack.decode(result, type=RunResult))
+    made = job_of(msgspec.msgpack.decode(job, type=dict[str, Any]))
+    values = msgspec.msgpack.decode(result, type=dict[str, Any])
+    if "margins" not in values:  # of version 0.6
+        values = trial_of_system(made.system).upgraded(values)
+    return Run(made, msgspec.convert(values, RunResult))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-from rampart.sim.campaign.defaults import EXACT_BELOW_M
 from rampart.sim.campaign.statistics import Rate
 
 NONE, MINUS = "–", "−"  # noqa: RUF001 - typography for people
@@ -28,13 +27,13 @@ def interval(found: Rate) -> str:
     return f"{percent(found.low)} to {percent(found.high)} %" if found.of else ""
 
 
-def metres(value: float | None) -> str:
-    """Return a clearance; above `EXACT_BELOW_M` the simulator knows only a bound."""
+def margin_text(value: float | None, unit: str, exact_below: float | None) -> str:
+    """Return a margin; from `exact_below` on only a bound is known, None: always exact."""
     if value is None or not math.isfinite(value):
         return NONE
-    if value >= EXACT_BELOW_M:
-        return f"≥ {EXACT_BELOW_M:g} m"
-    return f"{value:.2f} m".replace("-", MINUS)
+    if exact_below is not None and value >= exact_below:
+        return f"≥ {exact_below:g} {unit}"
+    return f"{value:.2f} {unit}".replace("-", MINUS)
 
 
 def seconds(value: float | None) -> str:

@@ -12,8 +12,10 @@ from collections.abc import Callable
 from typing import Any
 
 from rampart.actors.osmosis.airport.model import rectangle
-from rampart.sim.campaign.defaults import EXACT_BELOW_M
 from rampart.sim.osmosis.robot import CIRCUMRADIUS_M, LENGTH_M, WIDTH_M
+
+EXACT_BELOW_M = 1.0
+"""Clearances are exact below this; above it they may be lower bounds."""
 
 Pose = tuple[float, float, float]
 """x m, y m, yaw rad in `map`."""

@@ -39,6 +39,17 @@ def hit(port: int, what: str, node: str, _pace_s: float) -> bool:
     return True
 
 
+def excused_s(late_s: float) -> float:
+    """Return how long nothing that was not heard counts, wall seconds.
+
+    Args:
+        late_s: how much too late the launcher looked again. It was stopped (ctrl-Z) if that is
+            more than a loaded machine does; then what was sent meanwhile comes now, or after its
+            links have been dialled again.
+    """
+    return late_s + _RELINK_S if late_s > _STALL_S else 0.0
+
+
 class ProcessRun:
     """One run on processes. Use: `run`, once.
 
@@ -103,9 +114,8 @@ class ProcessRun:
             while why is None and not self.interrupted and not launcher.failure:
                 looked_s = clock.now()
                 await asyncio.sleep(_LOOK_S)
-                stall_s = clock.now() - looked_s - _LOOK_S * plan.rate
-                if stall_s > _STALL_S * plan.rate:  # ctrl-Z; what was sent meanwhile comes now
-                    trial.excuse(stall_s + _RELINK_S * plan.rate)
+                if wall_s := excused_s((clock.now() - looked_s) / plan.rate - _LOOK_S):
+                    trial.excuse(wall_s * plan.rate)
                 why = trial.over(clock.now())
             if launcher.failure:  # before its observer is told to end
                 why = self.failure = launcher.failure

@@ -36,6 +36,23 @@ from rampart.sim.runs.report import Written
 LAUNCHER = "launch.py"
 
 
+class Judgement(msgspec.Struct, frozen=True, kw_only=True):
+    """What a judge measured in a run.
+
+    Args:
+        margins: how far from harm the run was at its worst, by the names in `Trial.margins`; None
+            where there was nothing to measure.
+        severity: how bad an unsafe run was: the larger, the worse; 0 for a safe one.
+        unsafe_s: when it first became unsafe, simulated time.
+        narrowest_s: when the smallest margin was measured.
+    """
+
+    margins: dict[str, float | None] = {}
+    severity: float = 0.0
+    unsafe_s: float | None = None
+    narrowest_s: float | None = None
+
+
 class Trial:
     """A run that goes on for a while, without a judge.
 
@@ -44,6 +61,10 @@ class Trial:
         injector: who carries out faults.
         tells: who tells the story.
         retunings: changes to a system that have a name, see `Job.retuned`.
+        margins: how far from harm a run was: names, and how they are headed in a report.
+        margin_unit: of all of them.
+        exact_below: above it a margin may be a lower bound; None if all are exact.
+        pictures: class path of the `RunPictures` that a campaign's report shows; "" for none.
 
     Args:
         run: what is run.
@@ -62,6 +83,10 @@ class Trial:
     injector: ClassVar[type[Injector]] = Injector
     tells: ClassVar[type[Console]] = Console
     retunings: ClassVar[Mapping[str, dict[str, dict[str, Any]]]] = {}
+    margins: ClassVar[Mapping[str, str]] = {}
+    margin_unit: ClassVar[str] = "m"
+    exact_below: ClassVar[float | None] = None
+    pictures: ClassVar[str] = ""
 
     def __init__(self, run: RunContext, limit_s: float | None = None,
                  stream: TextIO | None = None) -> None:
@@ -148,9 +173,15 @@ class Trial:
             "faults": [{**msgspec.to_builtins(fault), "effective": fault.effective}
                        for fault in record.faults]}
 
-    def figures(self, record: RunRecord) -> dict[str, Any]:
-        """Return the fields of a campaign's `RunResult` that only a judge knows."""
-        raise NotImplementedError(f"{type(self).__name__} judges nothing: {record.run_id}")
+    def judgement(self, record: RunRecord) -> Judgement:
+        """Return what only a judge knows of a run that is over."""
+        del record
+        return Judgement()
+
+    @classmethod
+    def upgraded(cls, result: dict[str, Any]) -> dict[str, Any]:
+        """Return a result that a campaign of version 0.6 stored, with the fields of today."""
+        return result
 
     def report(self, record: RunRecord, directory: Path) -> Written:
         """Write as much of a report as can be written; by default there is none."""

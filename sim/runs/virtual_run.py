@@ -15,7 +15,6 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import msgspec
 
@@ -25,7 +24,7 @@ from rampart.actors.runtime.actor import Context
 from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.runs.record import RunRecord
-from rampart.sim.runs.trial import Trial
+from rampart.sim.runs.trial import Judgement, Trial
 from rampart.sim.virtual.network import NETWORKS, NetworkModel, SeededNetwork
 from rampart.sim.virtual.virtual_bus import Hub, Tap, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
@@ -44,7 +43,7 @@ class VirtualResult(msgspec.Struct, frozen=True):
 
     Attributes:
         record: The story of the run.
-        figures: What only a judge knows, see `Trial.figures`.
+        judgement: What only a judge knows.
         why: Why it ended.
         trace: SHA-256 over everything that was sent, in hexadecimal.
         messages: How many were sent.
@@ -54,7 +53,7 @@ class VirtualResult(msgspec.Struct, frozen=True):
     """
 
     record: RunRecord
-    figures: dict[str, Any]
+    judgement: Judgement
     why: str
     trace: str
     messages: int
@@ -181,7 +180,7 @@ class VirtualRun:
         await asyncio.gather(*watching)
         record = self.trial.conclude(now_s, why or "ended")
         return VirtualResult(
-            record, self.trial.figures(record), why or "ended", trace.digest(), trace.messages,
+            record, self.trial.judgement(record), why or "ended", trace.digest(), trace.messages,
             time.perf_counter() - begun_s,
             tuple((name, f"{type(error).__name__}: {error}") for name, error in machine.failures),
             "".join(f"--- {name}\n{''.join(traceback.format_exception(error))}"

@@ -351,4 +351,4 @@ def stored_run(data: bytes) -> None:
     job, result = msgspec.msgpack.decode(data, type=tuple[msgspec.Raw, msgspec.Raw])
     run = _run(bytes(job), bytes(result))
     run.job.text()
-    _ = run.job.key, run.result.margin_m
+    _ = run.job.key, run.result.margin

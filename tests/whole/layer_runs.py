@@ -49,8 +49,9 @@ def with_layers(directory: Path, system: str, layers: tuple[str, ...]) -> Path:
 def layered_job(directory: Path, system: str, layers: tuple[str, ...], *faults: str,
                 seed: int = 1) -> Job:
     """Return a run of mission A that ends soon after the robot has come to stand."""
-    return Job(row="x", system=str(with_layers(directory, system, layers)), mission="A",
-               patience_s=10.0, faults=tuple(map(parse_fault, faults)), seed=seed)
+    return Job(row="x", system=str(with_layers(directory, system, layers)),
+               options={"mission": "A"}, patience_s=10.0, seed=seed,
+               faults=tuple(map(parse_fault, faults)))
 
 
 def main(count: int) -> None:

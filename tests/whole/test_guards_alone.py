@@ -45,7 +45,7 @@ def both(made, system: str, layers: tuple[str, ...], without: tuple[str, ...], *
 def test_the_dead_man_alone_stops_a_robot_whose_safety_pilot_is_gone(job, system, fault):
     guarded, bare = both(job, system, ("dead_man",), (), fault)
     assert (guarded.safe, guarded.success) == (True, False)
-    assert guarded.prohibited_m > 0.9  # it stands on the centre line, where it was
+    assert guarded.margins["prohibited_m"] > 0.9  # it stands on the centre line, where it was
     assert not bare.safe
 
 
@@ -55,7 +55,7 @@ def test_the_safety_pilots_checks_alone_stop_a_robot_that_is_commanded_wrongly(
         job, system, faults):
     guarded, bare = both(job, system, ("safety_pilot_checks",), (), *faults)
     assert (guarded.safe, guarded.success, guarded.decisions) == (True, False, ())
-    assert guarded.prohibited_m > 0.9
+    assert guarded.margins["prohibited_m"] > 0.9
     assert not bare.safe
 
 
@@ -67,7 +67,7 @@ def test_the_obstacle_stop_needs_no_other_layer(job):
     result = run_job(job("paper", (), "obstacle-ahead:2@14", END))
     assert [o.effective for o in result.outcomes] == [True, True]
     assert result.safe
-    assert 0 < result.obstacle_m < 1
+    assert 0 < result.margins["obstacle_m"] < 1
 
 
 def test_the_safety_pilots_check_of_the_laser_alone_keeps_a_blind_robot_from_driving(job):

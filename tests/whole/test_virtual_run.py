@@ -26,10 +26,10 @@ SHORT = parse_fault("kill:mission_manager@6")
 """Loses the mission, so the run is over after ten simulated seconds."""
 
 
-def job(*faults: str, **changes) -> Job:
+def job(*faults: str, options=None, **changes) -> Job:
     """A job on the paper's system: what it does under a fault is known, and it is the quicker."""
-    return Job(row="test", mission="A", faults=tuple(map(parse_fault, faults)),
-               **{"system": "paper", **changes})
+    return Job(row="test", options={"mission": "A", **(options or {})},
+               faults=tuple(map(parse_fault, faults)), **{"system": "paper", **changes})
 
 
 def decisions(result):
@@ -41,8 +41,8 @@ def test_a_mission_without_a_fault_succeeds_without_a_decision():
     assert (result.success, result.safe, result.decisions) == (True, True, ())
     assert (result.false_alarms, result.failures) == (0, ())
     assert result.detected_after_s is None
-    assert result.obstacle_m > 0.3
-    assert result.prohibited_m > 0.3
+    assert result.margins["obstacle_m"] > 0.3
+    assert result.margins["prohibited_m"] > 0.3
 
 
 @pytest.mark.parametrize("network", ["measured", "lossy"])
@@ -222,7 +222,7 @@ def test_an_obstacle_appears_ahead_and_is_passed_or_waited_for():
     result = run_job(job("obstacle-ahead:3@15"))
     assert result.outcomes[0].effective
     assert result.safe
-    assert 0 < result.obstacle_m < 1
+    assert 0 < result.margins["obstacle_m"] < 1
 
 
 def test_a_fault_can_be_planned_for_a_goal():

@@ -14,6 +14,7 @@ from rampart.actors.osmosis.messages import ControlStatus, GroundTruth, MissionS
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
+from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.console import MissionConsole
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
 from rampart.sim.osmosis.trial.judge import Judge, JudgeSink
@@ -23,7 +24,7 @@ from rampart.sim.osmosis.trial.run_end import RunEnd
 from rampart.sim.runs.observer import Sink
 from rampart.sim.runs.record import RunRecord, Safety
 from rampart.sim.runs.report import Written, try_report
-from rampart.sim.runs.trial import Trial
+from rampart.sim.runs.trial import Judgement, Trial
 
 _PATIENCE_S = 60.0
 _SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not known"}
@@ -37,6 +38,9 @@ class MissionTrial(Trial):
     tells = MissionConsole
     retunings = {"mechanisms as in the paper": {
         "RM2": {"latched": True}, "RM5": {"latched": True}}}
+    margins = {"obstacle_m": "nearest obstacle", "prohibited_m": "nearest prohibited area"}
+    exact_below = EXACT_BELOW_M
+    pictures = "rampart.sim.osmosis.trial.run_maps:RunMaps"
 
     def __init__(self, run: RunContext, limit_s: float | None = None,
                  stream: TextIO | None = None) -> None:
@@ -86,14 +90,21 @@ class MissionTrial(Trial):
         return {**super().summary(record),
                 "lights": [msgspec.to_builtins(light) for light in _mission(record).lights]}
 
-    def figures(self, record: RunRecord) -> dict[str, Any]:
-        """Return what ground truth shows: collisions, clearances, and when it became unsafe."""
+    def judgement(self, record: RunRecord) -> Judgement:
+        """Return what ground truth shows: clearances, and when it became unsafe."""
         verdict, found = self.judge.verdict(), _mission(record)
-        return {
-            "collisions": found.collisions, "prohibited_s": round(found.prohibited_s, 3),
-            "obstacle_m": _metres(verdict.closest_obstacle_m),
-            "prohibited_m": _metres(verdict.closest_prohibited_m),
-            "unsafe_s": verdict.first_unsafe_s}
+        return Judgement(
+            margins={"obstacle_m": _metres(verdict.closest_obstacle_m),
+                     "prohibited_m": _metres(verdict.closest_prohibited_m)},
+            severity=_severity(found.prohibited_s, found.collisions),
+            unsafe_s=verdict.first_unsafe_s, narrowest_s=found.narrowest_s)
+
+    @classmethod
+    def upgraded(cls, result: dict[str, Any]) -> dict[str, Any]:
+        """Return a result with its clearances as margins, collisions and trespass as severity."""
+        margins = {name: result.pop(name) for name in cls.margins}
+        severity = _severity(result.pop("prohibited_s"), result.pop("collisions"))
+        return {**result, "margins": margins, "severity": severity}
 
     def report(self, record: RunRecord, directory: Path) -> Written:
         """Write as much of the inspection report as can be written."""
@@ -104,6 +115,10 @@ def _mission(record: RunRecord) -> MissionRecord:
     if not isinstance(record, MissionRecord):
         raise TypeError(f"{type(record).__name__}: no record of a mission")
     return record
+
+
+def _severity(prohibited_s: float, collisions: int) -> float:
+    return round(prohibited_s, 3) + collisions
 
 
 def _metres(value: float) -> float | None:

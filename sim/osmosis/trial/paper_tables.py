@@ -150,7 +150,8 @@ def paper_jobs(mission: str = "A", seed: int = 1, system: str = PAPER_SYSTEM) ->
             for name, variants in FAULTS.items():
                 for i, fault in enumerate(variants):
                     jobs.append(Job(
-                        row=name, system=system, mission=mission, obstacles=obstacles,
+                        row=name, system=system,
+                        options={"mission": mission, "obstacles": obstacles},
                         strategy=PAPER_STRATEGY, ftm=condition != CONDITIONS[0],
                         retuned=AS_THE_PAPER if condition == CONDITIONS[1] else {},
                         faults=(fault,) if fault else (), seed=seed + i))
@@ -176,7 +177,7 @@ def cells(runs: Iterable[Run]) -> list[Cell]:
     """Return tables IV and V, and what became of table V's runs under other conditions."""
     found: dict[tuple[str, str, int], list[Run]] = {}
     for run in runs:
-        found.setdefault((condition_of(run.job), run.job.row, run.job.obstacles), []).append(run)
+        found.setdefault((condition_of(run.job), run.job.row, _obstacles(run.job)), []).append(run)
     table = []
     for condition in (*CONDITIONS, FULL):
         verdicts = WITHOUT_FTM if condition == CONDITIONS[0] else WITH_FTM
@@ -188,6 +189,10 @@ def cells(runs: Iterable[Run]) -> list[Cell]:
     return table
 
 
+def _obstacles(job: Job) -> int:
+    return int(job.options.get("obstacles", 0))
+
+
 def _cell(condition: str, paper: str, runs: Sequence[Run]) -> Cell:
     counted = [run for run in runs if run.result.counts]
     bad = worst(counted or runs)
@@ -196,7 +201,7 @@ def _cell(condition: str, paper: str, runs: Sequence[Run]) -> Cell:
                  for d in bad.result.decisions[:6]]
     return Cell(
         table="IV" if condition == CONDITIONS[0] else "V", fault=bad.job.row,
-        obstacles=bad.job.obstacles, condition=condition, paper=paper,
+        obstacles=_obstacles(bad.job), condition=condition, paper=paper,
         expected=GOOD if condition == FULL else paper,
         ours=verdict(bad) if counted else NO_EFFECT, runs=len(runs),
         ineffective=len(runs) - len(counted), success=sum(r.result.success for r in counted),

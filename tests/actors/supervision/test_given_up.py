@@ -135,7 +135,8 @@ def test_a_node_that_is_adapted_is_not_held_to_what_it_was_given_up_for():
 def test_the_robot_stands_until_what_was_given_up_is_back_and_then_goes_on(tmp_path, node):
     result = run_virtually(Job(
         row="x", system=str(write_sick_system(tmp_path, node)), patience_s=120,
-        mission=str(write_short_mission(tmp_path)), faults=(parse_fault(f"kill:{node}@15"),)))
+        options={"mission": str(write_short_mission(tmp_path))},
+        faults=(parse_fault(f"kill:{node}@15"),)))
     record = result.record
     assert (record.mission, record.safety, record.reasons) == ("success", "safe", ())
     given_up = [e.t_s for e in record.events if f"{node} given up" in e.text]

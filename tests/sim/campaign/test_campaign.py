@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -13,6 +14,7 @@ import sys
 import time
 from collections import Counter
 from functools import partial
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -51,15 +53,15 @@ from tests.porter_actors import write_porter_system
 PAPER = systems.load("paper")
 GROUPS = fault_groups(PAPER)
 sample = partial(sample, faults=OsmosisFaults())
-BASES = [Job(row="", system="paper", mission="A", obstacles=n) for n in (0, 2)]
+BASES = [Job(row="", system="paper", options={"mission": "A", "obstacles": n}) for n in (0, 2)]
 SHORT = PlannedFault("kill:mission_manager", 3.0)
 """Over after seven simulated seconds of the paper's system, a fifth of a second of work."""
 
 
 def result(**changes) -> RunResult:
     values = {
-        "success": True, "safe": True, "reasons": (), "duration_s": 10.0, "collisions": 0,
-        "prohibited_s": 0.0, "obstacle_m": 0.8, "prohibited_m": 0.9, "unsafe_s": None,
+        "success": True, "safe": True, "reasons": (), "duration_s": 10.0,
+        "margins": {"obstacle_m": 0.8, "prohibited_m": 0.9}, "severity": 0.0, "unsafe_s": None,
         "injected_s": 5.0, "detected_after_s": 0.1, "recovered_after_s": 0.3, "false_alarms": 0,
         "decisions": (), "outcomes": (FaultOutcome("x@5", 5.0, 3),), "failures": (),
         "trace": "00", "wall_s": 0.1}
@@ -91,7 +93,7 @@ def test_a_sample_draws_all_kinds_patterns_and_conditions_alike():
     kinds = Counter(kind_of[job.faults[0].fault] for job in jobs)
     assert set(kinds) == set(GROUPS)
     assert min(kinds.values()) > 3000 / 6 * 0.8
-    assert 0.4 < sum(job.obstacles == 2 for job in jobs) / 3000 < 0.6
+    assert 0.4 < sum(job.options["obstacles"] == 2 for job in jobs) / 3000 < 0.6
     messages = [j.faults[0] for j in jobs
                 if kind_of[j.faults[0].fault] in {"paper", "sensor", "topic"}]
     permanent = sum(f.duration_s == math.inf and not f.on_s for f in messages)
@@ -142,7 +144,7 @@ def test_a_store_of_another_format_is_refused(tmp_path):
     with sqlite3.connect(tmp_path / "runs.sqlite") as database:
         database.execute("update about set value = '99'")
     database.close()
-    with pytest.raises(StoreError, match="format '99', this program reads 1"):
+    with pytest.raises(StoreError, match="format '99', this program reads 2"):
         Store(tmp_path)
 
 
@@ -216,6 +218,7 @@ def test_a_campaign_killed_in_the_middle_goes_on_where_it_was(tmp_path):
 FULL_DISK = """
 import msgspec, resource, sys
 from functools import partial
+from pathlib import Path
 from pathlib import Path
 from rampart.sim.campaign.job import Job, RunResult
 from rampart.sim.campaign.store import Store, StoreError
@@ -364,7 +367,7 @@ def test_a_row_of_nothing_but_ineffective_runs_says_so():
 
 
 @pytest.mark.parametrize(("ended", "success", "safe", "words"), [
-    ({"safe": False, "collisions": 1}, 2, 1, "success, unsafe"),
+    ({"safe": False, "severity": 1.0}, 2, 1, "success, unsafe"),
     ({"success": False}, 1, 2, "fail, safe")])
 def test_a_run_that_ends_badly_is_counted_though_its_fault_is_said_to_have_changed_nothing(
         ended, success, safe, words):
@@ -378,7 +381,7 @@ def test_a_run_that_ends_badly_is_counted_though_its_fault_is_said_to_have_chang
 
 def test_the_worst_run_is_unsafe_before_failed_before_close():
     close, failed, unsafe = (
-        result(obstacle_m=0.1), result(success=False), result(safe=False))
+        result(margins={"obstacle_m": 0.1}), result(success=False), result(safe=False))
     runs = runs_of(result(), close, failed, unsafe)
     assert sorted(runs, key=badness) == runs
     assert worst(runs).result is unsafe
@@ -386,12 +389,12 @@ def test_the_worst_run_is_unsafe_before_failed_before_close():
 
 def test_conditions_are_rows_of_their_own():
     runs = [run for condition in (
-        {"obstacles": 0}, {"obstacles": 2}, {"ftm": False}, {"strategy": "mission-first"},
+        {}, {"options": {"obstacles": 2}}, {"ftm": False}, {"strategy": "mission-first"},
         {"retuned": AS_THE_PAPER})
         for run in runs_of(result(), **condition)]
-    assert [(r.obstacles, r.ftm, r.strategy, r.retuned) for r in table([*runs, *runs])] == [
-        (0, True, "", {}), (2, True, "", {}), (0, False, "", {}), (0, True, "mission-first", {}),
-        (0, True, "", AS_THE_PAPER)]
+    assert [(r.options, r.ftm, r.strategy, r.retuned) for r in table([*runs, *runs])] == [
+        ({}, True, "", {}), ({"obstacles": 2}, True, "", {}), ({}, False, "", {}),
+        ({}, True, "mission-first", {}), ({}, True, "", AS_THE_PAPER)]
     assert total(runs, "all").runs == 5
 
 
@@ -411,7 +414,8 @@ def test_every_row_of_the_papers_tables_is_run_under_every_condition():
     jobs = paper_jobs()
     assert len(jobs) == len({job.key for job in jobs})
     assert {job.system for job in jobs} == {"paper"}
-    assert {(j.row, j.obstacles) for j in jobs} == {(f, n) for f in FAULTS for n in (0, 2)}
+    assert {(j.row, j.options["obstacles"]) for j in jobs} == {
+        (fault, n) for fault in FAULTS for n in (0, 2)}
     found = cells([Run(job, result()) for job in jobs])
     assert len(found) == len(CONDITIONS) * len(FAULTS) * 2
     assert {cell.ours for cell in found} == {"success, safe"}
@@ -423,7 +427,8 @@ def test_every_row_of_the_papers_tables_is_run_under_every_condition():
     ({}, "success, safe", (1, 3, 3)), ({"safe": False}, "success, unsafe", (0, 4, 3))])
 def test_in_the_papers_tables_a_run_without_effect_has_not_survived_but_an_unsafe_one_counts(
         ended, ours, counts):
-    jobs = [job for job in full_jobs() if job.row == "command not updated" and job.obstacles == 0]
+    jobs = [job for job in full_jobs()
+            if job.row == "command not updated" and not job.options["obstacles"]]
     nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
     cell, = cells([Run(job, result(outcomes=nothing, **ended) if job is jobs[2] else result())
                    for job in jobs])
@@ -436,7 +441,7 @@ def test_in_the_papers_tables_a_run_without_effect_has_not_survived_but_an_unsaf
 
 def test_the_full_system_is_given_the_runs_of_table_v_and_keeps_its_own_strategy():
     def what_goes_wrong(job: Job) -> tuple[object, ...]:
-        return job.row, job.faults, job.obstacles, job.seed, job.mission, job.network
+        return job.row, job.faults, job.options, job.seed, job.network
 
     jobs = full_jobs("B", seed=5)
     assert {(j.system, j.strategy, j.ftm) for j in jobs} == {("osmosis", "", True)}
@@ -465,8 +470,9 @@ def test_of_the_full_system_success_and_safety_are_expected_where_the_paper_has_
 
 def test_the_search_goes_where_the_margin_is_small():
     def fake(jobs):  # the nearer to 100 s and to gps-drift, the smaller the margin
-        return [result(obstacle_m=abs(j.faults[0].at_s - 100) / 100
-                       + (0.0 if j.faults[0].fault == "gps-drift" else 1.0)) for j in jobs]
+        return [result(margins={"obstacle_m": abs(j.faults[0].at_s - 100) / 100
+                                + (0.0 if j.faults[0].fault == "gps-drift" else 1.0)})
+                for j in jobs]
 
     pytest.importorskip("optuna")
     space = Space(tuple(BASES), {"sensor": ("gps-bias", "gps-drift", "gps-noise")})
@@ -484,20 +490,20 @@ def test_the_search_is_told_of_an_unsafe_run_though_its_fault_had_no_effect(monk
     monkeypatch.setattr(optuna.Study, "tell", lambda _self, _trial, value: told.append(value))
     nothing = (FaultOutcome("x@5", 5.0, 0, "it changed nothing"),)
     results = iter([result(outcomes=nothing),
-                    result(outcomes=nothing, safe=False, collisions=1)])
+                    result(outcomes=nothing, safe=False, severity=1.0)])
     search(Space(tuple(BASES), {"sensor": ("gps-bias",)}), 2,
            lambda _jobs: [next(results)], seed=1)
     assert told == [2.0, -1.0]
 
 
 def test_what_is_unsafe_for_longer_is_further_down():
-    assert margin(result(safe=False, prohibited_s=3.0)) < margin(
-        result(safe=False, collisions=1)) < 0 < margin(result())
+    assert margin(result(safe=False, severity=3.0)) < margin(
+        result(safe=False, severity=1.0)) < 0 < margin(result())
 
 
 def test_a_counterexample_is_shrunk_to_what_it_needs():
     needed = PlannedFault("laser-stuck", 37.42, duration_s=31.7, on_s=1.0, off_s=0.5, seed=77)
-    job = Job(row="x", obstacles=2, seed=99, faults=(
+    job = Job(row="x", options={"obstacles": 2}, seed=99, faults=(
         PlannedFault("gps-bias", 12.0), needed, PlannedFault("kill:DM3", 50.0)))
 
     def run(candidate: Job) -> RunResult:
@@ -506,7 +512,7 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
         return result(safe=not bad)
 
     small = shrink(job, run)
-    assert (len(small.faults), small.obstacles, small.seed) == (1, 0, 1)
+    assert (len(small.faults), small.options, small.seed) == (1, {"obstacles": 0}, 1)
     fault, = small.faults
     assert (fault.fault, fault.at_s, fault.on_s, fault.seed) == ("laser-stuck", 40.0, 0.0, 0)
     assert 5 <= fault.duration_s < 10
@@ -527,7 +533,7 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
     (("--fault", "gremlins"), "unknown fault 'gremlins'"),
     (("--fault", "kill:nobody"), "no node 'nobody'"),
     (("--fault", "gps-bias@soon"), "WHEN 'soon'"),
-    (("--runs", "3", "--obstacles", "many"), "--obstacles many: must be numbers"),
+    (("--runs", "3", "--obstacles", "many"), "--obstacles many: must be a number"),
     (("--runs", "3", "--obstacles", "99"), "obstacles = 99: Vallombre has places for 5"),
     (("--runs", "3", "--mission", "Z"), "Z"),
     (("--runs", "3", "--strategy", "hope"), "unknown strategy 'hope'"),
@@ -535,8 +541,8 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
     (("--runs", "3", "--patience", "0"), "--patience 0"),
     (("--replay", "ab"), "--out DIR is missing"),
     (("--replay", "ab", "--out", "/nowhere"), "no such directory"),
-    (("--system", "cell", "--paper"), "--system cell: it has no .robot."),
-    (("--system", "cell", "--paper", "--full"), "--system cell: it has no .robot."),
+    (("--system", "cell", "--paper"), "--system cell: nobody judges its runs"),
+    (("--system", "cell", "--paper", "--full"), "--system cell: nobody judges its runs"),
 ])
 def test_bad_usage_is_one_line_and_exit_code_2(capsys, arguments, words):
     assert rampart(["campaign", *arguments]) == 2
@@ -644,7 +650,8 @@ def test_a_row_of_the_full_system_that_is_not_as_expected_is_told_and_is_exit_co
     assert {(r["expected"], r["ours"]) for r in rows} == {("success, safe",) * 2}
     assert {r["fault"]: r["paper"] for r in rows} == {f: v[0] for f, v in WITH_FTM.items()}
 
-    lost = next(job for job in full_jobs() if job.row == "command not updated" and job.obstacles)
+    lost = next(job for job in full_jobs()
+                if job.row == "command not updated" and job.options["obstacles"])
     made_up[lost.key] = result(success=False, reasons=("goal 2 of 9 not reached",))
     assert rampart([*arguments, str(tmp_path / "bad")]) == 1
     rows = {(r["fault"], r["obstacles"]): r for r in json.loads(capsys.readouterr().out)}
@@ -669,3 +676,18 @@ def test_a_log_gets_a_line_a_minute_with_the_time_left_and_one_at_the_end():
     assert [i for i, line in enumerate(lines) if line] == [6, 12, 18, 19]
     assert lines[-1] == "30 of 30 runs, 0 unsafe with FTM"
     assert ProgressLog(total=1, done=0).made_one(5.0, unsafe=1) == "1 of 1 runs, 1 unsafe with FTM"
+
+
+def test_a_store_of_version_0_6_is_read_and_its_runs_are_repeated(tmp_path, capsys):
+    shutil.copy(Path(__file__).with_name("store_06.sqlite"), tmp_path / "runs.sqlite")
+    store = Store(tmp_path)
+    runs = list(store.runs())
+    assert {(run.job.row, run.job.options.get("obstacles"), run.result.success, run.result.safe)
+            for run in runs} == {("none", None, True, True), ("none", 2, True, True), (
+                SHORT.fault, None, False, True), (SHORT.fault, 2, False, True)}
+    assert all(0 < run.result.margin < math.inf for run in runs)
+    key = min(store.keys())
+    store.add(*runs[0])
+    store.close()
+    assert rampart(["campaign", "--replay", key, "--out", str(tmp_path), "--json"]) in {0, 1}
+    assert json.loads(capsys.readouterr().out)["job"]["options"]["mission"] == "A"

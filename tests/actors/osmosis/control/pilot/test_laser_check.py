@@ -53,14 +53,14 @@ def test_after_a_wrong_sweep_the_laser_is_not_believed_for_a_second():
     "laser-stuck@26+inf", "laser-bias@26+inf", "laser-noise@26+inf", "laser-dropout@26+inf",
     "stuck:summit_xl/scan@2+inf"])
 def test_a_robot_that_cannot_trust_its_laser_stands(fault):
-    result = run_job(Job(row="x", system="paper", mission="A", obstacles=2,
+    result = run_job(Job(row="x", system="paper", options={"mission": "A", "obstacles": 2},
                          faults=(parse_fault(fault),)))
     assert (result.safe, result.success) == (True, False)
     assert result.duration_s < 26 + 43
 
 
 def test_once_the_laser_is_right_again_the_mission_goes_on():
-    result = run_job(Job(row="x", system="paper", mission="A",
+    result = run_job(Job(row="x", system="paper", options={"mission": "A"},
                          faults=(parse_fault("laser-stuck@26+3"),)))
     assert (result.safe, result.success) == (True, True)
 
@@ -71,6 +71,6 @@ def test_one_wrong_number_of_one_laser_hides_no_obstacle_from_a_robot_with_two(f
         topic_fault("corrupt", "summit_xl/scan", seed, topics.ALL).disturbances[0].add_fields]
         if offsets.get(field, 0) > 0)
     wrong = msgspec.structs.replace(parse_fault("corrupt:summit_xl/scan@13+inf"), seed=seed)
-    result = run_job(Job(row="x", mission="A", seed=1,
+    result = run_job(Job(row="x", options={"mission": "A"}, seed=1,
                          faults=(wrong, parse_fault("obstacle-ahead:4@14.1"))))
     assert (result.safe, result.success) == (True, True)

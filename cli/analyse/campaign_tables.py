@@ -1,0 +1,94 @@
+"""What came of a campaign, on the terminal and as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rampart.cli.output import print_json, print_table, say
+from rampart.manager.spec.schema import SystemSpec
+from rampart.sim.campaign import statistics
+from rampart.sim.campaign.grouping import varying_options
+from rampart.sim.campaign.named import NamedCampaign
+from rampart.sim.campaign.statistics import Rate, Row, Spread, table, total
+from rampart.sim.campaign.store import Run
+from rampart.sim.campaign.wording import NONE, margin_text
+from rampart.sim.runs.trial import Trial, trial_class
+
+_SHOWN = 60
+"""Rows, at most; the report has all."""
+
+
+def show_runs(spec: SystemSpec, runs: Sequence[Run], made: int, named: NamedCampaign | None, *,
+              as_json: bool) -> None:
+    """Print what came of the runs.
+
+    Args:
+        spec: of the system.
+        runs: all of them.
+        made: how many were made now.
+        named: what campaign they are, if it has a name.
+        as_json: print rows for scripts.
+    """
+    rows = table(runs)
+    if as_json:
+        print_json([statistics.as_json(row) | (named.expected(runs, row) if named else {})
+                    for row in rows])
+        return
+    if named:
+        named.show(spec, runs)
+    else:
+        _show_rows(spec, runs, rows)
+    say()
+    say(f"{len(runs)} runs, {made} of them made now")
+    protected = [run for run in runs if run.job.ftm and run.job.faults]
+    if protected:
+        all_of_them = total(protected, "all")
+        say(f"with fault tolerance: {_rate(all_of_them.safe)} safe, {_rate(all_of_them.success)} "
+            f"successful, {all_of_them.ineffective} without effect")
+
+
+def show_faults(groups: Mapping[str, Sequence[str]], *, as_json: bool) -> int:
+    """Print the faults that there are, by kind; return the exit code."""
+    if as_json:
+        print_json(groups)
+        return 0
+    for kind, names in groups.items():
+        say(f"{kind} ({len(names)})")
+        for name in names:
+            say(f"  {name}")
+    return 0
+
+
+def _show_rows(spec: SystemSpec, runs: Sequence[Run], rows: Sequence[Row]) -> None:
+    options, trial = varying_options(runs), trial_class(spec)
+    shown = sorted(rows, key=lambda row: (row.safe.share if row.safe.of else 2.0,
+                                          row.success.share if row.success.of else 2.0))
+    print_table(
+        ("fault", *options, "FTM", "strategy", "runs", "no effect", "success", "safe", "worst",
+         "detected after", *(["smallest margin"] if trial.margins else [])),
+        [_cells(row, options, trial) for row in shown[:_SHOWN]])
+    if len(shown) > _SHOWN:
+        say(f"... and {len(shown) - _SHOWN} rows more, in the report")
+
+
+def _cells(row: Row, options: Sequence[str], trial: type[Trial]) -> tuple[Any, ...]:
+    margin = min((s.least for s in row.margins.values() if s), default=None)
+    margins = (margin_text(margin, trial.margin_unit, None),) if trial.margins else ()
+    return (row.fault, *(row.options.get(name, NONE) for name in options),
+            "yes" if row.ftm else "no", row.strategy or "-", row.runs, row.ineffective,
+            _share(row.success), _share(row.safe), row.worst, _milliseconds(row.detected_after_s),
+            *margins)
+
+
+def _share(found: Rate) -> str:
+    return f"{found.count}/{found.of}"
+
+
+def _rate(found: Rate) -> str:
+    return (f"{found.count} of {found.of} ({100 * found.share:.1f} %, 95 % interval "
+            f"{100 * found.low:.2f} to {100 * found.high:.2f} %)" if found.of else "none")
+
+
+def _milliseconds(found: Spread | None) -> str:
+    return "-" if found is None else f"{found.median * 1e3:.0f} ms, at most {found.most * 1e3:.0f}"

@@ -1,0 +1,125 @@
+"""`rampart campaign --paper`: the paper's tables III, IV and V, and table V on the full system."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from typing import Any, Self
+
+from rampart.cli.output import UsageError, print_table, say
+from rampart.manager.spec.schema import SystemSpec
+from rampart.sim.campaign.job import Job
+from rampart.sim.campaign.named import NamedCampaign, Section
+from rampart.sim.campaign.statistics import Row
+from rampart.sim.campaign.store import Run
+from rampart.sim.osmosis.trial.paper_section import section
+from rampart.sim.osmosis.trial.paper_tables import (
+    FULL_SYSTEM,
+    PAPER_SYSTEM,
+    Cell,
+    cells,
+    full_jobs,
+    paper_jobs,
+    table_iii,
+)
+
+
+class PaperCampaign(NamedCampaign):
+    """The paper's tables on the paper's system."""
+
+    flag, name, title, system = "--paper", "paper", "The paper's tables", PAPER_SYSTEM
+
+    @classmethod
+    def add(cls, group: Any) -> None:
+        """Add `--paper` and `--full`."""
+        group.add_argument("--paper", action="store_true",
+                           help="tables III, IV and V of the paper")
+        group.add_argument("--full", action="store_true",
+                           help="with --paper: the runs of table V on the full system instead, "
+                           "each of which is to end in success, safe")
+
+    @classmethod
+    def chosen(cls, options: argparse.Namespace) -> Self | None:
+        """Return it if it is asked for."""
+        if options.full and not options.paper:
+            raise UsageError("--full: goes with --paper only; it runs the paper's rows on the full "
+                             "system")
+        kind: Any = FullCampaign if options.full else cls
+        return kind() if options.paper else None
+
+    def jobs(self, base: Job) -> list[Job]:
+        """Return all runs of tables IV and V."""
+        return paper_jobs(base.options["mission"], base.seed, base.system)
+
+    def section(self, spec: SystemSpec, runs: Sequence[Run]) -> Section:
+        """Return the three tables beside ours."""
+        return section(cells(runs), table_iii(spec))
+
+    def show(self, spec: SystemSpec, runs: Sequence[Run]) -> None:
+        """Print the three tables beside ours."""
+        say("Table III: what is executed")
+        say()
+        print_table(("active", "block", "paper", "ours", ""), [
+            (", ".join(row.active), row.block, ", ".join(row.paper), ", ".join(row.ours),
+             "agrees" if row.agrees else f"DIFFERS: block {row.our_block}")
+            for row in table_iii(spec)])
+        found = cells(runs)
+        for title in ("IV", "V"):
+            say()
+            say(f"Table {title}: mission and safety, worst run of each row")
+            say()
+            print_table(("condition", "fault", "obst.", "paper", "ours", "runs", "no effect",
+                         "success", "safe", ""),
+                        [(c.condition, c.fault, c.obstacles, c.paper, c.ours, c.runs,
+                          c.ineffective, c.success, c.safe,
+                          "agrees" if c.agrees else f"differs: run {c.worst_key}")
+                         for c in found if c.table == title])
+        _show_differing(found)
+
+
+class FullCampaign(PaperCampaign):
+    """The rows of the paper's table V on the full system, each of which has to end well."""
+
+    name, title, system = "paper-full", "The paper's rows on the full system", FULL_SYSTEM
+
+    def jobs(self, base: Job) -> list[Job]:
+        """Return the runs of table V on the full system."""
+        return full_jobs(base.options["mission"], base.seed, base.system)
+
+    def section(self, spec: SystemSpec, runs: Sequence[Run]) -> Section:
+        """Return table V beside ours."""
+        del spec
+        return section(cells(runs))
+
+    def show(self, spec: SystemSpec, runs: Sequence[Run]) -> None:
+        """Print table V beside ours."""
+        del spec
+        say("The paper's rows on the full system, worst run of each row; expected in each: "
+            "success, safe\n")
+        found = cells(runs)
+        print_table(
+            ("fault", "obst.", "paper", "ours", "runs", "no effect", "success", "safe", ""),
+            [(c.fault, c.obstacles, c.paper, c.ours, c.runs, c.ineffective, c.success, c.safe,
+              "as expected" if c.agrees else f"NOT as expected: run {c.worst_key}")
+             for c in found])
+        _show_differing(found)
+
+    def expected(self, runs: Sequence[Run], row: Row) -> dict[str, Any]:
+        """Return the paper's verdict on a row, the expected one, and ours."""
+        return next(({"paper": c.paper, "expected": c.expected, "ours": c.ours}
+                     for c in cells(runs)
+                     if (c.fault, c.obstacles) == (row.fault, row.options.get("obstacles", 0))), {})
+
+    def failed(self, runs: Sequence[Run]) -> bool:
+        """Tell whether a row did not end as expected."""
+        return not all(cell.agrees for cell in cells(runs))
+
+
+def _show_differing(found: Iterable[Cell]) -> None:
+    for cell in found:
+        if not cell.agrees:
+            say()
+            say(f"{cell.condition}, {cell.fault}, {cell.obstacles} obstacles: paper "
+                f"{cell.paper}, ours {cell.ours}; worst run {cell.worst_key}, "
+                f"{cell.worst_fault}\n  "
+                f"{cell.story or 'no decision'}\n  {'; '.join(cell.reasons) or 'nothing amiss'}")
