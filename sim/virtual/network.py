@@ -79,7 +79,6 @@ class SeededNetwork:
     def __init__(self, model: NetworkModel, seed: Any, timing: Timing | None = None,
                  local: Sequence[str] = ()) -> None:
         self.model = model
-        self.lost = self.duplicated = self.overtaken = 0
         self._rng = random.Random(f"network {seed}")  # noqa: S311 no secret
         delays_ms = (timing or measured()).message_ms
         self._delay_s = drawer(delays_ms, self._rng)
@@ -117,10 +116,8 @@ class SeededNetwork:
 
         def arrivals(now_s: float) -> Sequence[float]:
             if model.loss and dice() < model.loss:
-                self.lost += 1
                 return ()
             if model.duplication and dice() < model.duplication:
-                self.duplicated += 1
                 return (arrival(now_s), arrival(now_s))
             return (arrival(now_s),)
 
@@ -133,7 +130,6 @@ class SeededNetwork:
                 at_s += model.extra_s * dice()
             if at_s < last_s:
                 if model.reordering and dice() < model.reordering:
-                    self.overtaken += 1
                     return at_s
                 at_s = last_s
             last_s = at_s
