@@ -1,6 +1,6 @@
-"""The observer: lives in the launcher's process and hears what the run's story is made of.
+"""The observer: runs in the launcher's process and hears what the run's story is made of.
 
-It controls nothing. Whoever wants the story (judge, report, console, launcher) is a sink: a
+It controls nothing. What wants the story (judge, report, console, launcher) is a sink: a
 function of topic, message and header, called on the observer's loop in order of arrival. A robot
 whose own topics belong to the story derives its observer, which its application names.
 """

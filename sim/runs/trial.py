@@ -135,19 +135,17 @@ class Trial:
         self._brought_back += 1
         if self.console:
             self.console.line(now_s, f"{name} brought back")
+        event = ProcessEvent(name, "respawned", 0, self._brought_back, LAUNCHER, "")
         self.recorder.feed(
-            topics.PROCESS_EVENT,
-            ProcessEvent(name, "respawned", 0, self._brought_back, LAUNCHER, ""),
-            Header(LAUNCHER, 1, self._brought_back, now_s))
+            topics.PROCESS_EVENT, event, Header(LAUNCHER, 1, self._brought_back, now_s))
 
     def excuse(self, stall_s: float) -> None:
         """Do not count simulated seconds in which the launcher heard nothing, being stopped."""
 
     def over(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
-        if self.limit_s is not None and now_s >= self.limit_s:
-            return "its time is over"
-        return None
+        is_over = self.limit_s is not None and now_s >= self.limit_s
+        return "its time is over" if is_over else None
 
     def conclude(self, now_s: float, why: str) -> RunRecord:
         """Return the record of the run, with a verdict if there is one.
