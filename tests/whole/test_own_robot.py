@@ -190,7 +190,8 @@ REFUSED = [
     (["--virtual"],
      "--virtual: in virtual time a run has to end: give --duration S, or tank an [end] with "
      "after_s"),
-    (["--fault", "kill:nobody"], "fault 'kill:nobody': no node 'nobody'; there are: supervisor, pump_controller, "
+    (["--fault", "kill:nobody"],
+     "fault 'kill:nobody': no node 'nobody'; there are: supervisor, pump_controller, "
      "tank_manager, D_LEVEL, D_CRASH, R_SHUT, R_RESTART"),
     (["--patience", "7"],
      "--patience 7: tank has no mission: its runs end after --duration S"),
