@@ -469,10 +469,10 @@ def test_without_a_robot_timeouts_are_five_periods_of_what_they_wait_for():
     cell = (systems.SHIPPED / "cell.toml").read_text(encoding="utf-8")
     before, _, rest = cell.partition("[timing]")
     left = rest.partition("# ---- Nodes")[2]
-    said = "control_period_s = 0.1\nmanager_timeout_s = 0.7\n"
+    said = "control_period_s = 0.1\nheartbeat_timeout_s = 0.3\nmanager_timeout_s = 0.7\n"
     timing = parse_specification(f"{before}[timing]\n{said}# {left}", FILE).timing
     assert (timing.heartbeat_timeout_s, timing.command_timeout_s, timing.manager_timeout_s,
-            timing.detection_silence_timeout_s) == (0.5, 0.5, 0.7, 1.0)
+            timing.detection_silence_timeout_s) == (0.3, 0.5, 0.7, 1.0)
 
 
 def test_recoveries_without_any_mechanism_are_refused():
