@@ -9,6 +9,7 @@ import msgspec
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.zenoh_bus import endpoint
+from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.chosen_topics import choose_topics
 from rampart.actors.layout.wiring import (
@@ -114,8 +115,10 @@ def load_run(plan: RunPlan, spec: SystemSpec) -> RunContext:
     """Load what all actors of a run have in common; done once, before the fork.
 
     Raises:
-        ValueError: the application's options are unsound; the message names file and value.
+        ValueError: the application's options are unsound, or there is no such program as a node's
+            command names; the message names file and value.
     """
+    check_programs(plan, spec)
     return RunContext(plan, spec, load_document(plan), load_application(plan, spec))
 
 

@@ -37,7 +37,7 @@ _ROOMS_OF_0_6 = ("actors", "manager", "sim")
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One actor of the system: its name, class and parameters.
+    """One actor of the system: its name, class and parameters, and where these are in its table.
 
     `hears` and `publishes` are the topics that its parameters name, as `heard` and `published` have
     them.
@@ -46,6 +46,7 @@ class Member:
     name: str
     actor: type[Actor]
     parameters: Actor.Parameters
+    table: str = "parameters."
     hears: Mapping[str, Members] = field(default_factory=dict)
     publishes: Mapping[str, Members] = field(default_factory=dict)
 
@@ -120,6 +121,9 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
         raise ValueError(f"{file}: {path}.{error}") from None
     except (TypeError, NameError) as error:
         raise ValueError(f"{file}: {path}.actor = {node.actor!r}: Parameters: {error}") from None
+    if node.command:
+        return Member(node.name, actor, read_parameters(
+            actor.Parameters, node.command_parameters, file, node.name, spec), "")
     given = {name: derived[name] for name in takes & derived.keys()} | node.parameters
     return Member(node.name, actor, read_parameters(
         actor.Parameters, given, file, f"{path}.parameters", spec))
