@@ -43,7 +43,8 @@ class Child:
         self._text = b""
 
     def start(self, *, who: str, command: Sequence[str], folder: Path,
-              environment: Mapping[str, str], limits: ChildLimits, log: Path, inherited: Sequence[int]) -> None:
+              environment: Mapping[str, str], limits: ChildLimits, log: Path,
+              inherited: Sequence[int]) -> None:
         """Start it.
 
         Args:
