@@ -66,7 +66,9 @@ def test_the_c_program_is_a_node_and_faults_can_be_put_into_what_it_says(tmp_pat
         assert heard(tug) == [5.0, 5.0]
         done = tug.tool("inject", "drop:tug/wheels", "--duration", "1", "--json")
         assert done.returncode == 0, done.stderr
-        assert msgspec.json.decode(done.stdout)["affected"] > 0
+        (disturbed,) = msgspec.json.decode(done.stdout)["injections"]
+        assert disturbed["nodes"] == ["wheels"]
+        assert disturbed["affected"] > 0
 
 
 @pytest.mark.processes
