@@ -25,9 +25,12 @@ def block(language: str, begins: str = "") -> str:
     return next(found for found in blocks if found.startswith(begins))
 
 
+TUG = block("toml", "name = \"tug\"")
+
+
 def write_tug(folder, *, compiled: bool = True) -> None:
     """Write the system of the page into a folder."""
-    (folder / "tug.toml").write_text(block("toml", "name"))
+    (folder / "tug.toml").write_text(TUG)
     (folder / "tug.py").write_text(block("python", "from rampart"))
     if compiled:
         (folder / "wheels.c").write_text(block("c"))
@@ -75,7 +78,7 @@ def test_the_c_program_is_a_node_and_faults_can_be_put_into_what_it_says(tmp_pat
 def test_the_plain_zenoh_program_is_a_node(tmp_path):
     write_tug(tmp_path, compiled=False)
     (tmp_path / "wheels.py").write_text(block("python", "import json"))
-    (tmp_path / "tug.toml").write_text(block("toml", "name").replace(
+    (tmp_path / "tug.toml").write_text(TUG.replace(
         '["./wheels"]', f'[{json.dumps(sys.executable)}, "wheels.py"]').replace(
         "notify = true", 'key = "wheels/alive"'))
     with RealRun(tmp_path, "tug.toml") as tug:

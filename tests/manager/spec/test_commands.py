@@ -13,9 +13,7 @@ from rampart.manager.spec.specification import (
     check_modules,
     parse_specification,
 )
-from tests.documents.test_foreign_nodes import block, write_tug
-
-TUG = block("toml", "name")
+from tests.documents.test_foreign_nodes import TUG, write_tug
 
 
 def refusal(text: str) -> str:
