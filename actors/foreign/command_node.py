@@ -75,6 +75,8 @@ class CommandNode(Actor):
         if not strays.kill_strays(plan.folder, self.name):
             raise CommandError("processes of its predecessor do not end")
         folder = folder_of(plan, parameters.folder)
+        if not folder.is_dir():
+            raise CommandError(f"folder {folder}: there is none")
         program = find_program(parameters.command[0], folder, parameters.env.get("PATH"))
         if program is None:
             raise CommandError(f"{parameters.command[0]}: no such program in {folder}")
@@ -83,7 +85,7 @@ class CommandNode(Actor):
         own = {strays.NODE: self.name, strays.FOLDER: plan.folder,
                "RAMPART_INCARNATION": str(self.context.incarnation),
                "RAMPART_ORIGIN_S": repr(self.clock.source_time(0.0)),
-               "RAMPART_RATE": repr(self.clock.rate),
+               "RAMPART_RATE": repr(self.clock.rate), "RAMPART_SEED": str(plan.seed),
                "RAMPART_SOCKET": str(channel.other.fileno()),
                "RAMPART_ZENOH": endpoint(plan.folder, self.name)}
         own |= self._watch()

@@ -244,7 +244,7 @@ class Keeper:
             try:
                 self._become(keeper, printed)
             except Exception as error:  # whatever it is, the node's process is to tell it
-                why = error.strerror if isinstance(error, OSError) else str(error)
+                why = getattr(error, "strerror", None) or str(error)
                 os.write(failed, f"cannot be started: {why}".encode()[:4000])
             os._exit(127)
         for fd in (printed, failed, *self._inherited()):
@@ -275,7 +275,10 @@ class Keeper:
                 resource.setrlimit(getattr(resource, name), (most, most))
             except ValueError:
                 raise ValueError(f"{name} {most} is above the hard limit") from None
-        os.execvpe(command[0], command, environment)  # noqa: S606 what the system names
+        try:
+            os.execve(command[0], command, environment)  # noqa: S606 what the system names
+        except FileNotFoundError:  # it was there a moment ago
+            raise FileNotFoundError("there is no interpreter as its first line names it") from None
 
     def _inherited(self) -> list[int]:
         fds = self._order["fds"]

@@ -18,6 +18,7 @@ from rampart.actors.layout.wiring import (
     load_class,
     load_member,
     partners,
+    topics_of,
 )
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
@@ -79,7 +80,7 @@ class Layout:
         own += [load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
                 for n in spec.actors()]
         self.members, self.topics = choose_topics(
-            own, application_class(spec).topics, plan.system_file)
+            own, (*application_class(spec).topics, *stand_in_topics(spec)), plan.system_file)
         self._partners = partners(self.members.values())
 
     def listen(self, node: str) -> str:
@@ -120,6 +121,16 @@ def load_run(plan: RunPlan, spec: SystemSpec) -> RunContext:
     """
     check_programs(plan, spec)
     return RunContext(plan, spec, load_document(plan), load_application(plan, spec))
+
+
+def stand_in_topics(spec: SystemSpec) -> list[Topic[Any]]:
+    """Return the topics that are declared by what plays commands in virtual time.
+
+    Raises:
+        ValueError: there is no such class.
+    """
+    classes = [load_class(node.stand_in, field="stand_in") for node in spec.nodes if node.stand_in]
+    return [topic for one in classes for topics in topics_of(one) for topic in topics]
 
 
 def judge_class(spec: SystemSpec) -> type[Handlers] | None:

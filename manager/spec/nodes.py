@@ -163,8 +163,8 @@ def _wrong_command(node: NodeSpec) -> Iterator[tuple[Any, ...]]:
     command = list(node.command)
     if node.actor:
         yield "command", f"either actor or command is right; it has actor = {node.actor!r}", command
-    if node.kind in (Kind.MANAGER, Kind.WORLD):
-        yield "command", f"a node of kind {node.kind.value!r} has to be an actor", command
+    if node.kind is Kind.MANAGER:
+        yield "command", "the manager has to be an actor", command
     if not node.command[0]:
         yield "command", "the first is the program, and it has no name", command
     if any("\0" in text for text in (*command, *node.env, *node.env.values(), node.folder)):

@@ -1,4 +1,4 @@
-"""docs/foreign_nodes.md: its C and its Python are nodes that work; its tables are those there are."""
+"""docs/foreign_nodes.md: its C and its Python are nodes that work, its numbers are right."""
 
 from __future__ import annotations
 

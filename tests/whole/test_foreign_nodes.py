@@ -177,18 +177,26 @@ def test_a_flood_and_one_that_ends_at_once_harm_nobody_and_a_killed_launcher_end
         assert not Path(folder).exists()
 
 
-@pytest.mark.parametrize(("heartbeat", "program"), [
-    ('{ topic = "tug/wheels", timeout_s = 0.5 }', "wheels"),
-])
-def test_a_topic_may_be_the_heartbeat(tmp_path, heartbeat, program):
+def test_a_topic_may_be_the_heartbeat_and_two_commands_share_a_process(tmp_path):
     write_tug(tmp_path)
-    (tmp_path / "tug.toml").write_text(
-        TUG.replace("{ notify = true, timeout_s = 0.5 }", heartbeat))
+    (tmp_path / "tug.toml").write_text(TUG.replace("notify = true", 'topic = "tug/wheels"').replace(
+        'command = ["./wheels"]', 'command = ["./wheels"]\nprocess = "both"').replace(
+        "[[event]]", """
+[[node]]
+name = "beside"
+command = ["sleep", "604"]
+kind = "control"
+process = "both"
+
+[[event]]"""))
     with RealRun(tmp_path, "tug.toml") as tug:
         tug.sleep_until(1)
-        assert state(tug, "wheels") == ("running", 1)
-        os.kill(find(tug, "wheels", program), signal.SIGSTOP)
-        comes_back(tug, "wheels", 2, program)
+        assert state(tug, "wheels") == state(tug, "beside") == ("running", 1)
+        beside = find(tug, "beside", "sleep 604")
+        os.kill(find(tug, "wheels", "/wheels"), signal.SIGSTOP)
+        comes_back(tug, "wheels", 2, "/wheels")
+        comes_back(tug, "beside", 2, "sleep 604")
+        assert gone(beside)
 
 
 def test_a_memory_limit_and_a_program_of_another_format_are_told(tmp_path):

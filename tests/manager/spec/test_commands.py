@@ -6,6 +6,7 @@ import pytest
 
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.layout.layout import Layout
+from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.manager.spec.nodes import COMMAND_NODE
 from rampart.manager.spec.specification import (
@@ -61,7 +62,7 @@ WRONG = [
     ('stand_in = "tug:VirtualWheels"', "parameters = { radius_m = 0.1 }", "wheels: parameters: a "
      "command takes none; they are for the actor that stand_in names"),
     (f'{COMMAND}\nkind = "control"', f'{COMMAND}\nkind = "manager"', "wheels: command = "
-     "['./wheels']: a node of kind 'manager' has to be an actor"),
+     "['./wheels']: the manager has to be an actor"),
     (BEAT, f"{BEAT}\nlimits = {{ memory = 1 }}", "$.node[1].limits.memory = 1: unknown field; "
      "known: memory_mb, processor_s, open_files, file_mb"),
     (BEAT, f"{BEAT}\nlimits = {{ open_files = 1 }}", "$.node[1].limits.open_files = 1: Expected "
@@ -92,6 +93,25 @@ def tug(tmp_path, monkeypatch):
         return RunPlan(system_file=str(tmp_path / "tug.toml"), **plan)
 
     return write
+
+
+@pytest.mark.parametrize(("old", "new", "line"), [
+    ("tug:VirtualWheels", "tug:Nobody", "$.node[1].stand_in = 'tug:Nobody': no such actor class; "
+     "known: Driver, VirtualWheels"),
+    ("stand_in", "parameters = { radius_m = 1 }\nstand_in", "$.node[1].parameters.radius_m = 1: "
+     "unknown parameter; known: none, its class declares no Parameters")])
+def test_a_stand_in_is_held_to_what_the_file_says_of_it_in_real_runs_too(tug, old, new, line):
+    plan = tug(old, new)
+    with pytest.raises(ValueError, match="node") as refused:
+        Layout(plan, load_system(plan))
+    assert str(refused.value) == f"{plan.system_file}: {line}"
+
+
+def test_what_only_the_stand_in_declares_is_a_topic(tug):
+    plan = tug("tug:Driver", "rampart.actors.runtime.stub_node:StubNode")
+    layout = Layout(plan, load_system(plan))
+    assert [key for key in layout.topics if key.startswith("tug/")] == ["tug/command", "tug/wheels"]
+    assert [t.key for t in system_topics(layout.spec)][-2:] == ["tug/command", "tug/wheels"]
 
 
 @pytest.mark.parametrize(("old", "new", "line"), [
