@@ -40,7 +40,7 @@ def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: 
         ways: dict[str, dict[str, Members]] = {"heard": {}, "published": {}}
         for way, named in topics_named(member.parameters).items():
             for parameter, key, path in named:
-                where = f"{file}: {member.name}: parameters.{parameter}"
+                where = f"{file}: {member.name}: {member.table}{parameter}"
                 found[key] = topic = _topic(key, every, where)
                 if way == "heard" and topic in member.actor.inputs():
                     raise ValueError(f"{where}: {member.actor.__name__} hears {key!r} anyway")

@@ -32,6 +32,8 @@ TopicsHeard = Annotated[tuple[str, ...], msgspec.Meta(extra={"names": "topic", "
 TopicPublished = Annotated[
     str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "published"})]
 """Key of a topic that the node publishes because its parameters say so."""
+TopicsPublished = Annotated[tuple[str, ...], msgspec.Meta(
+    extra={"names": "topic", "way": "published"})]
 FieldName = Annotated[str, msgspec.Meta(
     pattern=r"^[^:]+:[^:]+\Z", extra={"names": "field", "way": "heard"})]
 """A field of the messages of a topic, "topic:field", as of `rampart.actors.bus.fields`."""
