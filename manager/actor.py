@@ -3,7 +3,7 @@
 All decisions are the arbiter's. The actor hands it what detection and recovery modules report,
 in the handler of that very message, and sends the commands that come out before the handler
 returns: between a detection and its recovery no timer is waited for. Timers only repeat what is
-in force, show that the manager lives, and let the arbiter notice silence.
+in force, show that the manager runs, and let the arbiter notice silence.
 
 One that was killed finds out what is in force from the recovery modules themselves, and adopts it;
 until it knows, it releases nothing. What they cannot tell it has from its checkpoint
@@ -17,6 +17,7 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from rampart.actors.bus.bounds import DOCUMENT_CHARS, clip
 from rampart.actors.bus.topic import Topic
@@ -68,7 +69,6 @@ class FtmManager(Actor):
         self._system: SystemSpec = context.run.system
         self._document: Document = dict(context.run.document)
         self._adapted: m.AdaptedSystem | None = context.run.adapted
-        self._strategy = self._system.strategy
         self._arbiter = build_arbiter(self._system, first_start=context.incarnation == 1)
         now_s = self.clock.now()
         self.arbiter_state = self._arbiter.initial(
@@ -80,16 +80,13 @@ class FtmManager(Actor):
         self._request = 0
 
     @classmethod
-    def output_names(
-        cls, topic: Topic[Any], name: str, parameters: Any
-    ) -> tuple[str, ...] | None:
+    def output_names(cls, topic: Topic[Any], name: str, parameters: Any) -> tuple[str, ...] | None:
         """Command any recovery module."""
-        if topic is topics.RECOVERY_COMMAND:
-            return None
-        return super().output_names(topic, name, parameters)
+        return None if topic is topics.RECOVERY_COMMAND else super().output_names(
+            topic, name, parameters)
 
     def on_start(self) -> None:
-        """Say at once that the manager lives, and what it has latched."""
+        """Say at once that the manager runs, and what it has latched."""
         memory = self.kept(MANAGER_STATE)
         if memory is not None:
             self.arbiter_state = recall(
@@ -145,7 +142,7 @@ class FtmManager(Actor):
 
     @every(0.1)
     def tick(self) -> None:
-        """Let time pass, and show that the manager lives."""
+        """Let time pass, and show that the manager runs."""
         self._step(Tick())
         self._show()
         if self._system.layers.supervisor_respawn:
@@ -176,8 +173,7 @@ class FtmManager(Actor):
         for node in system.actors():
             if node.kind in REPORTS_ON:
                 load_member(node, system, file)
-        busy = self.arbiter_state.busy
-        if busy:
+        if busy := self.arbiter_state.busy:
             return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"
         text = msgspec.json.encode(document).decode()
         if len(text) > DOCUMENT_CHARS:
@@ -186,9 +182,7 @@ class FtmManager(Actor):
         arbiter = build_arbiter(system)
         self.arbiter_state = take_over(arbiter, self.arbiter_state, self.clock.now())
         self._arbiter, self._document, self._system = arbiter, document, system
-        self._strategy = system.strategy
-        self._adapted = m.AdaptedSystem(
-            self._version + 1, clip(describe(change)), by, text)
+        self._adapted = m.AdaptedSystem(self._version + 1, clip(describe(change)), by, text)
         self.publish(topics.ADAPTED_SYSTEM, self._adapted)
         self._step(Tick())
         return ""
@@ -197,7 +191,7 @@ class FtmManager(Actor):
 
     def _step(self, event: Input) -> None:
         now_s = self.clock.now()
-        # Before simulated time 0 the system is starting: nobody's silence means anything yet.
+        # Before simulated time 0 the system is starting: silence means nothing yet.
         missed_s = now_s - self._ran_s - (ABSENCE_S if now_s > 0 else 0.0)
         self._ran_s = now_s
         state = self.arbiter_state
@@ -239,16 +233,16 @@ class FtmManager(Actor):
     def _publish_decision(self, made: DecisionMade) -> None:
         decision = self._arbiter.explain(made)  # the commands are on their way already
         self.publish(topics.DECISION, m.DecisionRecord(
-            made.number, self._strategy, decision.active, decision.rule, decision.recoveries,
-            tuple(map(clip, decision.path)),
+            made.number, self._system.strategy, decision.active, decision.rule,
+            decision.recoveries, tuple(map(clip, decision.path)),
             tuple((name, clip(why)) for name, why in decision.rejected), made.detected_s))
 
     def _status(self) -> m.ManagerStatus:
         state = self.arbiter_state
+        views = tuple(m.DetectionView(t.name, t.active, t.reason, t.nodes)
+                      for t in state.detections)
         return m.ManagerStatus(state.active, state.silent, state.activated, state.latched,
-                               self._strategy, state.number, tuple(
-                                   m.DetectionView(t.name, t.active, t.reason, t.nodes)
-                                   for t in state.detections))
+                               self._system.strategy, state.number, views)
 
     def _show(self) -> None:
         self._shown = self._status()
@@ -262,10 +256,8 @@ def _says_all_is_well(event: Input) -> bool:
     to hear one.
     """
     match event:
-        case DetectionHeard():
-            return not event.active
-        case RecoveryHeard():
-            return not event.activated
+        case DetectionHeard(active=False) | RecoveryHeard(activated=False):
+            return True
     return False
 
 
@@ -276,12 +268,10 @@ def _is_calm(status: m.ManagerStatus) -> bool:
 def forgive_absence(state: State, missed_s: float) -> State:
     """Return the state of an arbiter for which `missed_s` of its time did not pass.
 
-    A manager that was stopped and goes on has heard nobody meanwhile, and that is not their
+    A manager that was stopped and goes on has heard no module meanwhile, and that is not their
     fault: their reports wait unread. Taken for silence, it would be an emergency stop.
     """
-    replace = msgspec.structs.replace
     return replace(
-        state,
-        started_s=state.started_s + missed_s,
+        state, started_s=state.started_s + missed_s,
         detections=tuple(replace(t, heard_s=t.heard_s + missed_s) for t in state.detections),
         recoveries=tuple(replace(t, ordered_s=t.ordered_s + missed_s) for t in state.recoveries))

@@ -45,7 +45,7 @@ STILL_UPWARD: set[tuple[str, str]] = set()
 
 STILL_ROBOTIC: set[str] = set()
 
-STILL_NAMED = {"manager.spec.mobile_robot"}
+STILL_NAMED: set[str] = set()
 
 STILL_TOO_LONG: set[str] = set()
 

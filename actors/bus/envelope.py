@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -92,6 +93,7 @@ def _decoder(kind: type[Any]) -> Callable[[bytes], Envelope[Any]]:
     return decoder.decode
 
 
+@dataclass(slots=True)
 class _Heard:
     """What was heard from the present incarnation of a node.
 
@@ -101,12 +103,9 @@ class _Heard:
         recent: of commands, by key, the last numbers.
     """
 
-    __slots__ = ("incarnation", "newest", "recent")
-
-    def __init__(self, incarnation: int) -> None:
-        self.incarnation = incarnation
-        self.newest: dict[str, int] = {}
-        self.recent: dict[str, deque[int]] = {}
+    incarnation: int
+    newest: dict[str, int] = field(default_factory=dict)
+    recent: dict[str, deque[int]] = field(default_factory=dict)
 
 
 class ArrivalGuard:
@@ -133,10 +132,8 @@ class ArrivalGuard:
         self._heard: dict[str, _Heard] = {}
         self._strangers: deque[str] = deque()
 
-    def receiver(
-        self, topic: Topic[Any], take: Callable[[str, Envelope[Any]], None],
-        refuse: Callable[[str, str], None],
-    ) -> Callable[[str, bytes], None]:
+    def receiver(self, topic: Topic[Any], take: Callable[[str, Envelope[Any]], None],
+                 refuse: Callable[[str, str], None]) -> Callable[[str, bytes], None]:
         """Return what is to be called with key and payload of each message of a topic.
 
         Args:
@@ -163,8 +160,7 @@ class ArrivalGuard:
                 return
             heard = heard_of.get(message.source)
             if heard is None or heard.incarnation != message.incarnation:
-                objection = object_to(heard, message)
-                if objection:
+                if objection := object_to(heard, message):
                     refuse(key, objection)
                     return
                 heard = meet(message.source, message.incarnation)

@@ -49,8 +49,7 @@ class RateLimit:
     def __init__(self, per_s: int) -> None:
         self._per_s = per_s
         self._begun_s = -math.inf
-        self._passed = 0
-        self._left_out = 0
+        self._passed = self._left_out = 0
 
     def allows(self, now_s: float) -> bool:
         """Whether one more may pass now; if not it is counted."""

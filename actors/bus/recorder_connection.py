@@ -4,7 +4,7 @@ Why not a subscriber? One that hears everything over Zenoh takes an eleventh of 
 messages a second, all of it wake-ups, and every node pays for one more link. So the recorder is not
 on the bus at all: it listens on a unix socket, and a node that publishes puts a copy of each
 message there. The recorder comes by some twenty times a second and takes what has gathered. The
-price is one system call a message while somebody records, and one a second while nobody does.
+price is one system call a message during a recording, and one a second without one.
 
 A node never waits for the recorder: what does not fit into the socket is lost to the recording,
 where the gap in the sequence numbers shows. What a node has handed over survives its SIGKILL.
@@ -80,13 +80,11 @@ class RecorderConnection:
     def take(self, key: str, payload: bytes) -> None:
         """Hand over a message that is being sent. Never waits and never raises."""
         now_s = self._clock()
-        if self._socket is None:
-            if now_s < self._next_look_s:
-                return
+        if self._socket is None and now_s >= self._next_look_s:
             self._next_look_s = now_s + RETRY_S
             self._look()
-            if self._socket is None:
-                return
+        if self._socket is None:
+            return
         data = frame(now_s, key, payload)
         if len(data) > MAX_FRAME_BYTES:
             return
@@ -115,7 +113,7 @@ class RecorderConnection:
             if not is_same_user(connection):
                 raise PermissionError(self._address)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-        except OSError:  # nobody records, which is the rule
+        except OSError:  # no recorder is there, which is the rule
             connection.close()
             return
         self._socket = connection

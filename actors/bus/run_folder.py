@@ -44,17 +44,16 @@ def make(port: int, launcher: int) -> str:
     Raises:
         OSError: there is no place for it.
     """
-    failure: OSError | None = None
+    failure: OSError = FileNotFoundError("no folder for temporary files")
     for place in _places():
         _remove_stale(place)
         try:
             folder = tempfile.mkdtemp(prefix=f"rampart-{port}-{launcher}-", dir=place)
-            (Path(folder) / _ISSUED).mkdir(mode=0o700)
+            Path(folder, _ISSUED).mkdir(mode=0o700)
+            return folder
         except OSError as error:
             failure = error
-            continue
-        return folder
-    raise failure or FileNotFoundError("no folder for temporary files")
+    raise failure
 
 
 def remove(folder: str) -> None:

@@ -17,6 +17,9 @@ ROOT = "rampart"
 
 T = TypeVar("T", bound=msgspec.Struct)
 
+Members = tuple[str, ...] | None
+"""Names of members of a topic family; None for all of them, or where there is no family."""
+
 
 class Qos(Enum):
     """How a topic's messages travel and wait.

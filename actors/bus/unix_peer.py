@@ -1,10 +1,11 @@
-"""Who is at the other end of a unix socket."""
+"""Who is at the other end of a unix socket, and what that process is doing."""
 
 from __future__ import annotations
 
 import os
 import socket
 import struct
+from pathlib import Path
 
 _CREDENTIALS = struct.Struct("3i")
 
@@ -38,3 +39,12 @@ def receive_signed(connection: socket.socket, size: int) -> tuple[bytes, int]:
             pid, uid, _gid = _CREDENTIALS.unpack(content)
             return data, pid if uid == os.getuid() else 0
     return data, 0
+
+
+def process_state(pid: int) -> str:
+    """Return the state letter of /proc/PID/stat, or "X" if there is no such process."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return "X"
+    return stat.rpartition(")")[2].split()[0]

@@ -1,11 +1,11 @@
 """The bus over Zenoh: a partial mesh of peers on unix sockets, no router, no rendezvous.
 
 Every actor listens on a socket of its own in the folder of the run, which only the run's user can
-enter, and at its start dials the actors that it shares a topic with. Who starts later dials who is
-there already, so a respawned actor is connected to all its partners by the time `open` returns, and
-no process is a single point of failure.
+enter, and at its start dials the actors that it shares a topic with. The later node dials those
+that are there already, so a respawned actor is connected to all its partners by the time `open`
+returns, and no process is a single point of failure.
 
-**Nobody's start waits for a partner that does not answer.** Zenoh dials all partners in the
+**No start waits for a partner that does not answer.** Zenoh dials all partners in the
 background and goes on trying; `open` waits until those that are there are linked, and not for one
 that is dead or stopped, nor for one that is slower than `PATIENCE_S`. Such a link comes later, so a
 stopped process that goes on finds its partners again.
@@ -23,7 +23,6 @@ import secrets
 import socket
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -33,7 +32,7 @@ from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import socket_path
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import HELLO
-from rampart.actors.bus.unix_peer import peer
+from rampart.actors.bus.unix_peer import peer, process_state
 
 LEASE_MS = 2000
 """A link that is silent for so long is closed; a stopped process is found sooner by heartbeat."""
@@ -56,13 +55,11 @@ _FIRST_LOOKS = 5
 """So many looks, a millisecond each, before a partner that is missing is looked at more closely."""
 
 _PROTOCOL = "unixsock-stream"
-_STOPPED = (b"T", b"t")
 _ALIVE = f"{ROOT}/alive"
-_PRIORITY = {
-    Qos.SENSOR: zenoh.Priority.DATA,
-    Qos.STATE: zenoh.Priority.INTERACTIVE_HIGH,
-    Qos.COMMAND: zenoh.Priority.INTERACTIVE_HIGH,
-}
+_DELIVERY = {
+    Qos.SENSOR: (zenoh.Priority.DATA, zenoh.CongestionControl.DROP),
+    Qos.STATE: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.DROP),
+    Qos.COMMAND: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK)}
 
 
 def endpoint(folder: str, name: str) -> str:
@@ -90,8 +87,7 @@ def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
         "transport/link/tx/lease": LEASE_MS,
         "downsampling": [{"messages": ["put"], "flows": ["ingress"], "rules": [
-            {"key_expr": HELLO.pattern, "freq": _HELLOS_PER_S}]}],
-    }
+            {"key_expr": HELLO.pattern, "freq": _HELLOS_PER_S}]}]}
     if listen:
         settings["id"] = _mark(listen) + secrets.token_hex(8)
     for key, value in settings.items():
@@ -110,10 +106,9 @@ def _answers(where: str) -> bool:
         probe.setblocking(False)
         try:
             probe.connect(where.removeprefix(f"{_PROTOCOL}/"))
-            status = Path(f"/proc/{peer(probe)[0]}/stat").read_bytes()
-        except OSError:  # nobody, or so many wait to be let in that nobody is
+            return process_state(peer(probe)[0]) not in "TtX"
+        except OSError:  # none, or so many wait to be let in that none is
             return False
-    return status.rpartition(b") ")[2][:1] not in _STOPPED
 
 
 class ZenohBus:
@@ -129,10 +124,8 @@ class ZenohBus:
 
     bursts = True
 
-    def __init__(
-        self, node: str, incarnation: int, listen: str | None, dial: Iterable[str],
-        recorder: RecorderConnection | None = None,
-    ) -> None:
+    def __init__(self, node: str, incarnation: int, listen: str | None, dial: Iterable[str],
+                 recorder: RecorderConnection | None = None) -> None:
         self._node = node
         self._incarnation = incarnation
         self._listen = listen
@@ -156,10 +149,10 @@ class ZenohBus:
             self._session = zenoh.open(session_config(self._listen, self._dial))
         except zenoh.ZError as error:
             text = " ".join(str(error).split())
-            if "acquire lock" in text:
-                raise BusError(f"{self._listen} is in use by another process "
-                               f"(node {self._node})") from None
-            raise BusError(f"cannot open {self._listen} (node {self._node}): {text}") from None
+            node = f"(node {self._node})"
+            raise BusError(f"{self._listen} is in use by another process {node}"
+                           if "acquire lock" in text
+                           else f"cannot open {self._listen} {node}: {text}") from None
         await self._linked(self._session)
         if self._node:
             self._held.append(self._session.liveliness().declare_token(
@@ -184,14 +177,9 @@ class ZenohBus:
         """Send to all present subscribers of the key."""
         publisher = self._publishers.get(key)
         if publisher is None:
+            priority, congestion_control = _DELIVERY[topic.qos]
             publisher = self._publishers[key] = self._require().declare_publisher(
-                key,
-                priority=_PRIORITY[topic.qos],
-                express=True,
-                congestion_control=zenoh.CongestionControl.BLOCK
-                if topic.qos is Qos.COMMAND
-                else zenoh.CongestionControl.DROP,
-            )
+                key, priority=priority, express=True, congestion_control=congestion_control)
         publisher.put(payload)
         if self._recorder is not None:
             self._recorder.take(key, payload)
@@ -248,15 +236,9 @@ class ZenohBus:
 
     def _drain(self) -> None:
         self._woken = False
-        while self._arrived:
+        while self._session is not None and self._arrived:
             try:
-                call = self._arrived.popleft()
-            except IndexError:
-                return
-            if self._session is None:
-                continue
-            try:
-                call()
+                self._arrived.popleft()()
             except Exception as error:  # what else has arrived is not to wait for the next message
                 asyncio.get_running_loop().call_exception_handler({
                     "message": f"{self._node or 'tool'}: a message could not be handed over",

@@ -11,7 +11,7 @@ Two subtleties, both about a module that was not there for a while:
   run for a while reads its mail first, and judges a little later.
 * A respawned module does not know yet whether the fault is there. Had it reported idle from its
   first moment, the manager would let go of a robot whose fault persists. So from its second
-  life on it is silent until it knows, and the manager takes silence for activity.
+  incarnation on it is silent until it knows, and the manager takes silence for activity.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class DetectionModule(Actor):
     A subclass either calls `activate` and `know_idle` itself, or has a `Monitor` (`judged_by`),
     hands it what it hears, and calls `follow` after each event. One that calls them itself calls
     `know_idle` whenever what it hears proves that the fault is not there, idle or not: from its
-    second life on it is silent, and counts as active, until it has called one of the two.
+    second incarnation on it is silent, and counts as active, until it has called one of the two.
     """
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.DETECTION,)
@@ -152,7 +152,7 @@ class DetectionModule(Actor):
 
     @every(0.2)
     def repeat(self) -> None:
-        """Say it again, for whoever has joined since."""
+        """Say it again, for nodes that have joined since."""
         self._note_absence()
         if self._told or self.first_life:
             self.publish(topics.DETECTION, self._report)

@@ -11,9 +11,9 @@ from rampart.manager.spec.tables import Positive
 
 
 class StubDetection(DetectionModule):
-    """Active while somebody says so on `stub/trigger` (`rampart trigger NAME`).
+    """Active while it is told so on `stub/trigger` (`rampart trigger NAME`).
 
-    What it was told dies with it: in a new life it is idle from the start.
+    What it was told dies with its process: the next incarnation is idle from the start.
     """
 
     class Parameters(DetectionModule.Parameters, frozen=True):
@@ -30,7 +30,7 @@ class StubDetection(DetectionModule):
         margin_m: Positive | None = None
 
     def on_start(self) -> None:
-        """In a new life, say at once that nobody has said anything yet."""
+        """As a later incarnation, say at once that it was told nothing yet."""
         if not self.first_life:
             self.know_idle()
 

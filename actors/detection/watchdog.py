@@ -20,9 +20,9 @@ from typing import Any
 from rampart.actors.bus import messages as m
 from rampart.actors.bus import topics
 from rampart.actors.bus.plausible import is_possible
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.detection.module import DetectionModule, Waiting
-from rampart.actors.runtime.actor import Context, Header, Members, on
+from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import HeartbeatTimeout, NodeNames
 
 
@@ -96,7 +96,7 @@ class WatchdogCore:
             self._succeed(one, incarnation)
         elif one.gone_s is not None and (
                 stamp_s <= one.gone_s or not is_possible(stamp_s, now_s)):
-            return  # sent before it died, and under way since; or nobody knows when
+            return  # sent before it died, and under way since; or at an impossible time
         one.gone_s = None
         one.heard = True
         one.failure = ""
@@ -165,7 +165,7 @@ class Watchdog(DetectionModule):
 
     @classmethod
     def watches(cls, name: str, parameters: Parameters) -> tuple[str, ...]:  # noqa: ARG003
-        """Watch the life of the watched nodes."""
+        """Hear when processes of the watched nodes appear and vanish."""
         return parameters.watch
 
     def on_peer(self, node: str, incarnation: int, alive: bool) -> None:

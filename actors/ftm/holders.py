@@ -1,4 +1,4 @@
-"""Who holds a thing that is held as long as anybody holds it: the brake, a bound on the pilot.
+"""What is in force as long as there is a holder: the brake, a bound on the pilot.
 
 A holder that is no recovery module of the system is obeyed all the same: a brake on its word costs
 a mission, one that is not applied may cost more. But no recovery of the system will ever let go for
@@ -26,7 +26,7 @@ class Holders(Generic[V], dict[str, V]):
 
     Args:
         known: names of the recovery modules of the system; None if they are not known, and then
-            nobody is a stranger.
+            no holder counts as unknown.
         crowded: what `OTHERS` holds: the strictest there is.
     """
 
@@ -38,22 +38,21 @@ class Holders(Generic[V], dict[str, V]):
     @property
     def unknown(self) -> tuple[str, ...]:
         """The holders that are no recovery modules of the system."""
-        return () if self._known is None else tuple(
-            name for name in self if name not in self._known)
+        return tuple(filter(self.is_unknown, self))
 
     def is_unknown(self, name: str) -> bool:
         """Whether a name is that of no recovery module of the system."""
         return self._known is not None and name not in self._known
 
     def hold(self, name: str, value: V) -> None:
-        """Have somebody hold; what the same one held before is replaced."""
+        """Note a holder; what it held before is replaced."""
         if name in self or not self.is_unknown(name) or len(self.unknown) < UNKNOWN:
             self[name] = value
         else:
             self[OTHERS] = self._crowded
 
     def let_go(self, name: str) -> None:
-        """Have a holder let go; who holds nothing may say so as well."""
+        """Have a holder let go; one that holds nothing may say so as well."""
         if name != OTHERS:
             self.pop(name, None)
 

@@ -158,7 +158,7 @@ _Views = Annotated[tuple[DetectionView, ...], msgspec.Meta(max_length=MANY)]
 
 
 class ManagerStatus(Message, frozen=True):
-    """The manager's view, and by its regularity the proof that it lives."""
+    """The manager's view, and by its regularity the proof that the manager works."""
 
     active: Names
     silent: Names

@@ -11,8 +11,8 @@ from rampart.actors.ftm import messages as m
 
 # Detection, recovery, manager.
 HOLDS = Topic("holds/{name}", m.Holds, Qos.STATE, 5, "",
-              "Who makes {name} stand and is no recovery module of the system; silent while "
-              "nobody does. `rampart reset` lets go in its place.")
+              "Holders of {name} that are no recovery modules of the system; silent while there "
+              "are none. `rampart reset` lets go in their place.")
 DETECTION = Topic("detection/{name}", m.DetectionReport, Qos.STATE, 5, "",
                   "State of detection module {name}.")
 RECOVERY_COMMAND = Topic("recovery/{name}/command", m.RecoveryCommand, Qos.STATE, 5, "",

@@ -9,9 +9,9 @@ import msgspec
 
 from rampart.actors.bus.zenoh_bus import endpoint
 from rampart.actors.ftm.messages import AdaptedSystem
+from rampart.actors.layout.chosen_topics import choose_topics
 from rampart.actors.layout.wiring import (
     Member,
-    choose_topics,
     import_class,
     load_class,
     load_member,
@@ -20,13 +20,8 @@ from rampart.actors.layout.wiring import (
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan, load_document, tailor
-from rampart.manager.spec.specification import (
-    Kind,
-    NodeSpec,
-    SystemSpec,
-    check_document,
-    check_modules,
-)
+from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
+from rampart.manager.spec.specification import check_document, check_modules
 
 SUPERVISOR_CLASS = "rampart.actors.supervision.supervisor:Supervisor"
 
@@ -77,11 +72,10 @@ class Layout:
         world = {"seed": plan.seed, **(application or Application()).world_parameters(),
                  "dead_man": spec.layers.dead_man,
                  "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
-        members = [*own, *(
-            load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
-            for n in spec.actors())]
+        own += [load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
+                for n in spec.actors()]
         self.members, self.topics = choose_topics(
-            members, application_class(spec).topics, plan.system_file)
+            own, application_class(spec).topics, plan.system_file)
         self._partners = partners(self.members.values())
 
     def listen(self, node: str) -> str:
@@ -93,9 +87,8 @@ class Layout:
         return [endpoint(self.plan.folder, p) for p in self._partners[node]]
 
 
-def adapted_system(
-    layout: Layout, run: RunContext, adapted: AdaptedSystem
-) -> tuple[Layout, RunContext]:
+def adapted_system(layout: Layout, run: RunContext,
+                   adapted: AdaptedSystem) -> tuple[Layout, RunContext]:
     """Return layout and context of the system as it was changed while running.
 
     Raises:

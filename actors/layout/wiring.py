@@ -7,11 +7,10 @@ process of the system.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import traceback
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -19,19 +18,15 @@ from typing import Any, TypeVar
 import msgspec
 
 import rampart
-from rampart.actors.bus.fields import Field
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
-from rampart.actors.runtime.parameters import messages_said, read_parameters, topics_named
+from rampart.actors.runtime.parameters import read_parameters
 from rampart.files import working_folder
 from rampart.manager.spec.checks import modules
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
 T = TypeVar("T")
-
-Names = Mapping[str, tuple[str, ...] | None]
-"""Key of a topic → names of the members of a family; None for all, or for no family."""
 
 REPORTS_ON: Mapping[Kind, Topic[Any]] = {
     Kind.DETECTION: topics.DETECTION, Kind.RECOVERY: topics.RECOVERY}
@@ -51,130 +46,54 @@ class Member:
     name: str
     actor: type[Actor]
     parameters: Actor.Parameters
-    hears: Names = field(default_factory=dict)
-    publishes: Names = field(default_factory=dict)
+    hears: Mapping[str, Members] = field(default_factory=dict)
+    publishes: Mapping[str, Members] = field(default_factory=dict)
 
 
-def published(member: Member) -> dict[str, tuple[str, ...] | None]:
+def published(member: Member) -> dict[str, Members]:
     """Return topic key → names of the family members published (None: any, or not a family)."""
+    actor = member.actor
     return _together({
-        t.key: member.actor.output_names(t, member.name, member.parameters) if t.is_family else None
-        for t in (*member.actor.outputs, *BASE_OUTPUTS)
-    }, member.publishes)
+        t.key: actor.output_names(t, member.name, member.parameters) if t.is_family else None
+        for t in (*actor.outputs, *BASE_OUTPUTS)}, member.publishes)
 
 
-def heard(member: Member) -> dict[str, tuple[str, ...] | None]:
-    """Return topic key → names of the family members heard (None: all, or not a family)."""
+def heard(member: Member) -> dict[str, Members]:
+    """Return topic key → names of the family members heard (None: all, or not a family).
+
+    Without what every actor hears: tools dial for themselves, and hellos use the links there are.
+    """
+    actor = member.actor
     return _together({
-        t.key: member.actor.names(t, member.name, member.parameters) if t.is_family else None
-        for t in member.actor.inputs()
-        if t not in BASE_INPUTS  # tools dial for themselves; hellos use the links there are
-    }, member.hears)
+        t.key: actor.names(t, member.name, member.parameters) if t.is_family else None
+        for t in topics_of(actor)[0]}, member.hears)
 
 
-def _together(declared: dict[str, tuple[str, ...] | None], chosen: Names
-              ) -> dict[str, tuple[str, ...] | None]:
+def _together(declared: dict[str, Members], chosen: Mapping[str, Members]) -> dict[str, Members]:
     for key, names in chosen.items():
         there = declared.get(key, ())
         declared[key] = None if there is None or names is None else (*there, *names)
     return declared
 
 
-def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: str
-                  ) -> tuple[dict[str, Member], dict[str, Topic[Any]]]:
-    """Return the members with the topics that their parameters name, and those topics by key.
-
-    Args:
-        members: all of a system.
-        known: topics besides those of their classes.
-        file: name of the spec, for messages.
-
-    Raises:
-        ValueError: no actor of the system has such a topic, no actor publishes what is to be heard,
-            or its messages have no such field; the message names node, parameter and value.
-    """
-    everyone = list(members)
-    every: dict[str, Topic[Any]] = {topic.key: topic for topic in known}
-    for member in everyone:
-        for topic in (*member.actor.outputs, *BASE_OUTPUTS, *member.actor.inputs()):
-            every.setdefault(topic.key, topic)
-    found: dict[str, Topic[Any]] = {}
-    chosen: dict[str, Member] = {}
-    for member in everyone:
-        ways: dict[str, dict[str, tuple[str, ...] | None]] = {"heard": {}, "published": {}}
-        for way, named in topics_named(member.parameters).items():
-            for parameter, key, path in named:
-                where = f"{file}: {member.name}: parameters.{parameter}"
-                found[key] = topic = _topic(key, every, where)
-                if way == "heard" and topic in member.actor.inputs():
-                    raise ValueError(f"{where}: {member.actor.__name__} hears {key!r} anyway")
-                if path:
-                    _check_field(topic, path, where)
-                name = topic.member(key)
-                there = ways[way].get(topic.key, ())
-                ways[way][topic.key] = (*(there or ()), name) if name else None
-        _check_messages(member, found, file)
-        chosen[member.name] = replace(member, hears=ways["heard"], publishes=ways["published"])
-    return chosen, found
-
-
-def _topic(key: str, known: Mapping[str, Topic[Any]], where: str) -> Topic[Any]:
-    topic = next((t for t in known.values() if t.member(key) is not None), None)
-    if topic is None:
-        near = difflib.get_close_matches(key, known, 3)
-        hint = f"; the nearest: {', '.join(near)}" if near else ""
-        raise ValueError(f"{where}: no actor has a topic {key!r}{hint}")
-    return topic
-
-
-def _check_messages(member: Member, chosen: Mapping[str, Topic[Any]], file: str) -> None:
-    for name, said in messages_said(member.parameters).items():
-        topic = chosen[said.topic]
-        try:
-            msgspec.convert(said.fields, topic.type)
-        except ValueError as error:
-            raise ValueError(f"{file}: {member.name}: parameters.{name}: topic {topic.key}: "
-                             f"{error}") from None
-
-
-def _check_field(topic: Topic[Any], path: str, where: str) -> None:
-    try:
-        Field(topic.type, path)
-    except ValueError as error:
-        raise ValueError(f"{where}: topic {topic.key}: {error}") from None
-
-
-def partners(members: Iterable[Member]) -> dict[str, tuple[str, ...]]:
+def partners(members: Collection[Member]) -> dict[str, tuple[str, ...]]:
     """Return for each node the nodes it shares a key or a watch with, in the given order."""
-    everyone = list(members)
-    out = {m.name: published(m) for m in everyone}
-    into = {m.name: heard(m) for m in everyone}
-    watched = {m.name: m.actor.watches(m.name, m.parameters) for m in everyone}
+    out = {m.name: published(m) for m in members}
+    into = {m.name: heard(m) for m in members}
+    watched = {m.name: m.actor.watches(m.name, m.parameters) for m in members}
 
     def feeds(a: str, b: str) -> bool:
-        return any(
+        return b in watched[a] or any(
             key in into[b] and (names is None or (wanted := into[b][key]) is None
-                                or bool(set(names) & set(wanted)))
-            for key, names in out[a].items()
-        )
+                                or not set(names).isdisjoint(wanted))
+            for key, names in out[a].items())
 
-    return {
-        a.name: tuple(
-            b.name for b in everyone
-            if b.name != a.name and (
-                feeds(a.name, b.name) or feeds(b.name, a.name)
-                or b.name in watched[a.name] or a.name in watched[b.name])
-        )
-        for a in everyone
-    }
+    return {a: tuple(b for b in out if b != a and (feeds(a, b) or feeds(b, a))) for a in out}
 
 
 def topics_of(actor: type[Actor]) -> tuple[tuple[Topic[Any], ...], tuple[Topic[Any], ...]]:
     """Return (inputs, outputs) of an actor class without what every actor has."""
-    return (
-        tuple(t for t in actor.inputs() if t not in BASE_INPUTS),
-        tuple(actor.outputs),
-    )
+    return tuple(t for t in actor.inputs() if t not in BASE_INPUTS), tuple(actor.outputs)
 
 
 def load_member(node: NodeSpec, spec: SystemSpec, file: str,

@@ -17,7 +17,7 @@ from rampart.actors.ftm.messages import RecoveryCommand, RecoveryPhase
 from rampart.actors.recovery.module import RecoveryModule
 
 _FAREWELLS = 5
-"""How often the end of an order is said: one second long, for whoever is being respawned."""
+"""How often the end of an order is said: one second long, for a node that is being respawned."""
 
 
 class HeldOrder:
@@ -26,7 +26,7 @@ class HeldOrder:
     Args:
         module: whose order it is; told of how it goes.
         give: publishes the order with its reason, or its end.
-        inherits: an earlier life of the module may have left an order behind.
+        inherits: an earlier incarnation of the module may have left an order behind.
     """
 
     def __init__(self, module: RecoveryModule, give: Callable[[bool, str], None], *,
@@ -55,7 +55,7 @@ class HeldOrder:
         self._give(False, "")
 
     def stay_idle(self) -> None:
-        """End an order that an earlier life of the module may have left behind."""
+        """End an order that an earlier incarnation may have left behind."""
         if self._inherits:
             self._inherits = False
             self.let_go()

@@ -19,16 +19,12 @@ import math
 from typing import Any, ClassVar
 
 from rampart.actors.bus.bounds import clip
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import topics
-from rampart.actors.ftm.messages import (
-    RecoveryCommand,
-    RecoveryPhase,
-    RecoveryReport,
-    RecoveryState,
-)
-from rampart.actors.runtime.actor import Actor, Context, Header, Members, every, on
+from rampart.actors.ftm.messages import RecoveryCommand, RecoveryReport, RecoveryState
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
+from rampart.manager.model.mechanisms import RecoveryPhase
 
 _P = RecoveryPhase
 _ENDS = frozenset({_P.DONE, _P.DEGRADED, _P.FAILED})

@@ -27,11 +27,11 @@ from typing import Any, NamedTuple
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.messages import Heartbeat
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import ProcessEvent, RecoveryCommand, RespawnRequest
 from rampart.actors.recovery.module import RecoveryModule
-from rampart.actors.runtime.actor import Context, Header, Members, on
+from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import NodeNames
 
 _REQUESTS_PER_INCARNATION = 1_000_000

@@ -44,11 +44,6 @@ class StubRecovery(RecoveryModule):
 
     def _finish(self) -> None:
         self._timer = None
-        if self.phase is not RecoveryPhase.ACTING:
-            return
-        if self.parameters.ends == "done":
-            self.succeed()
-        elif self.parameters.ends == "failed":
-            self.fail("its parameters say so")
-        else:
-            self.degrade()
+        if self.phase is RecoveryPhase.ACTING:
+            ends = RecoveryPhase(self.parameters.ends)
+            self._end(ends, "its parameters say so" if ends is RecoveryPhase.FAILED else "")

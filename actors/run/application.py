@@ -40,7 +40,7 @@ class Application:
         faults: class path of its `Faults`; "" if it has none of its own.
         observer: class path of who hears a run for judge and report.
         examples: of the command line, for its help: options, and what they do.
-        trial: class path of the `Trial` that its runs are; "" if nobody judges them.
+        trial: class path of the `Trial` that its runs are; "" if they have no verdict.
 
     Attributes:
         options: what was chosen for this run.

@@ -20,7 +20,7 @@ from rampart.actors.bus.zenoh_bus import endpoint
 REPLAY = "replay"
 """Name of the one socket in the folder of a replay: it plays all nodes."""
 
-_NAME = re.compile(r"@rampart\.(\d+)\.launcher$")
+_NAME = re.compile(r"@rampart\.(\d+)\.launcher$", re.MULTILINE)
 _TIMEOUT_S = 1.0
 
 
@@ -68,28 +68,27 @@ def find_runs() -> list[RunInfo]:
         table = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return []
-    ports = {int(m[1]) for line in table.splitlines() if (m := _NAME.search(line))}
-    return [info for port in sorted(ports) if (info := ask(port)) is not None]
+    ports = sorted(set(map(int, _NAME.findall(table))))
+    return [info for port in ports if (info := ask(port)) is not None]
 
 
 def find_run(port: int | None = None) -> RunInfo:
     """Return the one run there is, or the one on a base port.
 
-    A replay counts only where there is no run: whoever says nothing means the robot.
+    A replay counts only where there is no run: without a port the robot is meant.
 
     Raises:
         NoRunError: there is none, or there are several and no port was given.
     """
-    runs = find_runs()
+    found = find_runs()
     if port is not None:
-        for run in runs:
-            if run.base_port == port:
-                return run
-        known = ", ".join(str(r.base_port) for r in runs) or "none"
-        raise NoRunError(f"--port {port}: no run there; runs found: {known}")
+        runs = [run for run in found if run.base_port == port]
+    else:
+        runs = [run for run in found if not run.replay_of] or found
     if not runs:
-        raise NoRunError("no run found; start one with `python launch.py`")
-    runs = [run for run in runs if not run.replay_of] or runs
+        known = ", ".join(str(run.base_port) for run in found) or "none"
+        raise NoRunError("no run found; start one with `python launch.py`" if port is None else
+                         f"--port {port}: no run there; runs found: {known}")
     if len(runs) > 1:
         listed = ", ".join(f"{r.base_port} ({r.title})" for r in runs)
         raise NoRunError(f"several runs, choose one with --port: {listed}")

@@ -15,13 +15,9 @@ from rampart.actors.ftm.messages import NamedFault
 from rampart.actors.web.access import page_url
 from rampart.files import toml
 from rampart.files.reading import FileError, read_text
-from rampart.manager.spec.specification import (
-    Layers,
-    SpecificationError,
-    SystemSpec,
-    check_document,
-    read_document,
-)
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.specification import check_document, read_document
+from rampart.manager.spec.tables import Layers, SpecificationError
 
 SUPERVISOR = "supervisor"
 OBSERVER = "observer"
@@ -47,8 +43,8 @@ class RunPlan(msgspec.Struct, frozen=True):
         origin_s: reading of the monotonic clock at simulated time 0; set when all is loaded.
         checkpoints: directory for the nodes' checkpoints; "" keeps none, whatever the spec says.
         hmi_host: address at which the operator's page is served.
-        hmi_token: what everybody has to show there; "" for nothing, on loopback.
-        hmi_token_is_new: it was made for this run, so that nobody has it yet who needs it.
+        hmi_token: what every browser has to show there; "" for nothing, on loopback.
+        hmi_token_is_new: it was made for this run, so the operator has yet to be told.
         faults: what the page offers to inject by name.
         waits: True has the mission wait until the operator starts it from the page.
         virtual: whether time is virtual: nothing outside of the process is used.
@@ -117,15 +113,12 @@ def load_document(plan: RunPlan) -> dict[str, Any]:
         text = read_text(Path(plan.system_file), toml.MAX_SIZE)
     except FileError as error:
         raise SpecificationError(plan.system_file, "$", str(error)) from None
-    document = read_document(text, plan.system_file)
     chosen = {"strategy": plan.strategy, "shadow": plan.shadow}
-    return {**document, **{key: name for key, name in chosen.items() if name}}
+    return read_document(text, plan.system_file) | {k: name for k, name in chosen.items() if name}
 
 
 def tailor(plan: RunPlan, spec: SystemSpec) -> SystemSpec:
     """Return a spec with the baseline's layers off where the plan says so."""
-    if not plan.ftm:
-        spec = msgspec.structs.replace(spec, layers=Layers(
-            dead_man=False, safety_pilot_checks=False, manager_watch=False,
-            supervisor_respawn=False, ftm=False, checkpoints=False))
-    return spec
+    return spec if plan.ftm else msgspec.structs.replace(spec, layers=Layers(
+        dead_man=False, safety_pilot_checks=False, manager_watch=False,
+        supervisor_respawn=False, ftm=False, checkpoints=False))

@@ -13,41 +13,28 @@ process and its liveliness token are still there.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import msgspec
 
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES, clip
-from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.envelope import STRANGERS, ArrivalGuard, Envelope, Header, pack, too_long
 from rampart.actors.bus.fields import Field
 from rampart.actors.bus.limits import RateLimit, ReportLimit
 from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection
-from rampart.actors.bus.run_folder import Register
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT
-from rampart.actors.run.run_context import RunContext
-from rampart.actors.runtime.checkpoint import CheckpointStore, Keeper, NoCheckpoints, S, StateFormat
-from rampart.actors.runtime.clock import Clock
-from rampart.actors.runtime.declaration import (
-    BASE_INPUTS,
-    BASE_OUTPUTS,
-    Declared,
-    Members,
-    every,
-    on,
-)
+from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
+from rampart.actors.runtime.context import Context
+from rampart.actors.runtime.declaration import BASE_INPUTS, BASE_OUTPUTS, Declared, every, on
 from rampart.actors.runtime.injection import InjectedFaults
 from rampart.actors.runtime.mailbox import IDLE, Dispatcher
 from rampart.actors.runtime.parameters import read_parameters, topics_named
 from rampart.actors.runtime.timer import Timer, Timers
-from rampart.actors.runtime.usage import Usage, read_usage
 
-__all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "Members", "every", "on"]
+__all__ = ["BASE_INPUTS", "BASE_OUTPUTS", "Actor", "Context", "Header", "every", "on"]
 
 _REPEATED_SOON_HZ = 7.0
 """A state that is repeated this often anyway is not repeated for a newcomer."""
@@ -57,43 +44,6 @@ _HELLOS_PER_S = 100
 
 _STRANGE_HELLOS_PER_S = 5
 """Of those that are no nodes of the system."""
-
-
-@dataclass(frozen=True, slots=True)
-class Context:
-    """What an actor is given when it is made.
-
-    Attributes:
-        name: the node's name, unique in the system.
-        incarnation: which process of the node this is, counted from 1.
-        clock: simulated time.
-        bus: this actor's access to the bus, not yet open.
-        parameters: the node's parameters, as the system spec gives them or read already.
-        run: what all actors of the run have in common, loaded once.
-        pid: number of the process that it runs in.
-        checkpoints: where this node's state is kept.
-        heartbeat_period_s: simulated seconds between two heartbeats.
-        failed: told of the error that ends the actor, while its peers still see it alive.
-        register: returns the incarnation of a node that was issued last, None if it is not known.
-        members: names of all nodes of the system; what others make it remember is bounded.
-        topics: those that parameters of the system's nodes name, by key.
-        usage: returns what a process uses of the machine; in virtual time there are none.
-    """
-
-    name: str
-    incarnation: int
-    clock: Clock
-    bus: Bus
-    parameters: Mapping[str, Any] | msgspec.Struct = field(default_factory=dict)
-    run: RunContext = field(default_factory=RunContext)
-    pid: int = field(default_factory=os.getpid)
-    checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
-    heartbeat_period_s: float = 0.1
-    failed: Callable[[Exception], None] = lambda _error: None
-    register: Register = lambda _node: None
-    members: frozenset[str] = frozenset()
-    topics: Mapping[str, Topic[Any]] = field(default_factory=dict)
-    usage: Callable[[int], Usage | None] = read_usage
 
 
 def _all_of(handlers: Sequence[Callable[[Any, Header], None]]) -> Callable[[Any, Header], None]:
@@ -342,7 +292,7 @@ class Actor(Declared):
                   handler: Callable[[Any, Header], None]) -> Callable[[str, bytes], None]:
         command, members = topic.qos is Qos.COMMAND, self.context.members
         slot = id(handler)  # two handlers of one topic wait side by side
-        dispatcher, mailbox = self._dispatcher, self._dispatcher.mailbox
+        dispatcher = self._dispatcher
 
         def take(key: str, message: Envelope[Any]) -> None:
             item = partial(handler, message.body, message)
@@ -350,10 +300,7 @@ class Actor(Declared):
                 dispatcher.work(item)
                 return
             reserved = not members or message.source in members
-            if command:
-                mailbox.put(item, reserved=reserved)
-            else:
-                mailbox.put_message(f"{key} {slot}", item, reserved=reserved)
+            dispatcher.put_message(None if command else f"{key} {slot}", item, reserved=reserved)
 
         return self._guard.receiver(topic, take, self._reject)
 
@@ -362,7 +309,7 @@ class Actor(Declared):
         self.report_diagnostic("payload rejected", reason, key)
 
     def _peer_changed(self, node: str, incarnation: int, alive: bool) -> None:
-        self._dispatcher.mailbox.put_message(
+        self._dispatcher.put_message(
             f"peer {node} {incarnation} {alive}", lambda: self.on_peer(node, incarnation, alive))
 
     def _overflowed(self, _item: Any) -> None:
@@ -388,7 +335,7 @@ class Actor(Declared):
         context = self.context
         self.publish(HEARTBEAT, Heartbeat(
             context.pid, self._dispatcher.progress, context.heartbeat_period_s, self._rejected,
-            self._dispatcher.mailbox.overflowed))
+            self._dispatcher.overflowed))
         left_out = self._reports.left_out(self.clock.now())
         if left_out:
             self.report_diagnostic(

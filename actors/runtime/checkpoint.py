@@ -51,7 +51,7 @@ class SupersededError(CheckpointError):
 
 
 class BusyError(CheckpointError):
-    """Somebody else holds the store's lock; perhaps not for long."""
+    """Another process or thread holds the store's lock; perhaps not for long."""
 
 
 class StateError(ValueError):
@@ -325,7 +325,7 @@ class Keeper:
         self._store.close()
 
     def _load(self) -> Loaded:
-        """Load, again if somebody holds the lock; each attempt waits as long as the store does."""
+        """Load, again if the lock is held; each attempt waits as long as the store does."""
         for _ in range(BUSY_TIMES - 1):
             with contextlib.suppress(BusyError):
                 return self._store.load()

@@ -33,7 +33,7 @@ APPLICATION = 0x52504350
 """`application_id` of the files ("RPCP")."""
 
 LOCK_PATIENCE_S = 0.1
-"""A statement waits at most so long for a lock that somebody else holds."""
+"""A statement waits at most so long for a lock that another process holds."""
 
 LARGEST_STATE_BYTES = 2 << 20
 """A thousand times what states are. More is neither kept nor read."""
@@ -116,7 +116,7 @@ def inspect(file: Path) -> None:
     """Make sure that opening a file, and what lies beside it, can neither block nor take for ever.
 
     Raises:
-        Unsound: it is no regular file, too large, or somebody else's.
+        Unsound: it is no regular file, too large, or another user's.
         OSError: that cannot be found out.
     """
     users = users_of(file.parent)
@@ -252,7 +252,7 @@ def read(connection: sqlite3.Connection, file: Path, run: str) -> Found:
 
 
 def read_owner(connection: sqlite3.Connection) -> Owner | None:
-    """Return who has claimed the file, None if nobody has.
+    """Return the owner that has claimed the file, None if there is none.
 
     Raises:
         Unsound: the row is not what was written.

@@ -19,10 +19,10 @@ once in `log_limit_bytes`, waits for it: 15 to 25 ms were measured.
 damaged, the file is set aside and begun anew with what is sound of it: a file is either whole or
 replaced, and there is no kind of damage that is dealt with in a way of its own.
 
-*Claimed.* Who loads claims the file for its incarnation, and every save asks, in the same
-transaction, whether the claim still stands: an older process is refused, should it still run. What
-can be read is used even if the claim fails, for a lock or a full disk; then the first save claims,
-and its generation follows all that the older process has written by then.
+*Claimed.* A process that loads claims the file for its incarnation, and every save asks, in the
+same transaction, whether the claim still stands: an older process is refused, should it still run.
+What can be read is used even if the claim fails, for a lock or a full disk; then the first save
+claims, and its generation follows all that the older process has written by then.
 
 Assumed: the directory is on a local file system (SQLite's locks and shared log index do not work
 over most network ones), and the disk keeps what it has acknowledged to have synced.

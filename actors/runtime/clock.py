@@ -19,30 +19,27 @@ class Clock:
         rate: simulated seconds per second of `source`; above 0.
         source: monotonic time source in seconds; an event loop's `time` in actors.
 
+    Attributes:
+        rate: simulated seconds per second of the time source.
+
     Raises:
         ValueError: the rate is not positive.
     """
 
-    __slots__ = ("_origin_s", "_rate", "_source")
+    __slots__ = ("_origin_s", "_source", "rate")
 
-    def __init__(
-        self, origin_s: float, rate: float = 1.0, source: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, origin_s: float, rate: float = 1.0,
+                 source: Callable[[], float] = time.monotonic) -> None:
         if not rate > 0:
             raise ValueError(f"rate = {rate}: must be above 0")
         self._origin_s = origin_s
-        self._rate = rate
+        self.rate = rate
         self._source = source
-
-    @property
-    def rate(self) -> float:
-        """Simulated seconds per second of the time source."""
-        return self._rate
 
     def now(self) -> float:
         """Return simulated seconds since the start of the run."""
-        return (self._source() - self._origin_s) * self._rate
+        return (self._source() - self._origin_s) * self.rate
 
     def source_time(self, simulated_s: float) -> float:
         """Return the reading of the time source at a simulated time."""
-        return self._origin_s + simulated_s / self._rate
+        return self._origin_s + simulated_s / self.rate

@@ -82,12 +82,14 @@ def corrupt(body: Any, order: Injection, elapsed_s: float, draw: Random) -> Any:
         for holder, name in _places(data, path):
             fill = is_array(name, type(holder[name])) and not isinstance(value, bytes)
             holder[name] = _changed(name, holder[name], lambda _: value) if fill else value  # noqa: B023
-    for path, rate in order.ramp_fields.items():
-        _add(data, path, lambda x: x + rate * elapsed_s)  # noqa: B023
-    for path, bias in order.add_fields.items():
-        _add(data, path, lambda x: x + bias)  # noqa: B023
-    for path, sigma in order.noise_fields.items():
-        _add(data, path, lambda x: x + draw.gauss(0.0, sigma))  # noqa: B023
+    changes: tuple[tuple[dict[str, float], Callable[[float, float], float]], ...] = (
+        (order.ramp_fields, lambda x, rate: x + rate * elapsed_s),
+        (order.add_fields, lambda x, bias: x + bias),
+        (order.noise_fields, lambda x, sigma: x + draw.gauss(0.0, sigma)))
+    for fields, change in changes:
+        for path, by in fields.items():
+            for holder, name in _places(data, path):
+                holder[name] = _changed(name, holder[name], lambda x: change(x, by))  # noqa: B023
     for path in order.keep_ends:
         for holder, name in _places(data, path):
             if len(holder[name]) > 2:
@@ -104,11 +106,6 @@ def wrap(angle_rad: float) -> float:
         return angle_rad
     turned = math.remainder(angle_rad, 2 * math.pi)
     return math.pi if turned <= -math.pi else turned
-
-
-def _add(data: Any, path: str, change: Change) -> None:
-    for holder, name in _places(data, path):
-        holder[name] = _changed(name, holder[name], change)
 
 
 def _changed(name: str, value: Any, change: Change) -> Any:

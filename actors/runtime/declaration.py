@@ -10,13 +10,11 @@ from typing import Any, ClassVar, TypeVar
 
 import msgspec
 
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT, INJECTION_REPORT
 
 F = TypeVar("F", bound=Callable[..., None])
 
-Members = tuple[str, ...] | None
-"""Names of members of a topic family; None for all."""
 
 BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, HELLO, DIAGNOSTIC, INJECTION_REPORT)
 """What every actor publishes besides its own outputs."""

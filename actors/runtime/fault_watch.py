@@ -86,7 +86,7 @@ class FaultWatch:
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """Who has reported."""
+        """The nodes that have reported."""
         return tuple(dict.fromkeys(report.node for report in self.reports.values()))
 
     @property
@@ -96,13 +96,13 @@ class FaultWatch:
 
     @property
     def unanswered(self) -> tuple[Order, ...]:
-        """The orders on which nobody has reported."""
+        """The orders on which no node has reported."""
         answered = {injection for injection, _, _ in self.reports}
         return tuple(order for order in self.orders if order.injection not in answered)
 
     @property
     def unfinished(self) -> tuple[Order, ...]:
-        """The orders of which not everybody who answered has reported the end."""
+        """The orders whose end not all nodes that answered have reported."""
         going_on = {r.injection for r in self.reports.values() if not r.finished}
         return tuple(order for order in self.orders
                      if order.injection in going_on or order in self.unanswered)

@@ -24,96 +24,6 @@ MESSAGE_SLOTS = 1024
 _OPEN_SHARE = 0.5
 """Of either, for senders that are no nodes of the system; the rest is reserved for its nodes."""
 
-
-class Mailbox:
-    """Items in order of first arrival; a newer item with the same `slot` takes the old one's place.
-
-    All methods run on the actor's event loop.
-
-    Args:
-        capacity: Commands that may wait.
-        slots: Keys of which a message may wait.
-        on_overflow: Called with a message that is refused because too many wait.
-        on_item: Called whenever something was put in.
-
-    Attributes:
-        waiting: Slots of the items that wait, oldest first; empty if nothing does.
-        overflowed: Messages refused because too many waited.
-    """
-
-    def __init__(
-        self, capacity: int = COMMAND_CAPACITY, on_overflow: Callable[[Any], None] | None = None,
-        on_item: Callable[[], None] = lambda: None, slots: int = MESSAGE_SLOTS,
-    ) -> None:
-        self._capacity = capacity
-        self._slots = slots
-        self._on_overflow = on_overflow
-        self._on_item = on_item
-        self.waiting: deque[tuple[str | None, Any]] = deque()
-        self._latest: dict[str, Any] = {}
-        self._commands = 0
-        self.overflowed = 0
-
-    def __len__(self) -> int:
-        return len(self.waiting)
-
-    def put_latest(self, slot: str, item: Any) -> None:
-        """Add an item of the actor's own, or replace the one that waits in the same slot."""
-        if slot not in self._latest:
-            self.waiting.append((slot, None))
-        self._latest[slot] = item
-        self._on_item()
-
-    def put_message(self, slot: str, item: Any, *, reserved: bool = True) -> bool:
-        """Add a message of which the latest counts; False if too many others wait.
-
-        Args:
-            slot: of its key.
-            item: the message.
-            reserved: the sender may use all of the room, not only what is open to everybody.
-        """
-        if slot not in self._latest and len(self._latest) >= self._room(self._slots, reserved):
-            return self._refuse(item)
-        self.put_latest(slot, item)
-        return True
-
-    def put(self, item: Any, *, reserved: bool = True) -> bool:
-        """Add a message that must be handled; False if the queue is full.
-
-        Args:
-            item: the message.
-            reserved: the sender may use all of the room, not only what is open to everybody.
-        """
-        if self._commands >= self._room(self._capacity, reserved):
-            return self._refuse(item)
-        self._commands += 1
-        self.waiting.append((None, item))
-        self._on_item()
-        return True
-
-    @staticmethod
-    def _room(most: int, reserved: bool) -> int:
-        return most if reserved else int(most * _OPEN_SHARE)
-
-    def _refuse(self, item: Any) -> bool:
-        self.overflowed += 1
-        if self._on_overflow:
-            self._on_overflow(item)
-        return False
-
-    def take(self) -> Any:
-        """Remove and return the oldest item.
-
-        Raises:
-            IndexError: the mailbox is empty.
-        """
-        slot, item = self.waiting.popleft()
-        if slot is None:
-            self._commands -= 1
-            return item
-        return self._latest.pop(slot)
-
-
 # What a dispatcher is doing. Numbers, because they are compared and set for each item.
 RESTING = 0
 """Nothing, and what comes goes through the mailbox."""
@@ -124,33 +34,93 @@ AWAKE = 2
 
 
 class Dispatcher:
-    """Handles an actor's items, each to its end before the next one.
+    """Holds an actor's items in order of first arrival, and handles one after the other.
 
-    Messages that arrive in bursts all wait in the mailbox until the burst is over: what is
-    overtaken within one need not be handled. What arrives by itself is handled at once.
+    A newer item with the same slot takes the old one's place. Messages that arrive in bursts all
+    wait until the burst is over: what is overtaken within one need not be handled. What arrives by
+    itself is handled at once. All methods run on the actor's event loop.
 
     Args:
         bursts: Whether messages arrive in bursts, see `Bus`.
         on_overflow: Called with a message that is refused because too many wait.
+        capacity: Commands that may wait.
+        slots: Keys of which a message may wait.
 
     Attributes:
-        mailbox: Items that wait.
         stance: `RESTING`, `IDLE` or `AWAKE`.
         progress: Items handled so far.
         stopping: It was asked to end, and handles nothing more.
+        overflowed: Messages refused because too many waited.
     """
 
-    def __init__(self, bursts: bool, on_overflow: Callable[[Any], None]) -> None:
-        self.mailbox = Mailbox(on_overflow=on_overflow, on_item=self.wake)
+    def __init__(self, bursts: bool, on_overflow: Callable[[Any], None], *,
+                 capacity: int = COMMAND_CAPACITY, slots: int = MESSAGE_SLOTS) -> None:
         self.stance = AWAKE
         self.progress = 0
-        self._waiting = self.mailbox.waiting
         self.stopping = False
+        self.overflowed = 0
+        self._on_overflow = on_overflow
+        self._capacity = capacity
+        self._slots = slots
+        self._waiting: deque[tuple[str | None, Any]] = deque()
+        self._latest: dict[str, Any] = {}
+        self._commands = 0
         self._bursts = bursts
         self._held = False
         self._pace_s = 0.0
         self._at_rest = RESTING if bursts else IDLE
         self._ended: asyncio.Future[None] | None = None
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    # -- the mailbox ----------------------------------------------------------------------------
+
+    def put(self, slot: str, item: Callable[[], None]) -> None:
+        """Handle an item of the actor's own; one that waits is replaced by the next of its slot."""
+        if self.stance == IDLE:
+            self.work(item)
+        else:
+            self._put_latest(slot, item)
+
+    def put_message(self, slot: str | None, item: Any, *, reserved: bool = True) -> bool:
+        """Have a message handled; False if too many others wait.
+
+        Args:
+            slot: of its key, if only the latest counts; None for a command, all of which count.
+            item: the message.
+            reserved: the sender may use all of the room, not only what is open to everybody.
+        """
+        share = 1.0 if reserved else _OPEN_SHARE
+        if slot is None:
+            fits = self._commands < self._capacity * share
+        else:
+            fits = slot in self._latest or len(self._latest) < self._slots * share
+        if not fits:
+            self.overflowed += 1
+            self._on_overflow(item)
+        elif slot is None:
+            self._commands += 1
+            self._waiting.append((None, item))
+            self._wake()
+        else:
+            self._put_latest(slot, item)
+        return fits
+
+    def _put_latest(self, slot: str, item: Any) -> None:
+        if slot not in self._latest:
+            self._waiting.append((slot, None))
+        self._latest[slot] = item
+        self._wake()
+
+    def _take(self) -> Any:
+        slot, item = self._waiting.popleft()
+        if slot is None:
+            self._commands -= 1
+            return item
+        return self._latest.pop(slot)
+
+    # -- handling -------------------------------------------------------------------------------
 
     async def run(self) -> None:
         """Handle items until `stop` was handled.
@@ -160,19 +130,12 @@ class Dispatcher:
         """
         self._ended = asyncio.get_running_loop().create_future()
         self.stance = RESTING
-        self.wake()
+        self._wake()
         await self._ended
-
-    def put(self, slot: str, item: Callable[[], None]) -> None:
-        """Handle an item of the actor's own; one that waits is replaced by the next of its slot."""
-        if self.stance == IDLE:
-            self.work(item)
-        else:
-            self.mailbox.put_latest(slot, item)
 
     def stop(self) -> None:
         """End after the items that already wait."""
-        self.mailbox.put_latest("stop", self._stop)
+        self._put_latest("stop", self._stop)
 
     def abandon(self) -> None:
         """Handle nothing more, not even what waits."""
@@ -182,14 +145,14 @@ class Dispatcher:
         """Handle nothing while held."""
         self._held = held
         self._change_rest()
-        self.wake()
+        self._wake()
 
     def slow_down(self, pace_s: float) -> None:
         """Take so many seconds of the loop's clock for each item."""
         self._pace_s = pace_s
         self._change_rest()
 
-    def wake(self) -> None:
+    def _wake(self) -> None:
         """See to it that the mailbox is worked off."""
         if self.stance != AWAKE and self._ended is not None:
             self.stance = AWAKE
@@ -208,7 +171,7 @@ class Dispatcher:
             if self._held or not waiting:
                 self.stance = RESTING if self._held else self._at_rest
                 return
-            item = self.mailbox.take()
+            item = self._take()
         try:
             while True:
                 item()
@@ -218,7 +181,7 @@ class Dispatcher:
                     return  # still awake: whatever arrives meanwhile waits
                 if not waiting or self.stopping:
                     break
-                item = self.mailbox.take()
+                item = self._take()
         except Exception as error:
             self._end(error)
             return

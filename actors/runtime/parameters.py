@@ -14,9 +14,9 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 import msgspec
 from msgspec import inspect
 
+from rampart.manager.spec.budget import find_false_alarm
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import Name, SpecificationError
-from rampart.manager.spec.timeouts import find_false_alarm
 
 P = TypeVar("P", bound=msgspec.Struct)
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from functools import partial
 
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.mailbox import Dispatcher
@@ -50,7 +49,7 @@ class Timers:
         self._dispatcher = dispatcher
         self._count = 0
         self._pending: set[Timer] = set()
-        self._periodic: list[_Ticker] = []
+        self._ended = False
 
     def __len__(self) -> int:
         return len(self._pending)
@@ -71,43 +70,26 @@ class Timers:
         return timer
 
     def every(self, period_s: float, name: str, call: Callable[[], None]) -> None:
-        """Have `call` made each `period_s` simulated seconds, first after one period."""
-        self._periodic.append(_Ticker(
-            self._clock, period_s, partial(self._dispatcher.put, f"timer {name}", call)))
+        """Have `call` made each `period_s` simulated seconds, first after one period.
+
+        A call that is late skips; it does not catch up.
+        """
+        loop, clock, slot = asyncio.get_running_loop(), self._clock, f"timer {name}"
+        post_at = getattr(loop, "post_at", loop.call_at)  # cheaper, on a virtual loop
+        due_s = clock.now() + period_s
+
+        def tick(*_: None) -> None:
+            nonlocal due_s
+            if not self._ended:
+                now_s, next_s = clock.now(), due_s + period_s
+                due_s = next_s if next_s > now_s else now_s + period_s
+                post_at(clock.source_time(due_s), tick, None, None)
+                self._dispatcher.put(slot, call)
+
+        post_at(clock.source_time(due_s), tick, None, None)
 
     def cancel(self) -> None:
         """Make none of the calls any more."""
+        self._ended = True
         for timer in list(self._pending):
             timer.cancel()
-        for ticker in self._periodic:
-            ticker.cancel()
-
-
-class _Ticker:
-    """A periodic timer. One that is late skips; it does not catch up."""
-
-    __slots__ = ("_call", "_cancelled", "_clock", "_due_s", "_period_s", "_post_at")
-
-    def __init__(self, clock: Clock, period_s: float, call: Callable[[], None]) -> None:
-        loop = asyncio.get_running_loop()
-        self._clock = clock
-        self._post_at = getattr(loop, "post_at", loop.call_at)  # cheaper, on a virtual loop
-        self._period_s = period_s
-        self._call = call
-        self._cancelled = False
-        self._arm(clock.now() + period_s)
-
-    def cancel(self) -> None:
-        """Tick no more."""
-        self._cancelled = True
-
-    def _arm(self, due_s: float) -> None:
-        self._due_s = due_s
-        self._post_at(self._clock.source_time(due_s), _Ticker._fire, self, None)
-
-    def _fire(self, _nothing: None) -> None:
-        if not self._cancelled:
-            now_s, next_s = self._clock.now(), self._due_s + self._period_s
-            self._arm(next_s if next_s > now_s else now_s + self._period_s)
-            self._call()
-

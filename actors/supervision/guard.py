@@ -1,7 +1,7 @@
 """The launcher's guard: brings back supervisor and spawners, those that hang too.
 
-The supervisor brings everybody back, and needs a spawner for it; which of the three is missing
-the guard replaces. Who is dead is seen in /proc. Who hangs is judged with `patience`: a process
+The supervisor brings the nodes back, and needs a spawner for it; which of the three is missing
+the guard replaces. Death is seen in /proc. Hanging is judged with `patience`: a process
 that waits for a processor is left alone. Of two spawners that hang one is replaced first, and the
 other one when that is back, so that no error of judgement leaves none.
 """
@@ -105,7 +105,7 @@ class Guard:
                 all_there = await self.look_after()
                 if all_there:
                     self._trouble = ""
-            except Exception as error:  # no descriptors left, or what nobody has thought of
+            except Exception as error:  # no descriptors left, or what was not thought of
                 all_there = False
                 why = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
                 self._tell(f"cannot look after supervisor and spawners: {why}")

@@ -58,8 +58,10 @@ def signal_node(node: str, name: str, port: int | None = None) -> RunProcess:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code: 0 signalled, 2 bad usage or no such node."""
     streams.secure()
+    options = _parser().parse_args(arguments)
     try:
-        _run(_parser().parse_args(arguments))
+        for line in _listed(options) if options.list else _signalled(options):
+            print(line)
     except SignalError as refusal:
         print(f"kill-node: {refusal}", file=sys.stderr)
         return 2
@@ -79,21 +81,25 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(options: argparse.Namespace) -> None:
-    if options.list:
-        _print_list(find_processes(options.port), as_json=options.json)
-        return
+def _signalled(options: argparse.Namespace) -> list[str]:
     if options.node is None:
         raise SignalError("no node given; --list shows what there is")
     if options.signal not in SIGNALS:
         raise SignalError(f"--signal {options.signal}: unknown signal; known: {', '.join(SIGNALS)}")
     victim = signal_node(options.node, options.signal, options.port)
     if options.json:
-        print(json.dumps({"node": options.node, "pid": victim.pid, "signal": options.signal,
-                          "incarnation": victim.incarnation}))
-    else:
-        print(f"{options.node} (pid {victim.pid}, incarnation {victim.incarnation}): "
-              f"{options.signal}")
+        return [json.dumps({"node": options.node, "pid": victim.pid, "signal": options.signal,
+                            "incarnation": victim.incarnation})]
+    return [f"{options.node} (pid {victim.pid}, incarnation {victim.incarnation}): "
+            f"{options.signal}"]
+
+
+def _listed(options: argparse.Namespace) -> list[str]:
+    rows = [{"name": name, "pid": p.pid, "incarnation": p.incarnation, "port": p.port}
+            for p in find_processes(options.port) for name in p.names]
+    if options.json:
+        return [json.dumps(rows)]
+    return ["{port:>6} {pid:>8} #{incarnation:<4} {name}".format(**row) for row in rows]
 
 
 def _find(processes: list[RunProcess], node: str, port: int | None) -> RunProcess:
@@ -108,16 +114,6 @@ def _find(processes: list[RunProcess], node: str, port: int | None) -> RunProces
         ports = ", ".join(str(p.port) for p in matches)
         raise SignalError(f"{node}: in several runs; choose one with --port: {ports}")
     return max(matches, key=lambda p: p.incarnation)
-
-
-def _print_list(processes: list[RunProcess], *, as_json: bool) -> None:
-    rows = [{"name": n, "pid": p.pid, "incarnation": p.incarnation, "port": p.port}
-            for p in processes for n in p.names]
-    if as_json:
-        print(json.dumps(rows))
-        return
-    for row in rows:
-        print(f"{row['port']:>6} {row['pid']:>8} #{row['incarnation']:<4} {row['name']}")
 
 
 if __name__ == "__main__":

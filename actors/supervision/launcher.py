@@ -1,8 +1,8 @@
 """The root of a run: starts spawners and supervisor, brings them back, and cleans up after all.
 
-The launcher owns the lifeline (see `lifeline`), is the subreaper of the run (orphans of a dead
+The launcher owns the lifeline (see `node_process`), is the subreaper of the run (orphans of a dead
 spawner become its children, so no zombie stays), and answers tools that look for the run. It is
-the last guard: the supervisor brings everybody back, the launcher brings back the supervisor
+the last guard: the supervisor brings the nodes back, the launcher brings back the supervisor
 (see `guard`).
 """
 
@@ -29,8 +29,7 @@ from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.actors.supervision.guard import Guard
-from rampart.actors.supervision.lifeline import kill_leftovers
-from rampart.actors.supervision.process_title import kill
+from rampart.actors.supervision.process_title import kill, kill_leftovers
 from rampart.actors.supervision.spawner import NAMES, Loaded
 from rampart.actors.supervision.spawner_client import (
     START_PATIENCE_S,
@@ -122,7 +121,7 @@ class Launcher:
             [sys.executable, "-P", "-m", "rampart.actors.supervision.spawner", name,
              str(self._lifeline[0])],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[self._lifeline[0]],
-            env=working_folder.environment(), process_group=0)  # see `lifeline`
+            env=working_folder.environment(), process_group=0)  # see `node_process`
         assert spawner.stdin is not None  # noqa: S101 for the type checker
         with contextlib.suppress(BrokenPipeError):  # it has died: what waits for it will notice
             spawner.stdin.write(msgspec.json.encode(self.plan))
@@ -198,7 +197,7 @@ class Launcher:
                 pass
 
     def observers_bus(self) -> ZenohBus:
-        """Return the bus of an observer in this process, which hears everybody; not yet open."""
+        """Return the bus of an observer in this process, which hears all nodes; not yet open."""
         folder = self.plan.folder
         others = [endpoint(folder, name) for name in self.names if name != OBSERVER]
         return ZenohBus(OBSERVER, 1, endpoint(folder, OBSERVER), others,

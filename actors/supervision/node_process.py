@@ -2,6 +2,20 @@
 
 SIGTERM asks the actors to end in order. SIGUSR2 wedges the event loop for good, process and
 liveliness token still there: the fault that only a heartbeat from the loop can show.
+
+The lifeline: a pipe whose only write end is in the launcher.
+
+When the launcher ends, however it ends, the kernel closes the write end and every process of
+the run reads end-of-file. A thread does the reading, so that a wedged event loop dies too. A
+stopped process cannot read. Two things end it all the same:
+
+* whichever process reads the end kills all others of the run before itself: one that is not
+  stopped is enough;
+* the launcher has the run in a process group of its own, and when the last process outside that
+  holds it together, the launcher, is gone, the kernel sends SIGHUP and SIGCONT to the group if one
+  of its members is stopped (setpgid(2), "orphaned process group"): with all of them stopped there
+  is still the kernel. Not where what adopts the launcher's children is of the same session, as
+  a shell that is the first process of a container.
 """
 
 from __future__ import annotations
@@ -11,6 +25,7 @@ import contextlib
 import os
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -27,8 +42,7 @@ from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
 from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 from rampart.actors.runtime.clock import Clock
-from rampart.actors.supervision.lifeline import exit_with_launcher
-from rampart.actors.supervision.process_title import set_title
+from rampart.actors.supervision.process_title import end_run, kill, set_title
 from rampart.actors.supervision.unseen import tell_of_callbacks
 from rampart.files.plain_text import one_line
 from rampart.manager.spec.schema import Kind
@@ -39,6 +53,18 @@ WORLD_NICE = -10
 EXIT_OK = 0
 EXIT_FAILED = 1
 EXIT_BUS = 3
+
+
+def exit_with_launcher(lifeline: int, launcher: int, folder: str) -> None:
+    """Start the thread that ends this process, and all of the run, when the launcher has ended."""
+
+    def wait() -> None:
+        while os.read(lifeline, 1):
+            pass
+        end_run(launcher, folder)
+        kill(os.getpid())
+
+    threading.Thread(target=wait, name="lifeline", daemon=True).start()
 
 
 def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
@@ -74,7 +100,7 @@ def node_main(layout: Layout, names: tuple[str, ...], incarnation: int, run: Run
         names: of the actors.
         incarnation: of the process.
         run: what all actors of the run have in common.
-        lifeline: read end of the pipe; see `lifeline`.
+        lifeline: read end of the pipe; see above.
         born: called as soon as the process has its title, before it does anything that others see.
     """
     told: list[Exception] = []

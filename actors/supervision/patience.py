@@ -6,9 +6,9 @@ counts in which the process could have run:
 
 * not what it spent in the run queue, which the kernel counts (`/proc/PID/schedstat`, proc(5));
 * of a process that is on the run queue right now, only what it has run, for the kernel adds the
-  wait that is not over yet later: who spins is found out, who waits is not;
+  wait that is not over yet later: spinning is found out, waiting is not;
 * nothing while the kernel itself makes it wait (state D: a disk, or memory that is swapped);
-* and no more than a moment a look, so that a caller who stood still itself blames no other.
+* and no more than a moment a look, so that a caller that stood still itself blames no other.
 
 A stopped process (state T) is not on the run queue: all of its time counts.
 """
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from rampart.actors.supervision.process_title import process_state
+from rampart.actors.bus.unix_peer import process_state
 
 
 class Usage(NamedTuple):
@@ -31,7 +31,7 @@ class Usage(NamedTuple):
 
 
 AT_LEISURE = Usage("S", 0.0, 0.0)
-"""Of who waits for nothing."""
+"""Of a process that waits for nothing."""
 
 
 def usage(pid: int) -> Usage:

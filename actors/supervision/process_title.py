@@ -16,6 +16,9 @@ from pathlib import Path
 
 import setproctitle
 
+from rampart.actors.bus.run_folder import remove
+from rampart.actors.bus.unix_peer import process_state
+
 _TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
 
 
@@ -68,15 +71,6 @@ def find_process(pid: int) -> RunProcess | None:
     return process if process and process_state(pid) not in "ZX" else None
 
 
-def process_state(pid: int) -> str:
-    """Return the state letter of /proc/PID/stat, or "X" if there is no such process."""
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return "X"
-    return stat.rpartition(")")[2].split()[0]
-
-
 def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> bool:
     """Send a signal to a process; False if it is gone."""
     try:
@@ -84,3 +78,15 @@ def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+def kill_leftovers(launcher: int) -> list[int]:
+    """SIGKILL all processes of a launcher's run except this one; return their pids."""
+    return [process.pid for process in find_processes(launcher=launcher)
+            if process.pid != os.getpid() and kill(process.pid)]
+
+
+def end_run(launcher: int, folder: str) -> None:
+    """Leave nothing of a run whose launcher has ended: neither processes nor its folder."""
+    kill_leftovers(launcher)
+    remove(folder)

@@ -16,9 +16,10 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
+from rampart.actors.bus.unix_peer import process_state
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.supervision.patience import AT_LEISURE, Usage, usage
-from rampart.actors.supervision.process_title import find_processes, process_state
+from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.supervision.spawner_client import SpawnerClient, SpawnerUnavailableError
 
 __all__ = ["Living", "OsProcesses", "ProcessHandle", "Processes", "SpawnerUnavailableError"]
@@ -35,10 +36,11 @@ class Living(NamedTuple):
 class ProcessHandle:
     """One process, held so that its number cannot come to mean another one.
 
-    This class itself is the hold on none: see `NO_PROCESS` and `NOT_HELD`.
+    This class itself is the hold on none: either there is no process, or (`is_gone` False) there
+    was no descriptor left to hold it by.
     """
 
-    def __init__(self, *, is_gone: bool) -> None:
+    def __init__(self, *, is_gone: bool = True) -> None:
         self._is_gone = is_gone
 
     def kill(self) -> None:
@@ -63,13 +65,6 @@ class ProcessHandle:
         """Let go of it."""
 
 
-NO_PROCESS = ProcessHandle(is_gone=True)
-"""In the place of a handle where there is no process."""
-
-NOT_HELD = ProcessHandle(is_gone=False)
-"""In the place of a handle on a process for which no descriptor was left."""
-
-
 class Processes(Protocol):
     """The processes of one run."""
 
@@ -82,7 +77,7 @@ class Processes(Protocol):
         Raises:
             SpawnerBusyError: It is under way; to be called again with the same names and
                 incarnation.
-            SpawnerUnavailableError: Nobody could do it now; likewise.
+            SpawnerUnavailableError: No spawner could do it now; likewise.
             OSError: Likewise, for want of memory or descriptors.
         """
 
@@ -98,7 +93,7 @@ class Processes(Protocol):
         """Start processes by a changed system from now on."""
 
     def end(self, handles: Sequence[ProcessHandle], grace_s: float) -> None:
-        """End processes: asked to, in the sequence given, and killed if they linger."""
+        """End the processes held: asked to, in the sequence given, and killed if they linger."""
 
     def close(self) -> None:
         """Let go of everything."""

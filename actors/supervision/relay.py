@@ -1,6 +1,6 @@
-"""Messages that the supervisor passes on: it has a link to everybody, and others have not.
+"""Messages that the supervisor passes on: it has a link to every node, and others have not.
 
-Who shows error reports and orders faults, as the operator's page does, thus needs one link only.
+The operator's page, which shows error reports and orders faults, thus needs one link only.
 """
 
 from __future__ import annotations

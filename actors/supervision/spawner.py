@@ -6,8 +6,8 @@ folder of the run, where only the run's user gets in, and issues the incarnation
 There are two of them, `a` and `b`: if one dies, the other forks nodes and its own new sibling.
 
 Requests and replies are one JSON datagram each way on a sequenced-packet socket. A request to fork
-is answered by the new process itself, and by its answer it learns whether it is still wanted: who
-does not wait for it any more has closed the connection (see `spawner_client`).
+is answered by the new process itself, and by its answer it learns whether it is still wanted: a
+caller that does not wait any more has closed the connection (see `spawner_client`).
 """
 
 from __future__ import annotations
@@ -25,15 +25,14 @@ from typing import NoReturn
 import msgspec
 from msgspec.structs import replace
 
-from rampart.actors.bus.run_folder import issue, issued, remove, socket_path
+from rampart.actors.bus.run_folder import issue, issued, socket_path
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.layout import Layout, adapted_system, load_run
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
-from rampart.actors.supervision.lifeline import kill_leftovers
 from rampart.actors.supervision.node_process import node_main, wedge
-from rampart.actors.supervision.process_title import set_title
+from rampart.actors.supervision.process_title import end_run, set_title
 from rampart.files import streams, working_folder
 from rampart.manager.spec.tables import Supervision
 
@@ -57,9 +56,9 @@ class Ping(msgspec.Struct, frozen=True, tag="ping"):
 
 
 class Adapt(msgspec.Struct, frozen=True, tag="adapt"):
-    """Fork from now on by a changed system: an encoded `AdaptedSystem`."""
+    """Fork from now on by a changed system."""
 
-    adapted: str
+    adapted: AdaptedSystem
 
 
 class SetOrigin(msgspec.Struct, frozen=True, tag="origin"):
@@ -174,8 +173,7 @@ class Spawner:
         if isinstance(request, SetOrigin):
             self._layout.plan = replace(self._layout.plan, origin_s=request.origin_s)
         elif isinstance(request, Adapt):
-            adapted = msgspec.json.decode(request.adapted, type=AdaptedSystem)
-            self._layout, self._run = adapted_system(self._layout, self._run, adapted)
+            self._layout, self._run = adapted_system(self._layout, self._run, request.adapted)
 
     def _fork(self, request: ForkRequest, connection: socket.socket) -> None:
         for name in request.names:
@@ -190,7 +188,7 @@ class Spawner:
 
         def born() -> None:
             if not _answer(connection, Reply()):
-                os._exit(0)  # nobody waits for it any more: another one may have its place
+                os._exit(0)  # not waited for any more: another one may have its place
             connection.close()
             issue(folder, request.names, request.incarnation)
 
@@ -221,8 +219,7 @@ class Spawner:
     def _launcher_gone(self, lifeline: int) -> None:
         if os.read(lifeline, 1):
             return
-        kill_leftovers(self._layout.plan.launcher_pid)
-        remove(self._layout.plan.folder)
+        end_run(self._layout.plan.launcher_pid, self._layout.plan.folder)
         os._exit(0)
 
 
@@ -259,10 +256,10 @@ def main() -> int:
         spawner.open()
         loaded = Loaded(tuple(layout.members), spec.supervision)
         print(msgspec.json.encode(loaded).decode(), flush=True)
-        os.dup2(2, 1)  # nobody reads the pipe from here on
-        streams.secure()  # and perhaps nobody stderr: that ends no node
+        os.dup2(2, 1)  # the pipe is not read from here on
+        streams.secure()  # and stderr perhaps neither: that ends no node
         spawner.serve()
-    except BrokenPipeError:  # the launcher ended while this was loading: nobody to tell
+    except BrokenPipeError:  # the launcher ended while this was loading
         os._exit(2)
     return 0
 

@@ -3,16 +3,16 @@
 A spawner that is stopped, hung or starved must cost its caller no time and lead to no second
 process of one incarnation. Both follow from how a request ends:
 
-* The new process itself answers, and runs only if its answer was accepted. Who withdraws a request
-  shuts its end of the connection first and looks for an answer then. The kernel decides which of
-  the two came first: either the answer is there, and with it the process, or it is refused, and the
-  process ends at once, however late a spawner comes to fork it.
+* The new process itself answers, and runs only if its answer was accepted. A caller that withdraws
+  a request shuts its end of the connection first and looks for an answer then. The kernel decides
+  which of the two came first: either the answer is there, and with it the process, or it is
+  refused, and the process ends at once, however late a spawner comes to fork it.
 * So a request may wait while its caller goes on: `fork` is called again, and finds the answer.
 
 Nothing is killed here. Whether a spawner hangs or only waits for a processor is judged by the
-launcher (`guard`), who can replace it. Answers are not believed blindly: both ends check the other
-one's user, and the process is the one that sent the answer, as the kernel says, if /proc shows it
-under the title that was asked for.
+launcher (`guard`), which can replace it. Answers are not believed blindly: both ends check the
+other one's user, and the process is the one that sent the answer, as the kernel says, if /proc
+shows it under the title that was asked for.
 """
 
 from __future__ import annotations
@@ -27,18 +27,9 @@ import msgspec
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.unix_peer import is_same_user, receive_signed
 from rampart.actors.ftm.messages import AdaptedSystem
+from rampart.actors.supervision import spawner as protocol
 from rampart.actors.supervision.process_title import find_process, kill
-from rampart.actors.supervision.spawner import (
-    MAX_DATAGRAM,
-    NAMES,
-    Adapt,
-    ForkRequest,
-    Ping,
-    Reply,
-    Request,
-    SetOrigin,
-    address,
-)
+from rampart.actors.supervision.spawner import NAMES, Reply, Request
 
 WAIT_S = 0.05
 """A fork takes a millisecond or two. So long its caller stands still for it, at most for each
@@ -122,7 +113,7 @@ class _Asked:
     def _read(self) -> None:
         sender = 0
         try:
-            data, sender = receive_signed(self._connection, MAX_DATAGRAM)
+            data, sender = receive_signed(self._connection, protocol.MAX_DATAGRAM)
             self._unanswered -= 1
             if data and self._unanswered > 0:
                 return
@@ -154,7 +145,7 @@ class SpawnerClient:
         self._forks: dict[tuple[str, ...], tuple[int, _Asked]] = {}
         self._pings: dict[str, _Asked] = {}
         self._slow: set[str] = set()
-        self._adapt: Adapt | None = None
+        self._adapt: protocol.Adapt | None = None
 
     def fork(self, names: tuple[str, ...], incarnation: int) -> int:
         """Fork a process for the named actors and return its pid.
@@ -168,7 +159,7 @@ class SpawnerClient:
                 incarnation, which goes on waiting.
             SpawnerUnavailableError: no spawner could do it, or none has answered for long.
         """
-        requests: list[Request] = [ForkRequest(names, incarnation)]
+        requests: list[Request] = [protocol.ForkRequest(names, incarnation)]
         if self._adapt is not None:  # a spawner may have loaded the file as it was
             requests.insert(0, self._adapt)
         asked = self._resumed(names, incarnation)
@@ -206,7 +197,7 @@ class SpawnerClient:
             asked, wait_s = self._reach([name], []), WAIT_S
             if asked is None:
                 return False
-            asked.send(Ping())
+            asked.send(protocol.Ping())
         reply = asked.reply(wait_s)
         if reply is None:
             self._pings[name] = asked
@@ -219,13 +210,13 @@ class SpawnerClient:
             SpawnerUnavailableError: it does not answer.
         """
         asked = self._reach([NAMES[0]], [])
-        reply = asked.ask(SetOrigin(origin_s), START_PATIENCE_S) if asked else None
+        reply = asked.ask(protocol.SetOrigin(origin_s), START_PATIENCE_S) if asked else None
         if reply is None or reply.error:
             raise SpawnerUnavailableError("spawner_a: no answer")
 
     def adapt(self, adapted: AdaptedSystem) -> None:
         """Have the spawners fork by a changed system from now on, those still to come included."""
-        self._adapt = Adapt(msgspec.json.encode(adapted).decode())
+        self._adapt = protocol.Adapt(adapted)
 
         for name in NAMES:
             asked = self._reach([name], [])
@@ -268,7 +259,7 @@ class SpawnerClient:
             try:
                 connection.setblocking(False)  # who does not accept must not keep us
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
-                connection.connect(address(self.folder, name))
+                connection.connect(protocol.address(self.folder, name))
                 if is_same_user(connection):
                     return _Asked(name, connection)
                 failures.append(f"spawner_{name}: its name is taken by another user")

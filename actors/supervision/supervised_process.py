@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import NamedTuple
@@ -45,7 +45,7 @@ class State(Enum):
     STOPPED = "stopped"
     WEDGED = "wedged"
     CRASHED = "crashed"
-    """It has ended, or there was none yet, and nobody has asked for another one."""
+    """It has ended, or there was none yet, and no other one was asked for."""
     RESTARTING = "restarting"
     """It was killed if it was there, and another one is forked as soon as it is gone."""
     GIVEN_UP = "given up"
@@ -85,7 +85,7 @@ class Action(Enum):
     PUBLISH = auto()
     """Publish the table of all nodes."""
     SEARCH = auto()
-    """Adopt a process that nobody holds, if there is one."""
+    """Adopt a process that is not held, if there is one."""
     RECOVER = auto()
     """Ask for a restart, if it is the supervisor's to ask."""
     KILL = auto()
@@ -112,34 +112,31 @@ class Transition(NamedTuple):
 _A, _E, _S = Action, Event, State
 _PRESENT = (_S.STARTING, _S.RUNNING, _S.STOPPED, _S.WEDGED)
 _WAITING = (_S.RESTARTING, _S.GIVEN_UP)
+_SAID = (_A.TELL, _A.PUBLISH)
 _LOST = (_A.TELL, _A.PUBLISH, _A.RECOVER)
 _NEW = (_A.TELL, _A.PUBLISH, _A.HOLD)
+_OVER = (_A.KILL, _A.TELL, _A.PUBLISH, _A.FORK_WHEN_GONE)
 
-TRANSITIONS: Mapping[tuple[State, Event], Transition] = {
-    (_S.STARTING, _E.HEARD): Transition(_S.RUNNING, "running", (_A.TELL, _A.PUBLISH)),
-    (_S.STOPPED, _E.HEARD): Transition(_S.RUNNING, "resumed", (_A.TELL, _A.PUBLISH)),
-    (_S.WEDGED, _E.HEARD): Transition(_S.RUNNING, "resumed", (_A.TELL, _A.PUBLISH)),
-    (_S.STARTING, _E.SILENT): Transition(_S.WEDGED, "wedged", _LOST),
-    (_S.RUNNING, _E.SILENT): Transition(_S.WEDGED, "wedged", _LOST),
-    (_S.RUNNING, _E.SILENT_STOPPED): Transition(_S.STOPPED, "stopped", _LOST),
-    # One that was never heard: another process that nobody holds may have its socket.
-    (_S.STARTING, _E.ENDED): Transition(
-        _S.CRASHED, "crashed", (_A.TELL, _A.SEARCH, _A.PUBLISH, _A.RECOVER)),
-    **{(state, _E.ENDED): Transition(_S.CRASHED, "crashed", _LOST)
-       for state in (_S.RUNNING, _S.STOPPED, _S.WEDGED)},
-    (_S.CRASHED, _E.START): Transition(_S.RESTARTING, "", (_A.FORK,)),
-    **{(state, _E.RESTART): Transition(_S.RESTARTING, "", (_A.KILL, _A.FORK_WHEN_GONE))
-       for state in (*_PRESENT, _S.CRASHED)},
-    (_S.GIVEN_UP, _E.RESTART): Transition(_S.GIVEN_UP, "given up", (_A.TELL,)),
-    **{(state, _E.TOO_OFTEN): Transition(
-        _S.GIVEN_UP, "given up", (_A.KILL, _A.TELL, _A.PUBLISH, _A.FORK_WHEN_GONE))
-       for state in (*_PRESENT, _S.CRASHED)},
-    (_S.RESTARTING, _E.STARTED): Transition(_S.STARTING, "started", _NEW),
-    **{(state, _E.FORKED): Transition(_S.STARTING, "respawned", _NEW) for state in _WAITING},
-    **{(state, _E.ADOPTED): Transition(_S.RUNNING, "adopted", (_A.TELL, _A.HOLD))
-       for state in State},
-    (_S.GIVEN_UP, _E.ADAPTED): Transition(_S.CRASHED),
-}
+_ROWS: tuple[tuple[Iterable[State], Event, Transition], ...] = (
+    ((_S.STARTING,), _E.HEARD, Transition(_S.RUNNING, "running", _SAID)),
+    ((_S.STOPPED, _S.WEDGED), _E.HEARD, Transition(_S.RUNNING, "resumed", _SAID)),
+    ((_S.STARTING, _S.RUNNING), _E.SILENT, Transition(_S.WEDGED, "wedged", _LOST)),
+    ((_S.RUNNING,), _E.SILENT_STOPPED, Transition(_S.STOPPED, "stopped", _LOST)),
+    # One that was never heard: another process, not held, may have its socket.
+    ((_S.STARTING,), _E.ENDED, Transition(
+        _S.CRASHED, "crashed", (_A.TELL, _A.SEARCH, _A.PUBLISH, _A.RECOVER))),
+    ((_S.RUNNING, _S.STOPPED, _S.WEDGED), _E.ENDED, Transition(_S.CRASHED, "crashed", _LOST)),
+    ((_S.CRASHED,), _E.START, Transition(_S.RESTARTING, "", (_A.FORK,))),
+    ((*_PRESENT, _S.CRASHED), _E.RESTART, Transition(
+        _S.RESTARTING, "", (_A.KILL, _A.FORK_WHEN_GONE))),
+    ((_S.GIVEN_UP,), _E.RESTART, Transition(_S.GIVEN_UP, "given up", (_A.TELL,))),
+    ((*_PRESENT, _S.CRASHED), _E.TOO_OFTEN, Transition(_S.GIVEN_UP, "given up", _OVER)),
+    ((_S.RESTARTING,), _E.STARTED, Transition(_S.STARTING, "started", _NEW)),
+    (_WAITING, _E.FORKED, Transition(_S.STARTING, "respawned", _NEW)),
+    (State, _E.ADOPTED, Transition(_S.RUNNING, "adopted", (_A.TELL, _A.HOLD))),
+    ((_S.GIVEN_UP,), _E.ADAPTED, Transition(_S.CRASHED)))
+
+TRANSITIONS = {(state, event): then for states, event, then in _ROWS for state in states}
 
 
 @dataclass(slots=True)

@@ -25,27 +25,20 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.messages import Heartbeat
-from rampart.actors.bus.topic import Topic
+from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import Layout, adapted_system
-from rampart.actors.runtime.actor import Context, Header, Members, every, on
+from rampart.actors.runtime.actor import Context, Header, every, on
 from rampart.actors.runtime.timer import Timer
 from rampart.actors.supervision.patience import Patience
-from rampart.actors.supervision.processes import (
-    NO_PROCESS,
-    NOT_HELD,
-    Living,
-    OsProcesses,
-    Processes,
-    ProcessHandle,
-)
+from rampart.actors.supervision.processes import Living, OsProcesses, Processes, ProcessHandle
 from rampart.actors.supervision.relay import Relay
 from rampart.actors.supervision.spawner_client import SpawnerBusyError, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import (
@@ -57,7 +50,7 @@ from rampart.actors.supervision.supervised_process import (
     SupervisedProcess,
 )
 from rampart.manager.spec.adaptation import changed_actors
-from rampart.manager.spec.specification import Kind
+from rampart.manager.spec.schema import Kind
 
 STOP_GRACE_S = 0.5
 """Wall seconds between SIGTERM and SIGKILL at the end of a run."""
@@ -84,7 +77,7 @@ class _Process(SupervisedProcess):
         next_step: Towards its fork, while that is under way; there is never more than one.
     """
 
-    handle: ProcessHandle = NO_PROCESS
+    handle: ProcessHandle = field(default_factory=ProcessHandle)
     next_step: Timer | None = None
 
     def take(self, pid: int, incarnation: int) -> None:
@@ -94,7 +87,7 @@ class _Process(SupervisedProcess):
 
     def let_go(self) -> None:
         self.handle.close()
-        self.handle = NO_PROCESS
+        self.handle = ProcessHandle()
 
     def kill(self) -> None:
         """End it at once, and do not hear of that."""
@@ -129,8 +122,7 @@ class Supervisor(Relay):
                            Patience(2 * _CHECK_S / self._plan.rate))
             for name, unit in self._layout.units.items()}
         for node, incarnation in run.known_incarnations.items():
-            process = self._process_of(node)
-            if process is not None:
+            if (process := self._process_of(node)) is not None:
                 process.incarnation = process.highest = incarnation
         self._version = (0, run.adapted.version if run.adapted else 0)
         if run.adapted is not None:
@@ -153,23 +145,21 @@ class Supervisor(Relay):
         """Adopt what runs, start what does not, in the order of the spec."""
         living = self._machine.living()
         for process in self._processes.values():
-            if self._adopt_living(process, living):
-                continue
-            if self.context.incarnation == 1 or self._owns(process):
+            if not self._adopt_living(process, living) and (
+                    self._incarnation == 1 or self._owns(process)):
                 self._on(process, Event.START)
         self._publish_table()
 
     def on_stop(self) -> None:
         """End all processes in reverse order: SIGTERM, then SIGKILL for those that linger.
 
-        After a failure nobody is ended: the next supervisor adopts them.
+        After a failure none is ended: the next supervisor adopts them.
         """
         handles = []
         for process in reversed(self._processes.values()):
             if not self._dispatcher.stopping:
                 process.let_go()
-            elif process.handle not in (NO_PROCESS, NOT_HELD) and (
-                    process.shown is not fm.NodeState.CRASHED):
+            elif process.shown is not fm.NodeState.CRASHED:
                 process.handle.ignore()
                 handles.append(process.handle)
         self._machine.end(handles, STOP_GRACE_S)
@@ -187,10 +177,9 @@ class Supervisor(Relay):
                 header.incarnation == process.incarnation and process.pid != message.pid
                 and process.is_dead):
             self._look_for(process)
-        if (header.incarnation, message.pid) != (process.incarnation, process.pid):
-            return
-        if process.waits:  # said before it was killed
-            return
+        if process.waits or (
+                header.incarnation, message.pid) != (process.incarnation, process.pid):
+            return  # said before it was killed, or by another one
         process.heard_s[header.source] = self._loop.time()
         process.requested_by = ""
         self._on(process, Event.HEARD)
@@ -250,7 +239,7 @@ class Supervisor(Relay):
     @every(_CHECK_S)
     def check(self) -> None:
         """Look for processes whose loops are silent."""
-        # A supervisor that was stopped, starved or waiting for a hung spawner heard nobody. What
+        # A supervisor that was stopped, starved or waiting for a hung spawner heard no node. What
         # was said is still on its way here, and silence counts only while this loop turned.
         now, period_s = self._loop.time(), _CHECK_S / self._plan.rate
         stall_s = now - self._checked_s - period_s
@@ -377,7 +366,7 @@ class Supervisor(Relay):
     def _hold(self, process: _Process, pid: int) -> None:
         if process.pid != pid:  # it was replaced while this waited
             return
-        process.handle = NOT_HELD
+        process.handle = ProcessHandle(is_gone=False)
         try:
             process.handle = self._machine.hold(pid, lambda: self._dispatcher.put(
                 f"exit {pid}", lambda: self._ended(process, pid)))

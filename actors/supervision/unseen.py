@@ -1,7 +1,7 @@
 """Nothing that runs on an event loop ends unseen: neither a task nor a callback.
 
-asyncio tells of a task's failure when somebody asks for its result or when it is collected, which
-may be never, and of a callback's on a log that nobody reads. Here a failed callback is told in one
+asyncio tells of a task's failure when its result is asked for or when it is collected, which
+may be never, and of a callback's on a log that is not shown. Here a failed callback is told in one
 line, and the end of a task that is to run as long as the loop is given to those who can act on it.
 """
 

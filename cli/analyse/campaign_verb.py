@@ -8,7 +8,17 @@ from importlib.metadata import entry_points
 
 from rampart.actors.layout.layout import application_class
 from rampart.cli import application_options, systems
-from rampart.cli.verbs import add_options, flag, group, help_of, number, option, several, whole, word
+from rampart.cli.verbs import (
+    add_options,
+    flag,
+    group,
+    help_of,
+    number,
+    option,
+    several,
+    whole,
+    word,
+)
 from rampart.sim.campaign.defaults import BACKENDS, PATIENCE_S
 from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.virtual.network import NETWORKS

@@ -11,11 +11,11 @@ import msgspec
 from rampart.actors.bus.bounds import MAX_PAYLOAD_BYTES
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.ftm import topics
-from rampart.actors.layout.layout import SUPERVISOR_CLASS, application_class
+from rampart.actors.layout.layout import Layout
 from rampart.actors.layout.system_topics import find_topic
-from rampart.actors.layout.wiring import load_class, topics_of
+from rampart.actors.layout.wiring import heard, published
 from rampart.actors.run.run_info import NoRunError, find_run
-from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR
+from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 from rampart.cli import systems
 from rampart.cli.output import UsageError, unknown
@@ -44,14 +44,12 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
         UsageError: the spec names an actor class that does not exist, or one of them declares a
             topic that makes no sense.
     """
-    members = [(SUPERVISOR, SUPERVISOR_CLASS), (OBSERVER, application_class(spec).observer),
-               *((node.name, node.actor) for node in spec.actors())]
-    inputs, outputs = {}, {}
-    for name, path in members:
-        try:
-            inputs[name], outputs[name] = topics_of(load_class(path))
-        except ValueError as error:
-            raise UsageError(f"node {name}: {error}") from None
+    try:
+        members = Layout(RunPlan(), spec).members.values()
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    inputs = {member.name: heard(member) for member in members}
+    outputs = {member.name: published(member) for member in members}
     return [TopicUse(topic, _who(topic, BASE_OUTPUTS, outputs) or ("tools",),
                      _who(topic, BASE_INPUTS, inputs)) for topic in systems.topics_of(spec)]
 
@@ -171,10 +169,10 @@ def markdown(spec: SystemSpec) -> str:
 
 
 def _who(topic: Topic[Any], of_all: Collection[Topic[Any]],
-         of_each: Mapping[str, Collection[Topic[Any]]]) -> tuple[str, ...]:
+         of_each: Mapping[str, Collection[str]]) -> tuple[str, ...]:
     if topic in of_all:
         return ("every node",)
-    return tuple(name for name, those in of_each.items() if topic in those)
+    return tuple(name for name, those in of_each.items() if topic.key in those)
 
 
 def rate(topic: Topic[Any]) -> str:

@@ -45,7 +45,8 @@ from rampart.actors.supervision.process_title import find_processes
 from rampart.cli import systems
 from rampart.cli.output import UsageError, refusing
 from rampart.cli.session import pause
-from rampart.manager.spec.specification import Kind, SystemSpec, check_document, read_document
+from rampart.manager.spec.schema import Kind, SystemSpec
+from rampart.manager.spec.specification import check_document, read_document
 
 DEFAULT_PORT = 7400
 PAGE = "replay_page"

@@ -6,9 +6,9 @@ which some of them can be. Counterexamples are found smallest first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
-from itertools import chain, combinations
-from typing import TypeVar
+from collections.abc import Collection, Iterator, Sequence
+from functools import cache
+from itertools import chain, combinations, product
 
 import msgspec
 
@@ -46,7 +46,6 @@ class Property(msgspec.Struct, frozen=True):
 
 
 Trace = tuple[str, ...]
-T = TypeVar("T")
 
 
 class Case(msgspec.Struct, frozen=True):
@@ -78,14 +77,14 @@ class ActiveSets:
         self.strategy = strategy
         names = arrangement.mechanisms.names
         self.cases = [
-            Case(active, frozenset(late), strategy.choose(active, arrangement, frozenset(late)))
-            for size in range(1, len(names) + 1)
-            for active in combinations(names, size)
-            for late in (subsets(active) if strategy.patient else ((),))]
+            Case(active, late, strategy.choose(active, arrangement, late))
+            for active in subsets(names) if active
+            for late in map(frozenset, subsets(active) if strategy.patient else ((),))]
         self._by_set = {(case.active, case.late): case for case in self.cases}
-        tree, recover = arrangement.tree, arrangement.mechanisms.recover
-        self.last_resort = frozenset(recover[tree.root])
-        self._milder: dict[tuple[tuple[str, ...], tuple[str, ...]], tuple[str, str] | None] = {}
+        self._recover = arrangement.mechanisms.recover
+        self._contracts = arrangement.mechanisms.contracts
+        self.last_resort = frozenset(self._recover[arrangement.tree.root])
+        self._find_milder = cache(self._compare)
 
     def check(self) -> Iterator[Property]:
         """Check every property in turn."""
@@ -98,91 +97,74 @@ class ActiveSets:
                 ("monotone", self._less_safe_with_more),
                 ("no-harm", self._harm),
                 ("repairs-run", self._starving_repair)):
-            yield judge(name, self.strategy.name, self.cases, find)
+            yield judge(name, self.strategy.name, len(self.cases), [
+                (case.describe(), *wrong) for case in self.cases
+                if (wrong := next(find(case), None))])
 
     @property
     def stops_for_good(self) -> int:
         """In how many sets a recovery is run that stays until an operator resets it."""
-        contracts = self.arrangement.mechanisms.contracts
-        return sum(any(contracts[r].latched for r in case.decision.recoveries)
+        return sum(any(self._contracts[r].latched for r in case.decision.recoveries)
                    for case in self.cases if not case.late)
 
     @property
     def stuck_behind_last_resort(self) -> int:
         """In how many sets a latched last resort runs, and a repair that is needed never does.
 
-        `repairs-run` exempts these: the robot stands, and somebody has to come anyhow. But the
-        reset is refused as long as the last resort is decided on, which is as long as nobody
-        repairs by hand.
+        `repairs-run` exempts these: the robot stands, and an operator has to come anyhow. But the
+        reset is refused as long as the last resort is decided on, which is until the repair has
+        been made by hand.
         """
         return sum(self._starve(case)[1] for case in self.cases if not case.late)
 
-    # -- the properties: each yields a trace if the case violates it -----------------------------
+    # -- the properties: each yields what is wrong if the case violates it -----------------------
 
-    def _no_single_decision(self, case: Case) -> Trace | None:
+    def _no_single_decision(self, case: Case) -> Iterator[Trace]:
         taken = case.decision.recoveries
-        again = self.strategy.choose(case.active, self.arrangement, case.late)
-        known = self.arrangement.mechanisms.contracts
-        if again != case.decision:
-            return (case.describe(), "asked again, it decides otherwise")
-        if not taken or not set(taken) <= known.keys() or len(set(taken)) != len(taken):
-            return (case.describe(), "that is not a set of known recoveries, each once")
-        exclusive = self.strategy.exclusive and not self.arrangement.compound
-        if exclusive and len(taken) != 1:
-            return (case.describe(), "a strategy that runs one at a time has to take one")
-        return None
+        if self.strategy.choose(case.active, self.arrangement, case.late) != case.decision:
+            yield ("asked again, it decides otherwise",)
+        if not taken or not set(taken) <= self._contracts.keys() or len(set(taken)) != len(taken):
+            yield ("that is not a set of known recoveries, each once",)
+        if self.strategy.exclusive and not self.arrangement.compound and len(taken) != 1:
+            yield ("a strategy that runs one at a time has to take one",)
 
-    def _conflicting_claims(self, case: Case) -> Trace | None:
+    def _conflicting_claims(self, case: Case) -> Iterator[Trace]:
         for one, other in combinations(case.decision.recoveries, 2):
             if self.arrangement.mechanisms.overlap(one, other):
-                return (case.describe(), f"{one} and {other} claim the same resource")
-        return None
+                yield (f"{one} and {other} claim the same resource",)
 
-    def _too_unsafe(self, case: Case) -> Trace | None:
+    def _too_unsafe(self, case: Case) -> Iterator[Trace]:
         for name in case.active:
-            for asked in self.arrangement.mechanisms.recover[name]:
+            for asked in self._recover[name]:
                 if not self._covered(asked, case.decision.recoveries):
-                    return (case.describe(), f"{name} asks for {asked}, and nothing that runs is "
-                                             "as safe")
-        return None
+                    yield (f"{name} asks for {asked}, and nothing that runs is as safe",)
 
-    def _stop_not_taken(self, case: Case) -> Trace | None:
+    def _stop_not_taken(self, case: Case) -> Iterator[Trace]:
         root = self.arrangement.tree.root
         if root in case.active and not self.last_resort <= set(case.decision.recoveries):
-            return (case.describe(), f"{root} asks for {listing(sorted(self.last_resort))}, the "
-                                     "last resort, and it is not run")
-        return None
+            yield (f"{root} asks for {listing(sorted(self.last_resort))}, the last resort, and it "
+                   "is not run",)
 
-    def _escalation_without_end(self, case: Case) -> Trace | None:
-        recover = self.arrangement.mechanisms.recover
-        contracts = self.arrangement.mechanisms.contracts
+    def _escalation_without_end(self, case: Case) -> Iterator[Trace]:
         for recovery in case.decision.recoveries:
-            sakes = [n for n in case.decision.mechanisms if recovery in recover[n]]
-            tried = succession(recovery, sakes or case.decision.mechanisms, contracts,
+            sakes = [n for n in case.decision.mechanisms if recovery in self._recover[n]]
+            tried = succession(recovery, sakes or case.decision.mechanisms, self._contracts,
                                self.arrangement)
             if not self.last_resort & set(tried):
-                return (case.describe(), f"if all fail: {' > '.join(tried)}, and the last resort "
-                                         "is never tried")
-        return None
+                yield (f"if all fail: {' > '.join(tried)}, and the last resort is never tried",)
 
-    def _less_safe_with_more(self, case: Case) -> Trace | None:
+    def _less_safe_with_more(self, case: Case) -> Iterator[Trace]:
         mechanisms = self.arrangement.mechanisms
         for extra in mechanisms.names:
             if extra in case.active:
                 continue
             more = self._by_set[mechanisms.sort((*case.active, extra)), case.late]
-            pair = case.decision.recoveries, more.decision.recoveries
-            if pair not in self._milder:
-                self._milder[pair] = self._find_milder(*pair)
-            milder = self._milder[pair]
+            milder = self._find_milder(case.decision.recoveries, more.decision.recoveries)
             if milder:
-                return (case.describe(), more.describe(),
-                        f"with {extra} active as well, {milder[1]} runs instead of {milder[0]}, "
-                        "which is safer")
-        return None
+                yield more.describe(), (f"with {extra} active as well, {milder[1]} runs instead of "
+                                        f"{milder[0]}, which is safer")
 
-    def _find_milder(self, before: tuple[str, ...], after: tuple[str, ...]
-                     ) -> tuple[str, str] | None:
+    def _compare(self, before: tuple[str, ...], after: tuple[str, ...]) -> tuple[str, str] | None:
         """Return a recovery that ran before, and a less safe one that runs instead of it.
 
         Compared is what is safest of each: repairs that run beneath make nothing less safe.
@@ -194,42 +176,35 @@ class ActiveSets:
                 return had, lower[0]
         return None
 
-    def _harm(self, case: Case) -> Trace | None:
-        for one in case.decision.recoveries:
-            for other in case.decision.recoveries:
-                harmed = self.arrangement.mechanisms.harms(one, other)
-                if harmed:
-                    return (case.describe(), f"{one} disables {', '.join(sorted(harmed))}, which "
-                                             f"{other} needs")
-        return None
+    def _harm(self, case: Case) -> Iterator[Trace]:
+        for one, other in product(case.decision.recoveries, repeat=2):
+            harmed = self.arrangement.mechanisms.harms(one, other)
+            if harmed:
+                yield (f"{one} disables {', '.join(sorted(harmed))}, which {other} needs",)
 
-    def _starving_repair(self, case: Case) -> Trace | None:
+    def _starving_repair(self, case: Case) -> Iterator[Trace]:
         """Find a repair that is asked for and never run, though all recoveries succeed.
 
         Exempt is what starves while a latched last resort runs (`stuck_behind_last_resort`).
         """
         trace, behind = self._starve(case)
-        return None if behind else trace
+        if trace and not behind:
+            yield trace
 
-    def _starve(self, case: Case) -> tuple[Trace | None, bool]:
+    def _starve(self, case: Case) -> tuple[Trace, bool]:
         """Return how a repair starves, if one does, and whether behind a latched last resort.
 
         What a repair is asked for persists until that repair has run, and so do the consequences
         that are detected above it. Everything else may go away by itself, and is let go.
         """
-        recover = self.arrangement.mechanisms.recover
-        contracts = self.arrangement.mechanisms.contracts
-        repairs = {name for name, c in contracts.items() if c.kind.repairs}
-        stops = {name for name in self.last_resort if contracts[name].latched}
-        tree = self.arrangement.tree
-        trace = [case.describe()]
+        recover, tree = self._recover, self.arrangement.tree
+        repairs = {name for name, c in self._contracts.items() if c.kind.repairs}
+        stops = {name for name in self.last_resort if self._contracts[name].latched}
+        trace: list[str] = []
         active = case.active
-        while True:
-            broken = [n for n in active if set(recover[n]) <= repairs]
+        while broken := [n for n in active if set(recover[n]) <= repairs]:
             lasting = tuple(n for n in active if n in broken or any(
                 tree.is_above(n, b) for b in broken))
-            if not broken:
-                return None, False
             decision = self._by_set[lasting, case.late.intersection(lasting)].decision
             if lasting != active:
                 trace.append(f"what else was active goes away; {listing(lasting)} active: runs "
@@ -241,6 +216,7 @@ class ActiveSets:
                 return tuple(trace), bool(stops.intersection(decision.recoveries))
             active = tuple(n for n in lasting if n not in cured)
             trace.append(f"{listing(decision.recoveries)} done")
+        return (), False
 
     def _covered(self, recovery: str, by: tuple[str, ...]) -> bool:
         return any(one == recovery or self.safety.is_above(one, recovery) for one in by)
@@ -251,26 +227,22 @@ def order_agrees_with_tree(arrangement: Arrangement, safety: PartialOrder) -> Pr
     tree, recover = arrangement.tree, arrangement.mechanisms.recover
     pairs = [(upper, lower) for upper in tree.names
              for lower in tree.members(tree.below[tree.number[upper]])]
-
-    def contradiction(pair: tuple[str, str]) -> Trace | None:
-        upper, lower = pair
-        for high in recover[lower]:
-            for low in recover[upper]:
-                if safety.is_above(high, low):
-                    return (f"{upper} is above {lower} in the FTMTree, but {high} of {lower} is "
-                            f"safer than {low} of {upper}",)
-        return None
-
-    return judge("order-agrees-with-tree", "", pairs, contradiction)
+    found: list[Trace] = []
+    for upper, lower in pairs:
+        safer = [both for both in product(recover[lower], recover[upper]) if safety.is_above(*both)]
+        if safer:
+            high, low = safer[0]
+            found.append((f"{upper} is above {lower} in the FTMTree, but {high} of {lower} is "
+                          f"safer than {low} of {upper}",))
+    return judge("order-agrees-with-tree", "", len(pairs), found)
 
 
-def judge(name: str, strategy: str, cases: list[T], find: Callable[[T], Trace | None]
-          ) -> Property:
-    """Look for counterexamples in all cases; keep the first few."""
-    found = [trace for case in cases if (trace := find(case)) is not None]
-    return Property(name, strategy, not found, len(cases), len(found), tuple(found[:KEPT]))
+def judge(name: str, strategy: str, cases: int, found: Sequence[Trace]) -> Property:
+    """Return a property with the first few of its counterexamples."""
+    return Property(name, strategy, not found, cases, len(found), tuple(found[:KEPT]))
 
 
-def subsets(names: Collection[str]) -> Iterator[tuple[str, ...]]:
-    """Yield all sets of some names, the empty one first and smaller ones before larger."""
-    return chain.from_iterable(combinations(names, size) for size in range(len(names) + 1))
+def subsets(names: Collection[str], most: int | None = None) -> Iterator[tuple[str, ...]]:
+    """Yield all sets of some names, of `most` at most, smaller ones before larger."""
+    sizes = range(1 + (len(names) if most is None else most))
+    return chain.from_iterable(combinations(names, size) for size in sizes)

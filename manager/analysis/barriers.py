@@ -1,13 +1,13 @@
 """Which mechanisms stand between causes and the top event.
 
 A mechanism on event *e* is a *barrier on a cut set* if the top does not occur from exactly the
-events of that set once *e* is kept from occurring. Whoever wants two barriers on every way to the
-top reads off here where one is missing.
+events of that set once *e* is kept from occurring. Where two barriers are wanted on every way to
+the top, this shows where one is missing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 
@@ -42,14 +42,14 @@ def guard(spec: SystemSpec, sets: Iterable[Sequence[str]]) -> tuple[Guarded, ...
     tree = spec.build_fault_tree()
     order = spec.build_ftm_tree().names if spec.mechanisms else ()
     event_of = {m.name: m.event for m in spec.mechanisms}
-    return tuple(
-        Guarded(tuple(events), tuple(
-            name for name in order if not _occurs(tree, events, event_of[name])))
-        for events in sets)
+    return tuple(_guarded(tree, events, events, order, event_of) for events in sets)
 
 
-def _occurs(tree: FaultTree, given: Iterable[str], prevented: str = "") -> bool:
-    return tree.top in tree.occurring(given, prevented)
+def _guarded(tree: FaultTree, events: Sequence[str], occurred: Sequence[str],
+             mechanisms: Iterable[str], event_of: Mapping[str, str]) -> Guarded:
+    """Return some events with the mechanisms that keep the top from occurring."""
+    return Guarded(tuple(events), tuple(
+        name for name in mechanisms if tree.top not in tree.occurring(occurred, event_of[name])))
 
 
 def outlook(spec: SystemSpec, active: Iterable[str], given: Iterable[str] = ()) -> Outlook:
@@ -70,12 +70,9 @@ def outlook(spec: SystemSpec, active: Iterable[str], given: Iterable[str] = ()) 
     left = {name: tuple(upper for upper in ftms.chain(ftms.root, name) if upper in idle)
             for name in breached}
     # If what has occurred suffices already, the next event is looked at by itself.
-    base = () if _occurs(tree, occurred) else occurred
-    following = []
-    for event in tree.events.values():
-        if not event.required and event.name not in occurred \
-                and _occurs(tree, (*base, event.name)):
-            following.append(Guarded((event.name,), tuple(
-                name for name in idle
-                if not _occurs(tree, (*base, event.name), event_of[name]))))
+    base = () if tree.top in tree.occurring(occurred) else occurred
+    following = [
+        _guarded(tree, (name,), (*base, name), idle, event_of)
+        for name, event in tree.events.items() if not event.required and name not in occurred
+        and tree.top in tree.occurring((*base, name))]
     return Outlook(occurred, left, tuple(sorted(following, key=lambda g: len(g.barriers))))

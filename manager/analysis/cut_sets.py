@@ -16,7 +16,10 @@ The way, for trees with hundreds of events and millions of cut sets:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import reduce
+from itertools import chain, islice
+from operator import and_, or_
 
 import msgspec
 from oxidd.bdd import BDDFunction, BDDManager
@@ -54,13 +57,15 @@ class _Module(msgspec.Struct, frozen=True):
         names: Of its variables, from the top.
         families: Store of the family.
         family: The minimal solutions.
-        sizes: How many cut sets of each size, those of the modules below multiplied out.
+        weight: How many cut sets of each size, those of the modules below multiplied out.
+        below: The sizes of the sets below each node of the family as a bitmask.
     """
 
     names: tuple[str, ...]
     families: Families
     family: int
-    sizes: tuple[int, ...]
+    weight: Mapping[int, int]
+    below: dict[int, int]
 
 
 class CutSets:
@@ -84,13 +89,13 @@ class CutSets:
         self._gates, modules = prepare(formula)
         self._modules: dict[str, _Module] = {}
         self._constants = dict(formula.house)
-        self._sizes_below: dict[int, dict[int, int]] = {}
         for number, name in enumerate(modules, 1):
             progress(f"module {number} of {len(modules)}: {name}")
             module = self._modules[name] = self._solve(name, bounds, progress)
             if module.family in {EMPTY, UNIT}:  # by house events below it
                 self._constants[name] = module.family == UNIT
-        self.sizes = self._weight(formula.top)
+        weight = self._weight(formula.top)
+        self.sizes = tuple(weight.get(size, 0) for size in range(max(weight, default=-1) + 1))
 
     @property
     def count(self) -> int:
@@ -109,72 +114,56 @@ class CutSets:
             TooLargeError: The tree is nested too deeply to list its sets; they can be counted.
         """
         depth: dict[str, int] = {}
+        levels = 0
         for name, module in self._modules.items():  # inner ones come first
             depth[name] = 1 + max((depth.get(entry, 0) for entry in module.names), default=0)
-        levels = max((depth[name] + len(module.names) for name, module in self._modules.items()),
-                     default=0)
+            levels = max(levels, depth[name] + len(module.names))
         if levels > _LISTING_LEVELS:
             raise TooLargeError(f"nested {levels} levels deep, too deeply to list the sets; they "
                                 "can be counted, --count")
-        left = self.count if limit is None else limit
-        for size in range(len(self.sizes) if max_order is None else
-                          min(len(self.sizes), max_order + 1)):
-            if not self.sizes[size]:
-                continue
-            for found in self._of_size(self.formula.top, size):
-                if left <= 0:
-                    return
-                left -= 1
-                yield tuple(sorted(found))
+        for found in islice(chain.from_iterable(
+                self._of_size(self.formula.top, size) for size in range(len(self.sizes))
+                if max_order is None or size <= max_order), limit and max(0, limit)):
+            yield tuple(sorted(found))
 
-    def _weight(self, name: str) -> tuple[int, ...]:
+    def _weight(self, name: str) -> Mapping[int, int]:
+        """Return how many sets of each size a name stands for."""
         module = self._modules.get(name)
         if module is not None:
-            return module.sizes
+            return module.weight
         if name in self.formula.house:
-            return (1,) if self.formula.house[name] else ()
-        return (0, 1)
+            return {0: 1} if self.formula.house[name] else {}
+        return {1: 1}
 
     def _of_size(self, name: str, size: int) -> Iterator[frozenset[str]]:
         module = self._modules.get(name)
-        if module is None:
-            if len(self._weight(name)) > size and self._weight(name)[size]:
-                yield frozenset((name,)) if size else frozenset()
-            return
-        yield from self._paths(module, module.family, size)
+        if module is not None:
+            yield from self._paths(module, module.family, size)
+        elif size in self._weight(name):
+            yield frozenset((name,)) if size else frozenset()
 
     def _paths(self, module: _Module, node: int, size: int) -> Iterator[frozenset[str]]:
+        if size < 0 or not self._possible(module, node) >> size & 1:
+            return
         if node == UNIT:
-            if size == 0:
-                yield frozenset()
-            return
-        if node == EMPTY or size < 0:
-            return
-        if not self._possible(module, node) >> size & 1:
+            yield frozenset()
             return
         families = module.families
         name = module.names[families.variable[node]]
-        weight = self._weight(name)
-        for part in range(min(size, len(weight) - 1) + 1):
-            if weight[part]:
-                for rest in self._paths(module, families.high[node], size - part):
-                    for own in self._of_size(name, part):
-                        yield own | rest
+        for part in sorted(self._weight(name)):
+            for rest in self._paths(module, families.high[node], size - part):
+                for own in self._of_size(name, part):
+                    yield own | rest
         yield from self._paths(module, families.low[node], size)
 
     def _possible(self, module: _Module, node: int) -> int:
         """Return the sizes of the sets below a node as a bitmask, so that no way is a dead end."""
-        known = self._sizes_below.setdefault(id(module), {EMPTY: 0, UNIT: 1})
+        known, families = module.below, module.families
         if node not in known:
-            families = module.families
-            weights = [sum(1 << size for size, count in enumerate(self._weight(name)) if count)
-                       for name in module.names]
             for one in families.upwards(module.family):
-                own, high = weights[families.variable[one]], known[families.high[one]]
                 known[one] = known[families.low[one]]
-                for size in range(own.bit_length()):
-                    if own >> size & 1:
-                        known[one] |= high << size
+                for size in self._weight(module.names[families.variable[one]]):
+                    known[one] |= known[families.high[one]] << size
         return known[node]
 
     def _solve(self, top: str, bounds: Sequence[int], progress: Progress) -> _Module:
@@ -182,11 +171,9 @@ class CutSets:
         for bound in bounds:
             progress(f"{top}: up to {bound} nodes")
             # To build a diagram is cheap, to find its minimal solutions is not: try all orders.
-            built = sorted(
-                ((diagram, order) for order in inside.orders()
-                 if (diagram := inside.diagram(order, bound)) is not None),
-                key=lambda found: len(found[0].level))
-            for diagram, order in built:
+            built = [(diagram, order) for order in inside.orders()
+                     if (diagram := inside.diagram(order, bound)) is not None]
+            for diagram, order in sorted(built, key=lambda found: len(found[0].level)):
                 families = Families(bound)
                 try:
                     with deep_recursion(len(order)):
@@ -194,9 +181,8 @@ class CutSets:
                             len(diagram.level) - 1, families, monotone=self.formula.is_monotone)
                 except TooManyNodesError:
                     continue
-                weights = [self._weight(name) for name in order]
-                return _Module(order, families, family,
-                               tuple(families.sizes(family, weights.__getitem__)))
+                weight = families.sizes(family, [self._weight(name) for name in order])
+                return _Module(order, families, family, weight, {EMPTY: 0, UNIT: 1})
         raise TooLargeError(f"gate {top!r} with {len(inside.leaves)} inputs and modules: more than "
                             f"{bounds[-1]} nodes with every variable order tried")
 
@@ -210,18 +196,17 @@ class _Inside:
         self._house = constants
         self._top = top
         self._modules = modules
-        self._sequence, leaves = self._search(lambda inputs: inputs)
-        self.leaves = tuple(name for name in leaves if name not in constants)
-        self._users = Counter(
-            entry for name in self._sequence for entry in gates[name].inputs)
+        self._sequence, self.leaves = self._search(lambda inputs: inputs)
+        self._users = Counter(entry for name in self._sequence for entry in gates[name].inputs)
 
     def _search(self, way: _Way) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Search with the inputs of each gate in a sequence of choice."""
-        return search(self._top, lambda name: () if name != self._top and (
+        """Search with the inputs of each gate in a sequence of choice; return gates and leaves."""
+        gates, leaves = search(self._top, lambda name: () if name != self._top and (
             name in self._modules or name not in self._gates) else way(self._gates[name].inputs))
+        return gates, tuple(name for name in leaves if name not in self._house)
 
-    def orders(self) -> Iterator[tuple[str, ...]]:
-        """Yield variable orders to try."""
+    def orders(self) -> Iterable[tuple[str, ...]]:
+        """Return variable orders to try."""
         below: dict[str, int] = {}
         for name in self._sequence:
             below[name] = 1 + sum(below.get(entry, 1) for entry in self._gates[name].inputs)
@@ -231,10 +216,8 @@ class _Inside:
             lambda inputs: sorted(inputs, key=lambda n: (-users[n], below.get(n, 1))),
             lambda inputs: sorted(inputs, key=lambda n: below.get(n, 1)),
             lambda inputs: sorted(inputs, key=lambda n: -below.get(n, 1)),
-            lambda inputs: inputs[::-1],
-        )
-        yield from dict.fromkeys(
-            tuple(n for n in self._search(way)[1] if n not in self._house) for way in ways)
+            lambda inputs: inputs[::-1])
+        return dict.fromkeys(self._search(way)[1] for way in ways)
 
     def diagram(self, order: tuple[str, ...], bound: int) -> Diagram | None:
         """Return the module's decision diagram, or None if it grows beyond a bound."""
@@ -253,7 +236,7 @@ class _Inside:
         for name in self._sequence:
             gate = self._gates[name]
             value[name] = _gate(manager, gate, [value[entry] for entry in gate.inputs])
-            for entry in gate.inputs:  # what nobody needs any more can be collected
+            for entry in gate.inputs:  # what is not needed any more can be collected
                 left[entry] -= 1
                 if not left[entry] and entry in inner:
                     del value[entry]
@@ -263,13 +246,9 @@ class _Inside:
 def _gate(manager: BDDManager, gate: Connective, inputs: list[BDDFunction]) -> BDDFunction:
     count = len(inputs)
     if gate.low == 1 and gate.high == count:
-        result = manager.false()
-        for one in inputs:
-            result = result | one
+        result = reduce(or_, inputs, manager.false())
     elif gate.low == gate.high == count:
-        result = manager.true()
-        for one in inputs:
-            result = result & one
+        result = reduce(and_, inputs, manager.true())
     else:
         result = _at_least(manager, inputs, gate.low)
         if gate.high < count:
@@ -289,22 +268,11 @@ def _at_least(manager: BDDManager, inputs: list[BDDFunction], required: int) -> 
 def _as_numbers(function: BDDFunction) -> Diagram:
     """Copy a diagram into plain numbers; the top has the last one."""
     diagram = Diagram()
-    known: dict[BDDFunction, int] = {}
-    stack = [function]
-    while stack:
-        f = stack[-1]
-        if f in known:
-            stack.pop()
-            continue
-        cofactors = f.cofactors()
-        if cofactors is None:
-            known[f] = UNIT if f.valid() else EMPTY
-            continue
-        missing = [c for c in cofactors if c not in known]
-        if missing:
-            stack.extend(missing)
-        else:
-            known[f] = diagram.add(f.node_level() or 0, known[cofactors[0]], known[cofactors[1]])
+    inner, constants = search(function, lambda f: f.cofactors() or ())
+    known = {f: UNIT if f.valid() else EMPTY for f in constants}
+    for f in inner:
+        high, low = f.cofactors() or (f, f)
+        known[f] = diagram.add(f.node_level() or 0, known[high], known[low])
     if known[function] in {EMPTY, UNIT}:
         diagram.add(0, known[function], known[function])  # a constant, as the last number
     return diagram

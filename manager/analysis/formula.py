@@ -7,12 +7,15 @@ holds when the number of its inputs that hold lies between two bounds, or when i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from typing import TypeVar
 
 import msgspec
 
 from rampart.manager.model.fault_tree import FaultTree
 from rampart.manager.model.order import find_cycle
+
+Node = TypeVar("Node", bound=Hashable)
 
 GENERATED = ".."
 """Stands in the names of gates and events that are made up; no name in a file can hold it."""
@@ -75,14 +78,12 @@ class Formula:
         self.is_monotone = all(gates[name].is_monotone for name in self.sequence)
 
     def _only_top(self) -> str:
-        used = {entry for gate in self.gates.values() for entry in gate.inputs}
-        tops = [name for name in self.gates if name not in used]
+        tops = self.gates.keys() - {entry for gate in self.gates.values() for entry in gate.inputs}
         if len(tops) != 1:
-            found = ", ".join(sorted(tops)[:8]) + (", ..." if len(tops) > 8 else "")
             raise FormulaError(
-                f"{len(tops)} gates are no input of another: {found or 'none'}; say which is the "
+                f"{len(tops)} gates are no input of another: {first_few(tops)}; say which is the "
                 "top" if tops else "no gates; a top is needed")
-        return tops[0]
+        return tops.pop()
 
     def holds(self, occurred: frozenset[str]) -> bool:
         """Tell whether the top occurs when exactly these basic events do."""
@@ -94,16 +95,21 @@ class Formula:
         return value[self.top]
 
 
-def search(top: str, inputs: Callable[[str], Sequence[str]]
-           ) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def first_few(names: Collection[str]) -> str:
+    """Return the first eight names of some, for a message."""
+    return ", ".join(sorted(names)[:8]) + (", ..." if len(names) > 8 else "")
+
+
+def search(top: Node, inputs: Callable[[Node], Sequence[Node]]
+           ) -> tuple[tuple[Node, ...], tuple[Node, ...]]:
     """Search depth first, from the left.
 
     Returns:
         What has inputs, each after these; and what has none, as it is met.
     """
-    gates: list[str] = []
-    leaves: list[str] = []
-    met: set[str] = set()
+    gates: list[Node] = []
+    leaves: list[Node] = []
+    met: set[Node] = set()
     stack = [(top, False)]
     while stack:
         name, leaving = stack.pop()

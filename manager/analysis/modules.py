@@ -1,7 +1,7 @@
 """Modules of a formula: gates whose events occur nowhere else.
 
 A module is analysed by itself and counts as one event above (Dutuit and Rauzy 1996). Inputs of a
-gate that nobody else uses are gathered into a gate of their own first, which is a module then.
+gate that no other gate uses are gathered into a gate of their own first, which is a module then.
 """
 
 from __future__ import annotations
@@ -30,13 +30,11 @@ def prepare(formula: Formula) -> tuple[dict[str, Connective], list[str]]:
                 and (e not in gates or e in modules)]
         if uniform and 2 <= len(lone) < len(gate.inputs):
             gathered = f"{name}{GENERATED}lone"
-            rest = tuple(e for e in gate.inputs if e not in lone)
-            both = (gathered, *rest)
-            gates[gathered] = Connective(
-                tuple(lone), 1 if gate.low == 1 else len(lone), len(lone))
-            gates[name] = Connective(both, 1 if gate.low == 1 else len(both), len(both))
-    modules = _modules(gates, formula.top)
-    return gates, modules
+            rest = [e for e in gate.inputs if e not in lone]
+            for own, inputs in ((gathered, lone), (name, [gathered, *rest])):
+                count = len(inputs)
+                gates[own] = Connective(tuple(inputs), 1 if gate.low == 1 else count, count)
+    return gates, _modules(gates, formula.top)
 
 
 def _without_aliases(gates: dict[str, Connective], top: str) -> dict[str, Connective]:
@@ -61,31 +59,27 @@ def _modules(gates: dict[str, Connective], top: str) -> list[str]:
     """
     first: dict[str, int] = {}
     last: dict[str, int] = {}
-    left: dict[str, int] = {}
-    sequence: list[str] = []
+    left: dict[str, int] = {}  # gates, inner ones first
     date = 0
     stack: list[tuple[str, bool]] = [(top, False)]
     while stack:
         name, leaving = stack.pop()
         date += 1
+        last[name] = date
         if leaving:
-            left[name] = last[name] = date
-            sequence.append(name)
-            continue
-        if name in first:
-            last[name] = date
-            continue
-        first[name] = last[name] = date
-        if name in gates:
-            stack.append((name, True))
-            stack.extend((entry, False) for entry in reversed(gates[name].inputs))
-    earliest: dict[str, int] = {}
-    latest: dict[str, int] = {}
+            left[name] = date
+        elif name not in first:
+            first[name] = date
+            if name in gates:
+                stack.append((name, True))
+                stack.extend((entry, False) for entry in reversed(gates[name].inputs))
+    earliest, latest = dict(first), dict(last)  # of what is below, too
     modules = []
-    for name in sequence:
-        inputs = gates[name].inputs
-        earliest[name] = min(min(first[e], earliest.get(e, first[e])) for e in inputs)
-        latest[name] = max(max(last[e], latest.get(e, last[e])) for e in inputs)
-        if earliest[name] > first[name] and latest[name] < left[name]:
+    for name, left_at in left.items():
+        below = gates[name].inputs
+        met_first, met_last = min(earliest[e] for e in below), max(latest[e] for e in below)
+        if first[name] < met_first and met_last < left_at:
             modules.append(name)
+        earliest[name] = min(first[name], met_first)
+        latest[name] = max(last[name], met_last)
     return modules

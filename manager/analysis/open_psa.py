@@ -12,6 +12,7 @@ XML from strangers is read without document type definitions, entities, or anyth
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from itertools import count
@@ -21,10 +22,20 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import DefusedXMLParser
 
 from rampart.files.reading import FileError, check_size, plain_line, shown
-from rampart.manager.analysis.formula import GENERATED, Connective, Formula, FormulaError
+from rampart.manager.analysis.formula import (
+    GENERATED,
+    Connective,
+    Formula,
+    FormulaError,
+    first_few,
+)
 from rampart.manager.spec.schema import SystemSpec
 
 CONNECTIVES = ("and", "or", "not", "xor", "nand", "nor", "iff", "imply", "atleast", "cardinality")
+_TAKES = {"not": 1, "xor": 2, "iff": 2, "imply": 2}
+"""Connectives with a fixed number of inputs."""
+
+_NEGATED = frozenset({"not", "nand", "nor", "iff"})
 REFERENCES = ("event", "gate", "basic-event", "house-event")
 MAX_BYTES = 16 << 20
 """Of a file; published fault trees with thousands of gates have one or two million."""
@@ -49,6 +60,9 @@ _UNSUPPORTED = {
     "define-substitution": "substitutions would change the cut sets",
     "include": "other files are not read",
 }
+
+
+_Path = tuple[str, ...]
 
 
 class OpenPsaError(ValueError):
@@ -87,9 +101,14 @@ class _Definition(msgspec.Struct, frozen=True):
 
     kind: str
     path: str
-    place: tuple[str, ...]
+    place: _Path
     private: bool
     element: ET.Element
+
+    @property
+    def name(self) -> str:
+        """Unique among all definitions."""
+        return ".".join(self.place) if self.private else self.place[-1]
 
 
 def read_open_psa(text: str | bytes, file: str, top: str = "") -> Formula:
@@ -126,30 +145,37 @@ class _Reader:
 
     def __init__(self, root: ET.Element, file: str) -> None:
         self._error = partial(OpenPsaError, file)
-        self._definitions: dict[tuple[str, ...], _Definition] = {}
-        self._public: dict[str, tuple[str, ...]] = {}
+        self._definitions: dict[_Path, _Definition] = {}
+        self._public: dict[str, _Definition] = {}
         self._gates: dict[str, Connective] = {}
         self._basic: set[str] = set()
         self._house: dict[str, bool] = {}
         for definition in self._find(root):
-            self._add(definition)
-        self._names = {place: self._name(place) for place in self._definitions}
+            name = definition.place[-1]
+            earlier = self._definitions.get(definition.place) or (
+                None if definition.private else self._public.get(name))
+            # An event may be used in a fault tree and given its probability in the model data.
+            if earlier is not None:
+                raise self._error(definition.path,
+                                  f"duplicate name {name!r}, already defined at {earlier.path}")
+            self._definitions[definition.place] = definition
+            if not definition.private:
+                self._public[name] = definition
 
     # -- definitions ----------------------------------------------------------------------------
 
     def _find(self, root: ET.Element) -> Iterator[_Definition]:
-        stack: list[tuple[ET.Element, str, tuple[str, ...], bool]] = [
-            (root, "/opsa-mef", (), False)]
+        stack: list[tuple[ET.Element, str, _Path, bool]] = [(root, "/opsa-mef", (), False)]
         while stack:
             parent, path, place, private = stack.pop()
             inner = []
-            counts: dict[str, int] = {}
+            counts = Counter[str]()
             if len(place) > MAX_CONTAINERS:
                 raise self._error(
                     path, f"more than {MAX_CONTAINERS} fault trees and components in each other")
             for element in parent:
                 tag = element.tag
-                counts[tag] = counts.get(tag, 0) + 1
+                counts[tag] += 1
                 name = element.get("name", "")
                 here = f"{path}/{tag}[{f'@name={shown(name)}' if name else counts[tag]}]"
                 if tag in _UNSUPPORTED:
@@ -171,51 +197,26 @@ class _Reader:
             raise self._error(path, f"name {shown(name)}: expected at most {MAX_NAME} characters")
         return name
 
-    def _add(self, definition: _Definition) -> None:
-        place, name = definition.place, definition.place[-1]
-        earlier = self._definitions.get(place) or (
-            None if definition.private else self._definitions.get(self._public.get(name, ())))
-        # An event may be used in a fault tree and given its probability in the model data.
-        if earlier is not None:
-            raise self._error(definition.path,
-                              f"duplicate name {name!r}, already defined at {earlier.path}")
-        self._definitions[place] = definition
-        if not definition.private:
-            self._public[name] = place
-
-    def _name(self, place: tuple[str, ...]) -> str:
-        return ".".join(place) if self._definitions[place].private else place[-1]
-
     # -- formulas -------------------------------------------------------------------------------
 
     def formula(self, top: str) -> Formula:
         """Return the formula of all definitions."""
-        for place, definition in self._definitions.items():
-            name = self._names[place]
+        for definition in self._definitions.values():
             if definition.kind == "gate":
-                self._define_gate(name, definition)
+                self._define_gate(definition)
             elif definition.kind == "house-event":
-                self._house[name] = self._constant(definition)
+                constant = definition.element.find("constant")
+                self._house[definition.name] = (
+                    constant is not None and self._truth(constant, definition.path))
             else:
-                self._basic.add(name)
+                self._basic.add(definition.name)
+        if top and top not in self._gates:
+            raise self._error("/opsa-mef", f"unknown top gate {top!r}; known: "
+                                           f"{first_few(self._gates)}")
         try:
-            return Formula(self._gates, frozenset(self._basic), self._house,
-                           self._resolved_top(top))
+            return Formula(self._gates, frozenset(self._basic), self._house, top)
         except FormulaError as error:
             raise self._error("/opsa-mef", str(error)) from None
-
-    def _resolved_top(self, top: str) -> str:
-        if not top:
-            return ""
-        if top not in self._gates:
-            known = ", ".join(sorted(self._gates)[:8])
-            raise self._error("/opsa-mef", f"unknown top gate {top!r}; known: {known}"
-                              + (", ..." if len(self._gates) > 8 else ""))
-        return top
-
-    def _constant(self, definition: _Definition) -> bool:
-        constant = definition.element.find("constant")
-        return constant is not None and self._truth(constant, definition.path)
 
     def _truth(self, constant: ET.Element, path: str) -> bool:
         value = constant.get("value", "")
@@ -223,10 +224,11 @@ class _Reader:
             raise self._error(f"{path}/constant", f"value {value!r}: expected 'true' or 'false'")
         return value == "true"
 
-    def _define_gate(self, name: str, definition: _Definition) -> None:
+    def _define_gate(self, definition: _Definition) -> None:
         bodies = [child for child in definition.element if child.tag not in _ASIDE]
         if len(bodies) != 1:
             raise self._error(definition.path, f"{len(bodies)} formulas; a gate has exactly one")
+        name = definition.name
         pending = [(name, bodies[0], definition.path)]
         place = definition.place[:-1]
         numbers = count(1)
@@ -235,25 +237,24 @@ class _Reader:
             here = f"{path}/{body.tag}" if len(path) < _PATH_SHOWN else f"{path[:_PATH_SHOWN]}..."
             if body.tag in REFERENCES:
                 self._gates[own] = Connective((self._refer(body, place, here),), 1, 1)
-                continue
-            if body.tag == "constant":
+            elif body.tag == "constant":
                 self._house[f"{own}{GENERATED}constant"] = self._truth(body, path)
                 self._gates[own] = Connective((f"{own}{GENERATED}constant",), 1, 1)
-                continue
-            if body.tag not in CONNECTIVES:
+            elif body.tag in CONNECTIVES:
+                inputs = []
+                for child in body:
+                    if child.tag in REFERENCES:
+                        inputs.append(self._refer(child, place, here))
+                    elif child.tag not in _ASIDE:
+                        nested = f"{name}{GENERATED}{next(numbers)}"
+                        pending.append((nested, child, here))
+                        inputs.append(nested)
+                self._gates[own] = self._connective(own, body, inputs, here)
+            else:
                 raise self._error(
                     here[:200], f"unknown connective; known: {', '.join(CONNECTIVES)}")
-            inputs = []
-            for child in body:
-                if child.tag in REFERENCES:
-                    inputs.append(self._refer(child, place, here))
-                elif child.tag not in _ASIDE:
-                    nested = f"{name}{GENERATED}{next(numbers)}"
-                    pending.append((nested, child, here))
-                    inputs.append(nested)
-            self._gates[own] = self._connective(own, body, inputs, here)
 
-    def _refer(self, element: ET.Element, place: tuple[str, ...], path: str) -> str:
+    def _refer(self, element: ET.Element, place: _Path, path: str) -> str:
         name = element.get("name", "")
         here = f"{path}/{element.tag}[@name={shown(name)}]"
         found = self._resolve(name, place)
@@ -263,54 +264,48 @@ class _Reader:
                 self._basic.add(name)  # MEF lets basic events be declared by their use
                 return name
             raise self._error(here, f"there is no {kind or 'event'} {name!r}")
-        actual = self._definitions[found].kind
-        if kind and kind != actual:
-            raise self._error(here, f"{name!r} is a {actual}, not a {kind}")
-        return self._names[found]
+        if kind and kind != found.kind:
+            raise self._error(here, f"{name!r} is a {found.kind}, not a {kind}")
+        return found.name
 
-    def _resolve(self, name: str, place: tuple[str, ...]) -> tuple[str, ...] | None:
+    def _resolve(self, name: str, place: _Path) -> _Definition | None:
         """Look a name up: in the innermost container first, then outwards, then in public."""
         parts = tuple(name.split("."))
-        for depth in range(len(place), -1, -1):
-            candidate = (*place[:depth], *parts)
-            if candidate in self._definitions:
-                return candidate
-        return self._public.get(name)
+        candidates = ((*place[:depth], *parts) for depth in range(len(place), -1, -1))
+        return next((self._definitions[candidate] for candidate in candidates
+                     if candidate in self._definitions), self._public.get(name))
 
     def _connective(self, name: str, element: ET.Element, inputs: list[str], path: str
                     ) -> Connective:
         tag, count = element.tag, len(inputs)
-        exactly = {"not": 1, "xor": 2, "iff": 2, "imply": 2}.get(tag, 0)
         if not count:
             raise self._error(path, "empty gate; it needs inputs")
-        if exactly and count != exactly:
-            raise self._error(path, f"{count} inputs; {tag!r} takes {exactly}")
-        entries = tuple(inputs)
+        if count != _TAKES.get(tag, count):
+            raise self._error(path, f"{count} inputs; {tag!r} takes {_TAKES[tag]}")
+        low, high = 1, count
         match tag:
             case "atleast":
-                return Connective(entries, self._number(element, "min", count, path), count)
+                low = self._number(element, "min", count, path)
             case "cardinality":
                 low = self._number(element, "min", count, path)
                 high = self._number(element, "max", count, path)
                 if low > high:
                     raise self._error(path, f"min = {low} is more than max = {high}")
-                return Connective(entries, low, high)
             case "imply":
-                self._gates[f"{name}{GENERATED}not"] = Connective((entries[0],), 1, 1, negated=True)
-                return Connective((f"{name}{GENERATED}not", entries[1]), 1, 2)
+                self._gates[f"{name}{GENERATED}not"] = Connective((inputs[0],), 1, 1, negated=True)
+                inputs = [f"{name}{GENERATED}not", inputs[1]]
             case "xor" | "iff":
-                return Connective(entries, 1, 1, negated=tag == "iff")
+                high = 1
             case "and" | "nand":
-                return Connective(entries, count, count, negated=tag == "nand")
-            case _:
-                return Connective(entries, 1, count, negated=tag in {"nor", "not"})
+                low = count
+        return Connective(tuple(inputs), low, high, negated=tag in _NEGATED)
 
     def _number(self, element: ET.Element, attribute: str, count: int, path: str) -> int:
         text = element.get(attribute, "")
-        if not text.isdecimal() or len(text) > 9 or int(text) > count or (
-                attribute == "min" and int(text) == 0 and element.tag == "atleast"):
-            raise self._error(path, f"{attribute} = {text!r}: expected a number from "
-                              f"{1 if element.tag == 'atleast' else 0} to {count}, the inputs")
+        least = 1 if element.tag == "atleast" else 0
+        if not text.isdecimal() or len(text) > 9 or not least <= int(text) <= count:
+            raise self._error(path, f"{attribute} = {text!r}: expected a number from {least} to "
+                                    f"{count}, the inputs")
         return int(text)
 
 
@@ -322,24 +317,20 @@ def write_open_psa(spec: SystemSpec) -> str:
     root = ET.Element("opsa-mef")
     tree = ET.SubElement(root, "define-fault-tree", name=spec.name)
     data = ET.SubElement(root, "model-data")
-    barriers: dict[str, str] = {mechanism.event: mechanism.name for mechanism in spec.mechanisms}
+    barriers = {mechanism.event: mechanism.name for mechanism in spec.mechanisms}
     gates = {event.name for event in spec.events if event.required}
     for event in spec.events:
-        inner = event.name in gates
-        element = ET.SubElement(tree if inner else data,
-                                "define-gate" if inner else "define-basic-event", name=event.name)
+        element = (ET.SubElement(tree, "define-gate", name=event.name) if event.required else
+                   ET.SubElement(data, "define-basic-event", name=event.name))
         if event.title:
             ET.SubElement(element, "label").text = event.title
         if event.name in barriers:
             attributes = ET.SubElement(element, "attributes")
             ET.SubElement(attributes, "attribute", name="barrier", value=barriers[event.name])
-        if inner:
-            if event.required == len(event.of):
-                gate = ET.SubElement(element, "and")
-            elif event.required == 1:
-                gate = ET.SubElement(element, "or")
-            else:
-                gate = ET.SubElement(element, "atleast", min=str(event.required))
+        if event.required:
+            kind = {1: "or", len(event.of): "and"}.get(event.required, "atleast")
+            gate = ET.SubElement(
+                element, kind, {"min": str(event.required)} if kind == "atleast" else {})
             for entry in event.of:
                 ET.SubElement(gate, "gate" if entry in gates else "basic-event", name=entry)
     ET.indent(root)

@@ -4,9 +4,9 @@ What is explored is the arbiter itself (`Arbiter.step`), in two compositions:
 
 * *one recovery with its module and the bus between them*: the module, as it is specified in
   `rampart.actors.recovery.module`, obeys, finishes, fails, dies and comes back at any moment. It
-  shows that a module never holds its resources unless the arbiter knows that it may; * *several
-  recoveries together*, by what the arbiter knows: anything that modules can report may be reported
-  at any moment. It shows that the arbiter never lets two hold the same resource.
+  shows that a module never holds its resources unless the arbiter knows that it may;
+* *several recoveries together*, by what the arbiter knows: anything that modules can report may be
+  reported at any moment. It shows that the arbiter never lets two hold the same resource.
 
 In both, detection modules change at any moment, a message takes any time or is lost, and any
 deadline may pass. Three reductions keep that finite and small; `docs/verification.md` argues for
@@ -26,10 +26,11 @@ each:
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import combinations
 
 import msgspec
+from msgspec.structs import replace
 
 from rampart.manager.arbitration.arbiter import Arbiter
 from rampart.manager.arbitration.arbiter_state import ResetAsked, State, Tick
@@ -39,6 +40,10 @@ from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, Re
 from rampart.manager.model.order import PartialOrder, Tree
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision, Late
+
+Steps = Iterator[tuple[str, "Situation"]]
+Violations = dict[str, tuple[str, ...]]
+"""Properties that fail, each with the shortest way there."""
 
 _OVER = -1e9
 _OLD, _CURRENT = 5, 10
@@ -64,13 +69,6 @@ class Situation(msgspec.Struct, frozen=True):
 
     state: State
     modules: tuple[Module, ...]
-
-
-class Violation(msgspec.Struct, frozen=True):
-    """A property that fails, and the shortest way there."""
-
-    name: str
-    trace: tuple[str, ...]
 
 
 class AsTold:
@@ -109,11 +107,9 @@ class Transitions:
     def __init__(self, contracts: Iterable[Contract], order: PartialOrder,
                  asked: Iterable[frozenset[str]], urgent: Iterable[str] = (), *,
                  exclusive: bool, with_modules: bool = False, deaths: bool = True) -> None:
-        contracts = list(contracts)
-        inside = [c.name for c in contracts]
-        self.contracts = {c.name: msgspec.structs.replace(
-            c, needs=frozenset(), escalate_to=c.escalate_to if c.escalate_to in inside else "")
-            for c in contracts}
+        inside = {c.name: c for c in contracts}
+        self.contracts = {n: replace(c, needs=frozenset(), escalate_to=(
+            c.escalate_to if c.escalate_to in inside else "")) for n, c in inside.items()}
         self.names = tuple(self.contracts)
         self.asked = sorted({frozenset(), *asked}, key=lambda s: (len(s), sorted(s)))
         self.urgent = frozenset(urgent)
@@ -123,32 +119,32 @@ class Transitions:
         local = PartialOrder(self.names, {
             name: [o for o in self.names if order.is_above(name, o)] for name in self.names})
         top = local.names[0]
-        self.arbiter = Arbiter(
-            Arrangement(
-                Mechanisms([Mechanism(f"F_{n}", f"D_{n}", n) for n in self.names],
-                           list(self.contracts.values())),
-                Tree({f"F_{n}": None if n == top else f"F_{top}" for n in self.names}), local),
-            AsTold(exclusive=exclusive), DetectionRules(1.0, 0.0, 0.0, 0.0))
+        mechanisms = Mechanisms([Mechanism(f"F_{n}", f"D_{n}", n) for n in self.names],
+                                list(self.contracts.values()))
+        tree = Tree({f"F_{n}": None if n == top else f"F_{top}" for n in self.names})
+        self.arbiter = Arbiter(Arrangement(mechanisms, tree, local), AsTold(exclusive=exclusive),
+                               DetectionRules(1.0, 0.0, 0.0, 0.0))
 
     def initial(self) -> Situation:
         """Return the state in which all are idle and have been heard.
 
         Before that an arbiter adopts what an earlier one ordered; it is not explored.
         """
-        state = self.arbiter.initial(0.0)
-        return self._canonical(msgspec.structs.replace(state, oriented=True),
+        return self._canonical(replace(self.arbiter.initial(0.0), oriented=True),
                                tuple(Module() for _ in self.names) if self.with_modules else ())
 
-    def successors(self, now: Situation) -> Iterator[tuple[str, Situation]]:
+    def successors(self, now: Situation) -> Steps:
         """Yield everything that may happen next, in words, with the state that follows."""
         active = {t.name for t in now.state.detections if t.active}
         for asked in self.asked:
-            if {f"D_{n}" for n in asked} != active:
+            changes = {f"D_{n}": n in asked for n in self.names
+                       if (n in asked) != (f"D_{n}" in active)}
+            if changes:
                 yield (f"asked for: {', '.join(sorted(asked)) or 'nothing'}",
-                       self._ask(now, asked))
+                       self._detect(now, changes))
         for index, name in enumerate(self.names):
             if f"D_{name}" in active and self.contracts[name].kind.repairs:
-                yield f"{name}'s cause comes back", self._again(now, name)
+                yield f"{name}'s cause comes back", self._detect(now, {f"D_{name}": True})
             yield from self._module_steps(now, index, name) if self.with_modules \
                 else self._reports(now, index, name)
             track = now.state.recoveries[index]
@@ -158,23 +154,20 @@ class Transitions:
             if track.latched:
                 yield f"{name} is reset", self._step(now, now.state, ResetAsked(name))
 
-    def _reports(self, now: Situation, index: int, name: str) -> Iterator[tuple[str, Situation]]:
+    def _reports(self, now: Situation, index: int, name: str) -> Steps:
         """Yield every report that a module could send."""
         track = now.state.recoveries[index]
         if track.wanted:
             for phase in (RecoveryPhase.ACTING, RecoveryPhase.DONE, RecoveryPhase.FAILED):
                 if not track.acknowledged or track.phase is not phase:
-                    yield f"{name} reports {phase}", self._step(
-                        now, now.state, RecoveryHeard(name, True, phase, _CURRENT))
+                    yield f"{name} reports {phase}", self._hear(now, name, phase)
             if track.acknowledged and self.deaths:
-                yield f"{name} reports idle, it was respawned", self._step(
-                    now, now.state, RecoveryHeard(name, False, RecoveryPhase.IDLE, _OLD))
+                yield f"{name} reports idle, it was respawned", self._hear(
+                    now, name, RecoveryPhase.IDLE, current=False)
         elif track.letting_go:
-            yield f"{name} reports that it has let go", self._step(
-                now, now.state, RecoveryHeard(name, False, RecoveryPhase.IDLE, _CURRENT))
+            yield f"{name} reports that it has let go", self._hear(now, name, RecoveryPhase.IDLE)
 
-    def _module_steps(self, now: Situation, index: int, name: str
-                      ) -> Iterator[tuple[str, Situation]]:
+    def _module_steps(self, now: Situation, index: int, name: str) -> Steps:
         module, track = now.modules[index], now.state.recoveries[index]
         acting = module.phase is RecoveryPhase.ACTING
         if not module.current and track.wanted:
@@ -184,45 +177,38 @@ class Transitions:
         if acting:
             for phase, words in ((RecoveryPhase.DONE, "is done"), (RecoveryPhase.FAILED, "fails")):
                 yield f"{name} {words}", self._with_module(
-                    now, index, msgspec.structs.replace(module, phase=phase))
-        yield f"the arbiter hears {name}", self._hear(now, index, name)
+                    now, index, replace(module, phase=phase))
+        yield f"the arbiter hears {name}", self._hear(
+            now, name, module.phase, current=module.current)
         if module.phase is not RecoveryPhase.IDLE and self.deaths:
             yield f"{name} dies and comes back idle", self._with_module(
                 now, index, Module(current=False))
 
     # -- single steps ---------------------------------------------------------------------------
 
-    def _ask(self, now: Situation, asked: frozenset[str]) -> Situation:
+    def _detect(self, now: Situation, changes: Mapping[str, bool]) -> Situation:
+        """Return what follows when detection modules become active, or idle."""
         tracks = tuple(
-            track if track.active == (track.name[2:] in asked)
-            else msgspec.structs.replace(track, active=not track.active, reported=not track.active,
-                                         rises=2)
-            for track in now.state.detections)
-        return self._step(now, msgspec.structs.replace(now.state, detections=tracks), Tick())
+            replace(t, active=changes[t.name], reported=changes[t.name], rises=2)
+            if t.name in changes else t for t in now.state.detections)
+        return self._step(now, replace(now.state, detections=tracks), Tick())
 
-    def _again(self, now: Situation, name: str) -> Situation:
-        tracks = tuple(
-            msgspec.structs.replace(track, rises=2) if track.name == f"D_{name}" else track
-            for track in now.state.detections)
-        return self._step(now, msgspec.structs.replace(now.state, detections=tracks), Tick())
-
-    def _hear(self, now: Situation, index: int, name: str) -> Situation:
-        module = now.modules[index]
+    def _hear(self, now: Situation, name: str, phase: RecoveryPhase, *, current: bool = True
+              ) -> Situation:
+        """Return what follows when the arbiter hears a module, on its present command or not."""
         return self._step(now, now.state, RecoveryHeard(
-            name, module.phase is not RecoveryPhase.IDLE, module.phase,
-            _CURRENT if module.current else _OLD))
+            name, phase is not RecoveryPhase.IDLE, phase, _CURRENT if current else _OLD))
 
     def pass_deadline(self, now: Situation, index: int) -> Situation:
         """Return what follows when the deadline of a recovery passes."""
         tracks = list(now.state.recoveries)
-        tracks[index] = msgspec.structs.replace(tracks[index], ordered_s=_OVER)
-        return self._step(
-            now, msgspec.structs.replace(now.state, recoveries=tuple(tracks)), Tick())
+        tracks[index] = replace(tracks[index], ordered_s=_OVER)
+        return self._step(now, replace(now.state, recoveries=tuple(tracks)), Tick())
 
     def _with_module(self, now: Situation, index: int, module: Module) -> Situation:
         excused = now.modules[index].excused and module.phase is not RecoveryPhase.IDLE
         modules = list(now.modules)
-        modules[index] = msgspec.structs.replace(module, excused=excused)
+        modules[index] = replace(module, excused=excused)
         return Situation(now.state, tuple(modules))
 
     def _step(self, now: Situation, state: State, event: RecoveryHeard | ResetAsked | Tick
@@ -233,35 +219,31 @@ class Transitions:
                                     strict=self.with_modules):
             current = module.current and is_.command == was.command
             given_up = (was.wanted or was.letting_go) and not is_.wanted and not is_.letting_go
-            busy = module.phase is not RecoveryPhase.IDLE
-            modules.append(Module(module.phase, current, busy and (
-                module.excused or given_up or bool(is_.failure))))
+            excused = module.excused or given_up or bool(is_.failure)
+            modules.append(Module(
+                module.phase, current, excused and module.phase is not RecoveryPhase.IDLE))
         return self._canonical(after, tuple(modules))
 
     def _canonical(self, state: State, modules: tuple[Module, ...]) -> Situation:
         """Forget what makes no difference: numbers, times, words."""
         rises = {t.name: t.rises for t in state.detections if t.active}
-        detections = tuple(
-            DetectionTrack(t.name, 0.0, ever_heard=True, reported=t.active, active=t.active,
-                           rises=1) for t in state.detections)
-        recoveries = tuple(
-            RecoveryTrack(
-                Command(t.name, t.wanted, _CURRENT),
-                ordered_s=_OVER if t.ordered_s < 0 and t.wanted and not (
-                    t.acknowledged and t.phase is not RecoveryPhase.ACTING) else 0.0,
-                cause=frozenset(
-                    (d, 1) for d, r in t.cause if rises.get(d) == r
-                    and self.contracts[t.name].kind.repairs),
-                heard=True, phase=t.phase if t.acknowledged else RecoveryPhase.IDLE,
-                acknowledged=t.acknowledged, draining=t.draining, letting_go=t.letting_go,
-                latched=t.latched, failure="failed" if t.failure else "",
-                failed_for=tuple(n for n in t.failed_for if f"D_{n[2:]}" in rises))
+        detections = tuple(DetectionTrack(
+            t.name, 0.0, ever_heard=True, reported=t.active, active=t.active, rises=1)
+            for t in state.detections)
+        recoveries = tuple(RecoveryTrack(
+            Command(t.name, t.wanted, _CURRENT),
+            ordered_s=_OVER if t.ordered_s < 0 and t.unfinished else 0.0,
+            cause=frozenset((d, 1) for d, r in t.cause
+                            if rises.get(d) == r and self.contracts[t.name].kind.repairs),
+            heard=True, phase=t.phase if t.acknowledged else RecoveryPhase.IDLE,
+            acknowledged=t.acknowledged, draining=t.draining, letting_go=t.letting_go,
+            latched=t.latched, failure="failed" if t.failure else "",
+            failed_for=tuple(n for n in t.failed_for if f"D_{n[2:]}" in rises))
             for t in state.recoveries)
-        decision = msgspec.structs.replace(state.decision, rejected=tuple(
+        decision = replace(state.decision, rejected=tuple(
             (name, "") for name, _ in state.decision.rejected))
-        return Situation(msgspec.structs.replace(
-            state, detections=detections, recoveries=recoveries, number=_NUMBER,
-            decision=decision), modules)
+        return Situation(replace(state, detections=detections, recoveries=recoveries,
+                                 number=_NUMBER, decision=decision), modules)
 
     # -- properties -----------------------------------------------------------------------------
 
@@ -281,15 +263,14 @@ class Transitions:
         if self.exclusive and len(in_force) > 1:
             yield "one-decision", f"{' and '.join(in_force)} are both in force"
         for index, track in enumerate(tracks):
-            if track.name in self.urgent and track.name in now.state.decision.recoveries \
-                    and not track.wanted:
+            waits = track.name in now.state.decision.recoveries and not track.wanted
+            if waits and track.name in self.urgent:
                 yield "emergency-stop-at-once", f"{track.name} was decided on and has to wait"
             if track.wanted and track.unfinished and not track.failure and not track.latched:
                 after = self.pass_deadline(now, index).state.recoveries[index]
                 if after.wanted and after.unfinished and not after.failure:
                     yield "recovery-ends", f"{track.name}'s deadline passes and nothing follows"
-            if track.name in now.state.decision.recoveries and not track.wanted \
-                    and not self._starts(now, index):
+            if waits and not self._starts(now, index):
                 yield "recovery-ends", f"{track.name} waits for ever"
 
     def _starts(self, now: Situation, waiting: int) -> bool:
@@ -297,8 +278,8 @@ class Transitions:
         for index in range(len(self.names)):
             if index != waiting:
                 now = self.pass_deadline(now, index)
-        name = self.names[waiting]
-        return now.state.recoveries[waiting].wanted or name not in now.state.decision.recoveries
+        return now.state.recoveries[waiting].wanted \
+            or self.names[waiting] not in now.state.decision.recoveries
 
     def cut_off(self, before: Situation, after: Situation) -> str:
         """Return which recovery is released half-way in a step, "" if none.
@@ -317,7 +298,7 @@ class Transitions:
         return ""
 
 
-def explore(system: Transitions) -> tuple[int, dict[str, Violation]]:
+def explore(system: Transitions) -> tuple[int, Violations]:
     """Visit every reachable state, breadth first.
 
     Returns:
@@ -325,27 +306,25 @@ def explore(system: Transitions) -> tuple[int, dict[str, Violation]]:
     """
     start = system.initial()
     came_from: dict[Situation, tuple[Situation, str] | None] = {start: None}
-    found: dict[str, Violation] = {}
+    found: Violations = {}
     waiting = deque([start])
 
     def trace(end: Situation, last: str) -> tuple[str, ...]:
         steps = [last]
-        here: Situation = end
-        while (step := came_from[here]) is not None:
-            here = step[0]
-            steps.append(step[1])
+        while (step := came_from[end]) is not None:
+            end, event = step
+            steps.append(event)
         return tuple(reversed(steps))
 
     while waiting:
         now = waiting.popleft()
         for name, problem in system.faults(now):
             if name not in found:
-                found[name] = Violation(name, trace(now, problem))
+                found[name] = trace(now, problem)
         for event, after in system.successors(now):
             victim = system.cut_off(now, after)
             if victim and "none-cut-off" not in found:
-                found["none-cut-off"] = Violation("none-cut-off", (
-                    *trace(now, event), f"{victim} is released half-way"))
+                found["none-cut-off"] = (*trace(now, event), f"{victim} is released half-way")
             if after not in came_from:
                 came_from[after] = (now, event)
                 waiting.append(after)

@@ -8,23 +8,24 @@ matters, and what was found about the paper's strategy is in `docs/verification.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from itertools import chain, combinations, permutations
+from itertools import combinations, permutations, product
 
 import msgspec
 
 from rampart.manager.analysis.active_sets import (
+    KEPT,
     MAX_MECHANISMS,
     ActiveSets,
     Property,
+    Trace,
     order_agrees_with_tree,
     subsets,
 )
-from rampart.manager.analysis.transitions import Transitions, Violation, explore
-from rampart.manager.model.mechanisms import Contract
-from rampart.manager.model.order import PartialOrder
+from rampart.manager.analysis.transitions import Transitions, Violations, explore
 from rampart.manager.spec.budget import patience_s
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.arrangement import Arrangement, arrange
+from rampart.manager.strategies.decision import Decision
 from rampart.manager.strategies.escalation import escalate
 from rampart.manager.strategies.registry import STRATEGIES, find_strategy
 
@@ -63,7 +64,7 @@ class Report(msgspec.Struct, frozen=True):
         active_sets: How many sets of active mechanisms were decided, for each strategy.
         states: How many states of the arbiter were visited, over all strategies.
         permissiveness: For each strategy, in how many active sets the robot must stop until
-            somebody resets it.
+            an operator resets it.
         stuck_behind_last_resort: For each strategy, in how many active sets a latched last resort
             runs and a repair that is needed never does; `repairs-run` exempts these.
         properties: The system's strategy first.
@@ -97,13 +98,12 @@ def verify(spec: SystemSpec, strategies: Iterable[str] = (), together: int = 2,
         TooLargeError: The system has too many mechanisms.
         UnknownStrategyError: No such strategy.
     """
+    count = 2 ** len(spec.mechanisms) - 1
     if len(spec.mechanisms) > MAX_MECHANISMS:
         raise TooLargeError(
-            f"{spec.name}: {len(spec.mechanisms)} mechanisms have "
-            f"{2 ** len(spec.mechanisms) - 1} active sets; at most {MAX_MECHANISMS} mechanisms "
-            "can be verified exhaustively")
-    names = tuple(strategies) or (
-        spec.strategy, *(name for name in STRATEGIES if name != spec.strategy))
+            f"{spec.name}: {len(spec.mechanisms)} mechanisms have {count} active sets; at most "
+            f"{MAX_MECHANISMS} mechanisms can be verified exhaustively")
+    names = tuple(strategies) or tuple(dict.fromkeys((spec.strategy, *STRATEGIES)))
     arrangement = arrange(
         spec.build_mechanisms(patience_s(spec)), spec.build_ftm_tree(), spec.build_order())
     safety = spec.build_safety_order()
@@ -111,20 +111,19 @@ def verify(spec: SystemSpec, strategies: Iterable[str] = (), together: int = 2,
     properties = [order_agrees_with_tree(arrangement, safety)]
     permissiveness, stuck = {}, {}
     for name in names:
-        progress(f"{name}: {2 ** len(spec.mechanisms) - 1} active sets")
+        progress(f"{name}: {count} active sets")
         sets = ActiveSets(arrangement, safety, find_strategy(name))
         permissiveness[name] = sets.stops_for_good
         stuck[name] = sets.stuck_behind_last_resort
         statically = {p.name: p for p in sets.check()}
-        states, violations = 0, dict[str, list[Violation]]()
-        for what, count, found in explorer.run(sets):
-            progress(f"{name}: {what}, {count} states")
-            states += count
-            for violation in found:
-                violations.setdefault(violation.name, []).append(violation)
+        states, violations = 0, list[tuple[str, Trace]]()
+        for what, visited, found in explorer.run(sets):
+            progress(f"{name}: {what}, {visited} states")
+            states += visited
+            violations += found.items()
         properties += _merge(name, statically, states, violations)
-    return Report(spec.name, spec.strategy, 2 ** len(spec.mechanisms) - 1, explorer.states,
-                  permissiveness, stuck, tuple(properties))
+    return Report(spec.name, spec.strategy, count, explorer.states, permissiveness, stuck,
+                  tuple(properties))
 
 
 _OF_STATES = ("one-decision", "no-conflicting-claims", "emergency-stop-at-once", "recovery-ends",
@@ -132,19 +131,16 @@ _OF_STATES = ("one-decision", "no-conflicting-claims", "emergency-stop-at-once",
 
 
 def _merge(strategy: str, statically: dict[str, Property], states: int,
-           violations: dict[str, list[Violation]]) -> Iterator[Property]:
+           violations: list[tuple[str, Trace]]) -> Iterator[Property]:
     """Yield one verdict a property, where it was checked on sets and on states on both."""
     for name in MEANING:
-        on_sets = statically.get(name)
-        if on_sets is None and name not in _OF_STATES:
-            continue
-        base = on_sets or Property(name, strategy, True, 0, 0, ())
         if name in _OF_STATES:
-            found = sorted(violations.get(name, ()), key=lambda v: len(v.trace))
-            traces = tuple(v.trace for v in found)
-            base = Property(name, strategy, base.holds and not found, base.cases + states,
-                            base.count + len(found), (base.counterexamples + traces)[:3])
-        yield base
+            base = statically.get(name, Property(name, strategy, True, 0, 0, ()))
+            found = sorted((trace for failed, trace in violations if failed == name), key=len)
+            yield Property(name, strategy, base.holds and not found, base.cases + states,
+                           base.count + len(found), (*base.counterexamples, *found)[:KEPT])
+        elif name in statically:
+            yield statically[name]
 
 
 class _Explorer:
@@ -154,77 +150,65 @@ class _Explorer:
         self.arrangement = arrangement
         self.together = together
         self.states = 0
-        self._known: dict[object, tuple[int, dict[str, Violation]]] = {}
-        tree, recover = arrangement.tree, arrangement.mechanisms.recover
-        self._urgent = frozenset(recover[tree.root])
+        self._known: dict[object, tuple[int, Violations]] = {}
+        self._urgent = frozenset(arrangement.mechanisms.recover[arrangement.tree.root])
 
-    def run(self, sets: ActiveSets) -> Iterator[tuple[str, int, list[Violation]]]:
+    def run(self, sets: ActiveSets) -> Iterator[tuple[str, int, Violations]]:
         """Yield, for each choice of recoveries, which they are, the states, the violations."""
         asked = _askable(sets)
         names = self.arrangement.mechanisms.recoveries
         exclusive = sets.strategy.exclusive and not self.arrangement.compound
-        for name in names:
-            for deaths in (True, False):
-                yield self._explore((name,), asked, exclusive=exclusive, with_modules=True,
-                                    deaths=deaths)
+        for name, deaths in product(names, (True, False)):
+            yield self._explore((name,), asked, exclusive=exclusive, with_modules=True,
+                                deaths=deaths)
         size = min(self.together, len(names))
-        if size > 1:
-            for chosen in combinations(names, size):
-                yield self._explore(chosen, asked, exclusive=exclusive)
+        for chosen in combinations(names, size) if size > 1 else ():
+            yield self._explore(chosen, asked, exclusive=exclusive)
 
     def _explore(self, names: tuple[str, ...], asked: frozenset[frozenset[str]], *,
                  exclusive: bool, with_modules: bool = False, deaths: bool = True
-                 ) -> tuple[str, int, list[Violation]]:
+                 ) -> tuple[str, int, Violations]:
         mechanisms, order = self.arrangement.mechanisms, self.arrangement.order
-        # Whoever is not among them may make one of them wait: as if it were not asked for yet.
+        # One that is not among them may make one of them wait: as if it were not asked for yet.
         here = frozenset(
             frozenset(part) for one in asked for part in subsets(one.intersection(names)))
         shape = _shape(names, here, self._urgent, self.arrangement)
         key = (shape, exclusive, with_modules, deaths)
         if key not in self._known:
-            count, found = explore(Transitions(
-                [mechanisms.contracts[n] for n in names], order, here,
-                self._urgent.intersection(names), exclusive=exclusive, with_modules=with_modules,
-                deaths=deaths))
-            self._known[key] = count, found
-            self.states += count
-        count, found = self._known[key]
-        return " and ".join(names), count, list(found.values())
+            contracts = [mechanisms.contracts[n] for n in names]
+            self._known[key] = explore(Transitions(
+                contracts, order, here, self._urgent.intersection(names), exclusive=exclusive,
+                with_modules=with_modules, deaths=deaths))
+            self.states += self._known[key][0]
+        return " and ".join(names), *self._known[key]
 
 
 def _askable(sets: ActiveSets) -> frozenset[frozenset[str]]:
     """Return the sets of recoveries that a strategy can ask for, after escalations as well."""
     arrangement = sets.arrangement
-    names = arrangement.mechanisms.recoveries
     decisions = {(c.decision.recoveries, c.decision.mechanisms): c.decision for c in sets.cases}
     found = set()
     for decision in decisions.values():
-        reachable = _reachable(decision.recoveries, decision.mechanisms, arrangement)
-        concerned = [n for n in names if n in reachable]
+        reachable = _reachable(decision, arrangement)
+        concerned = [n for n in arrangement.mechanisms.recoveries if n in reachable]
         most = len(concerned) if len(concerned) <= _ALL_FAILURES_OF else _FAILURES_AT_ONCE
-        for size in range(most + 1):
-            for failed in combinations(concerned, size):
-                if size and not set(failed).intersection(decision.recoveries):
-                    continue  # of what runs nothing has failed
+        for failed in subsets(concerned, most):
+            if not failed or set(failed).intersection(decision.recoveries):  # of what runs
                 found.add(frozenset(escalate(
                     decision, dict.fromkeys(failed, "failed"), arrangement).recoveries))
     return frozenset(found)
 
 
-def _reachable(recoveries: tuple[str, ...], mechanisms: tuple[str, ...], arrangement: Arrangement
-               ) -> set[str]:
-    """Return what escalation can lead to from some recoveries."""
-    recover, tree = arrangement.mechanisms.recover, arrangement.tree
-    found = set(recoveries)
-    for mechanism in mechanisms:
-        found |= set(chain.from_iterable(arrangement.mechanisms.alternatives(mechanism)))
-        for upper in tree.chain(tree.root, mechanism):
-            found |= set(recover[upper])
+def _reachable(decision: Decision, arrangement: Arrangement) -> set[str]:
+    """Return what escalation can lead to from a decision."""
+    tree, contracts = arrangement.tree, arrangement.mechanisms.contracts
+    found = set(decision.recoveries)
+    for mechanism in decision.mechanisms:
+        found.update(*arrangement.mechanisms.alternatives(mechanism),
+                     arrangement.demanded(tree.chain(tree.root, mechanism)))
     for name in list(found):
-        following = arrangement.mechanisms.contracts[name].escalate_to
-        while following and following not in found:
-            found.add(following)
-            following = arrangement.mechanisms.contracts[following].escalate_to
+        while (name := contracts[name].escalate_to) and name not in found:
+            found.add(name)
     return found
 
 
@@ -233,21 +217,17 @@ def _shape(names: tuple[str, ...], asked: frozenset[frozenset[str]], urgent: fro
     """Return what two choices of recoveries have in common if they behave alike."""
     if len(names) > 3:
         return names, asked
-
-    def seen(order: tuple[str, ...]) -> object:
-        return _profile(order, asked, urgent, arrangement.mechanisms.contracts, arrangement.order)
-
-    return min((seen(order) for order in permutations(names)), key=repr)
+    return min((_profile(some, asked, urgent, arrangement) for some in permutations(names)),
+               key=repr)
 
 
 def _profile(names: tuple[str, ...], asked: frozenset[frozenset[str]], urgent: frozenset[str],
-             contracts: dict[str, Contract], order: PartialOrder) -> object:
+             arrangement: Arrangement) -> object:
+    mechanisms, order = arrangement.mechanisms, arrangement.order
     number = {name: i for i, name in enumerate(names)}
     alone = tuple(
         (c.kind.repairs, c.interruptible, c.latched, number.get(c.escalate_to, -1), n in urgent)
-        for n in names for c in [contracts[n]])
-    pairs = tuple(
-        (order.is_above(a, b), bool(contracts[a].claims & contracts[b].claims),
-         bool(contracts[a].disables & contracts[b].needs))
-        for a, b in permutations(names, 2))
+        for n in names for c in [mechanisms.contracts[n]])
+    pairs = tuple((order.is_above(a, b), mechanisms.overlap(a, b), bool(mechanisms.harms(a, b)))
+                  for a, b in permutations(names, 2))
     return alone, pairs, tuple(sorted(tuple(sorted(number[n] for n in one)) for one in asked))

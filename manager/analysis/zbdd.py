@@ -8,8 +8,11 @@ the empty set alone. Variables are numbered from the top.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+
+from rampart.manager.analysis.formula import search
 
 EMPTY, UNIT = 0, 1
 
@@ -90,8 +93,7 @@ class Families:
         if u == UNIT:
             return u
         key = (u, v)
-        found = self._without.get(key)
-        if found is not None:
+        if (found := self._without.get(key)) is not None:
             return found
         x, y = self.variable[u], self.variable[v]
         if x == y:
@@ -116,8 +118,7 @@ class Families:
         if u == UNIT:
             return u  # a monotone function that is not constant does not hold for the empty set
         key = u << 32 | f
-        found = self._outside.get(key)
-        if found is not None:
+        if (found := self._outside.get(key)) is not None:
             return found
         x, y = self.variable[u], diagram.level[f]
         if x == y:
@@ -131,35 +132,25 @@ class Families:
         self._outside[key] = result
         return result
 
-    def upwards(self, family: int) -> Iterator[int]:
-        """Yield the nodes of a family, those below before those above."""
-        done = {EMPTY, UNIT}
-        stack = [family]
-        while stack:
-            node = stack[-1]
-            if node in done:
-                stack.pop()
-                continue
-            open_ = [n for n in (self.high[node], self.low[node]) if n not in done]
-            if open_:
-                stack.extend(open_)
-            else:
-                done.add(node)
-                stack.pop()
-                yield node
+    def upwards(self, family: int) -> tuple[int, ...]:
+        """Return the nodes of a family, those below before those above."""
+        return search(family, lambda node: (
+            (self.high[node], self.low[node]) if node > UNIT else ()))[0]
 
-    def sizes(self, family: int, weight: Callable[[int], Sequence[int]]) -> list[int]:
+    def sizes(self, family: int, weights: Sequence[Mapping[int, int]]) -> Counter[int]:
         """Return how many sets of each size a family has.
 
         Args:
             family: The family.
-            weight: For a variable, how many sets of each size it stands for: (0, 1) if it stands
-                for itself.
+            weights: For each variable, how many sets of each size it stands for: one of size 1
+                if it stands for itself.
         """
-        found: dict[int, list[int]] = {EMPTY: [], UNIT: [1]}
+        found = {EMPTY: Counter[int](), UNIT: Counter({0: 1})}
         for node in self.upwards(family):
-            found[node] = _add(_times(weight(self.variable[node]), found[self.high[node]]),
-                               found[self.low[node]])
+            found[node] = counts = found[self.low[node]].copy()
+            for size, count in weights[self.variable[node]].items():
+                for more, times in found[self.high[node]].items():
+                    counts[size + more] += count * times
         return found[family]
 
 
@@ -172,22 +163,3 @@ def deep_recursion(levels: int) -> Iterator[None]:
         yield
     finally:
         sys.setrecursionlimit(before)
-
-
-def _times(a: Sequence[int], b: Sequence[int]) -> list[int]:
-    if not a or not b:
-        return []
-    if list(a) == [0, 1]:
-        return [0, *b]
-    product = [0] * (len(a) + len(b) - 1)
-    for i, x in enumerate(a):
-        if x:
-            for j, y in enumerate(b):
-                product[i + j] += x * y
-    return product
-
-
-def _add(a: list[int], b: list[int]) -> list[int]:
-    if len(a) < len(b):
-        a, b = b, a
-    return [x + (b[i] if i < len(b) else 0) for i, x in enumerate(a)]

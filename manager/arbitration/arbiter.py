@@ -18,8 +18,8 @@ states can be explored. The strategy decides *which* recovery; the arbiter sees 
   cause persists.
 * A recovery that fails, is not done by its deadline, or needs a node that is reported failed is
   followed by the one it escalates to, else by that of the mechanism above. A repair also fails if
-  it is done but its cause persists. One that is late but still acting is let be as long as it is
-  in nobody's way: late is better than never.
+  it is done but its cause persists. One that is late but still acting is let be as long as no
+  other one has to wait for it: late is better than never.
 * An arbiter that starts while recoveries are activated, because the one before it was killed,
   adopts them, and releases none before it has heard every module (or has waited long enough).
 """
@@ -40,13 +40,13 @@ from rampart.manager.arbitration.arbiter_state import (
     ResetAsked,
     ShadowDiffered,
     State,
+    with_late,
 )
 from rampart.manager.arbitration.detection_track import (
     DetectionHeard,
     DetectionRules,
     DetectionTrack,
 )
-from rampart.manager.arbitration.lateness import with_late
 from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard, RecoveryTrack
 from rampart.manager.model.mechanisms import RecoveryPhase
 from rampart.manager.spec.budget import patience_s
@@ -98,12 +98,9 @@ class Arbiter:
         # flap. A repair that has been done has ended by itself. Held, its mechanism would still
         # count when another becomes active, and two unrelated crashes a second apart would end
         # in an emergency stop (block 4).
-        repairs = self.mechanisms.repairs.get(detection, ())
-        if repairs and all(
-                track.phase is RecoveryPhase.DONE and track.acknowledged
-                for track in (state.recoveries[self._recovery[name]] for name in repairs)):
-            return self._no_hold
-        return self.rules
+        repairs = [self._track(state, name) for name in self.mechanisms.repairs.get(detection, ())]
+        done = all(track.phase is RecoveryPhase.DONE and track.acknowledged for track in repairs)
+        return self._no_hold if repairs and done else self.rules
 
     def initial(self, now: float, number: int = 0) -> State:
         """Return the state in which an arbiter starts.
@@ -113,11 +110,10 @@ class Arbiter:
             number: Decisions are numbered from here on. Give each incarnation of the manager a
                 higher range, so that no two decisions of a run have the same number.
         """
-        return State(
-            tuple(DetectionTrack(name, heard_s=now) for name in self.mechanisms.detections),
-            tuple(RecoveryTrack(Command(name, False, number))
-                  for name in self.mechanisms.recoveries),
-            number, NOTHING_ACTIVE, now)
+        detections = (DetectionTrack(name, heard_s=now) for name in self.mechanisms.detections)
+        recoveries = (RecoveryTrack(Command(name, False, number))
+                      for name in self.mechanisms.recoveries)
+        return State(tuple(detections), tuple(recoveries), number, NOTHING_ACTIVE, now)
 
     def step(self, state: State, event: Input, now: float) -> tuple[State, tuple[Output, ...]]:
         """Take one input.
@@ -125,7 +121,7 @@ class Arbiter:
         Args:
             state: As returned by `initial` or by the last step.
             event: What happened; a detection or recovery module that is not of this system is
-                none of the arbiter's business and ignored.
+                ignored.
             now: Time, seconds; never less than before.
 
         Returns:
@@ -135,16 +131,14 @@ class Arbiter:
         answers: tuple[Output, ...] = ()
         match event:
             case DetectionHeard() if event.detection in self._detection:
+                tracks = list(state.detections)
                 index = self._detection[event.detection]
-                state = replace(state, detections=(
-                    *state.detections[:index],
-                    detection_track.hear(state.detections[index], event, self.rules, now),
-                    *state.detections[index + 1:]))
+                tracks[index] = detection_track.hear(tracks[index], event, self.rules, now)
+                state = replace(state, detections=tuple(tracks))
             case RecoveryHeard() if event.recovery in self._recovery:
                 state = self._hear_recovery(state, event, now)
             case ResetAsked():
-                state, answer = self._reset(state, event)
-                answers = (answer,)
+                state, answers = self._reset(state, event)
         if self._is_quiet(state, now):
             return state, answers
         late_before = state.late
@@ -174,50 +168,49 @@ class Arbiter:
                 return False
         return all(map(_is_at_rest, state.recoveries))
 
+    def _track(self, state: State, recovery: str) -> RecoveryTrack:
+        return state.recoveries[self._recovery[recovery]]
+
     def _with_recovery(self, state: State, track: RecoveryTrack) -> State:
-        index = self._recovery[track.name]
-        return replace(state, recoveries=(
-            *state.recoveries[:index], track, *state.recoveries[index + 1:]))
+        tracks = list(state.recoveries)
+        tracks[self._recovery[track.name]] = track
+        return replace(state, recoveries=tuple(tracks))
 
     def _hear_recovery(self, state: State, event: RecoveryHeard, now: float) -> State:
-        track = state.recoveries[self._recovery[event.recovery]]
+        track = self._track(state, event.recovery)
         number = state.number
         if event.activated and not state.oriented and not track.wanted and not track.heard:
             if event.decision <= LARGEST_NUMBER:  # or it is no number that was ever given
                 number = max(number, event.decision)
-            track = replace(
-                track, ordered_s=now, adopted=True,
-                latched=self.mechanisms.contracts[event.recovery].latched,
-                command=Command(event.recovery, True, event.decision,
-                                reason="adopted, it was found activated"))
+            command = Command(event.recovery, True, event.decision,
+                              reason="adopted, it was found activated")
+            track = replace(track, ordered_s=now, adopted=True, command=command,
+                            latched=self.mechanisms.contracts[event.recovery].latched)
         track = recovery_track.hear(track, event, now)
         if track.failure and not track.failed_for:
             track = replace(track, failed_for=recovery_track.sakes(
                 self.mechanisms.users[event.recovery], state.decision.active))
         return self._with_recovery(replace(state, number=number), track)
 
-    def _reset(self, state: State, event: ResetAsked) -> tuple[State, ResetAnswered]:
-        chosen = self._choose(state)[1]
-        refusal = latching.refusal(state, event.recovery, chosen)
-        if refusal:
-            return state, ResetAnswered(event.recovery, False, refusal)
-        track = replace(self._track(state, event.recovery), latched=False, adopted=False)
-        return self._with_recovery(state, track), ResetAnswered(
-            event.recovery, True, f"reset by {event.by}" if event.by else "reset")
+    def _reset(self, state: State, event: ResetAsked) -> tuple[State, tuple[ResetAnswered]]:
+        refusal = latching.refusal(state, event.recovery, self._choose(state)[1])
+        if not refusal:
+            state = self._with_recovery(state, replace(
+                self._track(state, event.recovery), latched=False, adopted=False))
+        return state, (ResetAnswered(event.recovery, not refusal, refusal or (
+            f"reset by {event.by}" if event.by else "reset")),)
 
     def _pass_time(self, state: State, now: float) -> State:
         timeout_s = self.rules.silence_timeout_s
         detections = tuple(
-            track if track.is_calm(now, timeout_s)
-            else detection_track.pass_time(track, self._rules_of(state, track.name), now)
-            for track in state.detections)
+            t if t.is_calm(now, timeout_s)
+            else detection_track.pass_time(t, self._rules_of(state, t.name), now)
+            for t in state.detections)
         believed = {track.name: track for track in detections}
         active = self._active(detections)
         contracts, users = self.mechanisms.contracts, self.mechanisms.users
-        recoveries = tuple(
-            recovery_track.judge(track, contracts[track.name], users[track.name], believed,
-                                 active, now)
-            for track in state.recoveries)
+        recoveries = tuple(recovery_track.judge(
+            t, contracts[t.name], users[t.name], believed, active, now) for t in state.recoveries)
         oriented = state.oriented or (
             all(t.ever_heard or t.silent for t in detections) and (
                 all(t.heard for t in recoveries)
@@ -234,9 +227,8 @@ class Arbiter:
     def _choose(self, state: State) -> tuple[Decision, Decision, Decision]:
         """Return the strategy's decision, that after escalation, and that after latching too."""
         chosen = decision = self.decider.choose(self._active(state.detections), state.late)
-        failures = {t.name: t.failure for t in state.recoveries if t.failure}
-        if self._needy and chosen.active:
-            failures = {**self._unmet(state), **failures}
+        failures = self._unmet(state) if self._needy and chosen.active else {}
+        failures |= {t.name: t.failure for t in state.recoveries if t.failure}
         if failures:
             decision = escalate(decision, failures, self.arrangement)
         kept = [t for t in state.recoveries if t.latched or t.adopted]
@@ -260,15 +252,11 @@ class Arbiter:
         if fresh:
             state = replace(state, number=state.number + 1, decision=decision)
         outputs: list[Output] = []
-        for before in state.recoveries:
-            if before.wanted and before.name not in chosen:
-                after = self._release(before, chosen, state.number, now)
-                state = self._with_recovery(state, after)
-                if after.command != before.command:
-                    outputs.append(after.command)
-        for name in chosen:
+        superseded = [t.name for t in state.recoveries if t.wanted and t.name not in chosen]
+        for name in (*superseded, *chosen):
             before = self._track(state, name)
-            after = self._activate(state, before, now)
+            after = (self._activate(state, before, now) if name in chosen
+                     else self._release(before, chosen, state.number, now))
             state = self._with_recovery(state, after)
             if after.command != before.command:
                 outputs.append(after.command)
@@ -279,15 +267,12 @@ class Arbiter:
         return state, tuple(outputs)
 
     def _ask_shadow(self, state: State, chosen: Decision) -> tuple[ShadowDiffered, ...]:
-        if self.shadow is None:
-            return ()
-        other = self.shadow.choose(chosen.active, state.late)
-        if set(other.recoveries) == set(chosen.recoveries):
-            return ()
-        return (ShadowDiffered(state.number, self.shadow.strategy.name, other, chosen.recoveries),)
-
-    def _track(self, state: State, recovery: str) -> RecoveryTrack:
-        return state.recoveries[self._recovery[recovery]]
+        if self.shadow is not None:
+            other = self.shadow.choose(chosen.active, state.late)
+            if set(other.recoveries) != set(chosen.recoveries):
+                return (ShadowDiffered(
+                    state.number, self.shadow.strategy.name, other, chosen.recoveries),)
+        return ()
 
     def _causes(self, state: State, recovery: str) -> list[DetectionTrack]:
         """Return the active detection modules that a recovery answers to.
@@ -307,8 +292,8 @@ class Arbiter:
         return (track.wanted and self.mechanisms.contracts[track.name].kind.repairs
                 and self._is_news(state, track))
 
-    def _is_news(self, state: State, track: RecoveryTrack,
-                 named: Callable[[str], str] = str) -> bool:
+    def _is_news(self, state: State, track: RecoveryTrack, named: Callable[[str], str] = str
+                 ) -> bool:
         """Tell whether its causes, with nodes named like this, are more than it was told of."""
         told = {named(node) for node in track.command.nodes}
         return any((cause.name, cause.rises) not in track.cause
@@ -326,7 +311,7 @@ class Arbiter:
         return replace(
             track, command=Command(track.name, False, number, reason=reason), cause=frozenset(),
             ordered_s=now, acknowledged=False, draining=False, adopted=False,
-            letting_go=not track.failure)  # nobody waits for the word of one that failed
+            letting_go=not track.failure)  # the word of one that failed is not waited for
 
     def _activate(self, state: State, track: RecoveryTrack, now: float) -> RecoveryTrack:
         """Activate a recovery, order it again if need be, or let it wait for another to drain."""
@@ -384,8 +369,7 @@ def build_arbiter(spec: SystemSpec, strategy: str = "", *, first_start: bool = T
     silence_s = timing.detection_silence_timeout_s
     arrangement = arrange(
         spec.build_mechanisms(patience_s(spec)), spec.build_ftm_tree(), spec.build_order())
-    return Arbiter(
-        arrangement, find_strategy(strategy or spec.strategy),
-        DetectionRules(silence_s, timing.startup_grace_s if first_start else silence_s,
-                       timing.release_hold_s, timing.release_hold_max_s),
-        find_strategy(spec.shadow) if spec.shadow else None)
+    rules = DetectionRules(silence_s, timing.startup_grace_s if first_start else silence_s,
+                           timing.release_hold_s, timing.release_hold_max_s)
+    return Arbiter(arrangement, find_strategy(strategy or spec.strategy), rules,
+                   find_strategy(spec.shadow) if spec.shadow else None)

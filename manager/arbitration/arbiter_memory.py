@@ -1,11 +1,11 @@
 """What of the arbiter's state must survive the FTM Manager's death, and how it is taken up again.
 
 Little: an arbiter that starts hears from the modules what is detected and what is in force, adopts
-it, and releases nothing before it has heard them all. Three things nobody else knows:
+it, and releases nothing before it has heard them all. Three things only the arbiter knows:
 
-* *Latches.* Whether somebody has reset an emergency stop is the arbiter's knowledge. If it dies
+* *Latches.* Whether an operator has reset an emergency stop is the arbiter's knowledge. If it dies
   together with a recovery module that cannot find out from the world what it has done (RM1 can, by
-  the brakes), nobody is left to be asked, and the plant would go on.
+  the brakes), no process is left that knows, and the plant would go on.
 * *How much a detection module has flapped*, by which its all-clear is believed sooner or later.
 * *The number of the last decision*, so that none is given twice.
 
@@ -51,12 +51,9 @@ class Memory(msgspec.Struct, frozen=True):
 
 def remember(state: State) -> Memory:
     """Return what of a state must not be forgotten."""
-    return Memory(
-        state.number,
-        tuple(Latch(track.command, tuple(sorted(track.cause)))
-              for track in state.recoveries if track.latched),
-        tuple((track.name, track.bucket_s, track.bucket_at_s)
-              for track in state.detections if track.bucket_s > 0))
+    latches = (Latch(t.command, tuple(sorted(t.cause))) for t in state.recoveries if t.latched)
+    buckets = ((t.name, t.bucket_s, t.bucket_at_s) for t in state.detections if t.bucket_s > 0)
+    return Memory(state.number, tuple(latches), tuple(buckets))
 
 
 def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
@@ -71,15 +68,15 @@ def recall(arbiter: Arbiter, memory: Memory, now: float, number: int) -> State:
     state = arbiter.initial(now, max(number, memory.number))
     latches = {latch.command.recovery: latch for latch in memory.latches}
     buckets = {name: (bucket_s, at_s) for name, bucket_s, at_s in memory.buckets}
-    return replace(
-        state,
-        detections=tuple(
-            replace(track, bucket_s=buckets[track.name][0],
-                                    bucket_at_s=min(buckets[track.name][1], now))
-            if track.name in buckets else track for track in state.detections),
-        recoveries=tuple(
-            _latched(latches[track.name], now) if track.name in latches else track
-            for track in state.recoveries))
+    detections = list(state.detections)
+    for index, detection in enumerate(detections):
+        if detection.name in buckets:
+            bucket_s, at_s = buckets[detection.name]
+            detections[index] = replace(detection, bucket_s=bucket_s, bucket_at_s=min(at_s, now))
+    recoveries = tuple(
+        RecoveryTrack(latch.command, ordered_s=now, cause=frozenset(latch.cause), latched=True)
+        if (latch := latches.get(track.name)) else track for track in state.recoveries)
+    return replace(state, detections=tuple(detections), recoveries=recoveries)
 
 
 def take_over(arbiter: Arbiter, state: State, now: float) -> State:
@@ -94,10 +91,6 @@ def take_over(arbiter: Arbiter, state: State, now: float) -> State:
         fresh, started_s=state.started_s, oriented=state.oriented,
         detections=tuple(detections.get(t.name, t) for t in fresh.detections),
         recoveries=tuple(recoveries.get(t.name, t) for t in fresh.recoveries))
-
-
-def _latched(latch: Latch, now: float) -> RecoveryTrack:
-    return RecoveryTrack(latch.command, ordered_s=now, cause=frozenset(latch.cause), latched=True)
 
 
 def objection(memory: Memory) -> str:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import msgspec
+from msgspec.structs import replace
 
 from rampart.manager.arbitration.detection_track import DetectionHeard, DetectionTrack
 from rampart.manager.arbitration.recovery_track import Command, RecoveryHeard, RecoveryTrack
+from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import Decision
 
 
 class ResetAsked(msgspec.Struct, frozen=True, tag=True):
-    """Input: somebody asks to release a latched recovery."""
+    """Input: an operator request to release a latched recovery."""
 
     recovery: str
     by: str = ""
@@ -76,7 +78,7 @@ class State(msgspec.Struct, frozen=True):
         number: Of the last decision.
         decision: The last decision, as carried out.
         started_s: When the arbiter started.
-        oriented: It has heard everybody, or has waited long enough; adoption is over.
+        oriented: It has heard every module, or has waited long enough; adoption is over.
         since: Active mechanisms, each with the time since when it is active.
         late: Those whose recovery has not ended the error within its patience.
     """
@@ -120,3 +122,23 @@ class State(msgspec.Struct, frozen=True):
     def latched(self) -> tuple[str, ...]:
         """Names of the recovery modules that stay until they are reset."""
         return tuple(track.name for track in self.recoveries if track.latched)
+
+
+def with_late(state: State, active: tuple[str, ...], arrangement: Arrangement, now: float) -> State:
+    """Note since when mechanisms have had their turn, and which of them are late.
+
+    One that has to wait for a deeper one does not lose its patience meanwhile, or it would be
+    late, and the next above in force, the moment the deeper one has succeeded. One whose recovery
+    is in force is not late; but a repair ends the error or it does not.
+    """
+    tree, mechanisms = arrangement.tree, arrangement.mechanisms
+    before = dict(state.since)
+    in_time = [name for name in active if name not in state.late]
+    since = tuple((name, now if any(tree.is_above(name, deeper) for deeper in in_time)
+                   else before.get(name, now)) for name in active)
+    in_force = {track.name for track in state.recoveries
+                if track.in_force and not mechanisms.contracts[track.name].kind.repairs}
+    return replace(state, since=since, late=frozenset(
+        name for name, since_s in since
+        if name in state.late or (now - since_s > mechanisms.by_name[name].patience_s
+                                  and not in_force.issuperset(mechanisms.recover[name]))))

@@ -7,7 +7,7 @@ report younger than `silence_timeout_s` is taken for active, whatever the reason
 being respawned, which takes a fraction of the timeout, and one that crashes again and again is not
 excused for ever. Age is that of the report, not of its arrival: what repeats old news is silent.
 
-*One that lives and is not heard is replaced* once, well before its silence counts (`overdue`): its
+*One that runs and is not heard is replaced* once, well before its silence counts (`overdue`): its
 way out may be broken where its heartbeat's is not. Not while others are late as well: then it is
 the machine, or who listens, and a module that is killed for being late comes later still.
 
@@ -117,27 +117,20 @@ reports fit in before, and its successor has time to be heard after."""
 
 def overdue(tracks: tuple[DetectionTrack, ...], rules: DetectionRules, now: float
             ) -> DetectionTrack | None:
-    """Return the one module that is overdue while nobody else is late, if there is one."""
+    """Return the one module that is overdue while no other one is late, if there is one."""
     limit_s = OVERDUE_SHARE * rules.silence_timeout_s
-    found = None
-    for track in tracks:
-        age_s = now - track.heard_s
-        if age_s <= limit_s / 2:
-            continue
-        if found is not None or age_s <= limit_s:
-            return None
-        found = track
-    return found if found is not None and found.ever_heard and not found.silent else None
+    late = [track for track in tracks if now - track.heard_s > limit_s / 2]
+    return next((track for track in late if len(late) == 1 and now - track.heard_s > limit_s
+                 and track.ever_heard and not track.silent), None)
 
 
 def hear(track: DetectionTrack, report: DetectionHeard, rules: DetectionRules, now: float
          ) -> DetectionTrack:
     """Take in a report that arrives at `now`; it was true then at the latest."""
     heard_s = max(track.heard_s, min(report.stamp_s, now))
-    heard = replace(
-        track, heard_s=heard_s, ever_heard=True, reported=report.active,
-        incarnation=report.incarnation,
-        silent=track.silent and now - heard_s > rules.silence_timeout_s)
+    heard = replace(track, heard_s=heard_s, ever_heard=True, reported=report.active,
+                    incarnation=report.incarnation,
+                    silent=track.silent and now - heard_s > rules.silence_timeout_s)
     if report.active:
         heard = replace(heard, nodes=report.nodes, reason=report.reason)
     return _follow(track, heard, rules, now, report.since_s)

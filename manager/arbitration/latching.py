@@ -22,7 +22,7 @@ def refusal(state: State, recovery: str, decision: Decision) -> str:
 
     Args:
         state: Of the arbiter.
-        recovery: Name, as somebody typed it.
+        recovery: Name, as it was typed.
         decision: What would run if nothing were latched.
     """
     if recovery not in state.latched:
@@ -50,12 +50,11 @@ def keep(decision: Decision, kept: Sequence[RecoveryTrack], arrangement: Arrange
     safest = min(kept, key=lambda track: order.number[track.name])
     base = tuple(name for name in decision.recoveries
                  if name == safest.name or order.is_above(name, safest.name)) or (safest.name,)
+    others = [name for name in decision.recoveries if name not in base]
     beneath = () if exclusive else tuple(
-        name for name in decision.recoveries
-        if name not in base and contracts[name].kind.repairs
+        name for name in others if contracts[name].kind.repairs
         and arrangement.can_join(name, order.mask(base)))
     why = "is latched until reset" if safest.latched else \
         "was found activated, and not all modules have been heard yet"
     return replace(decision, recoveries=base + beneath, rejected=decision.rejected + tuple(
-        (name, f"{safest.name} {why}") for name in decision.recoveries
-        if name not in base and name not in beneath))
+        (name, f"{safest.name} {why}") for name in others if name not in beneath))

@@ -13,7 +13,7 @@ import msgspec
 
 from rampart.manager.model.gates import detection_gate, recovery_gate
 from rampart.manager.model.order import PartialOrder
-from rampart.manager.spec.schema import EventSpec, MechanismSpec, SystemSpec
+from rampart.manager.spec.schema import MechanismSpec, SystemSpec
 from rampart.manager.strategies.decision_words import decision_in_words
 
 WHATS = ("fault-tree", "ftm-tree", "order")
@@ -117,15 +117,14 @@ def draw(spec: SystemSpec, what: str, order: PartialOrder, criteria: Sequence[st
         criteria: Names of the orders that it is made of.
         situation: To show in it.
     """
-    note = situation.note(spec)
-    title = clean(spec.title)
     if what == "fault-tree":
-        return Diagram(what, f"Fault tree: {title}", note, *_fault_tree(spec, situation))
-    if what == "ftm-tree":
-        return Diagram(what, f"Tree of mechanisms: {title}", note, *_ftm_tree(spec, situation))
-    by = ", then ".join(map(clean, criteria))
-    return Diagram(what, f"Order of recoveries ({by}): {title}", note,
-                   *_order(spec, order, situation))
+        subject, parts = "Fault tree", _fault_tree(spec, situation)
+    elif what == "ftm-tree":
+        subject, parts = "Tree of mechanisms", _ftm_tree(spec, situation)
+    else:
+        subject = f"Order of recoveries ({', then '.join(map(clean, criteria))})"
+        parts = _order(spec, order, situation)
+    return Diagram(what, f"{subject}: {clean(spec.title)}", situation.note(spec), *parts)
 
 
 def clean(text: str) -> str:
@@ -156,37 +155,25 @@ _Parts = tuple[tuple[Box, ...], tuple[tuple[str, str], ...]]
 
 
 def _fault_tree(spec: SystemSpec, situation: Situation) -> _Parts:
-    asked = _is_asked_for(spec, situation)
-    barriers = {m.event: m for m in spec.mechanisms}
-    boxes = []
+    boxes = {}
     for event in spec.events:
-        box = Box(event.name, clean(event.title), _gate(event), event.required,
-                  len(event.of))
-        if event.name in barriers:
-            box = _bar(box, barriers[event.name], situation, asked)
-        boxes.append(box)
-    return tuple(boxes), tuple((e.name, lower) for e in spec.events for lower in e.of)
-
-
-def _gate(event: EventSpec) -> str:
-    if not event.of:
-        return ""
-    return event.gate if isinstance(event.gate, str) else "at-least"
+        gate = event.gate if isinstance(event.gate, str) else "at-least" if event.of else ""
+        boxes[event.name] = Box(event.name, clean(event.title), gate, event.required, len(event.of))
+    for mechanism in spec.mechanisms:
+        boxes[mechanism.event] = _bar(boxes[mechanism.event], mechanism, spec, situation)
+    return tuple(boxes.values()), tuple((e.name, lower) for e in spec.events for lower in e.of)
 
 
 def _ftm_tree(spec: SystemSpec, situation: Situation) -> _Parts:
-    asked = _is_asked_for(spec, situation)
     titles = {d.name: clean(d.title) for d in spec.detections}
     titles |= {r.name: clean(r.title) for r in spec.recoveries}
     boxes = []
     for mechanism in spec.mechanisms:
         detects, recovers = (gate.said_with(titles) for gate in (
             detection_gate(mechanism.detect), recovery_gate(mechanism.recover)))
-        boxes.append(_bar(Box(mechanism.name, f"{detects} → {recovers}"), mechanism, situation,
-                          asked))
-    if not boxes:
-        return (), ()
-    parents = spec.build_ftm_tree().parents
+        box = Box(mechanism.name, f"{detects} → {recovers}")
+        boxes.append(_bar(box, mechanism, spec, situation))
+    parents = spec.build_ftm_tree().parents if boxes else {}
     return tuple(boxes), tuple((parent, m) for m, parent in parents.items() if parent is not None)
 
 
@@ -197,16 +184,15 @@ def _order(spec: SystemSpec, order: PartialOrder, situation: Situation) -> _Part
     return boxes, covers(order)
 
 
-def _is_asked_for(spec: SystemSpec, situation: Situation) -> bool:
-    """Tell whether an active mechanism has a recovery that was decided, as in block 1 to 3."""
-    return any(m.name in situation.active and not set(m.recoveries).isdisjoint(
-        situation.recoveries) for m in spec.mechanisms)
+def _bar(box: Box, mechanism: MechanismSpec, spec: SystemSpec, situation: Situation) -> Box:
+    """Return a box with a mechanism on it.
 
-
-def _bar(box: Box, mechanism: MechanismSpec, situation: Situation, asked: bool) -> Box:
+    It is lit if its recovery was decided on and it is active; or where no active one is, block 4.
+    """
+    decided = [m.name for m in spec.mechanisms
+               if not set(m.recoveries).isdisjoint(situation.recoveries)]
     active = mechanism.name in situation.active
-    decided = not set(mechanism.recoveries).isdisjoint(situation.recoveries)
     return msgspec.structs.replace(
         box, mechanism=mechanism.name, detect=clean(mechanism.detect),
-        recover=clean(mechanism.recover), active=active,
-        decided=decided and (active or not asked))
+        recover=clean(mechanism.recover), active=active, decided=mechanism.name in decided and (
+            active or situation.active.isdisjoint(decided)))

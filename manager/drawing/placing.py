@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import reduce
 from graphlib import TopologicalSorter
+from itertools import accumulate
 from math import inf
 
 import msgspec
@@ -101,12 +102,10 @@ def place(sizes: Mapping[str, tuple[float, float]], edges: Sequence[tuple[str, s
     layer, block = _arrange(sizes, edges, uppers)
     left = min(block.left.values())
     x = {member: round(x - left, 2) for member, x in block.x.items()}
-    tall: dict[int, float] = {}
+    tall = [0.0] * (1 + max(layer.values()))
     for name, (_, height) in sizes.items():
-        tall[layer[name]] = max(tall.get(layer[name], 0.0), height)
-    tops = [0.0]
-    for row in range(len(tall)):
-        tops.append(tops[-1] + tall[row] + LAYER_GAP)
+        tall[layer[name]] = max(tall[layer[name]], height)
+    tops = list(accumulate(tall, lambda top, height: top + height + LAYER_GAP, initial=0.0))
     places = {name: Place(x[name] - width / 2, tops[layer[name]], width, height)
               for name, (width, height) in sizes.items()}
     lines = []
@@ -157,10 +156,8 @@ def _arrange(sizes: Mapping[str, tuple[float, float]], edges: Sequence[tuple[str
                 block = _Block(member, 0.0, range(first, layer[edges[member][1]]))
             else:
                 first, block = layer[member], blocks.pop(member)
-            if first in rows:
+            if rows.setdefault(first, block) is not block:
                 rows[first].take(block)
-            else:
-                rows[first] = block
         whole = blocks[name] = _Block(name, sizes.get(name, (0.0, 0.0))[0], (layer[name],))
         for first, row in sorted(rows.items()):
             whole.take(row, -(row.left[first] + row.right[first]) / 2)

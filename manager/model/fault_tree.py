@@ -5,7 +5,7 @@ barrier on one event: it is meant to keep that event from going further up. The 
 declaration of its own, it is read off the tree (paper, figures 6 and 8a): *the parent of an FTM
 is the nearest FTM above it*.
 
-An event may feed several gates, a common cause is a fact of life. But a mechanism must have one
+An event may feed several gates: it is a common cause then. But a mechanism must have one
 parent, otherwise "the lowest common dominant" of block 4 is not defined; so what is refused is
 not the shared event but a mechanism whose ways up end at two different ones.
 """
@@ -58,13 +58,14 @@ class FaultTree:
 
     def __init__(self, events: Sequence[Event]) -> None:
         self.events = {event.name: event for event in events}
-        for name, count in Counter(event.name for event in events).items():
-            if count > 1:
+        for name, times in Counter(event.name for event in events).items():
+            if times > 1:
                 raise FaultTreeError(name, "duplicate event name")
         self.parents: dict[str, list[str]] = {name: [] for name in self.events}
         for event in events:
             self._join(event)
-        cycle = find_cycle({event.name: event.inputs for event in events})
+        inputs = {event.name: event.inputs for event in events}
+        cycle = find_cycle(inputs)
         if cycle:
             raise FaultTreeError(cycle[0], f"cycle {' > '.join(cycle)}; "
                                            "an event cannot be its own cause")
@@ -75,6 +76,7 @@ class FaultTree:
             raise FaultTreeError(tops[1], f"unreachable from the top event {tops[0]!r}; exactly "
                                           "one event may be no input of any gate")
         self.top = tops[0]
+        self._upwards = tuple(TopologicalSorter(inputs).static_order())
 
     def _join(self, event: Event) -> None:
         if event.required and not event.inputs:
@@ -82,27 +84,22 @@ class FaultTree:
         if not 0 <= event.required <= len(event.inputs) or bool(event.inputs) > event.required:
             raise FaultTreeError(event.name, f"gate needs {event.required} of "
                                              f"{len(event.inputs)} inputs")
-        joined: set[str] = set()
         for name in event.inputs:
             if name not in self.parents:
                 raise FaultTreeError(event.name, f"unknown input {name!r}; "
                                                  f"known: {', '.join(self.parents)}")
-            if name in joined:
+            if event.name in self.parents[name][-1:]:
                 raise FaultTreeError(event.name, f"input {name!r} is listed twice")
-            joined.add(name)
             self.parents[name].append(event.name)
 
     def occurring(self, given: Iterable[str], prevented: str = "") -> set[str]:
         """Return all events that occur when the given ones do and one is prevented."""
         occurring = set(given) - {prevented}
-        changed = True
-        while changed:
-            changed = False
-            for event in self.events.values():
-                if event.name != prevented and event.required and event.name not in occurring \
-                        and sum(name in occurring for name in event.inputs) >= event.required:
-                    occurring.add(event.name)
-                    changed = True
+        for name in self._upwards:
+            event = self.events[name]
+            if name != prevented and event.required \
+                    and sum(entry in occurring for entry in event.inputs) >= event.required:
+                occurring.add(name)
         return occurring
 
     def derive_ftm_tree(self, placement: Mapping[str, str]) -> Tree:
@@ -121,19 +118,17 @@ class FaultTree:
                 raise FaultTreeError(mechanism, f"unknown event {event!r}; "
                                                 f"known: {', '.join(self.events)}")
             if event in at:
-                raise FaultTreeError(mechanism, f"event {event!r} already holds {at[event]}; "
-                                                "put an event between them to say which is nearer "
-                                                "to the top")
+                raise FaultTreeError(mechanism, f"event {event!r} already holds {at[event]}; put "
+                                     "an event between them to say which is nearer to the top")
             at[event] = mechanism
         nearest = self._nearest_mechanisms(at)
         parents: dict[str, str | None] = {}
         for mechanism, event in placement.items():
             above = nearest[event]
             if len(above) > 1:
-                raise FaultTreeError(
-                    mechanism, "several parents in the FTMTree: "
-                               f"{', '.join(sorted(name or 'none' for name in above))}; event "
-                               f"{event!r} has a way to the top past each of them")
+                found = ", ".join(sorted(name or "none" for name in above))
+                raise FaultTreeError(mechanism, f"several parents in the FTMTree: {found}; event "
+                                     f"{event!r} has a way to the top past each of them")
             parents[mechanism] = next(iter(above)) or None
         roots = [mechanism for mechanism, parent in parents.items() if parent is None]
         if len(roots) != 1:

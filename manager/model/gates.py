@@ -20,7 +20,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import lru_cache, reduce
-from itertools import chain, combinations
+from itertools import chain, combinations, product
 from operator import and_, or_
 
 import msgspec
@@ -96,7 +96,8 @@ class Gate(msgspec.Struct, frozen=True):
             yield (self.name,)
             return
         for chosen in combinations(self.inputs, self.required):
-            yield from _product([tuple(gate.alternatives()) for gate in chosen])
+            for ways in product(*(gate.alternatives() for gate in chosen)):
+                yield tuple(dict.fromkeys(chain.from_iterable(ways)))
 
     def __str__(self) -> str:
         if self.name:
@@ -141,16 +142,6 @@ def recovery_gate(text: str) -> Gate:
     if len(names) > MAX_NAMES:
         raise GateError(f"{len(names)} recovery modules; at most {MAX_NAMES} are right")
 
-    def check(part: Gate) -> None:
-        if part.negated:
-            raise GateError(f"'not {part.name}' cannot be run; names, 'and' and 'or' are right")
-        if not part.name and 1 < part.required < len(part.inputs):
-            raise GateError(f"'{part.required} of' does not say which; names, 'and' and 'or' "
-                            "are right")
-        for inner in part.inputs:
-            check(inner)
-
-    check(gate)
     ways = _count_ways(gate)
     if ways > MAX_WAYS:
         raise GateError(f"{ways} alternatives; at most {MAX_WAYS} are right")
@@ -181,24 +172,22 @@ def _truth_table(gate: Gate, names: tuple[str, ...]) -> int:
 
 
 def _count_ways(gate: Gate) -> int:
-    """Return how many alternatives there are, without making them: there may be millions."""
+    """Return how many alternatives there are, without making them: there may be millions.
+
+    Raises:
+        GateError: There is more in it than names, `and` and `or`.
+    """
+    if gate.negated:
+        raise GateError(f"'not {gate.name}' cannot be run; names, 'and' and 'or' are right")
     if gate.name:
         return 1
+    if 1 < gate.required < len(gate.inputs):
+        raise GateError(f"'{gate.required} of' does not say which; names, 'and' and 'or' are right")
     counts = [_count_ways(i) for i in gate.inputs]
     return sum(counts) if gate.required == 1 else math.prod(counts)
 
 
-def _product(parts: list[tuple[tuple[str, ...], ...]]) -> Iterator[tuple[str, ...]]:
-    """Yield the unions of one choice from each part, earlier choices first."""
-    if not parts:
-        yield ()
-        return
-    for head in parts[0]:
-        for tail in _product(parts[1:]):
-            yield tuple(dict.fromkeys((*head, *tail)))
-
-
-_TOKEN = re.compile(r"\s*([A-Za-z][A-Za-z0-9_]*|[0-9]+|[(),])")
+_TOKEN = re.compile(r"\s*(?:([A-Za-z][A-Za-z0-9_]*|[0-9]+|[(),])|(\S))")
 _MAX_DIGITS = 9
 
 
@@ -207,20 +196,16 @@ class _Parser:
 
     def __init__(self, text: str) -> None:
         self._tokens: list[str] = []
-        at = 0
-        text = text.rstrip()
-        while at < len(text):
-            match = _TOKEN.match(text, at)
-            if match is None:
-                raise GateError(f"unexpected {text[at:].strip()[:1]!r}; a gate is made of names, "
-                                "'and', 'or', 'not', 'k of (...)' and parentheses")
-            self._tokens.append(match[1])
-            at = match.end()
+        for token, stranger in _TOKEN.findall(text):
+            if stranger:
+                raise GateError(f"unexpected {stranger!r}; a gate is made of names, 'and', 'or', "
+                                "'not', 'k of (...)' and parentheses")
+            self._tokens.append(token)
         self._at = 0
-        self._depth = 0
+        self._depth = -1  # what stands in no parentheses is not nested
 
     def read(self) -> Gate:
-        gate = self._joined("or", lambda: self._joined("and", self._single))
+        gate = self._nested(self._or)
         if self._peek():
             raise GateError(f"unexpected {self._peek()!r} after a complete gate; join two parts "
                             "with 'and' or 'or'")
@@ -239,34 +224,35 @@ class _Parser:
         self._at += 1
         return token
 
-    def _or(self) -> Gate:
+    def _nested(self, part: Callable[[], Gate]) -> Gate:
         self._depth += 1
         if self._depth > MAX_DEPTH:
             raise GateError(f"nested more than {MAX_DEPTH} deep")
-        gate = self._joined("or", lambda: self._joined("and", self._single))
+        gate = part()
         self._depth -= 1
         return gate
 
-    def _joined(self, word: str, part: Callable[[], Gate]) -> Gate:
+    def _separated(self, by: str, part: Callable[[], Gate]) -> tuple[Gate, ...]:
         inputs = [part()]
-        while self._peek() == word:
+        while self._peek() == by:
             self._take()
             inputs.append(part())
-        if len(inputs) == 1:
-            return inputs[0]
-        return Gate(required=1 if word == "or" else len(inputs), inputs=tuple(inputs))
+        return tuple(inputs)
+
+    def _or(self) -> Gate:
+        inputs = self._separated("or", self._and)
+        return Gate(required=1, inputs=inputs) if len(inputs) > 1 else inputs[0]
+
+    def _and(self) -> Gate:
+        inputs = self._separated("and", self._single)
+        return Gate(required=len(inputs), inputs=inputs) if len(inputs) > 1 else inputs[0]
 
     def _single(self) -> Gate:
         token = self._take()
         if token == "not":  # noqa: S105 a word of the language
-            self._depth += 1
-            if self._depth > MAX_DEPTH:
-                raise GateError(f"nested more than {MAX_DEPTH} deep")
-            gate = _negate(self._single())
-            self._depth -= 1
-            return gate
+            return _negate(self._nested(self._single))
         if token == "(":  # noqa: S105
-            gate = self._or()
+            gate = self._nested(self._or)
             self._take(")")
             return gate
         if token.isdigit():
@@ -281,17 +267,14 @@ class _Parser:
     def _at_least(self, required: int) -> Gate:
         self._take("of")
         self._take("(")
-        inputs = [self._or()]
-        while self._peek() == ",":
-            self._take()
-            inputs.append(self._or())
+        inputs = self._separated(",", lambda: self._nested(self._or))
         self._take(")")
-        if len(inputs) > MAX_INPUTS:
-            raise GateError(f"{required} of {len(inputs)} inputs; at most {MAX_INPUTS} are right")
-        if not 1 <= required <= len(inputs):
-            raise GateError(f"{required} of {len(inputs)} inputs; between 1 and {len(inputs)} "
-                            "is right")
-        return Gate(required=required, inputs=tuple(inputs))
+        count = len(inputs)
+        if count > MAX_INPUTS:
+            raise GateError(f"{required} of {count} inputs; at most {MAX_INPUTS} are right")
+        if not 1 <= required <= count:
+            raise GateError(f"{required} of {count} inputs; between 1 and {count} is right")
+        return Gate(required=required, inputs=inputs)
 
 
 def _negate(gate: Gate) -> Gate:

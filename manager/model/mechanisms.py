@@ -9,7 +9,7 @@ robot with RM2.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from itertools import chain
 
@@ -59,7 +59,7 @@ class Contract(msgspec.Struct, frozen=True):
         escalate_to: Recovery to take when this one fails; "" for that of the mechanism above.
         needs: Preconditions: nodes or resources without which it is of no use. While a node
             among them is reported failed, the recovery counts as failed too.
-        disables: Nodes or resources that nobody can use while it is in force.
+        disables: Nodes or resources that cannot be used while it is in force.
     """
 
     name: str
@@ -114,10 +114,6 @@ class Mechanisms:
         self._gates = {m.name: detection_gate(m.detect) for m in mechanisms}
         self.recover = {name: ways[0] for name, ways in self._alternatives.items()}
         self.detect = {name: gate.names for name, gate in self._gates.items()}
-        for name, ways in self._alternatives.items():
-            for recovery in chain.from_iterable(ways):
-                if recovery not in self.contracts:
-                    raise ValueError(f"{name} names unknown recovery {recovery!r}")
         self.names = tuple(self.by_name)
         self.detections = tuple(dict.fromkeys(chain.from_iterable(self.detect.values())))
         self.recoveries = tuple(self.contracts)
@@ -127,6 +123,8 @@ class Mechanisms:
         run_for: dict[str, list[str]] = {detection: [] for detection in self.detections}
         for name, ways in self._alternatives.items():
             for recovery in chain.from_iterable(ways):
+                if recovery not in self.contracts:
+                    raise ValueError(f"{name} names unknown recovery {recovery!r}")
                 self.users[recovery].add(name)
                 self.causes[recovery].update(self.detect[name])
             for detection in self.detect[name]:
@@ -162,16 +160,6 @@ class Mechanisms:
     def alternatives(self, mechanism: str) -> tuple[tuple[str, ...], ...]:
         """Return the sets of recoveries that would do for a mechanism, preferred ones first."""
         return self._alternatives[mechanism]
-
-    def available(self, mechanism: str, failed: Collection[str]) -> tuple[str, ...]:
-        """Return the recoveries to run for a mechanism.
-
-        That is its first alternative without a failed one, else the first of all.
-        """
-        ways = self._alternatives[mechanism]
-        if not failed:
-            return ways[0]
-        return next((way for way in ways if not any(name in failed for name in way)), ways[0])
 
     def overlap(self, one: str, other: str) -> bool:
         """Tell whether two recoveries claim a common resource."""

@@ -23,6 +23,7 @@ from __future__ import annotations
 import graphlib
 from collections.abc import Iterable, Mapping, Sequence
 from graphlib import TopologicalSorter
+from itertools import chain
 
 
 class CycleError(ValueError):
@@ -64,10 +65,9 @@ class PartialOrder:
 
     def __init__(self, names: Sequence[str], above: Mapping[str, Iterable[str]]) -> None:
         relation = {name: tuple(above.get(name, ())) for name in names}
-        for upper in above:
-            for name in (upper, *above[upper]):
-                if name not in relation:
-                    raise UnknownElementError(f"unknown {name!r}; known: {', '.join(names)}")
+        for name in chain(above, *above.values()):
+            if name not in relation:
+                raise UnknownElementError(f"unknown {name!r}; known: {', '.join(names)}")
         cycle = find_cycle(relation)
         if cycle:
             raise CycleError(cycle)
@@ -75,15 +75,14 @@ class PartialOrder:
         self.number = {name: bit for bit, name in enumerate(self.names)}
         self.bit = {name: 1 << bit for name, bit in self.number.items()}
         below = [0] * len(self.names)
-        for bit in range(len(self.names) - 1, -1, -1):
-            for lower in relation[self.names[bit]]:
-                below[bit] |= self.bit[lower] | below[self.number[lower]]
-        self.below = tuple(below)
         up_set = [1 << bit for bit in range(len(self.names))]
         for bit, name in enumerate(self.names):  # an upper one is complete before its lowers
             for lower in relation[name]:
                 up_set[self.number[lower]] |= up_set[bit]
-        self.up_set = tuple(up_set)
+        for bit, name in reversed(tuple(enumerate(self.names))):
+            for lower in relation[name]:
+                below[bit] |= self.bit[lower] | below[self.number[lower]]
+        self.below, self.up_set = tuple(below), tuple(up_set)
 
     def mask(self, names: Iterable[str]) -> int:
         """Return the set of `names` as a bitmask; an unknown one raises UnknownElementError."""
@@ -141,12 +140,12 @@ class PartialOrder:
         """
         if upper != lower and not self.is_above(upper, lower):
             raise ValueError(f"{upper} is not above {lower}")
-        chain = [upper]
+        steps = [upper]
         target = self.up_set[self.number[lower]]
-        while chain[-1] != lower:
-            between = self.below[self.number[chain[-1]]] & target
-            chain.append(self.names[(between & -between).bit_length() - 1])
-        return tuple(chain)
+        while steps[-1] != lower:
+            between = self.below[self.number[steps[-1]]] & target
+            steps.append(self.names[(between & -between).bit_length() - 1])
+        return tuple(steps)
 
 
 def refine(criteria: Sequence[PartialOrder]) -> PartialOrder:

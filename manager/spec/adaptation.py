@@ -2,7 +2,7 @@
 
 A change is applied to the document that the system was read from, and the result is checked like
 a fresh spec, whole: so nothing can be changed into a system that would have been refused at load.
-Document in, document out; nobody sees a half-applied change.
+Document in, document out: a change is never seen half-applied.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ import msgspec
 
 from rampart.files import toml
 from rampart.files.reading import FileError, shown
-from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.schema import TABLES, SystemSpec
 from rampart.manager.spec.specification import check_document
-from rampart.manager.spec.tables import SpecificationError
 
 Document = dict[str, Any]
 
@@ -32,7 +31,7 @@ class Action(StrEnum):
     SET = "set"
 
 
-TABLES = ("detection", "recovery", "mechanism")
+CHANGEABLE = ("detection", "recovery", "mechanism")
 """Tables whose rows can be enabled, disabled, retuned and replaced, by name."""
 
 SETTINGS = ("strategy", "shadow", "order")
@@ -76,21 +75,20 @@ def adapt(document: Document, change: Change, file: str) -> tuple[Document, Syst
         SpecificationError: The changed system would make no sense.
     """
     after = copy.deepcopy(document)
-    if change.action is Action.SET:
-        _set(after, change)
-    else:
-        table, row = _find(after, change.name)
-        match change.action:
-            case Action.ENABLE | Action.DISABLE:
-                row["enabled"] = change.action is Action.ENABLE
-            case Action.RETUNE:
-                _retune(table, row, change)
-            case Action.REPLACE:
-                if change.values.get("name", change.name) != change.name:
-                    raise ChangeError(f"name = {change.values['name']!r}: a replacement keeps the "
-                                      f"name, {change.name!r}")
-                row.clear()
-                row.update({"name": change.name, **change.values})
+    match change.action:
+        case Action.SET:
+            _set(after, change)
+        case Action.ENABLE | Action.DISABLE:
+            _find(after, change.name)[1]["enabled"] = change.action is Action.ENABLE
+        case Action.RETUNE:
+            _retune(*_find(after, change.name), change)
+        case Action.REPLACE:
+            row = _find(after, change.name)[1]
+            if change.values.get("name", change.name) != change.name:
+                raise ChangeError(f"name = {change.values['name']!r}: a replacement keeps the "
+                                  f"name, {change.name!r}")
+            row.clear()
+            row.update({"name": change.name, **change.values})
     return after, check_document(after, file)
 
 
@@ -126,19 +124,19 @@ def changed_actors(before: SystemSpec, after: SystemSpec) -> tuple[str, ...]:
 
 
 def _find(document: Document, name: str) -> tuple[str, dict[str, Any]]:
-    found = [(table, row) for table in TABLES for row in document.get(table, ())
-             if row.get("name") == name]
-    if not found:
-        known = [row.get("name") for table in TABLES for row in document.get(table, ())]
+    rows = [(table, row) for table in CHANGEABLE for row in document.get(table, ())]
+    found = next((one for one in rows if one[1].get("name") == name), None)
+    if found is None:
+        known = ", ".join(str(row.get("name")) for _, row in rows)
         raise ChangeError(f"unknown detection module, recovery module or mechanism {name!r}; "
-                          f"known: {', '.join(map(str, known))}")
-    return found[0]
+                          f"known: {known}")
+    return found
 
 
 def _retune(table: str, row: dict[str, Any], change: Change) -> None:
     if not change.values:
         raise ChangeError(f"retune {change.name}: nothing to change; name fields and values")
-    known = _FIELDS[table]
+    known = [field.encode_name for field in msgspec.structs.fields(TABLES[table])]
     for key, value in change.values.items():
         if key == "name":
             raise ChangeError(f"name = {value!r}: a name cannot be changed")
@@ -160,11 +158,3 @@ def _set(document: Document, change: Change) -> None:
         raise ChangeError(f"set {change.name}: the value is missing")
     document[change.name] = change.values["value"]
 
-
-_FIELDS: dict[str, tuple[str, ...]] = {
-    field.encode_name: tuple(f.encode_name for f in msgspec.structs.fields(row))
-    for field in msgspec.structs.fields(SystemSpec) if field.encode_name in TABLES
-    for row in [field.type.__args__[0]]}
-
-__all__ = ["SETTINGS", "Action", "Change", "ChangeError", "SpecificationError", "adapt",
-           "changed_actors", "describe", "parse_value"]

@@ -9,40 +9,36 @@ from operator import or_
 
 from rampart.manager.model.fault_tree import FaultTreeError
 from rampart.manager.model.gates import recovery_gate
-from rampart.manager.model.order import CycleError, PartialOrder
+from rampart.manager.model.order import CycleError
 from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.spec.tables import Finding, unknown
+from rampart.manager.spec.tables import Finding, find_wrong_names, numbered, unknown
 from rampart.manager.strategies.registry import STRATEGIES
 
 
 def find_wrong_tree(spec: SystemSpec) -> Iterator[Finding]:
     """Events, gates, and where the mechanisms sit."""
-    names = [event.name for event in spec.events]
-    known = set(names)
-    for index, event in enumerate(spec.events):
-        path = f"$.event[{index}]"
+    paths = {event.name: path for path, event in numbered("event", spec.events)}
+    for path, event in numbered("event", spec.events):
         if event.of and event.gate is None:
             yield Finding(f"{path}.of", "inputs without a gate; add gate = 'or'", (event.of,))
         for place, name in enumerate(event.of):
-            if name not in known:
-                yield unknown(f"{path}.of[{place}]", name, "event", names)
+            if name not in paths:
+                yield unknown(f"{path}.of[{place}]", name, "event", paths)
     try:
         tree = spec.build_fault_tree()
     except FaultTreeError as error:
-        index = len(names) - 1 - names[::-1].index(error.subject) if error.subject else -1
-        path = f"$.event[{index}]" if error.subject else "$.event"
-        yield Finding(path, str(error), (error.subject,) if error.subject else ())
+        yield Finding(paths.get(error.subject, "$.event"), str(error),
+                      (error.subject,) if error.subject else ())
         return
-    mechanisms = [mechanism.name for mechanism in spec.mechanisms]
+    mechanisms = {m.name: (path, m.event) for path, m in numbered("mechanism", spec.mechanisms)}
     if not mechanisms:
         return
     try:
-        tree.derive_ftm_tree({m.name: m.event for m in spec.mechanisms})
+        tree.derive_ftm_tree({name: event for name, (_, event) in mechanisms.items()})
     except FaultTreeError as error:
         if error.subject:
-            index = mechanisms.index(error.subject)
-            yield Finding(f"$.mechanism[{index}].event", f"{error.subject}: {error}",
-                          (spec.mechanisms[index].event,))
+            path, sits_on = mechanisms[error.subject]
+            yield Finding(f"{path}.event", f"{error.subject}: {error}", (sits_on,))
         else:
             yield Finding("$.mechanism", str(error))
 
@@ -70,19 +66,13 @@ def find_wrong_orders(spec: SystemSpec) -> Iterator[Finding]:
             path = f"$.orders.{name}.{upper}"
             if upper not in recoveries:
                 yield unknown(path, upper, "recovery module", recoveries)
-            listed: set[str] = set()
-            for place, lower in enumerate(lowers):
-                if lower not in recoveries:
-                    yield unknown(f"{path}[{place}]", lower, "recovery module", recoveries)
-                if lower in listed:
-                    yield Finding(f"{path}[{place}]", "duplicate", (lower,))
-                listed.add(lower)
+            yield from find_wrong_names(path, lowers, "recovery module", recoveries, "duplicate")
         try:
             spec.build_order(name)
         except CycleError as error:
-            yield Finding(f"$.orders.{name}.{error.cycle[0]}",
-                          f"{error}; no recovery can be above itself",
-                          (list(relation[error.cycle[0]]),))
+            upper = error.cycle[0]
+            yield Finding(f"$.orders.{name}.{upper}", f"{error}; no recovery can be above itself",
+                          (list(relation[upper]),))
 
 
 def find_contradictions(spec: SystemSpec) -> Iterator[Finding]:
@@ -97,14 +87,14 @@ def find_contradictions(spec: SystemSpec) -> Iterator[Finding]:
 def find_wrong_compounds(spec: SystemSpec) -> Iterator[Finding]:
     """Recoveries that one mechanism runs together must be able to run together."""
     recoveries = {recovery.name: recovery for recovery in spec.recoveries}
-    for index, mechanism in enumerate(spec.mechanisms):
+    for path, mechanism in numbered("mechanism", spec.mechanisms):
         ways = recovery_gate(mechanism.recover).alternatives()
         together = dict.fromkeys(chain.from_iterable(permutations(way, 2) for way in ways))
         for one, other in together:
             shared = recoveries[one].claims & recoveries[other].claims
             harmed = recoveries[one].disables & recoveries[other].needs
             if shared or harmed:
-                yield Finding(f"$.mechanism[{index}].recover", (
+                yield Finding(f"{path}.recover", (
                     f"{one} and {other} both claim {', '.join(sorted(shared))}" if shared else
                     f"{one} disables {', '.join(sorted(harmed))}, which {other} needs"
                     ) + "; they cannot run together", (mechanism.recover,))
@@ -126,28 +116,19 @@ def find_wrong_precedence(spec: SystemSpec) -> Iterator[Finding]:
                 continue
             for above, below in product(recover[lower], recover[upper]):
                 if order.is_above(above, below):
-                    yield Finding(
-                        f"$.orders.{safer}.{above}",
-                        f"contradicts the FTMTree: {above} of {lower} is above {below} of {upper}, "
-                        f"but {upper} is above {lower}",
-                        (list(spec.orders[safer].get(above, ())),))
-    for index, recovery in enumerate(spec.recoveries):
+                    yield Finding(f"$.orders.{safer}.{above}", f"contradicts the FTMTree: {above} "
+                                  f"of {lower} is above {below} of {upper}, but {upper} is above "
+                                  f"{lower}", (list(spec.orders[safer].get(above, ())),))
+    for path, recovery in numbered("recovery", spec.recoveries):
         if recovery.escalate_to and order.is_above(recovery.name, recovery.escalate_to):
-            yield Finding(f"$.recovery[{index}].escalate_to",
-                          f"{recovery.name} is above it in the order {safer!r}; escalation "
-                          "must not lead to less", (recovery.escalate_to,))
-    for last_resort in recover[tree.root]:
-        yield from _undelayed(spec, order, last_resort)
-
-
-def _undelayed(spec: SystemSpec, order: PartialOrder, last_resort: str) -> Iterator[Finding]:
-    """A recovery of the FTMTree's root is a last resort: nothing may make it wait."""
-    recoveries = {r.name: (index, r.claims) for index, r in enumerate(spec.recoveries)}
-    for name in order.names:
-        index, claims = recoveries[name]
-        shared = claims & recoveries[last_resort][1]
+            yield Finding(f"{path}.escalate_to", f"{recovery.name} is above it in the order "
+                          f"{safer!r}; escalation must not lead to less", (recovery.escalate_to,))
+    # A recovery of the FTMTree's root is a last resort: nothing may make it wait.
+    claims = {r.name: (f"{path}.claims", r.claims)
+              for path, r in numbered("recovery", spec.recoveries)}
+    for last_resort, name in product(recover[tree.root], order.names):
+        shared = claims[name][1] & claims[last_resort][1]
         if name != last_resort and shared:
-            yield Finding(f"$.recovery[{index}].claims",
-                          f"{last_resort}, the last resort, would have to wait for {name}, which "
-                          f"claims {', '.join(sorted(shared))} as well",
-                          (sorted(claims),))
+            yield Finding(claims[name][0], f"{last_resort}, the last resort, would have to wait "
+                          f"for {name}, which claims {', '.join(sorted(shared))} as well",
+                          (sorted(claims[name][1]),))

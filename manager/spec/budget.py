@@ -1,6 +1,7 @@
-"""The time budget: recovery must start before a collision can.
+"""The times of a spec: the time budget from above, false alarms from below.
 
-For every mechanism, and for every guard beside the mechanisms, this inequality must hold:
+Recovery must start before a collision can. For every mechanism, and for every guard beside the
+mechanisms, this inequality must hold:
 
     detection + arbitration + actuation (+ respawn)  <=  time left
 
@@ -16,48 +17,68 @@ node's first message ends the error.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
-from rampart.manager.spec.mobile_robot import Hazard, guards, time_left
-from rampart.manager.spec.schema import MechanismSpec, SystemSpec, Within
-from rampart.manager.spec.timeouts import Budget
+import msgspec
+
+from rampart.manager.spec.mobile_robot import (
+    Hazard,
+    find_too_little_room,
+    time_left,
+    time_to_obstacle_s,
+)
+from rampart.manager.spec.schema import Kind, SystemSpec, Within
+from rampart.manager.spec.tables import Finding, Timing, numbered
+
+PERIODS_TO_MISS = 3
+"""A timeout shorter than so many periods would take a late message for a lost one."""
+
+_PERIODS = {
+    "heartbeat_timeout_s": "heartbeat_period_s", "command_timeout_s": "control_period_s",
+    "localization_timeout_s": "control_period_s", "scan_timeout_s": "control_period_s",
+    "dead_man_timeout_s": "control_period_s", "manager_timeout_s": "manager_period_s",
+    "detection_silence_timeout_s": "detection_period_s",
+}
+"""The period of what each timeout of `[timing]` waits for."""
+
+
+class Budget(msgspec.Struct, frozen=True):
+    """The two sides of the inequality, for one mechanism or guard; all times in seconds."""
+
+    name: str
+    hazard: str
+    time_left_s: float
+    detection_s: float
+    arbitration_s: float
+    actuation_s: float
+    respawn_s: float = 0.0
+
+    @property
+    def needed_s(self) -> float:
+        """From the error to the recovery being effective."""
+        return self.detection_s + self.arbitration_s + self.actuation_s + self.respawn_s
+
+    @property
+    def margin_s(self) -> float:
+        """What is left over; negative if the recovery comes too late."""
+        return self.time_left_s - self.needed_s
+
+    @property
+    def fits(self) -> bool:
+        """Whether the recovery starts in time."""
+        return self.margin_s >= -1e-9  # the sum of floats may exceed an equal bound by a rounding
+
+    def __str__(self) -> str:
+        respawn = f" + respawn {self.respawn_s:.3f}" if self.respawn_s else ""
+        return (f"{self.name} needs {self.needed_s:.3f} s (detection {self.detection_s:.3f} + "
+                f"arbitration {self.arbitration_s:.3f} + actuation {self.actuation_s:.3f}"
+                f"{respawn}) of {self.time_left_s:.3f} s before {self.hazard}")
 
 
 def check(spec: SystemSpec) -> list[Budget]:
     """Draw up the budget of every mechanism and guard that is switched on, mechanisms first."""
-    modules = _Modules(spec)
-    return [*(_of_mechanism(spec, mechanism, modules) for mechanism in spec.mechanisms
-              if spec.layers.ftm),
-            *(guards(spec.mobile, spec.timing, spec.layers) if spec.mobile else ())]
-
-
-class _Modules:
-    """A spec's modules by name, and the FTMTree: looked up once for all mechanisms."""
-
-    def __init__(self, spec: SystemSpec) -> None:
-        self.detections = {detection.name: detection for detection in spec.detections}
-        self.recoveries = {recovery.name: recovery for recovery in spec.recoveries}
-        self.mechanisms = {mechanism.name: mechanism for mechanism in spec.mechanisms}
-        self.parents = spec.build_ftm_tree().parents if spec.mechanisms else {}
-
-
-def _of_mechanism(spec: SystemSpec, mechanism: MechanismSpec, modules: _Modules) -> Budget:
-    timing = spec.timing
-    detections = modules.detections
-    repairs = any(modules.recoveries[name].kind.repairs for name in mechanism.recoveries)
-    if isinstance(mechanism.against, Within):
-        left_s, hazard = mechanism.against.within_s, mechanism.against.hazard
-    elif mechanism.against is not Hazard.PARENT:
-        left_s, hazard = time_left(spec.robot, mechanism.against, min(
-            detections[name].parameters.get("margin_m", math.inf)
-            for name in mechanism.detections))
-    else:
-        parent = modules.mechanisms[str(modules.parents[mechanism.name])]
-        left_s = min(detections[name].soonest_s for name in parent.detections)
-        hazard = f"{parent.detect} of {parent.name} detects the consequence"
-    # Which input of a gate opens it is not known: count on the slowest.
-    detection_s = max(detections[name].latency_s for name in mechanism.detections)
-    return Budget(mechanism.name, hazard, left_s, detection_s, timing.arbitration_s,
-                  timing.actuation_s, timing.respawn_s if repairs else 0.0)
+    return [*(_of_mechanisms(spec) if spec.layers.ftm else ()),
+            *(_of_guards(spec) if spec.mobile else ())]
 
 
 def patience_s(spec: SystemSpec) -> dict[str, float]:
@@ -66,7 +87,119 @@ def patience_s(spec: SystemSpec) -> dict[str, float]:
     What is left of the time before the hazard when detection has taken its longest, and when the
     next recovery still has to be decided on and to take effect.
     """
-    modules = _Modules(spec)
-    return {mechanism.name: max(0.0, budget.margin_s + budget.respawn_s)
-            for mechanism in spec.mechanisms
-            for budget in [_of_mechanism(spec, mechanism, modules)]}
+    return {budget.name: max(0.0, budget.margin_s + budget.respawn_s)
+            for budget in _of_mechanisms(spec)}
+
+
+def _of_mechanisms(spec: SystemSpec) -> Iterator[Budget]:
+    timing = spec.timing
+    detections = {detection.name: detection for detection in spec.detections}
+    repairs = {recovery.name for recovery in spec.recoveries if recovery.kind.repairs}
+    mechanisms = {mechanism.name: mechanism for mechanism in spec.mechanisms}
+    parents = spec.build_ftm_tree().parents if mechanisms else {}
+    for mechanism in spec.mechanisms:
+        listens_to = [detections[name] for name in mechanism.detections]
+        if isinstance(mechanism.against, Within):
+            left_s, hazard = mechanism.against.within_s, mechanism.against.hazard
+        elif mechanism.against is not Hazard.PARENT:
+            left_s, hazard = time_left(spec.robot, mechanism.against, min(
+                detection.parameters.get("margin_m", math.inf) for detection in listens_to))
+        else:
+            parent = mechanisms[str(parents[mechanism.name])]
+            left_s = min(detections[name].soonest_s for name in parent.detections)
+            hazard = f"{parent.detect} of {parent.name} detects the consequence"
+        # Which input of a gate opens it is not known: count on the slowest.
+        detection_s = max(detection.latency_s for detection in listens_to)
+        yield Budget(mechanism.name, hazard, left_s, detection_s, timing.arbitration_s,
+                     timing.actuation_s,
+                     0.0 if repairs.isdisjoint(mechanism.recoveries) else timing.respawn_s)
+
+
+def _of_guards(spec: SystemSpec) -> Iterator[Budget]:
+    """Draw up the budgets of a mobile robot's guards beside the mechanisms."""
+    timing, layers = spec.timing, spec.layers
+    pilot = next((node.name for node in spec.nodes if node.kind is Kind.PILOT), "pilot")
+    hits = time_to_obstacle_s(spec.robot), "the robot hits an obstacle"
+    drifts = time_left(spec.robot, Hazard.DRIFT, math.inf)
+    cycle_s = timing.control_period_s  # of the pilot: one to see, one to command
+    for name, switched_on, (left_s, hazard), detection_s, decision_s in (
+            (pilot, True, hits, cycle_s, cycle_s),
+            ("blind_pilot", layers.safety_pilot_checks, hits, timing.scan_timeout_s, cycle_s),
+            ("dead_man", layers.dead_man, hits, timing.dead_man_timeout_s, 0.0),
+            ("manager_watch", layers.manager_watch and layers.ftm, drifts,
+             timing.manager_timeout_s, cycle_s),
+            ("silent_detection", layers.ftm, drifts, timing.detection_silence_timeout_s,
+             timing.arbitration_s)):
+        if switched_on:
+            yield Budget(name, hazard, left_s, detection_s, decision_s, timing.actuation_s)
+
+
+def find_wrong_times(spec: SystemSpec) -> Iterator[Finding]:
+    """Times that are missing, contradictory, or raise false alarms."""
+    timing = spec.timing
+    if spec.mobile is not None:
+        yield from find_too_little_room(spec.mobile)
+    else:
+        for field, value in msgspec.structs.asdict(timing).items():
+            if math.isnan(value):
+                yield Finding(f"$.timing.{field}", "missing; it is derived from [robot], and this "
+                                                   "system has none")
+    if timing.release_hold_max_s < timing.release_hold_s:
+        yield Finding("$.timing.release_hold_max_s", "must be no less than release_hold_s = "
+                      f"{timing.release_hold_s}", (timing.release_hold_max_s,))
+    yield from find_false_alarms(timing)
+    for first in ("backoff", "attempt"):
+        first_s = getattr(spec.supervision, f"{first}_s")
+        most_s = getattr(spec.supervision, f"{first}_max_s")
+        if most_s < first_s:
+            yield Finding(f"$.supervision.{first}_max_s",
+                          f"must be no less than {first}_s = {first_s:g}", (most_s,))
+
+
+def find_false_alarms(timing: Timing) -> Iterator[Finding]:
+    """Find timeouts so tight that a healthy system trips them."""
+    for field, period_field in _PERIODS.items():
+        value = getattr(timing, field)
+        problem = find_false_alarm(timing, value, period_field)
+        if problem:
+            yield Finding(f"$.timing.{field}", problem, (value,))
+
+
+def find_false_alarm(timing: Timing, timeout_s: float, period_field: str) -> str:
+    """Say what is wrong with a timeout on what comes with a period of `[timing]`; "" if nothing."""
+    period_s = getattr(timing, period_field)
+    least_s = PERIODS_TO_MISS * period_s
+    if timeout_s >= least_s - 1e-9:
+        return ""
+    return (f"would raise false alarms; at least {least_s:.3f} s, {PERIODS_TO_MISS} periods of "
+            f"{period_field} = {period_s:.3f} s, is right")
+
+
+def find_wrong_budget(spec: SystemSpec) -> Iterator[Finding]:
+    """Mechanisms that come too late, or race what there is not."""
+    root = spec.build_ftm_tree().root if spec.mechanisms else ""
+    detections = {detection.name: detection for detection in spec.detections}
+    for row, mechanism in numbered("mechanism", spec.mechanisms):
+        path, hazard = f"{row}.against", mechanism.against
+        if isinstance(hazard, Within):
+            continue
+        if spec.mobile is None and hazard is not Hazard.PARENT:
+            needs = "needs a [robot]; 'parent' or { within_s = ..., hazard = '...' } is right"
+            yield (Finding(path, f"'drift', which it is if left out, {needs}")
+                   if hazard is Hazard.DRIFT else Finding(path, needs, (hazard.value,)))
+        if hazard is Hazard.PARENT and mechanism.name == root:
+            yield Finding(path, f"{root} is the root of the FTMTree and has no parent to be "
+                          "faster than", (hazard.value,))
+        if hazard is Hazard.INTRUSION and any(
+                "margin_m" not in detections[name].parameters for name in mechanism.detections):
+            yield Finding(path, f"{mechanism.detect} needs parameters.margin_m, the distance at "
+                          "which it warns", (hazard.value,))
+    for path, detection in numbered("detection", spec.detections):
+        margin_m = detection.parameters.get("margin_m", 0.0)
+        if spec.mobile is not None and margin_m >= spec.robot.corridor_clearance_m:
+            yield Finding(f"{path}.parameters.margin_m", "would raise false alarms; it must be "
+                          f"below corridor_clearance_m = {spec.robot.corridor_clearance_m:g}",
+                          (margin_m,))
+    for budget in check(spec):
+        if not budget.fits:
+            yield Finding("$.timing", f"the time budget does not fit: {budget}")

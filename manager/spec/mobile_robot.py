@@ -1,4 +1,4 @@
-"""A mobile robot: the room it has, the time that leaves, and its guards beside the mechanisms.
+"""A mobile robot: the room it has, and the time that leaves.
 
 With v the top speed, b the braking and v^2 / 2b the braking distance, the robot may wait at most
 
@@ -13,7 +13,7 @@ With v the top speed, b the braking and v^2 / 2b the braking distance, the robot
   / v`; when the Safety Pilot dies, or its last sweep of the laser was made, an obstacle may be
   just beyond the stop distance.
 
-Watchdog values need not be guessed (`rampart.manager.spec.timeouts` bounds them). `derive_timeouts`
+Watchdog values need not be guessed (`rampart.manager.spec.budget` bounds them). `derive_timeouts`
 takes nine tenths of the upper bound; the heartbeat timeout is what is left of the command's after a
 respawn, because a crash is better masked by RM3 than noticed by DM2, but no more than five periods.
 """
@@ -26,8 +26,7 @@ from enum import StrEnum
 
 import msgspec
 
-from rampart.manager.spec.tables import Finding, Layers, NonNegative, Positive, Table, Timing
-from rampart.manager.spec.timeouts import Budget
+from rampart.manager.spec.tables import Finding, NonNegative, Positive, Table, Timing
 
 SHARE = 0.9
 """Of the time that is left, a derived timeout takes this much."""
@@ -155,45 +154,24 @@ def derive_timeouts(robot: Robot | None, timing: Timing) -> Timing:
         return timing
     drift = time_to_drift_s(robot)
     noticed_s = SHARE * (drift - timing.arbitration_s - timing.actuation_s)
+    cycle_s, obstacle = timing.control_period_s, time_to_obstacle_s(robot)
     derived = {
         "command_timeout_s": noticed_s,
         "localization_timeout_s": noticed_s,
         "detection_silence_timeout_s": noticed_s,
-        "manager_timeout_s": SHARE * (drift - timing.control_period_s - timing.actuation_s),
-        "scan_timeout_s": SHARE * (
-            time_to_obstacle_s(robot) - timing.control_period_s - timing.actuation_s),
-        "dead_man_timeout_s": SHARE * (time_to_obstacle_s(robot) - timing.actuation_s),
+        "manager_timeout_s": SHARE * (drift - cycle_s - timing.actuation_s),
+        "scan_timeout_s": SHARE * (obstacle - cycle_s - timing.actuation_s),
+        "dead_man_timeout_s": SHARE * (obstacle - timing.actuation_s),
     }
-    for field, value in derived.items():
-        if math.isnan(getattr(timing, field)):
-            timing = msgspec.structs.replace(timing, **{field: _to_millisecond(value)})
+    timing = msgspec.structs.replace(timing, **{
+        field: _to_millisecond(value) for field, value in derived.items()
+        if math.isnan(getattr(timing, field))})
     if math.isnan(timing.heartbeat_timeout_s):
         before_consequence_s = min(timing.command_timeout_s, timing.localization_timeout_s) - (
             timing.arbitration_s + timing.actuation_s + timing.respawn_s)
         timing = msgspec.structs.replace(timing, heartbeat_timeout_s=_to_millisecond(
             min(5 * timing.heartbeat_period_s, before_consequence_s)))
     return timing
-
-
-def guards(robot: Robot, timing: Timing, layers: Layers) -> Iterator[Budget]:
-    """Draw up the budgets of the guards beside the mechanisms that are switched on."""
-    drift_s, obstacle_s = time_to_drift_s(robot), time_to_obstacle_s(robot)
-    collision = "the robot hits an obstacle"
-    # The Safety Pilot decides in its own cycle: one to see, one to command.
-    yield Budget("safety_pilot", collision, obstacle_s, timing.control_period_s,
-                 timing.control_period_s, timing.actuation_s)
-    if layers.safety_pilot_checks:
-        yield Budget("blind_pilot", collision, obstacle_s, timing.scan_timeout_s,
-                     timing.control_period_s, timing.actuation_s)
-    if layers.dead_man:
-        yield Budget("dead_man", collision, obstacle_s, timing.dead_man_timeout_s, 0.0,
-                     timing.actuation_s)
-    if layers.manager_watch and layers.ftm:
-        yield Budget("manager_watch", _WORDS[Hazard.DRIFT], drift_s,
-                     timing.manager_timeout_s, timing.control_period_s, timing.actuation_s)
-    if layers.ftm:
-        yield Budget("silent_detection", _WORDS[Hazard.DRIFT], drift_s,
-                     timing.detection_silence_timeout_s, timing.arbitration_s, timing.actuation_s)
 
 
 def find_too_little_room(robot: Robot) -> Iterator[Finding]:

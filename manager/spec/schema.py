@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 
@@ -59,7 +59,7 @@ class NodeSpec(Table, frozen=True):
         name: Unique among nodes, detection and recovery modules.
         actor: Its class, `module:Class`.
         kind: What it is.
-        process: Name of the OS process it lives in; "" for one of its own name.
+        process: Name of the OS process it runs in; "" for one of its own name.
         respawn: Who brings it back: a recovery module, or "supervisor".
         parameters: For the actor. A value of a key in `_s` may name a `[timing]` value.
     """
@@ -84,7 +84,7 @@ class DetectionSpec(Table, frozen=True):
         name: Of the module, e.g. "DM1".
         title: For people.
         actor: Its class, `module:Class`.
-        process: OS process it lives in; "" for one of its own name.
+        process: OS process it runs in; "" for one of its own name.
         enabled: False leaves out every mechanism that listens to it.
     """
 
@@ -238,7 +238,7 @@ class SystemSpec(Table, frozen=True):
     def without_disabled(self) -> SystemSpec:
         """Return the spec without the mechanisms that are disabled; itself if none is.
 
-        Modules that are disabled stay: their processes run, but nobody acts on what they say.
+        Modules that are disabled stay: their processes run, but what they say has no effect.
         """
         off = {d.name for d in self.detections if not d.enabled}
         off |= {r.name for r in self.recoveries if not r.enabled}
@@ -252,13 +252,11 @@ class SystemSpec(Table, frozen=True):
         `process` is filled in. With the layer `ftm` off, those that make up fault tolerance (the
         detection modules, the recovery modules, the FTM Manager) are left out.
         """
-        actors = [
-            *self.nodes,
-            *(NodeSpec(m.name, m.actor, Kind.DETECTION, m.process, parameters=m.parameters)
-              for m in self.detections),
-            *(NodeSpec(m.name, m.actor, Kind.RECOVERY, m.process, parameters=m.parameters)
-              for m in self.recoveries),
-        ]
+        actors = list(self.nodes)
+        actors += [NodeSpec(m.name, m.actor, Kind.DETECTION, m.process, parameters=m.parameters)
+                   for m in self.detections]
+        actors += [NodeSpec(m.name, m.actor, Kind.RECOVERY, m.process, parameters=m.parameters)
+                   for m in self.recoveries]
         tolerance = {Kind.DETECTION, Kind.RECOVERY, Kind.MANAGER}
         return tuple(msgspec.structs.replace(node, process=node.process or node.name)
                      for node in actors if self.layers.ftm or node.kind not in tolerance)
@@ -320,3 +318,11 @@ class SystemSpec(Table, frozen=True):
     def build_safety_order(self) -> PartialOrder:
         """Build the order that says which recovery is safer: the first criterion alone."""
         return self.build_order(self.criteria[0])
+
+
+TABLES: dict[str, type[Table]] = {"": SystemSpec, "gate": AtLeast, "against": Within}
+"""All tables of a spec by their names in the file; "" is the whole."""
+for _field in msgspec.structs.fields(SystemSpec):
+    for _type in (_field.type, *get_args(_field.type)):
+        if isinstance(_type, type) and issubclass(_type, Table):
+            TABLES[_field.encode_name] = _type

@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from enum import Enum
-from typing import Any, TypeVar
+from itertools import chain
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
@@ -26,38 +27,13 @@ from rampart.files import toml
 from rampart.files.reading import FileError
 from rampart.manager.model.mechanisms import RecoveryKind
 from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
-from rampart.manager.spec.mobile_robot import Hazard, Robot, derive_timeouts
-from rampart.manager.spec.schema import (
-    NODE_KINDS,
-    AtLeast,
-    DetectionSpec,
-    EventSpec,
-    Kind,
-    MechanismSpec,
-    NodeSpec,
-    RecoverySpec,
-    SystemSpec,
-    Within,
-)
-from rampart.manager.spec.tables import Layers, SpecificationError, Supervision, Table, Timing
-
-__all__ = [
-    "AtLeast", "DetectionSpec", "EventSpec", "Hazard", "Kind", "Layers", "MechanismSpec",
-    "NodeSpec", "RecoverySpec", "Robot", "SpecificationError", "Supervision", "SystemSpec",
-    "Timing", "check_document", "check_modules", "parse_specification", "read_document",
-]
-
-TABLES: dict[str, type[Table]] = {
-    "": SystemSpec, "robot": Robot, "timing": Timing, "layers": Layers,
-    "supervision": Supervision, "node": NodeSpec, "detection": DetectionSpec,
-    "recovery": RecoverySpec, "mechanism": MechanismSpec, "event": EventSpec, "gate": AtLeast,
-    "against": Within,
-}
+from rampart.manager.spec.mobile_robot import Hazard, derive_timeouts
+from rampart.manager.spec.schema import NODE_KINDS, TABLES, SystemSpec
+from rampart.manager.spec.tables import Finding, SpecificationError, numbered
 
 ENUMS: dict[tuple[str, str], Iterable[Enum]] = {
     ("node", "kind"): NODE_KINDS, ("recovery", "kind"): RecoveryKind,
-    ("mechanism", "against"): Hazard,
-}
+    ("mechanism", "against"): Hazard}
 
 LARGEST, SMALLEST = 1e9, 1e-9
 """Of numbers that the analyses calculate with: squares and quotients of these are far from the
@@ -66,8 +42,6 @@ limits of a float, and a thousand million seconds are thirty years.
 
 LARGEST_INTEGER = 2 ** 63 - 1
 """In parameters, which go to an actor as they are, by way of MessagePack."""
-
-Row = TypeVar("Row", NodeSpec, DetectionSpec, RecoverySpec)
 
 MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
             "orders": 16}
@@ -130,76 +104,75 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
         SpecificationError: A field is missing, unknown or of the wrong type, or the spec makes no
             sense.
     """
-    for path, problem, shown in _find_unwritable(document):
-        raise SpecificationError(file, path, problem, *shown)
-    for key, value in document.items():  # by hand: msgspec gives no path that ends the key here
-        if key not in _known_fields(""):
-            raise _unknown_field(file, f"$.{key}", "", value)
-    for key, most in MAX_ROWS.items():
-        rows = document.get(key, ())
-        if isinstance(rows, list | dict) and len(rows) > most:
-            raise SpecificationError(file, f"$.{key}", f"{len(rows)} of them; at most {most} are "
-                                     "right")
-    _check_orders(document.get("orders", {}), file)
+    for finding in chain(_find_unwritable(document), _find_misshapen(document)):
+        raise _refusal(file, finding)
     try:
         spec = msgspec.convert(document, SystemSpec)
     except msgspec.ValidationError as error:
-        raise _explain(error, document, file) from None
+        raise _refusal(file, _explain(error, document)) from None
     spec = replace(spec, timing=derive_timeouts(spec.mobile, spec.timing))
     spec = _resolve_timing_names(spec, file)
-    finding = find_nonsense(spec)
-    if finding is None:
+    wrong = find_nonsense(spec)
+    if wrong is None:
         enabled = spec.without_disabled()
-        finding = find_nonsense_of_rest(enabled) if enabled is not spec else None
+        wrong = find_nonsense_of_rest(enabled) if enabled is not spec else None
         spec = enabled
-    if finding is not None:
-        raise SpecificationError(file, finding.path, finding.problem, *finding.value)
+    if wrong is not None:
+        raise _refusal(file, wrong)
     return spec
 
 
-def _find_unwritable(document: dict[str, Any]) -> Iterator[tuple[str, str, tuple[object, ...]]]:
-    """Find nesting without end, and numbers that no time, distance or count is.
+def _refusal(file: str, finding: Finding) -> SpecificationError:
+    return SpecificationError(file, finding.path, finding.problem, *finding.value)
 
-    Yields:
-        Path, what is wrong, and the value if it can be shown.
-    """
+
+def _find_unwritable(document: dict[str, Any]) -> Iterator[Finding]:
+    """Find nesting without end, and numbers that no time, distance or count is."""
     left: list[tuple[object, str, int, bool]] = [(document, "$", 0, False)]
     while left:
         value, path, depth, free = left.pop()
         if depth > toml.MAX_DEPTH:
-            yield "$", f"nested more than {toml.MAX_DEPTH} deep; a spec needs three levels", ()
-            return
-        if isinstance(value, dict) and any(len(key) > toml.MAX_KEY for key in value):
-            yield path, f"a key of more than {toml.MAX_KEY} characters", ()
-            return
-        if isinstance(value, dict):
+            yield Finding("$", f"nested more than {toml.MAX_DEPTH} deep; a spec needs three levels")
+        elif isinstance(value, dict) and any(len(key) > toml.MAX_KEY for key in value):
+            yield Finding(path, f"a key of more than {toml.MAX_KEY} characters")
+        elif isinstance(value, dict):
             left += [(member, f"{path}.{key}", depth + 1, free or key == "parameters")
                      for key, member in reversed(value.items())]
         elif isinstance(value, list):
             left += [(member, f"{path}[{index}]", depth + 1, free)
                      for index, member in reversed([*enumerate(value)])]
         elif isinstance(value, float) and not math.isfinite(value):
-            yield path, "expected a finite number", (value,)
+            yield Finding(path, "expected a finite number", (value,))
         elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-            yield path, f"expected an integer of at most {LARGEST_INTEGER}", (value,)
+            yield Finding(path, f"expected an integer of at most {LARGEST_INTEGER}", (value,))
         elif isinstance(value, int | float) and not free and value and not (
                 SMALLEST <= abs(value) <= LARGEST):
-            yield path, f"out of all proportion; between {SMALLEST:g} and {LARGEST:g} is right", (
-                value,)
+            yield Finding(path, f"out of all proportion; between {SMALLEST:g} and {LARGEST:g} is "
+                                "right", (value,))
 
 
-def _check_orders(orders: object, file: str) -> None:
-    """Check the shape of `[orders.*]` by hand: msgspec cannot name the key of a dict."""
+def _find_misshapen(document: dict[str, Any]) -> Iterator[Finding]:
+    """Find by hand what msgspec gives no path for that ends in the key of a dict."""
+    for key, value in document.items():
+        if key not in _known_fields(""):
+            yield _unknown_field(f"$.{key}", "", value)
+    for key, most in MAX_ROWS.items():
+        rows = document.get(key, ())
+        if isinstance(rows, list | dict) and len(rows) > most:
+            yield Finding(f"$.{key}", f"{len(rows)} of them; at most {most} are right")
+    orders = document.get("orders", {})
     if not isinstance(orders, dict):
-        raise SpecificationError(file, "$.orders", "expected a table of orders", orders)
+        yield Finding("$.orders", "expected a table of orders", (orders,))
+        return
     for name, relation in orders.items():
         if not isinstance(relation, dict):
-            raise SpecificationError(file, f"$.orders.{name}", "expected a table, recovery = "
-                                     "[recoveries that it is above]", relation)
+            yield Finding(f"$.orders.{name}", "expected a table, recovery = [recoveries that it is "
+                          "above]", (relation,))
+            return
         for upper, lowers in relation.items():
             if not isinstance(lowers, list) or not all(isinstance(x, str) for x in lowers):
-                raise SpecificationError(file, f"$.orders.{name}.{upper}",
-                                         "expected a list of recovery names", lowers)
+                yield Finding(f"$.orders.{name}.{upper}", "expected a list of recovery names",
+                              (lowers,))
 
 
 def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
@@ -214,23 +187,26 @@ def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
                                                  f"{', '.join(times)}", value)
         return times[value]
 
-    def resolved(table: str, rows: Sequence[Row]) -> tuple[Row, ...]:
-        return tuple(replace(row, parameters={
-            key: resolve(value, f"$.{table}[{index}].parameters.{key}") if key.endswith("_s")
-            else value for key, value in row.parameters.items()}) for index, row in enumerate(rows))
+    def resolved(path: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: resolve(value, f"{path}.parameters.{key}") if key.endswith("_s") else value
+                for key, value in parameters.items()}
 
     detections = []
-    for index, row in enumerate(resolved("detection", spec.detections)):
-        within_s = resolve(row.within_s, f"$.detection[{index}].within_s")
+    for path, row in numbered("detection", spec.detections):
+        parameters = resolved(path, row.parameters)
+        within_s = resolve(row.within_s, f"{path}.within_s")
         if math.isnan(within_s):
-            within_s = row.parameters.get("timeout_s", within_s)
-        detections.append(replace(row, within_s=within_s))
-    return replace(spec, nodes=resolved("node", spec.nodes), detections=tuple(detections),
-                   recoveries=resolved("recovery", spec.recoveries))
+            within_s = parameters.get("timeout_s", within_s)
+        detections.append(replace(row, within_s=within_s, parameters=parameters))
+    nodes = (replace(row, parameters=resolved(path, row.parameters))
+             for path, row in numbered("node", spec.nodes))
+    recoveries = (replace(row, parameters=resolved(path, row.parameters))
+                  for path, row in numbered("recovery", spec.recoveries))
+    return replace(spec, nodes=tuple(nodes), detections=tuple(detections),
+                   recoveries=tuple(recoveries))
 
 
-def _explain(error: msgspec.ValidationError, document: dict[str, Any],
-             file: str) -> SpecificationError:
+def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> Finding:
     """Turn msgspec's words into ours: add the value, and what is known where names are wrong."""
     # A problem may quote a key of the file, the path at the end cannot.
     found = re.fullmatch(r"(?s)(.*) - at `([^`]*)`", str(error))
@@ -244,10 +220,10 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any],
 
     missing = re.search(r"missing required field `(\w+)`", problem)
     if missing:
-        return SpecificationError(file, path, f"required field {missing[1]!r} is missing")
+        return Finding(path, f"required field {missing[1]!r} is missing")
     if "unknown field `" in problem:
         key = next(key for key in value if key not in _known_fields(field))
-        return _unknown_field(file, f"{path}.{key}", field, value[key])
+        return _unknown_field(f"{path}.{key}", field, value[key])
     if (table, field) in ENUMS:
         known = [member.value for member in ENUMS[table, field]]
         problem = f"unknown {field}; known: {', '.join(known)}"
@@ -259,14 +235,13 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any],
         problem = "expected 'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"
     elif "regex" in problem:
         problem = "expected a name: a letter, then letters, digits and underscores"
-    return SpecificationError(file, path, problem.replace("`", ""), value)
+    return Finding(path, problem.replace("`", ""), (value,))
 
 
 def _known_fields(table: str) -> list[str]:
     return [field.encode_name for field in msgspec.structs.fields(TABLES[table])]
 
 
-def _unknown_field(file: str, path: str, table: str, value: object) -> SpecificationError:
-    return SpecificationError(
-        file, path, f"unknown field; known: {', '.join(_known_fields(table))}"
-        + ("" if table else "; what an application is told stands in [application]"), value)
+def _unknown_field(path: str, table: str, value: object) -> Finding:
+    return Finding(path, f"unknown field; known: {', '.join(_known_fields(table))}" + (
+        "" if table else "; what an application is told stands in [application]"), (value,))

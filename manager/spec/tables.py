@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Collection, Iterable, Iterator
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
 
@@ -26,6 +26,9 @@ DERIVED = math.nan
 
 _LONGEST_SHOWN = 200
 """Characters of a value in a message."""
+
+
+Row = TypeVar("Row")
 
 
 class SpecificationError(ValueError):
@@ -124,6 +127,23 @@ class Finding(NamedTuple):
 def unknown(path: str, value: str, what: str, known: Collection[str]) -> Finding:
     """Return the finding for a name that is none; it lists those that are."""
     return Finding(path, f"unknown {what}; known: {', '.join(known) or 'none'}", (value,))
+
+
+def find_wrong_names(path: str, names: Iterable[str], what: str, known: Collection[str],
+                     again: str) -> Iterator[Finding]:
+    """Find names in a list that are unknown, or listed `again`."""
+    listed: set[str] = set()
+    for place, name in enumerate(names):
+        if name not in known:
+            yield unknown(f"{path}[{place}]", name, what, known)
+        if name in listed:
+            yield Finding(f"{path}[{place}]", again, (name,))
+        listed.add(name)
+
+
+def numbered(table: str, rows: Iterable[Row]) -> Iterator[tuple[str, Row]]:
+    """Yield the rows of an array of tables, each with its path in the file."""
+    return ((f"$.{table}[{index}]", row) for index, row in enumerate(rows))
 
 
 class Supervision(Table, frozen=True):

@@ -6,7 +6,7 @@ tables of bitmasks that are made once, at load.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from functools import lru_cache, reduce
 from operator import or_
 
@@ -42,12 +42,10 @@ class Arrangement:
         self.asks = {name: order.mask(way) for name, way in mechanisms.recover.items()}
         self._bits = {name: tree.bit[name] | mask << self._width
                       for name, mask in self.asks.items()}
-        self._conflicts = {
-            name: order.mask(
-                other for other in order.names if other != name and (
-                    mechanisms.overlap(name, other) or mechanisms.harms(name, other)
-                    or mechanisms.harms(other, name)))
-            for name in order.names}
+        self._conflicts = {name: order.mask(
+            other for other in order.names if other != name and (
+                mechanisms.overlap(name, other) or mechanisms.harms(name, other)
+                or mechanisms.harms(other, name))) for name in order.names}
 
     def masks(self, active: Iterable[str]) -> tuple[int, int]:
         """Return the active mechanisms as a mask of `tree`, their recoveries as one of `order`.
@@ -62,14 +60,24 @@ class Arrangement:
                                       f"{', '.join(self.mechanisms.names)}") from None
         return bits & self._ftms, bits >> self._width
 
-    def demanded(self, active: Iterable[str], failed: Collection[str] = ()) -> tuple[str, ...]:
+    def demanded(self, active: Iterable[str]) -> tuple[str, ...]:
         """Return the recoveries that mechanisms ask for, each once, in the mechanisms' sequence."""
         return tuple(dict.fromkeys(
-            recovery for name in active for recovery in self.mechanisms.available(name, failed)))
+            recovery for name in active for recovery in self.mechanisms.recover[name]))
 
     def can_join(self, recovery: str, others: int) -> bool:
         """Tell whether a recovery can run beside others: no common claim, no need disabled."""
         return not self._conflicts[recovery] & others
+
+    def compatible(self, recoveries: Iterable[str]) -> tuple[str, ...]:
+        """Return those of some recoveries that can join those before them."""
+        taken: list[str] = []
+        mask = 0
+        for name in recoveries:
+            if self.can_join(name, mask):
+                taken.append(name)
+                mask |= self.order.bit[name]
+        return tuple(taken)
 
 
 arrange = lru_cache(maxsize=16)(Arrangement)

@@ -98,7 +98,6 @@ def turned_down(order: PartialOrder, taken: Collection[str], candidates: Iterabl
 def undominated(order: PartialOrder, names: Iterable[str]) -> tuple[tuple[str, str], ...]:
     """Return, for each element of a set without a greatest, one that it does not dominate."""
     members = tuple(dict.fromkeys(names))
-    return tuple(
-        (name, "does not dominate " + next(
-            other for other in members if other != name and not order.is_above(name, other)))
+    return tuple((name, "does not dominate " + next(
+        other for other in members if other != name and not order.is_above(name, other)))
         for name in members)

@@ -9,7 +9,7 @@ things worse.
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import msgspec
 
@@ -40,7 +40,10 @@ def escalate(decision: Decision, failures: Mapping[str, str], arrangement: Arran
             recoveries.update(dict.fromkeys(_companions(tried[-1], sakes, failures, arrangement)))
         rejected.extend((failed, f"failed: {failures[failed]}; escalated to {following}")
                         for failed, following in pairwise(tried))
-    taken = _compatible(tuple(recoveries), arrangement)
+    # What was escalated to may claim what another recovery of the decision claims.
+    compatible = arrangement.compatible(
+        sorted(recoveries, key=arrangement.order.number.__getitem__))
+    taken = tuple(name for name in recoveries if name in compatible)
     rejected.extend((name, "conflicts with the recovery that was escalated to")
                     for name in recoveries if name not in taken)
     return msgspec.structs.replace(
@@ -60,15 +63,12 @@ def succession(recovery: str, sakes: Iterable[str], failures: Container[str],
     above = list(reversed(tree.chain(tree.root, closest)))
     if closest in wanting and recovery in mechanisms.recover[closest]:
         above.pop(0)
-    alternatives = [name for mechanism in wanting
-                    for way in mechanisms.alternatives(mechanism)
-                    if not any(one in failures for one in way)
-                    for name in way]
+    alternatives = list(chain.from_iterable(_ways_left(wanting, failures, arrangement)))
+    higher = arrangement.demanded(above)
     while tried[-1] in failures:
         named = mechanisms.contracts[tried[-1]].escalate_to
-        candidates = [*alternatives, *([named] if named else [])]
-        candidates += [name for mechanism in above for name in mechanisms.recover[mechanism]]
-        following = next((name for name in candidates if name not in tried), None)
+        following = next((name for name in (*alternatives, named, *higher)
+                          if name and name not in tried), None)
         if following is None:
             break
         tried.append(following)
@@ -78,22 +78,11 @@ def succession(recovery: str, sakes: Iterable[str], failures: Container[str],
 def _companions(recovery: str, sakes: Iterable[str], failures: Container[str],
                 arrangement: Arrangement) -> tuple[str, ...]:
     """Return what an alternative runs together with a recovery, itself included; () for none."""
-    ways = (way for mechanism in sakes for way in arrangement.mechanisms.alternatives(mechanism))
-    return next((way for way in ways if recovery in way
-                 and not any(one in failures for one in way)), ())
+    return next((way for way in _ways_left(sakes, failures, arrangement) if recovery in way), ())
 
 
-def _compatible(recoveries: tuple[str, ...], arrangement: Arrangement) -> tuple[str, ...]:
-    """Return the recoveries that can run together, those higher in the order first.
-
-    What was escalated to may claim what another recovery of the decision claims.
-    """
-    order = arrangement.order
-    if len(recoveries) < 2:
-        return recoveries
-    taken, mask = set(), 0
-    for name in sorted(recoveries, key=order.number.__getitem__):
-        if arrangement.can_join(name, mask):
-            taken.add(name)
-            mask |= order.bit[name]
-    return tuple(name for name in recoveries if name in taken)
+def _ways_left(sakes: Iterable[str], failures: Container[str], arrangement: Arrangement
+               ) -> list[tuple[str, ...]]:
+    """Return the alternatives of some mechanisms in which no recovery has failed."""
+    return [way for mechanism in sakes for way in arrangement.mechanisms.alternatives(mechanism)
+            if not any(one in failures for one in way)]

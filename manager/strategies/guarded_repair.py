@@ -9,7 +9,7 @@ Our own strategy. The paper's safety-first has two costs, both found by `rampart
   once, FTM4 and FTM7, end in RM1. And it is not monotone: with FTM6 active *as well*, it is RM5.
 
 Repair under guard separates the two things that recoveries do. One recovery, the *guard*, takes
-the robot to a state that is safe enough for everybody: the least drastic one that is at least as
+the robot to a state that is safe enough for all of them: the mildest one that is at least as
 safe as each recovery asked for. Beneath it all repairs that are asked for run at once, so that the
 causes go away and the guard can be released.
 """
@@ -99,10 +99,11 @@ class GuardedRepair:
         mask = order.mask(taken)
         waiting = {name for name in candidates if arrangement.repairs & order.bit[name]
                    and not arrangement.can_join(name, mask)}
+        rejected = (
+            (name, "waits, another recovery claims the same" if name in waiting else why)
+            for name, why in turned_down(order, taken, candidates))
         return msgspec.structs.replace(
-            decision, path=dominance(order, taken, candidates) or taken,
-            rejected=tuple((name, "waits, another recovery claims the same" if name in waiting
-                            else why) for name, why in turned_down(order, taken, candidates)))
+            decision, path=dominance(order, taken, candidates) or taken, rejected=tuple(rejected))
 
 
 def _numbers(mask: int) -> list[int]:

@@ -25,9 +25,9 @@ class MissionFirst:
     conflict the one above in the order, else the one of the deeper mechanism, else the one
     declared first.
 
-    1. Nobody is late.
-    2. Somebody is late, so a barrier further up was taken.
-    3. The mechanism at the root is active: there is no more time for anybody, its recovery.
+    1. No active mechanism is late.
+    2. At least one is late, so a barrier further up was taken.
+    3. The mechanism at the root is active, no time is left for a deeper one: its recovery.
     """
 
     name = "mission-first"
@@ -61,23 +61,18 @@ class MissionFirst:
         mask = order.mask(demanded)
         ranked_recoveries = sorted(
             demanded, key=lambda r: (order.up_set[order.number[r]] & mask).bit_count())
-        taken: list[str] = []
-        mask = 0
-        for recovery in ranked_recoveries:
-            if arrangement.can_join(recovery, mask):
-                taken.append(recovery)
-                mask |= order.bit[recovery]
-        sakes = mechanisms.sort(
-            n for n in highest if arrangement.asks[n] & mask)
-        return Decision(active, 2 if climbed else 1, tuple(taken), sakes)
+        taken = arrangement.compatible(ranked_recoveries)
+        mask = order.mask(taken)
+        sakes = mechanisms.sort(n for n in highest if arrangement.asks[n] & mask)
+        return Decision(active, 2 if climbed else 1, taken, sakes)
 
     def explain(self, decision: Decision, arrangement: Arrangement) -> Decision:
         """Say which barriers were taken, and why the others wait."""
         tree, recover = arrangement.tree, arrangement.mechanisms.recover
         path, rejected = [], []
         for name in decision.active:
-            upper = next((m for m in decision.mechanisms if m == name or tree.is_above(m, name)),
-                         None)
+            upper = next((m for m in decision.mechanisms
+                          if m == name or tree.is_above(m, name)), None)
             if upper is not None:
                 path.append(" > ".join(tree.chain(upper, name)))
             for recovery in recover[name]:

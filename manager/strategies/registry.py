@@ -23,7 +23,8 @@ from rampart.manager.strategies.mission_first import MissionFirst
 from rampart.manager.strategies.safety_first import SafetyFirst
 from rampart.manager.strategies.simultaneous import Simultaneous
 
-STRATEGIES: dict[str, Strategy] = {}
+STRATEGIES: dict[str, Strategy] = {strategy.name: strategy for strategy in (
+    SafetyFirst(), MissionFirst(), Simultaneous(), GuardedRepair())}
 
 MEMORY = 4096
 """Decisions to remember; seven mechanisms have 128 active sets."""
@@ -44,21 +45,16 @@ def register(strategy: Strategy) -> None:
     STRATEGIES[strategy.name] = strategy
 
 
-for _strategy in (SafetyFirst(), MissionFirst(), Simultaneous(), GuardedRepair()):
-    register(_strategy)
-
-
 def find_strategy(name: str) -> Strategy:
     """Return the strategy of that name.
 
     Raises:
         UnknownStrategyError: There is none; the message lists those there are.
     """
-    try:
-        return STRATEGIES[name]
-    except KeyError:
+    if name not in STRATEGIES:
         raise UnknownStrategyError(
-            f"unknown strategy {name!r}; known: {', '.join(sorted(STRATEGIES))}") from None
+            f"unknown strategy {name!r}; known: {', '.join(sorted(STRATEGIES))}")
+    return STRATEGIES[name]
 
 
 class Decider:
@@ -67,8 +63,8 @@ class Decider:
     def __init__(self, strategy: Strategy, arrangement: Arrangement) -> None:
         self.strategy = strategy
         self.arrangement = arrangement
-        self._choose = lru_cache(MEMORY)(lambda active, late: strategy.choose(
-            active, arrangement, late))
+        self._choose = lru_cache(MEMORY)(
+            lambda active, late: strategy.choose(active, arrangement, late))
         self._explain = lru_cache(MEMORY)(lambda decision: strategy.explain(decision, arrangement))
 
     def choose(self, active: tuple[str, ...], late: Late = frozenset()) -> Decision:
@@ -83,8 +79,8 @@ class Decider:
 
 
 def decide(active: Iterable[str], mechanisms: Mechanisms, tree: Tree,  # noqa: PLR0917
-           order: PartialOrder,
-           strategy: str = "safety-first", late: Collection[str] = ()) -> Decision:
+           order: PartialOrder, strategy: str = "safety-first", late: Collection[str] = ()
+           ) -> Decision:
     """Decide by the strategy of that name, with the certificate.
 
     Raises:

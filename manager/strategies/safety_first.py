@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import msgspec
+from msgspec.structs import replace
 
 from rampart.manager.strategies.arrangement import Arrangement
 from rampart.manager.strategies.decision import (
@@ -61,25 +61,21 @@ class SafetyFirst:
         """Give the path of dominance, and why the others were rejected."""
         tree, order = arrangement.tree, arrangement.order
         recover = arrangement.mechanisms.recover
-        names, taken = decision.active, decision.recoveries
+        names, taken, chosen = decision.active, decision.recoveries, decision.mechanisms[0]
         if decision.rule == 1:
-            return msgspec.structs.replace(decision, path=names)
+            return replace(decision, path=names)
         if decision.rule == 2:
-            chosen = decision.mechanisms[0]
-            return msgspec.structs.replace(
-                decision, path=chains(tree, chosen, names), rejected=tuple(
-                    (recovery, f"{name} is dominated by {chosen}")
-                    for name in names for recovery in recover[name] if recovery not in taken))
-        no_block_2 = undominated(tree, names)
-        candidates = arrangement.demanded(names)
+            return replace(decision, path=chains(tree, chosen, names), rejected=tuple(
+                (recovery, f"{name} is dominated by {chosen}")
+                for name in names for recovery in recover[name] if recovery not in taken))
+        no_block_2, candidates = undominated(tree, names), arrangement.demanded(names)
         if decision.rule == 3:
-            return msgspec.structs.replace(
-                decision, path=dominance(order, taken, candidates) or taken,
-                rejected=no_block_2 + turned_down(order, taken, candidates))
-        return msgspec.structs.replace(
-            decision, path=chains(tree, decision.mechanisms[0], names),
-            rejected=no_block_2 + tuple(
-                pair for pair in undominated(order, candidates) if pair[0] not in taken))
+            return replace(decision, path=dominance(order, taken, candidates) or taken,
+                           rejected=no_block_2 + turned_down(order, taken, candidates))
+        no_block_3 = tuple(
+            pair for pair in undominated(order, candidates) if pair[0] not in taken)
+        return replace(
+            decision, path=chains(tree, chosen, names), rejected=no_block_2 + no_block_3)
 
 
 def _dominating(active: tuple[str, ...], arrangement: Arrangement, rms: int) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, Header, on
 from rampart.actors.runtime.fault_watch import FaultWatch
-from rampart.manager.spec.specification import Kind, SystemSpec
+from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.scenario import FaultOutcome, OnProcess, PlannedFault, action_of
 

@@ -28,7 +28,7 @@ from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.run.run_plan import SUPERVISOR
 from rampart.actors.runtime.actor import Actor, Context, on
 from rampart.actors.runtime.injection import MAX_DELAYED, MAX_IN_FORCE
-from rampart.actors.runtime.mailbox import Mailbox
+from rampart.actors.runtime.mailbox import Dispatcher
 from rampart.cli.osmosis.lines import OsmosisLines
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.sim.osmosis.actuator_faults import ActuatorFaults, Motor
@@ -208,15 +208,16 @@ def test_a_flood_of_strangers_does_not_bring_a_superseded_node_back():
 
 def test_strangers_in_the_mailbox_leave_room_for_the_nodes_of_the_system():
     refused = []
-    mailbox = Mailbox(capacity=8, slots=8, on_overflow=refused.append)
-    assert [mailbox.put(n, reserved=False) for n in range(6)] == [True] * 4 + [False] * 2
-    assert [mailbox.put(n) for n in range(6)] == [True] * 4 + [False] * 2
+    mailbox = Dispatcher(True, refused.append, capacity=8, slots=8)
+    assert [mailbox.put_message(None, n, reserved=False) for n in range(6)] == (
+        [True] * 4 + [False] * 2)
+    assert [mailbox.put_message(None, n) for n in range(6)] == [True] * 4 + [False] * 2
     assert [mailbox.put_message(f"{n}", n, reserved=False) for n in range(6)] == (
         [True] * 4 + [False] * 2)
     assert [mailbox.put_message(f"node {n}", n) for n in range(6)] == [True] * 4 + [False] * 2
     assert mailbox.put_message("0", "the newest", reserved=False)
     assert mailbox.overflowed == len(refused) == 8
-    mailbox.put_latest("timer", "an item of its own always has room")
+    mailbox.put("timer", "an item of its own always has room")
     assert len(mailbox) == 17
 
 

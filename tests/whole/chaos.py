@@ -33,7 +33,7 @@ from rampart.actors.runtime.checkpoint_store import SqliteCheckpoints
 from rampart.actors.supervision.kill_node import SIGNALS
 from rampart.actors.supervision.process_title import find_processes, process_state
 from rampart.actors.supervision.spawner import NAMES
-from rampart.manager.spec.specification import Kind, SystemSpec
+from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.testing import RealRun
 
 WAYS = ("KILL", "STOP", "SEGV", "WEDGE")

@@ -14,12 +14,11 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.detection.disagreement import Disagreement, Vote, agreeing, apart
 from rampart.actors.detection.finding import Sustained
-from rampart.actors.detection.process_usage import ProcessUsage
+from rampart.actors.detection.process_usage import ProcessUsage, Usage, read_usage
 from rampart.actors.detection.progress import Progress, ProgressMonitor, Step
 from rampart.actors.detection.rate import Rate, RateMonitor
 from rampart.actors.detection.threshold import Threshold
 from rampart.actors.runtime.parameters import read_parameters
-from rampart.actors.runtime.usage import Usage, read_usage
 from rampart.testing import Ear, VirtualSystem, play, run, table
 from tests.tank import LEVEL, PUMP, SECOND, THIRD, TOPICS, Level, Phase, Pump
 

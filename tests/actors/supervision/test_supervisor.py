@@ -141,8 +141,9 @@ class Machine:
 
     def end(self, handles: Sequence[Handle], grace_s: float) -> None:
         for handle in handles:
-            self.ended.append(handle._process.names[0])
-            handle.kill()
+            if isinstance(handle, Handle):  # else there was no process, or no descriptor for it
+                self.ended.append(handle._process.names[0])
+                handle.kill()
 
     def close(self) -> None:
         pass

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rampart.manager.spec.budget import check
+from rampart.manager.spec.budget import check, find_false_alarms
 from rampart.manager.spec.mobile_robot import (
     derive_timeouts,
     time_to_drift_s,
@@ -15,7 +15,6 @@ from rampart.manager.spec.mobile_robot import (
 )
 from rampart.manager.spec.schema import Within
 from rampart.manager.spec.tables import Timing
-from rampart.manager.spec.timeouts import find_false_alarms
 from tests.manager.bench import full_system, paper
 
 SPEC = paper()
@@ -170,6 +169,5 @@ def test_all_timeouts_are_guarded_against_false_alarms():
                          "dead_man_timeout_s": 0.15,
                          "manager_timeout_s": 0.3, "detection_silence_timeout_s": 0.6}.items():
         assert not list(find_false_alarms(with_timing(**{field: least}).timing))
-        path, value, _ = next(find_false_alarms(
-            with_timing(**{field: least - 0.01}).timing))
-        assert (f"$.timing.{field}", least - 0.01) == (path, value)
+        alarm = next(find_false_alarms(with_timing(**{field: least - 0.01}).timing))
+        assert (alarm.path, alarm.value) == (f"$.timing.{field}", (least - 0.01,))

@@ -23,7 +23,9 @@ from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleopera
 from rampart.actors.osmosis.messages import Mode
 from rampart.actors.runtime.actor import Actor, Context, every, on
 from rampart.actors.runtime.clock import Clock
-from rampart.manager.spec.specification import Layers, Robot, SystemSpec, Timing
+from rampart.manager.spec.mobile_robot import Robot
+from rampart.manager.spec.schema import SystemSpec
+from rampart.manager.spec.tables import Layers, Timing
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from tests.actors.osmosis.control.world import Circle, World

@@ -1,0 +1,54 @@
+"""What an actor is given when it is made: name, clock, bus, parameters, where its state is kept."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+
+from rampart.actors.bus.bus import Bus
+from rampart.actors.bus.run_folder import Register
+from rampart.actors.bus.topic import Topic
+from rampart.actors.run.run_context import RunContext
+from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
+from rampart.actors.runtime.clock import Clock
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What an actor is given when it is made.
+
+    Attributes:
+        name: the node's name, unique in the system.
+        incarnation: which process of the node this is, counted from 1.
+        clock: simulated time.
+        bus: this actor's access to the bus, not yet open.
+        parameters: the node's parameters, as the system spec gives them or read already.
+        run: what all actors of the run have in common, loaded once.
+        pid: number of the process that it runs in.
+        checkpoints: where this node's state is kept.
+        heartbeat_period_s: simulated seconds between two heartbeats.
+        failed: told of the error that ends the actor, while its peers still see it alive.
+        register: returns the incarnation of a node that was issued last, None if it is not known.
+        members: names of all nodes of the system; what others make it remember is bounded.
+        topics: those that parameters of the system's nodes name, by key.
+        usage: returns what a process uses of the machine, in place of the kernel.
+    """
+
+    name: str
+    incarnation: int
+    clock: Clock
+    bus: Bus
+    parameters: Mapping[str, Any] | msgspec.Struct = field(default_factory=dict)
+    run: RunContext = field(default_factory=RunContext)
+    pid: int = field(default_factory=os.getpid)
+    checkpoints: CheckpointStore = field(default_factory=NoCheckpoints)
+    heartbeat_period_s: float = 0.1
+    failed: Callable[[Exception], None] = lambda _error: None
+    register: Register = lambda _node: None
+    members: frozenset[str] = frozenset()
+    topics: Mapping[str, Topic[Any]] = field(default_factory=dict)
+    usage: Callable[[int], Any] | None = None
