@@ -15,6 +15,8 @@ from quadrotor.vehicle import G_MPS2, HOVER_N, INERTIA_KGM2, MASS_KG, Thrusts, V
 MOST_ACCEL_MPS2 = 3.0
 """Horizontally: a tilt of 17°."""
 CLIMB_MPS = 1.5
+_LIGHT_SHARE = 0.85
+"""With less thrust than this share of the weight it may stand on the ground: no trim is learnt."""
 STEP_S = 0.01
 """Of the pilot's loops."""
 
@@ -27,7 +29,8 @@ def bounded(value: float, most: float) -> float:
 class PositionControl:
     """Position → velocity (P) → acceleration (PI), in `map`."""
 
-    _POSITION_HZ, _SPEED_HZ, _REST_HZ2 = 0.9, 2.2, 0.5
+    _POSITION_HZ, _SPEED_HZ = 0.9, 2.2
+    _REST_HZ2: Vector = (0.5, 0.5, 2.5)
     _MOST_REST_MPS2 = 2.5
 
     def __init__(self) -> None:
@@ -52,7 +55,7 @@ class PositionControl:
         for i, (wanted, have) in enumerate(zip(velocity_mps, now, strict=True)):
             wrong = wanted - have
             self._rest[i] = bounded(
-                self._rest[i] + self._REST_HZ2 * bounded(wrong, 1.0) * step_s, self._MOST_REST_MPS2)
+                self._rest[i] + self._REST_HZ2[i] * bounded(wrong, 1.0) * step_s, self._MOST_REST_MPS2)
             asked.append(self._SPEED_HZ * wrong + self._rest[i])
         east, north, upward = asked
         shorter = min(1.0, MOST_ACCEL_MPS2 / max(math.hypot(east, north), 1e-6))
@@ -99,8 +102,9 @@ class AttitudeControl:
         for i in range(3):
             asked = bounded(sign * wrong[i + 1] * speeds[i], 4.0 if i < 2 else 1.0)
             short = asked - rate_radps[i]
-            self._rest[i] = bounded(self._rest[i] + self._REST_HZ2[i] * short * STEP_S,
-                                    self._MOST_REST_RADPS2[i])
+            if force[2] > _LIGHT_SHARE * G_MPS2:
+                self._rest[i] = bounded(self._rest[i] + self._REST_HZ2[i] * short * STEP_S,
+                                        self._MOST_REST_RADPS2[i])
             torque.append(INERTIA_KGM2[i] * (self._RATE_HZ[i] * short + self._rest[i]))
         self.trim = max(abs(f - HOVER_N) for f in mix(4 * HOVER_N, (
             INERTIA_KGM2[0] * self._rest[0], INERTIA_KGM2[1] * self._rest[1], 0.0))) / HOVER_N

@@ -1,7 +1,7 @@
 """The estimator: fuses IMUs, GPS, barometer and magnetometer into position, velocity and attitude.
 
 A complementary filter with fixed gains. The accelerometer leads; the velocity of the GPS corrects
-within half a second, its position within eight. So a position that jumps or drifts away pulls the
+within half a second, its position within five. So a position that jumps or drifts away pulls the
 estimate slowly enough to be noticed: it disagrees with the estimate, and detection modules compare
 the two. `FusedState` is pure.
 """
@@ -19,7 +19,7 @@ from rampart import Actor, Context, Header, every, on
 
 _STEP_S = 0.01
 _GPS_S = 0.1
-_SPEED_S, _PLACE_S, _HEIGHT_S = 0.5, 8.0, 8.0
+_SPEED_S, _PLACE_S, _HEIGHT_S = 0.4, 5.0, 8.0
 _BARO_HZ, _BARO_HZ2 = 0.56, 0.16
 _MOST_OFF_M, _MOST_OFF_MPS = 2.0, 2.0
 """What a sensor says is taken to be no further off than this."""

@@ -81,8 +81,8 @@ class Physics:
 
     @property
     def command_age_s(self) -> float:
-        """For how long no command came, s; at most an hour."""
-        return min(self.now_s - self._commanded_s, 3600.0)
+        """For how long no command came, s; 0 before the first."""
+        return max(self.now_s - self._commanded_s, 0.0) if self._commanded_s > -math.inf else 0.0
 
     @property
     def turning(self) -> bool:
