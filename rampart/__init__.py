@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rampart.actors.runtime.actor import Actor, Context, every, on
     from rampart.actors.runtime.checkpoint import StateFormat
     from rampart.actors.runtime.fault_watch import Order
+    from rampart.actors.runtime.parameters import FieldName, Suspects
     from rampart.actors.runtime.timer import Timer
     from rampart.manager.analysis.verification import verify
     from rampart.manager.arbitration.arbiter import Arbiter, build_arbiter
@@ -62,6 +63,7 @@ __all__ = [
     "Disturbance",
     "Fault",
     "Faults",
+    "FieldName",
     "Header",
     "HeldOrder",
     "InjectionReport",
@@ -82,6 +84,7 @@ __all__ = [
     "SpecificationError",
     "StateFormat",
     "Strategy",
+    "Suspects",
     "SystemSpec",
     "Tick",
     "Timer",
@@ -112,6 +115,7 @@ _HOMES = {
     "actors.runtime.actor": ("Actor", "Context", "every", "on"),
     "actors.runtime.checkpoint": ("StateFormat",),
     "actors.runtime.fault_watch": ("Order",),
+    "actors.runtime.parameters": ("FieldName", "Suspects"),
     "actors.runtime.timer": ("Timer",),
     "manager.analysis.verification": ("verify",),
     "manager.arbitration.arbiter": ("Arbiter", "build_arbiter"),

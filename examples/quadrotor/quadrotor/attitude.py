@@ -138,6 +138,7 @@ class VerticalFilter:
     def __init__(self) -> None:
         self.height_m = self.speed_mps = 0.0
         self._known = False
+        self._last_m = math.nan
 
     def step(self, upward_mps2: float, step_s: float) -> None:
         """Go on by a time."""
@@ -146,8 +147,9 @@ class VerticalFilter:
 
     def measured(self, altitude_m: float, step_s: float) -> None:
         """Take the height that the barometer says, each so many seconds."""
-        if not math.isfinite(altitude_m):
+        if not math.isfinite(altitude_m) or altitude_m == self._last_m:
             return
+        self._last_m = altitude_m
         if not self._known:
             self.height_m, self._known = altitude_m, True
         off_m = min(max(altitude_m - self.height_m, -self._JUMP_M), self._JUMP_M)

@@ -55,7 +55,8 @@ class PositionControl:
         for i, (wanted, have) in enumerate(zip(velocity_mps, now, strict=True)):
             wrong = wanted - have
             self._rest[i] = bounded(
-                self._rest[i] + self._REST_HZ2[i] * bounded(wrong, 1.0) * step_s, self._MOST_REST_MPS2)
+                self._rest[i] + self._REST_HZ2[i] * bounded(wrong, 1.0) * step_s,
+                self._MOST_REST_MPS2)
             asked.append(self._SPEED_HZ * wrong + self._rest[i])
         east, north, upward = asked
         shorter = min(1.0, MOST_ACCEL_MPS2 / max(math.hypot(east, north), 1e-6))

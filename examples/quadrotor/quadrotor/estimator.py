@@ -3,7 +3,8 @@
 A complementary filter with fixed gains. The accelerometer leads; the velocity of the GPS corrects
 within half a second, its position within five. So a position that jumps or drifts away pulls the
 estimate slowly enough to be noticed: it disagrees with the estimate, and detection modules compare
-the two. `FusedState` is pure.
+the two. What a sensor repeats to the last digit is not taken twice: it is stuck.
+`FusedState` is pure.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ _MOST_OFF_M, _MOST_OFF_MPS = 2.0, 2.0
 """What a sensor says is taken to be no further off than this."""
 
 _WAIT_S = 0.15
+_LATE_S = 0.3
 
 
 class FusedState:
@@ -39,6 +41,8 @@ class FusedState:
         self.position = [0.0, 0.0, 0.0]
         self.velocity = [0.0, 0.0, 0.0]
         self.fix_s = -math.inf
+        self._last_fix: t.GpsFix | None = None
+        self._last_altitude_m = math.nan
 
     def step(self, accel_mps2: Vector, step_s: float) -> None:
         """Go on by a time, with the acceleration in `map`."""
@@ -50,8 +54,9 @@ class FusedState:
         """Take a fix of the GPS."""
         place = gps.x_m, gps.y_m, gps.z_m
         speed = gps.velocity_x_mps, gps.velocity_y_mps, gps.velocity_z_mps
-        if not all(map(math.isfinite, (*place, *speed))):
+        if gps == self._last_fix or not all(map(math.isfinite, (*place, *speed))):
             return
+        self._last_fix = gps
         if self.fix_s == -math.inf:
             self.position, self.velocity = list(place), list(speed)
         slow = (_PLACE_S, _PLACE_S, _HEIGHT_S)
@@ -63,7 +68,8 @@ class FusedState:
 
     def pressure(self, altitude_m: float, step_s: float) -> None:
         """Take a height of the barometer, each so many seconds."""
-        if math.isfinite(altitude_m):
+        if math.isfinite(altitude_m) and altitude_m != self._last_altitude_m:
+            self._last_altitude_m = altitude_m
             off_m = bounded(altitude_m - self.position[2], _MOST_OFF_M)
             self.position[2] += _BARO_HZ * step_s * off_m
             self.velocity[2] += _BARO_HZ2 * step_s * off_m
@@ -100,8 +106,8 @@ class Estimator(Actor):
 
     @on(t.GPS)
     def gps(self, message: t.GpsFix, header: Header) -> None:
-        """Take a fix, unless it is one that was taken already."""
-        if header.stamp > self._state.fix_s:
+        """Take a fix, unless it is late, or was taken already."""
+        if header.stamp > self._state.fix_s and self.clock.now() - header.stamp < _LATE_S:
             self._state.fix(message, header.stamp)
 
     @on(t.BAROMETER)

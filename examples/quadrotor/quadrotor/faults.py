@@ -14,7 +14,7 @@ from typing import Any
 from quadrotor import topics as t
 from rampart import Disturbance, Fault, Faults, Order, ScenarioError, Topic
 
-_WEAK, _DRAIN = 0.7, 20.0
+_WEAK, _DRAIN = 0.7, 12.0
 _KINDS = {"weak-rotor": "rotor", "battery-drain": "battery"}
 
 
@@ -49,7 +49,7 @@ class QuadrotorFaults(Faults):
     others = {"vehicle": (*(f"weak-rotor:{i}:{_WEAK}" for i in range(4)),
                           f"battery-drain:{_DRAIN:g}")}
     titled = {"weak-rotor": ("vehicle", "the front left rotor loses 30 % of its thrust"),
-              "battery-drain": ("vehicle", "the battery drains twenty times as fast")}
+              "battery-drain": ("vehicle", "the battery drains twelve times as fast")}
     kinds = {**Faults.kinds, "sensor": "sensors", "vehicle": "the vehicle"}
 
     def own(self, fault: str, injection: str, duration_s: float | None

@@ -46,9 +46,15 @@ _IDLE: Thrusts = (0.0, 0.0, 0.0, 0.0)
 
 
 class Memory(msgspec.Struct, frozen=True):
-    """What outlives the process: whether it stands on the ground."""
+    """What outlives the process.
+
+    Attributes:
+        landed: whether it stands on the ground.
+        stays: whether it is to stay there, because it did not land as the mission wanted.
+    """
 
     landed: bool
+    stays: bool
 
 
 MEMORY = StateFormat(Memory)
@@ -68,7 +74,7 @@ class Believed:
         """Take an estimate, or refuse it."""
         place = at.x_m, at.y_m, at.z_m
         speed = at.velocity_x_mps, at.velocity_y_mps, at.velocity_z_mps
-        if stamp_s <= self._stamp_s or not (
+        if stamp_s <= self._stamp_s or at == self._last or not (
                 all(abs(p) < _MOST_PLACE_M for p in place)
                 and all(abs(v) < _MOST_SPEED_MPS for v in speed)
                 and all(map(math.isfinite, at.attitude))):
@@ -123,18 +129,20 @@ class Pilot(Actor):
         self._orders: dict[str, str] = {}
         self._yaw_rad: float | None = None
         self._held_yaw_rad = 0.0
+        self._rest_mps2 = 0.0
         self._held: tuple[str, Vector] | None = None
         self._source, self._source_s = "", self.clock.now()
         self._last_n = _IDLE
         self._light_s = 0.0
         self._landed = context.incarnation == 1
+        self._stays = False
         self._born_s = self.clock.now()
 
     def on_start(self) -> None:
         """Learn from the last incarnation whether it stood on the ground."""
         kept = self.kept(MEMORY)
         if kept is not None:
-            self._landed = kept.landed
+            self._landed, self._stays = kept.landed, kept.stays
 
     # -- what it hears ----------------------------------------------------------------------------
 
@@ -246,6 +254,7 @@ class Pilot(Actor):
             self._source, self._source_s = source, now_s
             self._held_yaw_rad = yaw(self._filter.q)
             self._position.reset()
+            self._rest_mps2 = 0.0
             self._held = None
 
     def _by_estimate(self, mode: str, at: t.Estimate) -> Vector:
@@ -268,16 +277,17 @@ class Pilot(Actor):
     def _by_own_sensors(self, now_s: float, *, hold: bool) -> Vector:
         """Level, and after a while, which may mend what is wrong, gently down."""
         waits = hold and now_s - self._source_s < _HOLD_S
-        speed_mps = 0.0 if waits else -self.parameters.level_descent_mps
-        return 0.0, 0.0, bounded(2.0 * (speed_mps - self._vertical.speed_mps), 3.0)
+        wrong_mps = (0.0 if waits else -self.parameters.level_descent_mps) - self._vertical.speed_mps
+        self._rest_mps2 = bounded(self._rest_mps2 + 1.0 * bounded(wrong_mps, 1.0) * STEP_S, 2.5)
+        return 0.0, 0.0, bounded(2.0 * wrong_mps + self._rest_mps2, 3.0)
 
     def _see_ground(self, upward_mps2: float, force_mps2: float) -> None:
         """Whoever asks for little thrust and feels his whole weight stands on the ground."""
         before = self._landed
         thrust_mps2 = sum(self._last_n) / MASS_KG
         if self._landed:
-            flies = self._source == "setpoint" and self._setpoint is not None and self._setpoint.fly
-            self._landed = not (flies and upward_mps2 > 0.5)
+            said = self._setpoint if self._source == "setpoint" and not self._stays else None
+            self._landed = not (said is not None and said.fly and upward_mps2 > 0.5)
         elif thrust_mps2 < _STANDS_SHARE * G_MPS2 and force_mps2 > 0.85 * G_MPS2:
             self._light_s += STEP_S
             self._landed = self._light_s > _STANDS_S
@@ -285,7 +295,8 @@ class Pilot(Actor):
             self._light_s = 0.0
         if before is not self._landed:
             self._light_s = 0.0
-            self.keep(MEMORY, Memory(self._landed))
+            self._stays = self._landed and self.mode != MODES[0]
+            self.keep(MEMORY, Memory(self._landed, self._stays))
 
     @every(0.05)
     def say(self) -> None:

@@ -129,7 +129,7 @@ class PilotStatus(Message):
     landed: bool
     tilt_rad: float
     attitude: Quaternion
-    imus_sound: Annotated[int, msgspec.Meta(ge=0, le=3)]
+    imus_sound: Annotated[int, msgspec.Meta(ge=0, le=100)]
     trim: float
     refused: float
 

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import math
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
-
 from quadrotor import topics as t
 from quadrotor.judge import FlightJudge
+
 from rampart import Verdict
+from rampart.actors.bus.envelope import decode
 from rampart.actors.layout.layout import load_run
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.runs.trial import Trial
 from rampart.sim.runs.virtual_run import VirtualRun
-from rampart.actors.bus.envelope import decode
 
 SYSTEM = Path(__file__).parents[1] / "quadrotor.toml"
 
