@@ -35,11 +35,10 @@ from rampart.cli.record import record_verbs
 from rampart.cli.verbs import FORMATTER, PORT, help_of
 from rampart.files import streams, working_folder
 
-_VERBS = (
-    node_verbs, topic_verbs, inject_verbs, operator_verbs, serving_verbs,
-    adapt_verb, record_verbs, cut_set_verbs, decide_verbs, tree_verbs,
-    verify_verb)
-"""Each adds its verbs, in this order in the help."""
+_OF_A_RUN = (node_verbs, topic_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
+             record_verbs)
+_OF_A_SYSTEM = (cut_set_verbs, decide_verbs, tree_verbs, verify_verb)
+# Each adds its verbs, in this order in the help.
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -51,8 +50,10 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="rampart", **help_of(__doc__))
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     verbs.add_parser("run", add_help=False, help="start a system: the same as launch.py")
+    for module in _OF_A_RUN:
+        module.add(verbs)
     verbs.add_parser("campaign", add_help=False, help="run many missions with faults in them")
-    for module in _VERBS:
+    for module in _OF_A_SYSTEM:
         module.add(verbs)
     common = argparse.ArgumentParser(add_help=False)
     PORT(common)

@@ -54,12 +54,15 @@ class Run:
                  reports: Path) -> None:
         self._options = options
         kind = trial_class(spec)
-        if kind.judges and options.duration is not None:
+        if kind.patient and options.duration is not None:
             raise UsageError(f"--duration {options.duration:g}: a mission ends by itself; "
                              "--patience S ends one that makes no progress")
-        if not kind.judges:
-            refuse(options, ("fault", "virtual", "wait", "patience"),
-                    f"{spec.name} has no mission: its [application] names no class with one")
+        if not kind.patient:
+            refuse(options, ("wait", "patience"),
+                   f"{spec.name} has no mission: its runs end after --duration S")
+            if options.virtual and (options.duration or spec.end.after_s) is None:
+                raise UsageError("--virtual: in virtual time a run has to end: give --duration S, "
+                                 f"or {spec.name} an [end] with after_s")
         application = load_application(plan, spec)
         if note := application.check(spec, virtual=options.virtual):
             _say(note)
@@ -70,7 +73,7 @@ class Run:
         plan = msgspec.structs.replace(
             plan, error_log=str(kept / ERROR_LOG), checkpoints=str(kept / "checkpoints"))
         self._trial = kind(replace(run, plan=plan),
-                           options.patience if kind.judges else options.duration, sys.stderr)
+                           options.patience if kind.patient else options.duration, sys.stderr)
         self._plan = plan
         self._scenario = [parse_fault(text) for text in options.fault]
         if self._scenario:
@@ -142,15 +145,14 @@ class Run:
             if not fault.effective:
                 _say(f"fault {fault.fault} had no effect: {one_line(fault.reason)}")
         if self._options.json:
-            if self._trial.judges:
-                more |= {"report": str(report.html) if report.html else None,
-                         "record": str(report.data) if report.data else None,
-                         "report_error": report.problem or None}
+            more |= {"report": str(report.html) if report.html else None,
+                     "record": str(report.data) if report.data else None,
+                     "report_error": report.problem or None}
             print(json.dumps({**self._trial.summary(record), **more}), flush=True)
             if why := streams.lost_result():
                 _say(f"stdout: {why}: the result is lost")
         if not self._trial.judges:
-            return EXIT_FAILED if failure else EXIT_SUCCESS
+            return EXIT_FAILED if failure or record.given_up else EXIT_SUCCESS
         if record.safety != "safe":
             return EXIT_UNSAFE if record.safety == "unsafe" else EXIT_NOT_KNOWN
         return EXIT_SUCCESS if record.mission == "success" else EXIT_FAILED

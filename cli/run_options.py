@@ -1,4 +1,16 @@
-"""What can be said on the command line when a system is started, and the plan that follows."""
+"""What can be said on the command line when a system is started, and the plan that follows.
+
+Start a system from its spec, run it, judge it, report on it.
+
+Examples:
+while it runs, from another shell:
+  kill-node NODE                                    kill a node and watch it come back
+  rampart inject --list                             the faults that can be injected
+  rampart status                                    what the robot and its nodes are doing
+exit code: 0 success and safe, 1 mission failed but safe, 2 bad usage or spec, 3 unsafe,
+4 safety not known: no ground truth ever came. A report that cannot be written and output that
+nobody reads change none of them; with --json, "report_error" says why there is no "report"
+"""
 
 from __future__ import annotations
 
@@ -22,7 +34,7 @@ from rampart.actors.web.access import Access, AccessError, is_loopback, new_toke
 from rampart.actors.web.token_file import SecretError, read_secret
 from rampart.cli import application_options
 from rampart.cli.output import UsageError, between, positive
-from rampart.cli.verbs import FORMATTER, add_options, flag, number, option, several, whole, word
+from rampart.cli.verbs import add_options, flag, help_of, number, option, several, whole, word
 from rampart.manager.spec.specification import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
 from rampart.sim.faults.faults import faults_of
@@ -44,17 +56,6 @@ _EXAMPLES = (
     ("--virtual --fault kill:NODE@30 --fault drop:TOPIC@goal2+5", "with faults"),
     *((f"--system {name}", "another one that is shipped") for name in systems.names().split(", ")),
 )
-
-_EPILOG = """\
-while it runs, from another shell:
-  kill-node NODE                                    kill a node and watch it come back
-  rampart inject --list                             the faults that can be injected
-  rampart status                                    what the robot and its nodes are doing
-exit code: 0 success and safe, 1 mission failed but safe, 2 bad usage or spec, 3 unsafe,
-4 safety not known: no ground truth ever came. A report that cannot be written and output that
-nobody reads change none of them; with --json, "report_error" says why there is no "report"
-"""
-
 
 _OPTIONS = (
     flag("--wait", "let the operator start the mission from the page"),
@@ -110,9 +111,9 @@ def parser(program: str = "", kind: type[Application] = Application,
     """
     examples = "".join(f"  {program} {how:<40} {what}\n" for how, what in (
         *_EXAMPLES, *kind.examples))
-    p = argparse.ArgumentParser(
-        prog=program, epilog=f"examples:\n{examples}{_EPILOG}", formatter_class=FORMATTER,
-        description="Start a system from its spec, run it, judge it, report on it.")
+    shown = help_of(__doc__)  # the examples themselves depend on program and system
+    shown["epilog"] = shown["epilog"].replace("examples:\n", f"examples:\n{examples}", 1)
+    p = argparse.ArgumentParser(prog=program, **shown)
     add_options(p, _OPTIONS)
     application_options.add(p, kind, said or {})
     return p
@@ -252,4 +253,3 @@ def _token(options: argparse.Namespace) -> tuple[str, bool]:
         raise UsageError(f"--hmi-host {host}: no address of this machine ({why}); 0.0.0.0 stands "
                          "for all it has") from None
     return token, bool(token) and not own
-

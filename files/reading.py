@@ -54,7 +54,8 @@ def check_size(data: bytes | bytearray | str, most: int) -> None:
         FileError: it is.
     """
     if len(data) > most:
-        raise FileError(f"longer than {_size(most)}, the most that is read")
+        size = f"{most >> 20} MB" if most >= 1 << 20 else f"{most >> 10} kB"
+        raise FileError(f"longer than {size}, the most that is read")
 
 
 def plain_line(text: str) -> str:
@@ -76,7 +77,3 @@ def shown(value: object, most: int = 60) -> str:
     except (ValueError, RecursionError):  # an integer of thousands of digits; nesting
         return "a value too large to show"
     return text if len(text) <= most else f"{text[:most - 3]}..."
-
-
-def _size(most: int) -> str:
-    return f"{most >> 20} MB" if most >= 1 << 20 else f"{most >> 10} kB"

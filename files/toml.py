@@ -25,6 +25,8 @@ MAX_KEY = 200
 MAX_DEPTH = 32
 """Of tables and arrays in each other."""
 
+_TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
+
 _MARK = re.compile(r'''
       """(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5}|\\?\Z)
     | \'\'\'(?:[^']|'(?!''))*+(?:'{3,5}|\Z)
@@ -62,7 +64,7 @@ def _check_shape(text: str) -> None:
             case "[" | "{":
                 depth += 1
                 if depth > MAX_DEPTH:
-                    raise _too_deep()
+                    raise FileError(_TOO_DEEP)
             case "]" | "}":
                 depth -= 1
             case ".":
@@ -79,14 +81,10 @@ def _check_nesting(document: dict[str, Any]) -> None:
     while left:
         value, depth = left.pop()
         if depth > MAX_DEPTH:
-            raise _too_deep()
+            raise FileError(_TOO_DEEP)
         if isinstance(value, dict):
             if any(len(key) > MAX_KEY for key in value):
                 raise FileError(f"a key of more than {MAX_KEY} characters")
             left += [(member, depth + 1) for member in value.values()]
         elif isinstance(value, list):
             left += [(member, depth + 1) for member in value]
-
-
-def _too_deep() -> FileError:
-    return FileError(f"nested more than {MAX_DEPTH} deep")

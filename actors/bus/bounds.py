@@ -44,6 +44,7 @@ MOST = 10_000
 Name = Annotated[str, Meta(max_length=NAME_CHARS)]
 Text = Annotated[str, Meta(max_length=TEXT_CHARS)]
 Document = Annotated[str, Meta(max_length=DOCUMENT_CHARS)]
+Few = Annotated[tuple[T, ...], Meta(max_length=16)]
 Many = Annotated[tuple[T, ...], Meta(max_length=MANY)]
 Most = Annotated[tuple[T, ...], Meta(max_length=MOST)]
 Names = Many[Name]

@@ -1,9 +1,8 @@
 """DM2 and DM6: command not updated, localization not updated (paper, table I); of any topic.
 
-Freshness of a stream of samples, judged by the time at which their content was true.
-
-The age of a sample counts from its stamp, not from its arrival: a frozen source that repeats an
-old sample, and a link that delivers each sample seconds late, are as stale as silence.
+A stream of samples is judged by the time at which their content was true. The age of a sample
+counts from its stamp, not from its arrival: a frozen source that repeats an old sample, and a link
+that delivers each sample seconds late, are as stale as silence.
 """
 
 from __future__ import annotations

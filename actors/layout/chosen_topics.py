@@ -55,7 +55,8 @@ def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: 
 
 
 def _topic(key: str, known: Mapping[str, Topic[Any]], where: str) -> Topic[Any]:
-    topic = next((t for t in known.values() if t.member(key) is not None), None)
+    topic = known.get(key) or next(
+        (t for t in known.values() if t.member(key) is not None), None)
     if topic is None:
         near = difflib.get_close_matches(key, known, 3)
         hint = f"; the nearest: {', '.join(near)}" if near else ""

@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 
+from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.zenoh_bus import endpoint
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.chosen_topics import choose_topics
@@ -20,6 +21,7 @@ from rampart.actors.layout.wiring import (
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan, load_document, tailor
+from rampart.actors.runtime.declaration import Handlers
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 from rampart.manager.spec.specification import check_document, check_modules
 
@@ -66,9 +68,10 @@ class Layout:
             node.name: unit.name for unit in self.units.values() for node in unit.nodes}
         supervisor = load_class(SUPERVISOR_CLASS)
         observer = load_class(application_class(spec).observer)
+        judged = {"judged": [topic.key for topic in judged_topics(spec, observer)]}
         heard = msgspec.convert({"nodes": tuple(self.unit_of)}, supervisor.Parameters)
         own = [Member(SUPERVISOR, supervisor, heard),
-               Member(OBSERVER, observer, observer.Parameters())]
+               Member(OBSERVER, observer, msgspec.convert(judged, observer.Parameters))]
         world = {"seed": plan.seed, **(application or Application()).world_parameters(),
                  "dead_man": spec.layers.dead_man,
                  "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
@@ -114,6 +117,28 @@ def load_run(plan: RunPlan, spec: SystemSpec) -> RunContext:
         ValueError: the application's options are unsound; the message names file and value.
     """
     return RunContext(plan, spec, load_document(plan), load_application(plan, spec))
+
+
+def judge_class(spec: SystemSpec) -> type[Handlers] | None:
+    """Return the class that a system names under `[judge]`, None if none.
+
+    Raises:
+        ValueError: there is no such class.
+    """
+    path = spec.judge.get("class")
+    if spec.judge and path is None:
+        raise ValueError("$.judge.class: missing; name a class derived from rampart.Judge")
+    return import_class(str(path), Handlers, "$.judge.class") if spec.judge else None
+
+
+def judged_topics(spec: SystemSpec, observer: type[Handlers]) -> list[Topic[Any]]:
+    """Return the topics that the judge hears and the observer would not.
+
+    Raises:
+        ValueError: there is no such judge.
+    """
+    judge = judge_class(spec)
+    return [] if judge is None else [t for t in judge.inputs() if t not in observer.inputs()]
 
 
 def application_class(spec: SystemSpec) -> type[Application]:

@@ -72,16 +72,13 @@ class _Fitting:
             _take(room, len(text.encode(errors="replace")) + 3)
             return text
         if isinstance(value, dict):
-            return self._mapping(value, room)
+            self.left_out += max(0, len(value) - self._bounds.items)
+            return {self.value(str(key), room): self.value(entry, room)
+                    for key, entry in islice(value.items(), self._bounds.items)}
         if isinstance(value, (list, tuple)):
             return self._list(value, room or _Room(self._bounds.room))
         _take(room, _NUMBER_BYTES)
         return value
-
-    def _mapping(self, value: dict[Any, Any], room: _Room | None) -> dict[str, Any]:
-        self.left_out += max(0, len(value) - self._bounds.items)
-        return {self.value(str(key), room): self.value(entry, room)
-                for key, entry in islice(value.items(), self._bounds.items)}
 
     def _list(self, value: list[Any] | tuple[Any, ...], room: _Room) -> list[Any]:
         shown: list[Any] = []

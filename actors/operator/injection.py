@@ -220,11 +220,10 @@ class Injections:
     def _conclude(self, o: Ordered) -> str:
         o.effective = o.affected > 0
         reason = next(iter(o.refused.values()), o.reason)
-        unit = "messages changed"
-        if any(x.topic is not bus_topics.INJECTION_REQUEST for x in o.orders):
-            unit = "ticks changed"
+        of_topics = all(x.topic is bus_topics.INJECTION_REQUEST for x in o.orders)
         if o.effective:
-            o.outcome = f"over, {o.affected} {unit}" + (f"; {reason}" if reason else "")
+            unit = "messages" if of_topics else "ticks"
+            o.outcome = f"over, {o.affected} {unit} changed" + (f"; {reason}" if reason else "")
         else:
             o.outcome = f"no effect: {reason or 'nothing was sent that it would have changed'}"
         return f"fault {o.fault}: {o.outcome}"

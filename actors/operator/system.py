@@ -83,9 +83,8 @@ def draw_system(spec: SystemSpec) -> dict[str, Any]:
     order = spec.build_order()
     tree = draw(spec, "fault-tree", order, spec.criteria, Situation())
     ranks = draw(spec, "order", order, spec.criteria, Situation())
-    note = ""
-    if len(tree.boxes) > MAX_BOXES:
-        note = f"The fault tree has {len(tree.boxes)} events; up to {MAX_BOXES} are drawn."
+    note = (f"The fault tree has {len(tree.boxes)} events; up to {MAX_BOXES} are drawn."
+            if len(tree.boxes) > MAX_BOXES else "")
     return {"title": spec.title or spec.name, "strategy": spec.strategy, "criteria": spec.criteria,
             "note": note,
             "tree": _fault_tree(spec, tree) if 0 < len(tree.boxes) <= MAX_BOXES else None,

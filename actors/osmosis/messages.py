@@ -1,8 +1,7 @@
 """The messages of Osmosis: SI units, REP-103 axes, REP-105 frames.
 
-The bus puts the header (source, incarnation, sequence, stamp) round these structs
-(`rampart.actors.bus.envelope`). Angles are in (-pi, pi], x forward, y left, yaw counter-clockwise.
-A field named `*_f32` is a little-endian float32 array as bytes.
+The bus puts the header round these structs (`rampart.actors.bus.envelope`). Angles: (-pi, pi], x
+forward, y left, yaw counter-clockwise. A field named `*_f32` is a little-endian float32 array.
 
 Every field but a measurement or a command is bounded by its type (`rampart.actors.bus.bounds`): a
 payload beyond the bounds never reaches an actor. A plain `float` may be anything, NaN and infinity
@@ -12,14 +11,12 @@ included; its reader judges it.
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated
-
-import msgspec
 
 from rampart.actors.bus.bounds import (
     Count,
     Duration,
     Explained,
+    Few,
     Floats32,
     Lasting,
     Many,
@@ -100,7 +97,7 @@ class BaseCommand(Twist, frozen=True):
 
 
 class BrakeCommand(Message, frozen=True):
-    """Low-level brake: blocks the wheels until the last of those that hold it has let go."""
+    """Low-level brake: blocks the wheels, whatever is commanded, until its last holder lets go."""
 
     engaged: bool
     reason: Text
@@ -180,7 +177,7 @@ class MissionAction(StrEnum):
 
 
 class MissionOrder(Message, frozen=True):
-    """Asks the Mission Manager for something, by whom and why; the same `order` twice is one."""
+    """An order to the Mission Manager, `by` whom and why; the same `order` twice is one order."""
 
     order: Name
     action: MissionAction
@@ -214,7 +211,7 @@ class MissionStatus(Message, frozen=True):
     reason: Text
     skipped: Many[Count] = ()
     unmeasured: Most[Name] = ()
-    orders: Annotated[tuple[MissionAction, ...], msgspec.Meta(max_length=16)] = ()
+    orders: Few[MissionAction] = ()
 
 
 class OfStep(Message, frozen=True):
@@ -277,8 +274,9 @@ class ControlStatus(OfStep, frozen=True):
     `blocked` holds at most one blockage, the one in front of the robot now. `reason` says why a
     route was refused. `unmeasured` names, on arrival, lights that were passed unmeasured.
 
-    The standby does the same: it goes back to the point `back_to`, drives round something while
-    `passing`, `aside_m` to the left of the route, and adds what the yaw loop has learnt.
+    For a standby to do the same: `back_to`, the point in `map` to which the robot goes back, if it
+    does; whether it is `passing` something beside the row; how far to the left of the route it
+    means to be; what its yaw loop has learnt.
     """
 
     phase: ControlPhase
@@ -296,7 +294,8 @@ class ControlStatus(OfStep, frozen=True):
 class LocalizationStatus(Message, frozen=True):
     """What the pose rests on: sources in use, and those that are not, each with the reason.
 
-    `bridged_m`: the way since two sources last agreed on the position. Deviations may be infinite.
+    Standard deviations are infinite before there is a pose. `bridged_m` is the way made since two
+    independent sources last agreed on the position.
     """
 
     in_use: Names
@@ -337,7 +336,7 @@ class PilotOrder(Message, frozen=True):
 class PilotStatus(Message, frozen=True):
     """What the Safety Pilot does and why: `reason` is empty while commands pass unchanged.
 
-    `top_speed_mps` is the lowest bound ordered, or 0; `forbids` why not even the joystick drives.
+    `top_speed_mps` is the lowest bound ordered, or 0; `forbids`: why not even the joystick drives.
     """
 
     mode: PilotMode
@@ -383,8 +382,9 @@ class ActuatorFault(Message, frozen=True):
     """Puts a fault of the base's actuators in force; 0 simulated seconds end it.
 
     `wheel`: front left, front right, rear left or rear right; a brake failure ignores it.
-    `strength` from 0 to 1: what is left of a weak wheel's torque and speed, or of the braking
-    torque. `InjectionReport.affected` counts the 10 ms ticks in which the fault changed something.
+    `strength` from 0 to 1, where 1 loses nothing: what is left of a weak wheel's torque and speed,
+    or with a brake failure of the braking torque, with wheels that do not lock; a stuck wheel
+    ignores it. `InjectionReport.affected` counts the 10 ms ticks in which something changed.
     """
 
     injection: Name

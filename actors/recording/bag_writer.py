@@ -14,18 +14,19 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
 
+from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.recording import foxglove as fg
 from rampart.actors.recording.json_schema import plain_schema
 from rampart.actors.recording.message_form import Forms, Recorded
 from rampart.actors.recording.run_documents import Documents
-from rampart.actors.recording.sequence_gaps import SequenceGaps
 from rampart.actors.recording.views import View, Views, encode
 
 PROFILE = "rampart"
@@ -70,6 +71,37 @@ def open_target(path: Path, *, overwrite: bool, probe: bool = False) -> BinaryIO
     except OSError as error:
         raise BagError(f"{path}: cannot be written: {error.strerror or error}") from None
     return file
+
+
+class SequenceGaps:
+    """What a recording has missed: each node numbers what it sends, without gaps. Pure.
+
+    Args:
+        from_start: whether every node is heard from its first message on; else only incarnations
+            that begin later are.
+    """
+
+    def __init__(self, *, from_start: bool = False) -> None:
+        self._from_start = from_start
+        self._first: dict[str, int] = {}
+        self._last: dict[tuple[str, int], int] = {}
+        self._lost = Counter[str]()
+
+    def hear(self, header: Header) -> None:
+        """Note one message; copies have the same number."""
+        one = (header.source, header.incarnation)
+        last = self._last.get(one)
+        if last is None:
+            first = self._first.setdefault(header.source, header.incarnation)
+            new = self._from_start or header.incarnation > first
+            last = 0 if new else header.sequence - 1
+        if header.sequence > last + 1:
+            self._lost[header.source] += header.sequence - last - 1
+        self._last[one] = max(last, header.sequence)
+
+    def lost(self) -> dict[str, int]:
+        """Return source → messages that were sent and not recorded."""
+        return dict(self._lost)
 
 
 class BagWriter:

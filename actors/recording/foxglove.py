@@ -59,11 +59,16 @@ class Color(Record, frozen=True):
     a: float
 
 
-class PoseInFrame(Record, frozen=True):
-    """A pose at a time."""
+class Stamped(Record, frozen=True):
+    """Base of what is true at a time, in some frame."""
 
     timestamp: Time
     frame_id: str
+
+
+class PoseInFrame(Stamped, frozen=True):
+    """A pose at a time."""
+
     pose: Pose
 
 
@@ -83,11 +88,9 @@ class FrameTransforms(Record, frozen=True):
     transforms: tuple[FrameTransform, ...]
 
 
-class LaserScan(Record, frozen=True):
+class LaserScan(Stamped, frozen=True):
     """A sweep of a planar laser, m and rad; null is no range."""
 
-    timestamp: Time
-    frame_id: str
     pose: Pose
     start_angle: float
     end_angle: float
@@ -148,12 +151,16 @@ class TriangleListPrimitive(Record, frozen=True):
     indices: tuple[int, ...] = ()
 
 
-class CubePrimitive(Record, frozen=True):
-    """A box."""
+class Solid(Record, frozen=True):
+    """Base of what fills a box of a size."""
 
     pose: Pose
     size: Vector3
     color: Color
+
+
+class CubePrimitive(Solid, frozen=True):
+    """A box."""
 
 
 class CylinderPrimitive(Record, frozen=True):
@@ -166,12 +173,8 @@ class CylinderPrimitive(Record, frozen=True):
     color: Color
 
 
-class SpherePrimitive(Record, frozen=True):
+class SpherePrimitive(Solid, frozen=True):
     """An ellipsoid."""
-
-    pose: Pose
-    size: Vector3
-    color: Color
 
 
 class ArrowPrimitive(Record, frozen=True):
@@ -203,11 +206,9 @@ class KeyValuePair(Record, frozen=True):
     value: str
 
 
-class SceneEntity(Record, frozen=True):
+class SceneEntity(Stamped, frozen=True):
     """A thing in the scene, which replaces the one with the same id on the same channel."""
 
-    timestamp: Time
-    frame_id: str
     id: str
     lifetime: Time
     frame_locked: bool

@@ -57,7 +57,7 @@ class MessageForm:
     def __init__(self, topic: Topic[Any] | None) -> None:
         kind: Any = topic.type if topic else Any
         self.topic = topic
-        self._decode = _decoder(kind)
+        self._decode: Callable[[bytes], Recorded[Any]] = msgspec.json.Decoder(Recorded[kind]).decode
         self._is_plain = topic is not None and _is_plain(topic.type)
 
     def recorded(self, payload: bytes) -> tuple[bytes, Header | None, Any]:
@@ -141,6 +141,9 @@ _of_anything = msgspec.msgpack.Decoder(Envelope[Any])
 _encode_msgpack = msgspec.msgpack.Encoder().encode
 
 
+_form = cache(MessageForm)
+
+
 class Forms:
     """The forms of the messages of a system.
 
@@ -155,13 +158,8 @@ class Forms:
     def of(self, key: str) -> MessageForm:
         """Return the form of the messages on a full key."""
         if key not in self._forms:
-            self._forms[key] = MessageForm(find_topic(key.removeprefix(f"{ROOT}/"), self._topics))
+            self._forms[key] = _form(find_topic(key.removeprefix(f"{ROOT}/"), self._topics))
         return self._forms[key]
-
-
-@cache
-def _decoder(kind: Any) -> Callable[[bytes], Recorded[Any]]:
-    return msgspec.json.Decoder(Recorded[kind]).decode
 
 
 def _is_plain(kind: Any) -> bool:

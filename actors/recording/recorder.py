@@ -18,14 +18,14 @@ import selectors
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from operator import itemgetter
 from pathlib import Path
 
 from rampart.actors.bus import recorder_connection
 from rampart.actors.bus.unix_peer import is_same_user
 from rampart.actors.recording.bag_writer import BagError, BagWriter, open_target
-from rampart.actors.recording.run_documents import Documents, collect
+from rampart.actors.recording.run_documents import collect
 from rampart.actors.run.run_info import RunInfo, ask
 
 PERIOD_S = 0.05
@@ -151,15 +151,12 @@ class Recorder:
         frames = self._gather()
         if self.writer is None:
             self._waiting += frames[:max(0, _WAITING_FRAMES - len(self._waiting))]
-            if not self._find_run():
-                return
-            frames, self._waiting = self._waiting, []
-        self._write(frames)
-
-    def _write(self, frames: Iterable[Frame]) -> None:
+            self._find_run()
+            frames = self._waiting
         writer, info = self.writer, self._info
-        if writer is None or info is None:
+        if writer is None or info is None:  # it is not known yet what runs
             return
+        self._waiting = []
         for at_s, key, payload in sorted(frames, key=itemgetter(0)):
             writer.take((at_s - info.origin_s) * info.rate, key, payload)
         now_s = time.monotonic()
@@ -182,24 +179,24 @@ class Recorder:
 
     # -- the run --------------------------------------------------------------------------------
 
-    def _find_run(self) -> bool:
-        """Whether it is known what runs; then the file is begun."""
+    def _find_run(self) -> None:
+        """Begin the file as soon as it is known what runs."""
         now_s = time.monotonic()
         if now_s < self._next_ask_s:
-            return False
+            return
         self._next_ask_s = now_s + _ASK_S
         info = ask(self._port)
         if info is None or self._launcher not in {None, info.pid}:
-            return False
+            return
         self._info, self._launcher = info, info.pid
-        documents = describe(info)
+        documents = collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
+                            nodes=tuple(info.nodes), started=_wall())
         begin_s = (min((f[0] for f in self._waiting), default=now_s) - info.origin_s) * info.rate
         zero_s = min(0.0, float(math.floor(begin_s)))
         file = open_target(self.path, overwrite=self._overwrite)
         self.writer = BagWriter(
             file, documents, time_zero_s=zero_s, begin_s=begin_s, wants=self._wants,
             views=documents.known.views(), from_start=self._from_start)
-        return True
 
     # -- sockets --------------------------------------------------------------------------------
 
@@ -236,12 +233,6 @@ class Recorder:
     def _drop(self, connection: socket.socket) -> None:
         self._sockets.unregister(connection)
         connection.close()
-
-
-def describe(info: RunInfo) -> Documents:
-    """Return what a recording keeps of a run."""
-    return collect(info.plan, run_id=info.run_id, title=info.title, rate=info.rate,
-                   nodes=tuple(info.nodes), started=_wall())
 
 
 def _wall() -> str:

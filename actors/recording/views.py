@@ -29,6 +29,8 @@ from rampart.manager.strategies.decision_words import decision_in_words
 View = tuple[str, fg.Record]
 """Channel and what is to be seen on it."""
 
+Shown = list[View]
+
 Translator = Callable[[str, Header, Any, int], list[View]]
 """Makes views of key, header and body of a message, and the time of the recording."""
 
@@ -77,14 +79,11 @@ class Views:
             at_ns: time of the recording.
         """
         translate = self.translators.get(topic)
-        if translate is None:
-            return []
-        return translate(key, header, body, at_ns)
+        return translate(key, header, body, at_ns) if translate else []
 
     # -- the log --------------------------------------------------------------------------------
 
-    def _decision(self, key: str, header: Header, body: fm.DecisionRecord, at_ns: int
-                  ) -> list[View]:
+    def _decision(self, key: str, header: Header, body: fm.DecisionRecord, at_ns: int) -> Shown:
         words = decision_in_words(body.active, body.rule, body.recoveries, body.strategy)
         level = fg.LogLevel.WARNING if body.active else fg.LogLevel.INFO
         return self._event(key, header, at_ns, level, f"decision {body.decision}: {words}")
@@ -101,8 +100,7 @@ class Views:
         return self._event(key, header, at_ns, fg.LogLevel.ERROR,
                            f"{body.context}: {body.reason} [{body.offender}]")
 
-    def _detection(self, key: str, header: Header, body: fm.DetectionReport, at_ns: int
-                   ) -> list[View]:
+    def _detection(self, key: str, header: Header, body: fm.DetectionReport, at_ns: int) -> Shown:
         was = self._seen.get(key)
         if not self.is_new(key, body.state) or (
                 was is None and body.state is fm.DetectionState.IDLE):
@@ -111,8 +109,7 @@ class Views:
         return [line(at_ns, fg.LogLevel.WARNING if active else fg.LogLevel.INFO, header.source,
                       f"detects: {body.reason}" if active else "is idle again")]
 
-    def _injection(self, key: str, header: Header, body: bm.InjectionReport, at_ns: int
-                   ) -> list[View]:
+    def _injection(self, key: str, header: Header, body: bm.InjectionReport, at_ns: int) -> Shown:
         if not self.is_new(f"{key} {body.injection}", (body.affected > 0, body.finished)):
             return []
         what = "is over" if body.finished else "is in force"
@@ -120,8 +117,7 @@ class Views:
         return [line(at_ns, fg.LogLevel.WARNING, header.source,
                       f"injection {body.injection} {what}, {body.affected} affected{why}")]
 
-    def _event(self, key: str, header: Header, at_ns: int, level: fg.LogLevel, text: str
-               ) -> list[View]:
+    def _event(self, key: str, header: Header, at_ns: int, level: fg.LogLevel, text: str) -> Shown:
         """Return a line for a message that counts, once for all its copies."""
         if not self.is_new(key, (header.source, header.incarnation, header.sequence)):
             return []

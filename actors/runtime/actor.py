@@ -256,7 +256,8 @@ class Actor(Declared):
                 self._bus.subscribe(topic, key, self._receiver(topic, handler))
         for key, handlers in self._chosen.items():
             topic = self.chosen_topic(key)
-            self._bus.subscribe(topic, f"{ROOT}/{key}", self._receiver(topic, _all_of(handlers)))
+            where = topic.pattern if key == topic.key else f"{ROOT}/{key}"
+            self._bus.subscribe(topic, where, self._receiver(topic, _all_of(handlers)))
         for node in self.watches(self.name, self.parameters):
             self._bus.watch(node, self._peer_changed)
         self.on_start()

@@ -62,6 +62,11 @@ class Handlers:
         cls._handlers = tuple(handlers.values())
         cls._periodic = tuple((period, name) for name, period in periodic.items())
 
+    @classmethod
+    def inputs(cls) -> tuple[Topic[Any], ...]:
+        """Topics it has handlers for, of an actor those that every actor hears included."""
+        return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
+
 
 class Declared(Handlers):
     """Base of all actors, as far as their classes alone tell.
@@ -98,11 +103,6 @@ class Declared(Handlers):
     def watches(cls, name: str, parameters: Any) -> tuple[str, ...]:  # noqa: ARG003
         """Nodes of which `on_peer` reports that they appear and vanish."""
         return ()
-
-    @classmethod
-    def inputs(cls) -> tuple[Topic[Any], ...]:
-        """Topics it has handlers for, those of every actor included."""
-        return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
 
     @classmethod
     def published(cls, key: str, name: str, parameters: Any) -> Topic[Any] | None:

@@ -28,6 +28,7 @@ RecoveryNames = Annotated[tuple[Name, ...], msgspec.Meta(extra={"names": "recove
 
 TopicHeard = Annotated[str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "heard"})]
 """Key of a topic, below `rampart/`, that the node hears because its parameters say so."""
+TopicsHeard = Annotated[tuple[str, ...], msgspec.Meta(extra={"names": "topic", "way": "heard"})]
 TopicPublished = Annotated[
     str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "published"})]
 """Key of a topic that the node publishes because its parameters say so."""

@@ -114,9 +114,8 @@ class Access(msgspec.Struct, frozen=True):
 
     def permits(self, shown: str | None) -> bool:
         """Tell whether a token is the right one; takes as long for any wrong one."""
-        if not self.token:
-            return True
-        return hmac.compare_digest((shown or "").encode(errors="replace"), self.token.encode())
+        return not self.token or hmac.compare_digest(
+            (shown or "").encode(errors="replace"), self.token.encode())
 
     def _own_name(self, name: str) -> bool:
         if name in LOOPBACK or name in (self.host.lower(), *(n.lower() for n in self.names)):
@@ -136,7 +135,5 @@ def shown_token(authorization: str | None, query: str | None,
     scheme, _, value = (authorization or "").partition(" ")
     if scheme.lower() == "bearer":
         return value.strip()
-    for name in subprotocols:
-        if name.startswith(TOKEN_PREFIX):
-            return name.removeprefix(TOKEN_PREFIX)
-    return query
+    return next((name.removeprefix(TOKEN_PREFIX) for name in subprotocols
+                 if name.startswith(TOKEN_PREFIX)), query)

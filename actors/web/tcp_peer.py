@@ -17,8 +17,7 @@ IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 _NETLINK_SOCK_DIAG = 4
 _SOCK_DIAG_BY_FAMILY = 20
 _NLM_F_REQUEST = 1
-_ANY_STATE = 0xFFFFFFFF
-_NO_COOKIE = 0xFFFFFFFF
+_ANY = 0xFFFFFFFF  # state; cookie
 _NLMSG = struct.Struct("=IHHII")
 _REQUEST = struct.Struct("=BBBxI")
 _COOKIE = struct.Struct("=III")
@@ -46,10 +45,10 @@ def user_of_peer(local: tuple[str, int], peer: tuple[str, int]) -> int | None:
     """
     theirs, ours = plain_address(peer[0]), plain_address(local[0])
     family = socket.AF_INET if theirs.version == 4 else socket.AF_INET6
-    asked = (_REQUEST.pack(family, socket.IPPROTO_TCP, 0, _ANY_STATE)
+    asked = (_REQUEST.pack(family, socket.IPPROTO_TCP, 0, _ANY)
              + struct.pack(">HH", peer[1], local[1])
              + theirs.packed.ljust(16, b"\0") + ours.packed.ljust(16, b"\0")
-             + _COOKIE.pack(0, _NO_COOKIE, _NO_COOKIE))
+             + _COOKIE.pack(0, _ANY, _ANY))
     answer = b""
     with contextlib.suppress(OSError), socket.socket(
             socket.AF_NETLINK, socket.SOCK_RAW, _NETLINK_SOCK_DIAG) as kernel:

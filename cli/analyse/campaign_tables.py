@@ -12,7 +12,7 @@ from rampart.sim.campaign.grouping import varying_options
 from rampart.sim.campaign.named import NamedCampaign
 from rampart.sim.campaign.statistics import Rate, Row, Spread, table, total
 from rampart.sim.campaign.store import Run
-from rampart.sim.campaign.wording import NONE, margin_text
+from rampart.sim.runs.report import NONE, margin_text
 from rampart.sim.runs.trial import Trial, trial_class
 
 _SHOWN = 60
@@ -42,7 +42,7 @@ def show_runs(spec: SystemSpec, runs: Sequence[Run], made: int, named: NamedCamp
     say()
     say(f"{len(runs)} runs, {made} of them made now")
     protected = [run for run in runs if run.job.ftm and run.job.faults]
-    if protected:
+    if protected and trial_class(spec).judges:
         all_of_them = total(protected, "all")
         say(f"with fault tolerance: {_rate(all_of_them.safe)} safe, {_rate(all_of_them.success)} "
             f"successful, {all_of_them.ineffective} without effect")
@@ -64,9 +64,11 @@ def _show_rows(spec: SystemSpec, runs: Sequence[Run], rows: Sequence[Row]) -> No
     options, trial = varying_options(runs), trial_class(spec)
     shown = sorted(rows, key=lambda row: (row.safe.share if row.safe.of else 2.0,
                                           row.success.share if row.success.of else 2.0))
+    verdicts = ("success", "safe", "worst") if trial.judges else ("restarts",)
+    margins = ("smallest margin",) if trial.margins else ()
     print_table(
-        ("fault", *options, "FTM", "strategy", "runs", "no effect", "success", "safe", "worst",
-         "detected after", *(["smallest margin"] if trial.margins else [])),
+        ("fault", *options, "FTM", "strategy", "runs", "no effect", *verdicts, "detected after",
+         *margins),
         [_cells(row, options, trial) for row in shown[:_SHOWN]])
     if len(shown) > _SHOWN:
         say(f"... and {len(shown) - _SHOWN} rows more, in the report")
@@ -77,7 +79,8 @@ def _cells(row: Row, options: Sequence[str], trial: type[Trial]) -> tuple[Any, .
     margins = (margin_text(margin, trial.margin_unit, None),) if trial.margins else ()
     return (row.fault, *(row.options.get(name, NONE) for name in options),
             "yes" if row.ftm else "no", row.strategy or "-", row.runs, row.ineffective,
-            _share(row.success), _share(row.safe), row.worst, _milliseconds(row.detected_after_s),
+            *((_share(row.success), _share(row.safe), row.worst) if row.judged
+              else (row.restarts,)), _milliseconds(row.detected_after_s),
             *margins)
 
 

@@ -41,7 +41,9 @@ _CONDITIONS = (
     whole("--seed", "N", "default: 1", 1),
     whole("--seeds", "N", "with --fault: so many runs of each, from --seed on (default: 1)", 1),
     number("--patience", "S", "simulated seconds without progress that end a run "
-           f"(default: {PATIENCE_S:g})", PATIENCE_S))
+           f"(default: {PATIENCE_S:g})", PATIENCE_S),
+    number("--duration", "S", "simulated seconds that a run of a system without a mission takes "
+           "(default: what the system's [end] says)"))
 
 _PLACE = (
     word("--out", "DIR", "default: reports/campaign-NAME, by what is run"),

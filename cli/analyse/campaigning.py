@@ -47,16 +47,17 @@ from rampart.sim.virtual.network import NETWORKS
 def campaign(options: argparse.Namespace) -> int:
     """Run the campaign, or what else was asked for."""
     spec = systems.load(options.system)
-    if not trial_class(spec).judges:
-        raise UsageError(f"--system {options.system}: nobody judges its runs: its [application] "
-                         "names no class with a mission")
     if options.list:
         return show_faults(all_groups(spec), as_json=options.json)
     if options.replay:
         return _replay(options)
     _check(options)
     if options.search is not None:
-        return hunt(options, _groups(options, spec), _base_jobs(options, spec), faults_of(spec))
+        if not trial_class(spec).margins:
+            raise UsageError(f"--search: {spec.name} has no judge that measures margins")
+        bases = _base_jobs(options, spec)
+        return hunt(options, _groups(options, spec), bases, faults_of(spec),
+                    _moments(spec, bases[0]))
     name, jobs = _choose(options, spec)
     named: NamedCampaign | None = options.named[0] if options.named else None
     directory = Path(options.out) if options.out else Path("reports") / f"campaign-{name}"
@@ -125,7 +126,8 @@ def _base_jobs(options: argparse.Namespace, spec: SystemSpec) -> list[Job]:
         except ValueError as error:
             raise UsageError(" ".join(str(error).split())) from None
     return [Job(row="", system=options.system, strategy=strategy, options=each, ftm=with_ftm,
-                network=options.network, seed=options.seed, patience_s=options.patience)
+                network=options.network, seed=options.seed, patience_s=options.patience,
+                duration_s=options.duration)
             for with_ftm, strategy, each in product(ftm, options.strategy or [""], chosen)]
 
 
@@ -140,9 +142,20 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
         together = f"-{options.together}" if options.together > 1 else ""
         return f"sample{together}", sample(
             jobs, groups, options.runs, seed=options.seed, faults=faults_of(spec),
-            together=options.together)
+            together=options.together, moments=_moments(spec, jobs[0]))
     faults = list(_planned(options.fault, spec, all_groups(spec)))
     return "faults", cross(jobs, faults, range(options.seed, options.seed + options.seeds))
+
+
+def _moments(spec: SystemSpec, job: Job) -> tuple[float, float]:
+    """Return between which moments faults are drawn: within a run that has none."""
+    if found := trial_class(spec).moments(spec):
+        return found
+    try:
+        lasts_s = run_virtually(job).record.duration_s
+    except ValueError as error:
+        raise UsageError(" ".join(str(error).split())) from None
+    return round(min(2.0, 0.1 * lasts_s), 2), round(0.9 * lasts_s, 2)
 
 
 def _groups(options: argparse.Namespace, spec: SystemSpec) -> dict[str, tuple[str, ...]]:

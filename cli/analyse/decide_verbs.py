@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from itertools import combinations
 from typing import Any
 
@@ -103,18 +103,14 @@ def show_table(options: argparse.Namespace) -> int:
     if options.format == "json":
         print_json(data, indent=False)
     elif options.format == "csv":
-        _print_csv(head, cells)
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([head, *cells])
+        say_text(text.getvalue().rstrip("\n"))
     else:
         print_table(head, cells)
         if len(strategies) > 1:
             say(f"{len(differing)} of {len(rows)} sets differ")
     return 0
-
-
-def _print_csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([head, *rows])
-    say_text(text.getvalue().rstrip("\n"))
 
 
 def _arbiter(spec: SystemSpec, strategy: str) -> Callable[[Iterable[str]], Decision]:

@@ -23,7 +23,7 @@ _SHRUNK_AT_MOST = 3
 
 
 def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases: Sequence[Job],
-         faults: Faults) -> int:
+         faults: Faults, moments: tuple[float, float]) -> int:
     """Search among the faults in `groups`, shrink what was found, and keep it."""
     directory = Path(options.out or "reports/campaign-search")
     with refusing(StoreError):
@@ -51,8 +51,8 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
             bar.update()
 
         try:
-            made = search(Space(tuple(bases), groups, faults.intruder), options.search, run,
-                          seed=options.seed, at_once=workers, seen=seen)
+            space = Space(tuple(bases), groups, faults.intruder, moments)
+            made = search(space, options.search, run, seed=options.seed, at_once=workers, seen=seen)
         except ImportError:
             raise UsageError("--search: Optuna is not installed; pip install 'rampart[search]'"
                              ) from None

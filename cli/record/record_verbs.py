@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.recording.bag_reader import BagReader, Summary
-from rampart.actors.recording.bag_repair import repair
+from rampart.actors.recording.bag_reader import BagReader, Summary, repair
 from rampart.actors.recording.bag_writer import BagError, check_target
 from rampart.actors.recording.process import stop_pipe, told
 from rampart.actors.recording.recorder import Recorder

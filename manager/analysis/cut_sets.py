@@ -121,10 +121,11 @@ class CutSets:
         if levels > _LISTING_LEVELS:
             raise TooLargeError(f"nested {levels} levels deep, too deeply to list the sets; they "
                                 "can be counted, --count")
-        for found in islice(chain.from_iterable(
-                self._of_size(self.formula.top, size) for size in range(len(self.sizes))
-                if max_order is None or size <= max_order), limit and max(0, limit)):
-            yield tuple(sorted(found))
+        found = chain.from_iterable(
+            self._of_size(self.formula.top, size) for size in range(len(self.sizes))
+            if max_order is None or size <= max_order)
+        for one in islice(found, None if limit is None else max(0, limit)):
+            yield tuple(sorted(one))
 
     def _weight(self, name: str) -> Mapping[int, int]:
         """Return how many sets of each size a name stands for."""

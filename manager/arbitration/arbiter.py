@@ -98,9 +98,12 @@ class Arbiter:
         # flap. A repair that has been done has ended by itself. Held, its mechanism would still
         # count when another becomes active, and two unrelated crashes a second apart would end
         # in an emergency stop (block 4).
-        repairs = [self._track(state, name) for name in self.mechanisms.repairs.get(detection, ())]
-        done = all(track.phase is RecoveryPhase.DONE and track.acknowledged for track in repairs)
-        return self._no_hold if repairs and done else self.rules
+        repairs = self.mechanisms.repairs.get(detection, ())
+        if repairs and all(
+                track.phase is RecoveryPhase.DONE and track.acknowledged
+                for track in (self._track(state, name) for name in repairs)):
+            return self._no_hold
+        return self.rules
 
     def initial(self, now: float, number: int = 0) -> State:
         """Return the state in which an arbiter starts.
@@ -252,11 +255,15 @@ class Arbiter:
         if fresh:
             state = replace(state, number=state.number + 1, decision=decision)
         outputs: list[Output] = []
-        superseded = [t.name for t in state.recoveries if t.wanted and t.name not in chosen]
-        for name in (*superseded, *chosen):
+        for before in state.recoveries:
+            if before.wanted and before.name not in chosen:
+                after = self._release(before, chosen, state.number, now)
+                state = self._with_recovery(state, after)
+                if after.command != before.command:
+                    outputs.append(after.command)
+        for name in chosen:
             before = self._track(state, name)
-            after = (self._activate(state, before, now) if name in chosen
-                     else self._release(before, chosen, state.number, now))
+            after = self._activate(state, before, now)
             state = self._with_recovery(state, after)
             if after.command != before.command:
                 outputs.append(after.command)

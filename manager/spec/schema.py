@@ -23,6 +23,7 @@ from rampart.manager.model.order import PartialOrder, Tree, refine
 from rampart.manager.spec.mobile_robot import Hazard, Robot
 from rampart.manager.spec.tables import (
     DERIVED,
+    End,
     Layers,
     Name,
     OptionalName,
@@ -210,6 +211,8 @@ class SystemSpec(Table, frozen=True):
 
     Attributes:
         application: What the system adds to the engine: `class`, and that class's options.
+        judge: Who says what a run was worth: `class`, and that class's parameters.
+        end: When a run is over.
         mobile: Speeds and distances of a mobile robot, `[robot]` in the file.
         strategy: By which the arbiter decides; `rampart.manager.strategies.registry` has them.
         shadow: A strategy that is asked as well, and whose differing decisions are recorded;
@@ -221,6 +224,8 @@ class SystemSpec(Table, frozen=True):
     name: Name
     title: str
     application: dict[str, Any] = {}
+    judge: dict[str, Any] = {}
+    end: End = End()
     mobile: Robot | None = msgspec.field(name="robot", default=None)
     strategy: str = "safety-first"
     shadow: str = ""

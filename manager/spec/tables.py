@@ -116,6 +116,17 @@ class Layers(Table, frozen=True):
     checkpoints: bool = True
 
 
+class End(Table, frozen=True):
+    """When a run of the system is over.
+
+    Attributes:
+        after_s: Simulated seconds after which it is, unless the command line says otherwise; None
+            for a system that goes on until it is told to end.
+    """
+
+    after_s: Positive | None = None
+
+
 class Finding(NamedTuple):
     """Something wrong: where, what, and the offending value if one value is to blame."""
 

@@ -12,7 +12,8 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from rampart.sim.campaign.wording import MINUS, count, margin_text, seconds
+from rampart.sim.campaign.wording import count, seconds
+from rampart.sim.runs.report import MINUS, margin_text
 
 WIDTH = 520.0
 """Of the drawing, in its own units; text is 14 of them high."""

@@ -47,6 +47,7 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         faults: What goes wrong.
         seed: Of everything random.
         patience_s: See `PATIENCE_S`.
+        duration_s: How long a run without a mission takes; None for what the spec says.
     """
 
     row: str
@@ -59,6 +60,7 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     faults: tuple[PlannedFault, ...] = ()
     seed: int = 1
     patience_s: float = PATIENCE_S
+    duration_s: float | None = None
 
     @property
     def key(self) -> str:
@@ -116,6 +118,8 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
         failures: Actors that ended by an error.
         trace: Hash over every message.
         wall_s: How long it took.
+        judged: Whether there was a judge; without one success and safety say nothing.
+        restarts: Of all nodes.
     """
 
     success: bool
@@ -134,6 +138,8 @@ class RunResult(msgspec.Struct, frozen=True, kw_only=True):
     failures: tuple[str, ...]
     trace: str
     wall_s: float
+    judged: bool = True
+    restarts: int = 0
 
     @property
     def stopped_for_good(self) -> bool:
@@ -169,7 +175,9 @@ def run_job(job: Job) -> RunResult:
     if effective:
         injected_s = min(effective)
     return RunResult(
-        success=record.mission == "success", safe=record.safety == "safe", reasons=record.reasons,
+        success=record.mission in {"success", None}, safe=record.safety in {"safe", None},
+        judged=record.mission is not None, restarts=sum(record.restarts.values()),
+        reasons=record.reasons,
         duration_s=round(record.duration_s, 2), margins=judged.margins, severity=judged.severity,
         unsafe_s=judged.unsafe_s,
         injected_s=injected_s, **latencies(record, injected_s),
@@ -201,9 +209,11 @@ def virtual_run(job: Job) -> VirtualRun:
         options=job.options)
     nodes, spec = can_be_hit(spec), tailor(plan, spec)
     application = _application(msgspec.json.encode(plan.options), file)
-    trial = trial_class(spec)(RunContext(plan, spec, document, application), job.patience_s)
-    if not trial.judges:
-        raise ValueError(f"{file}: nobody judges its runs")
+    kind = trial_class(spec)
+    if not kind.patient and (job.duration_s or spec.end.after_s) is None:
+        raise ValueError(f"{file}: $.end.after_s: missing; in virtual time a run has to end")
+    trial = kind(RunContext(plan, spec, document, application),
+                 job.patience_s if kind.patient else job.duration_s)
     return VirtualRun(trial, network=find_network(job.network), scenario=job.faults, nodes=nodes)
 
 

@@ -18,8 +18,8 @@ from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.faults.topic_faults import systematic_faults
 
-EARLIEST_S, LATEST_S = 2.0, 120.0
-"""Random faults are injected between these simulated times."""
+MOMENTS_S = 2.0, 120.0
+"""Random faults are injected between these simulated times, unless the system says otherwise."""
 
 LASTS_S = (0.5, 15.0)
 """Random transient faults last between these."""
@@ -66,7 +66,8 @@ def cross(jobs: Sequence[Job], faults: Iterable[PlannedFault | None], seeds: Ite
 
 
 def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *, seed: int,
-           faults: Faults, together: int = 1) -> list[Job]:
+           faults: Faults, together: int = 1, moments: tuple[float, float] = MOMENTS_S
+           ) -> list[Job]:
     """Return random runs: kind, fault, moment, length and pattern are drawn.
 
     A kind is drawn first, then a fault of it, so that the few faults of the actuators weigh as
@@ -80,6 +81,7 @@ def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *
         faults: Of the robot: those it names are of topics.
         seed: Of the choice and of the runs; a longer sample begins with the shorter one.
         together: How many faults at once.
+        moments: Between which simulated times they are injected.
 
     Raises:
         ValueError: No jobs or faults to choose from.
@@ -90,16 +92,17 @@ def sample(jobs: Sequence[Job], groups: dict[str, tuple[str, ...]], runs: int, *
     chosen = []
     for number in range(runs):
         dice = random.Random(f"campaign {seed} {number}")  # noqa: S311 no secret
-        wrong = tuple(_random_fault(dice, groups, kinds, faults) for _ in range(together))
+        wrong = tuple(_random_fault(dice, groups, kinds, faults, moments)
+                      for _ in range(together))
         chosen.append(_with(dice.choice(list(jobs)), wrong, dice.randrange(1, 2**31)))
     return chosen
 
 
 def _random_fault(dice: random.Random, groups: dict[str, tuple[str, ...]], kinds: Sequence[str],
-                  faults: Faults) -> PlannedFault:
+                  faults: Faults, moments: tuple[float, float]) -> PlannedFault:
     kind = dice.choice(kinds)
     fault = dice.choice(groups[kind])
-    at_s = round(dice.uniform(EARLIEST_S, LATEST_S), 2)
+    at_s = round(dice.uniform(*moments), 2)
     lasts_s = round(math.exp(dice.uniform(*map(math.log, LASTS_S))), 2)
     pattern = dice.choice(("permanent", "transient", "intermittent"))
     seed = dice.randrange(1000)

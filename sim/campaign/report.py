@@ -23,10 +23,10 @@ from rampart.sim.campaign.job import trial_of_system
 from rampart.sim.campaign.named import Section
 from rampart.sim.campaign.statistics import Row, Spread, rate, table, total
 from rampart.sim.campaign.store import Run
-from rampart.sim.campaign.wording import NONE, count, interval, margin_text, percent, seconds
+from rampart.sim.campaign.wording import count, interval, percent, seconds
 from rampart.sim.campaign.worst_runs import story, worth_showing
 from rampart.sim.runs.pictures import RunPictures
-from rampart.sim.runs.report import environment, write_atomically
+from rampart.sim.runs.report import NONE, environment, margin_text, write_atomically
 from rampart.sim.runs.trial import Trial
 from rampart.sim.runs.virtual_run import VirtualResult
 
@@ -120,6 +120,12 @@ def headline(runs: Sequence[Run]) -> str:
     if not runs:
         return "No run was made."
     faulty = [run for run in runs if run.job.faults]
+    if not all(run.result.judged for run in runs):
+        detected = sum(run.result.detected_after_s is not None for run in faulty)
+        restarts = sum(run.result.restarts for run in runs)
+        return (f"{_runs(len(runs))} without a judge: of {len(faulty):,} with a fault "
+                f"{sum(run.result.effective for run in faulty):,} had an effect and {detected:,} "
+                f"were detected; {count(restarts, 'restart')}.")
     if not faulty:
         return (f"{_runs(len(runs))} without a fault: {_many(runs, 'unsafe')}, "
                 f"{_many(runs, 'complete')}.")
@@ -169,6 +175,11 @@ def _figures(runs: Sequence[Run]) -> list[tuple[str, str, str]]:
     if not any(run.result.counts for run in protected):
         return figures
     row = total(protected, "")
+    if not row.judged:
+        return [*figures, ("not counted, no effect", f"{row.ineffective:,}", ""),
+                ("detected after, median",
+                 seconds(row.detected_after_s.median if row.detected_after_s else None), ""),
+                ("restarts", f"{row.restarts:,}", "")]
     unsafe = row.safe.of - row.safe.count
     return [
         *figures,
@@ -232,9 +243,11 @@ def _cells(row: Row, ftm: bool, trial: type[Trial]) -> dict[str, Any]:
     if ftm and recovered and recovered.n < counted:
         calm.append(f"{counted - recovered.n:,} not recovered")
     return {
-        "sum": False, "fault": row.fault, "worst": row.worst, "key": row.worst_key,
+        "sum": False, "fault": row.fault, "key": row.worst_key,
+        "worst": row.worst if row.judged else NONE,
         "runs": (f"{row.runs:,}", f"{row.ineffective:,} no effect" if row.ineffective else ""),
-        "success": _share(row.success.count, counted), "safe": _share(row.safe.count, counted),
+        "success": _share(row.success.count, counted if row.judged else 0),
+        "safe": _share(row.safe.count, counted if row.judged else 0),
         "unsafe": row.safe.count < counted,
         "detected": (found[0], "\n".join(found[1:])),
         "recovered": (calm[0], "\n".join(calm[1:])),

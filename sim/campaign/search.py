@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from rampart.sim.campaign.job import Job, RunResult, application_of_system, run_job
-from rampart.sim.campaign.plan import EARLIEST_S
+from rampart.sim.campaign.plan import MOMENTS_S
 from rampart.sim.faults.scenario import PlannedFault
 
 if TYPE_CHECKING:
     import optuna
 
-LATEST_S = 150.0
 _LASTS_S = (0.3, 60.0)
 
 Run = Callable[[Sequence[Job]], Sequence[RunResult]]
@@ -37,18 +36,20 @@ class Space:
         bases: What the runs have in common; the optimiser chooses among them.
         groups: Names of faults by kind.
         intruder: What may come on top of a fault, see `Faults`.
+        moments: Between which simulated times faults are injected.
     """
 
     bases: tuple[Job, ...]
     groups: Mapping[str, tuple[str, ...]]
     intruder: tuple[str, float, float] | None = None
+    moments: tuple[float, float] = MOMENTS_S
 
     def job(self, trial: optuna.Trial, seed: int) -> Job:
         """Return the run that the optimiser asks for."""
         base = self.bases[trial.suggest_int("base", 0, len(self.bases) - 1)]
         kind = trial.suggest_categorical("kind", sorted(self.groups))
         fault = trial.suggest_categorical(f"fault of {kind}", self.groups[kind])
-        at_s = round(trial.suggest_float("at_s", EARLIEST_S, LATEST_S), 2)
+        at_s = round(trial.suggest_float("at_s", *self.moments), 2)
         lasts_s = None if kind == "process" else round(
             trial.suggest_float("lasts_s", *_LASTS_S, log=True), 2)
         faults = [PlannedFault(fault, at_s, duration_s=lasts_s)]

@@ -55,8 +55,10 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     ftm: bool
     strategy: str
     retuned: dict[str, dict[str, Any]]
+    judged: bool
     runs: int
     ineffective: int
+    restarts: int
     success: Rate
     safe: Rate
     worst: str
@@ -134,7 +136,8 @@ def _row(condition: Job, runs: Sequence[Run]) -> Row:
     return Row(
         fault=condition.row, options=condition.options, ftm=condition.ftm,
         strategy=condition.strategy, retuned=condition.retuned, runs=len(runs),
-        ineffective=len(runs) - len(counted),
+        judged=all(run.result.judged for run in runs), ineffective=len(runs) - len(counted),
+        restarts=sum(run.result.restarts for run in runs),
         success=rate(sum(r.success for r in results), len(results)),
         safe=rate(sum(r.safe for r in results), len(results)),
         worst=verdict(bad) if counted else NO_EFFECT, worst_key=bad.job.key,
@@ -152,6 +155,9 @@ def as_json(row: Row) -> dict[str, object]:
     """Return a row as scripts get it: options and margins among the figures, rates as counts."""
     more = msgspec.to_builtins(row)
     options, margins = more.pop("options"), more.pop("margins")
+    if not row.judged:
+        more |= dict.fromkeys(("success", "safe", "success_interval", "safe_interval", "worst"))
+        return {**options, **margins, **more}
     return {**options, **margins, **more, "success": row.success.count, "safe": row.safe.count,
             "success_interval": [row.success.low, row.success.high],
             "safe_interval": [row.safe.low, row.safe.high]}

@@ -135,12 +135,12 @@ class Store:
     def _using(self) -> Iterator[None]:
         try:
             yield
-        except (sqlite3.Error, OSError, *_NO_RUN) as error:
+        except (sqlite3.Error, *_NO_RUN) as error:
             raise StoreError(f"{self.path}: cannot be used: {' '.join(str(error).split())}; "
                              "choose another --out") from None
 
 
-_NO_RUN = (ValueError, TypeError, LookupError, RecursionError)
+_NO_RUN = (ValueError, TypeError, LookupError, RecursionError, OSError)
 """What decoding raises that meets other bytes, or no bytes at all."""
 
 

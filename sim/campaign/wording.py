@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 from rampart.sim.campaign.statistics import Rate
-
-NONE, MINUS = "–", "−"  # noqa: RUF001 - typography for people
+from rampart.sim.runs.report import NONE
 
 
 def percent(share: float) -> str:
@@ -25,15 +24,6 @@ def percent(share: float) -> str:
 def interval(found: Rate) -> str:
     """Return the confidence interval of a share, or nothing if there were no runs."""
     return f"{percent(found.low)} to {percent(found.high)} %" if found.of else ""
-
-
-def margin_text(value: float | None, unit: str, exact_below: float | None) -> str:
-    """Return a margin; from `exact_below` on only a bound is known, None: always exact."""
-    if value is None or not math.isfinite(value):
-        return NONE
-    if exact_below is not None and value >= exact_below:
-        return f"≥ {exact_below:g} {unit}"
-    return f"{value:.2f} {unit}".replace("-", MINUS)
 
 
 def seconds(value: float | None) -> str:

@@ -68,9 +68,8 @@ class Fault(Struct, frozen=True):
             duration_s: simulated seconds, infinity for permanent; the fault's own if None.
         """
         lasts_s = self.duration_s if duration_s is None else duration_s
-        if len(self.disturbances) == 1:
-            return (self.disturbances[0].order(injection, lasts_s),)
-        return tuple(d.order(f"{injection}.{i}", lasts_s)
+        several = len(self.disturbances) > 1
+        return tuple(d.order(f"{injection}.{i}" if several else injection, lasts_s)
                      for i, d in enumerate(self.disturbances, start=1))
 
     def varied(self, *, share: float | None = None, on_s: float | None = None,

@@ -40,9 +40,8 @@ class Faults:
     left_out: ClassVar[Mapping[str, str]] = {}
     others: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     titled: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    kinds: ClassVar[Mapping[str, str]] = {
-        "none": "no fault", "topic": "topics", "process": "processes",
-        "several": "several at once"}
+    kinds: ClassVar[Mapping[str, str]] = {"none": "no fault", "topic": "topics",
+                                          "process": "processes", "several": "several at once"}
     intruder: ClassVar[tuple[str, float, float] | None] = None
 
     def own(self, fault: str, injection: str, duration_s: float | None) -> object | None:

@@ -1,6 +1,6 @@
 """The injector: carries out the planned faults of a run, and watches whether they had an effect.
 
-It lives beside the observer, outside the system under test. Faults of topics and actuators are
+It runs beside the observer, outside the system under test. Faults of topics and actuators are
 ordered over the bus and reported by those they hit; processes are hit through a `ProcessControl`. A
 robot whose faults are more than that has an injector of its own, derived from this one.
 """

@@ -70,8 +70,7 @@ class Console:
             return
         if plan.hmi_port:
             self.say(f"Operator's page: {plan.hmi_page_to_open}")
-        comes_back = [node.name for node in spec.nodes if node.respawn != SUPERVISOR]
-        if comes_back:
+        if comes_back := [node.name for node in spec.nodes if node.respawn != SUPERVISOR]:
             example = self.example if self.example in comes_back else comes_back[0]
             self.say(f"Try from another shell: kill-node {example}")
 
@@ -82,12 +81,14 @@ class Console:
     def take(self, _topic: Topic[Any], message: Any, header: Header) -> None:
         """Take one message of the run."""
         at = header.stamp
-        self._tell_left_out(at)
+        now_s = self._clock()
+        if count := self._reports.left_out(now_s) + self._others.left_out(now_s):
+            self.say(f"[{at:7.2f} s] {count} more lines were left out")
         if isinstance(message, fm.ProcessEvent):
             if message.event not in _QUIET_EVENTS and message.detail != "already":
                 detail = f" ({message.detail})" if message.detail else ""
-                self.line(at, f"{message.node} {message.event}, incarnation "
-                          f"{message.incarnation}{detail}")
+                which = f"incarnation {message.incarnation}"
+                self.line(at, f"{message.node} {message.event}, {which}{detail}")
         elif isinstance(message, fm.DetectionReport):
             self._take_detection(message, header)
         elif isinstance(message, fm.ManagerStatus):
@@ -110,12 +111,6 @@ class Console:
         if not self._is_limited or (limit or self._others).allows(self._clock()):
             self.say(f"[{at_s:7.2f} s] {clip(text, LINE_CHARS)}")
 
-    def _tell_left_out(self, at_s: float) -> None:
-        now_s = self._clock()
-        count = self._reports.left_out(now_s) + self._others.left_out(now_s)
-        if count:
-            self.say(f"[{at_s:7.2f} s] {count} more lines were left out")
-
     def conclusion(self, record: RunRecord, report: Path | None) -> None:
         """Say how it ended, and where the report is, if there is one."""
         for reason in record.reasons:
@@ -131,12 +126,10 @@ class Console:
             self.line(header.stamp, f"{header.source}: {what}")
 
     def _take_silence(self, silent: tuple[str, ...], at: float) -> None:
-        for name in silent:
-            if name not in self._silent:
-                self.line(at, f"{name} silent: it counts as active")
-        for name in self._silent:
-            if name not in silent:
-                self.line(at, f"{name}: no longer silent")
+        for name in (n for n in silent if n not in self._silent):
+            self.line(at, f"{name} silent: it counts as active")
+        for name in (n for n in self._silent if n not in silent):
+            self.line(at, f"{name}: no longer silent")
         self._silent = silent
 
     def show_live(self, text: str, at_s: float) -> None:

@@ -17,7 +17,6 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from rampart.actors.bus.topic import Topic
 from rampart.actors.runtime.declaration import Handlers
 
 
@@ -66,11 +65,6 @@ class Judge(Handlers):
 
     def __init__(self, parameters: Any = None) -> None:
         self.parameters = self.Parameters() if parameters is None else parameters
-
-    @classmethod
-    def hears(cls) -> tuple[Topic[Any], ...]:
-        """Return the topics that it has handlers for."""
-        return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
 
     def over(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on; asked now and then."""

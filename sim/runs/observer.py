@@ -1,6 +1,6 @@
-"""The observer: lives in the launcher's process and hears what the run's story is made of.
+"""The observer: runs in the launcher's process and hears what the run's story is made of.
 
-It controls nothing. Whoever wants the story (judge, report, console, launcher) is a sink: a
+It controls nothing. What wants the story (judge, report, console, launcher) is a sink: a
 function of topic, message and header, called on the observer's loop in order of arrival. A robot
 whose own topics belong to the story derives its observer, which its application names.
 """
@@ -8,6 +8,7 @@ whose own topics belong to the story derives its observer, which its application
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
@@ -16,6 +17,7 @@ from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.layout.layout import application_class
 from rampart.actors.layout.wiring import import_class
 from rampart.actors.runtime.actor import BASE_INPUTS, Actor, Context, Header, on
+from rampart.actors.runtime.parameters import TopicsHeard
 from rampart.manager.spec.schema import SystemSpec
 
 Sink = Callable[[Topic[Any], Any, Header], None]
@@ -24,9 +26,22 @@ Sink = Callable[[Topic[Any], Any, Header], None]
 class Observer(Actor):
     """Passes everything it hears to its sinks."""
 
+    class Parameters(Actor.Parameters, frozen=True):
+        """What it hears besides.
+
+        Attributes:
+            judged: keys of the topics that the judge hears.
+        """
+
+        judged: TopicsHeard = ()
+
+    parameters: Parameters
+
     def __init__(self, context: Context, sinks: Sequence[Sink] = ()) -> None:
         super().__init__(context)
         self._sinks = tuple(sinks)
+        for key in self.parameters.judged:
+            self.hear_topic(key, partial(self._pass_on, self.chosen_topic(key)))
         self._topic_of = {topic.type: topic for topic in self.inputs()
                           if topic not in BASE_INPUTS}
 
@@ -41,7 +56,10 @@ class Observer(Actor):
     @on(bus_topics.DIAGNOSTIC)
     def heard(self, message: Any, header: Header) -> None:
         """Pass one message on."""
-        topic = self._topic_of[type(message)]  # each topic heard here has a type of its own
+        # Each topic heard here has a type of its own.
+        self._pass_on(self._topic_of[type(message)], message, header)
+
+    def _pass_on(self, topic: Topic[Any], message: Any, header: Header) -> None:
         for sink in self._sinks:
             sink(topic, message, header)
 

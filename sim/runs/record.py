@@ -82,6 +82,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
         intervals: the same as bars for a timeline.
         decisions: of the FTM Manager.
         restarts: node name to number of restarts; nodes never restarted are left out.
+        given_up: nodes that were not restarted any more at its end.
         strategy: name of the manager's strategy, empty without FTMs.
         seed: of everything random.
         rate: simulated seconds per second.
@@ -97,6 +98,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     intervals: tuple[Interval, ...]
     decisions: tuple[DecisionLine, ...]
     restarts: dict[str, int]
+    given_up: tuple[str, ...] = ()
     strategy: str
     seed: int
     rate: float
@@ -120,6 +122,7 @@ class RunRecorder:
         self._open: dict[tuple[str, str], tuple[float, str]] = {}
         self._decisions: Remembered[tuple[int, int], DecisionLine] = Remembered(KEPT)
         self._restarts: dict[str, int] = Remembered(KEPT)
+        self._given_up: dict[str, None] = Remembered(KEPT)
         self._respawned: Remembered[tuple[str, int], None] = Remembered(KEPT)
         self._injections: dict[str, str] = Remembered(KEPT)
         self._take: dict[str, Callable[[Any, Header], None]] = {
@@ -151,7 +154,8 @@ class RunRecorder:
             "run_id": self._plan.run_id, "seed": self._plan.seed, "rate": self._plan.rate,
             "strategy": self._strategy, "duration_s": duration_s, "events": tuple(events),
             "intervals": tuple(sorted((*self._intervals, *still), key=lambda bar: bar.from_s)),
-            "decisions": tuple(self._decisions.values()), "restarts": dict(self._restarts)}
+            "decisions": tuple(self._decisions.values()), "restarts": dict(self._restarts),
+            "given_up": tuple(self._given_up)}
 
     def _detection(self, report: fm.DetectionReport, header: Header) -> None:
         active = report.state is fm.DetectionState.ACTIVE
@@ -192,6 +196,10 @@ class RunRecorder:
             self.turn("down", event.node, False, header.stamp)
             by = f" by {event.by}" if event.by else ""
             self._note(header.stamp, "clear", f"{event.node} {event.event}{by}")
+        if event.event == "given up":
+            self._given_up[event.node] = None
+        elif event.event in _RECOVERED:
+            self._given_up.pop(event.node, None)
         if event.event == "respawned":
             one = event.node, event.incarnation
             if one not in self._respawned:

@@ -10,7 +10,7 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +22,8 @@ from rampart.sim.runs.record import Interval, RunRecord
 _LANES = {"injection": "Injected", "down": "Node down", "detection": "Detected",
           "recovery": "Recovery", "stop": "Stopped"}
 _TICKS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 3600)
+
+NONE, MINUS = "–", "−"  # noqa: RUF001 - typography for people
 
 
 class Written(NamedTuple):
@@ -62,6 +64,31 @@ def try_report(run: RunRecord, render: Callable[[Any], str], directory: str | Pa
         for why, names in problems.items()))
 
 
+def render(run: RunRecord, title: str, margins: Sequence[tuple[str, str]] = ()) -> str:
+    """Return the page of a run of any system.
+
+    Args:
+        run: the record.
+        title: of the system.
+        margins: how far from harm it was at its worst: heading and text of each.
+    """
+    return environment().get_template("runs/report.html").render(
+        run=run, title=title, margins=margins, headline=_headline(run), lanes=lanes_of(run),
+        ticks=ticks_of(run.duration_s))
+
+
+def _headline(run: RunRecord) -> str:
+    """Return the result of the run in a sentence."""
+    if run.mission is None:
+        return "No judge heard this run."
+    if run.safety == "unsafe":
+        return "The system was not safe in this run."
+    if run.safety == "not known":
+        return "Nothing was heard by which safety could be judged."
+    return ("The task was done, and the system was safe." if run.mission == "success"
+            else "The task was not done; the system was safe.")
+
+
 def in_words(error: Exception) -> str:
     """Return an error in a few words, for a line that names the file."""
     if isinstance(error, OSError) and error.strerror:
@@ -93,6 +120,15 @@ def environment() -> jinja2.Environment:
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     made.filters.update(clock=clock)
     return made
+
+
+def margin_text(value: float | None, unit: str, exact_below: float | None) -> str:
+    """Return a margin; from `exact_below` on only a bound is known, None: always exact."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    if exact_below is not None and value >= exact_below:
+        return f"≥ {exact_below:g} {unit}"
+    return f"{value:.2f} {unit}".replace("-", MINUS)
 
 
 def clock(seconds: float | None) -> str:

@@ -9,6 +9,8 @@ with a verdict derives its own, which its application names.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
@@ -17,47 +19,35 @@ import msgspec
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import NodeTable, ProcessEvent
-from rampart.actors.layout.layout import application_class
+from rampart.actors.layout.layout import application_class, judge_class, judged_topics
 from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.layout.wiring import import_class
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import Actor, Context, Header
 from rampart.actors.runtime.clock import Clock
+from rampart.actors.runtime.parameters import read_parameters
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import INJECTOR, Injector, ProcessControl
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.runs.console import Console
+from rampart.sim.runs.judge import Judge, Verdict
 from rampart.sim.runs.observer import Sink, observer_class
-from rampart.sim.runs.record import RunRecord, RunRecorder
-from rampart.sim.runs.report import Written
+from rampart.sim.runs.record import RunRecord, RunRecorder, Safety
+from rampart.sim.runs.report import Written, margin_text, render, try_report
 
 LAUNCHER = "launch.py"
 
-
-class Judgement(msgspec.Struct, frozen=True, kw_only=True):
-    """What a judge measured in a run.
-
-    Args:
-        margins: how far from harm the run was at its worst, by the names in `Trial.margins`; None
-            where there was nothing to measure.
-        severity: how bad an unsafe run was: the larger, the worse; 0 for a safe one.
-        unsafe_s: when it first became unsafe, simulated time.
-        narrowest_s: when the smallest margin was measured.
-    """
-
-    margins: dict[str, float | None] = {}
-    severity: float = 0.0
-    unsafe_s: float | None = None
-    narrowest_s: float | None = None
+_SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not known"}
 
 
 class Trial:
     """A run that goes on for a while, without a judge.
 
     Class attributes:
-        judges: whether it ends by itself, with a verdict and a report.
+        judges: whether there is a verdict on it.
+        patient: whether it ends by itself, or when nothing progresses; else after a while.
         injector: who carries out faults.
         tells: who tells the story.
         retunings: changes to a system that have a name, see `Job.retuned`.
@@ -68,8 +58,8 @@ class Trial:
 
     Args:
         run: what is run.
-        limit_s: simulated seconds after which it is over; for one that judges, seconds without
-            progress.
+        limit_s: simulated seconds after which it is over, None for those of the specification;
+            for one that is patient, seconds without progress.
         stream: for the story; None keeps quiet.
 
     Attributes:
@@ -80,6 +70,7 @@ class Trial:
     """
 
     judges: ClassVar[bool] = False
+    patient: ClassVar[bool] = False
     injector: ClassVar[type[Injector]] = Injector
     tells: ClassVar[type[Console]] = Console
     retunings: ClassVar[Mapping[str, dict[str, dict[str, Any]]]] = {}
@@ -91,7 +82,7 @@ class Trial:
     def __init__(self, run: RunContext, limit_s: float | None = None,
                  stream: TextIO | None = None) -> None:
         self.run = run
-        self.limit_s = limit_s
+        self.limit_s = run.system.end.after_s if limit_s is None else limit_s
         self.strategy = run.system.strategy if run.plan.ftm else ""
         self.name = run.system.name
         self.title = run.system.title
@@ -124,8 +115,10 @@ class Trial:
                 heard(message)
 
         spec, observers = self.run.system, context(OBSERVER)
-        actors: list[Actor] = [
-            observer_class(spec)(observers, [take, *self.sinks(observers.clock)])]
+        kind = observer_class(spec)
+        judged = {topic.key: topic for topic in judged_topics(spec, kind)}
+        observers = replace(observers, parameters={"judged": list(judged)}, topics=judged)
+        actors: list[Actor] = [kind(observers, [take, *self.sinks(observers.clock)])]
         if scenario:
             self._injector = self.injector(
                 context(INJECTOR), scenario, control, nodes=nodes, known=system_topics(spec),
@@ -142,19 +135,17 @@ class Trial:
         self._brought_back += 1
         if self.console:
             self.console.line(now_s, f"{name} brought back")
+        event = ProcessEvent(name, "respawned", 0, self._brought_back, LAUNCHER, "")
         self.recorder.feed(
-            topics.PROCESS_EVENT,
-            ProcessEvent(name, "respawned", 0, self._brought_back, LAUNCHER, ""),
-            Header(LAUNCHER, 1, self._brought_back, now_s))
+            topics.PROCESS_EVENT, event, Header(LAUNCHER, 1, self._brought_back, now_s))
 
     def excuse(self, stall_s: float) -> None:
         """Do not count simulated seconds in which the launcher heard nothing, being stopped."""
 
     def over(self, now_s: float) -> str | None:
         """Return why the run is over, or None while it goes on."""
-        if self.limit_s is not None and now_s >= self.limit_s:
-            return "its time is over"
-        return None
+        is_over = self.limit_s is not None and now_s >= self.limit_s
+        return "its time is over" if is_over else None
 
     def conclude(self, now_s: float, why: str) -> RunRecord:
         """Return the record of the run, with a verdict if there is one.
@@ -171,14 +162,24 @@ class Trial:
         return {
             "mission": record.mission, "safety": record.safety, "reasons": record.reasons,
             "duration_s": round(record.duration_s, 2), "restarts": record.restarts,
+            "given_up": record.given_up,
             "decisions": msgspec.to_builtins(record.decisions),
             "faults": [{**msgspec.to_builtins(fault), "effective": fault.effective}
                        for fault in record.faults]}
 
-    def judgement(self, record: RunRecord) -> Judgement:
+    def judgement(self, record: RunRecord) -> Verdict:
         """Return what only a judge knows of a run that is over."""
-        del record
-        return Judgement()
+        return Verdict(success=record.mission == "success", safe=record.safety == "safe",
+                       reasons=record.reasons)
+
+    @classmethod
+    def moments(cls, spec: SystemSpec) -> tuple[float, float] | None:
+        """Return between which simulated times a campaign injects faults.
+
+        None: that follows from how long a run without a fault takes.
+        """
+        del spec
+        return None
 
     @classmethod
     def upgraded(cls, result: dict[str, Any]) -> dict[str, Any]:
@@ -186,16 +187,78 @@ class Trial:
         return result
 
     def report(self, record: RunRecord, directory: Path) -> Written:
-        """Write as much of a report as can be written; by default there is none."""
-        del record, directory
-        return Written(None, None, "")
+        """Write as much of a report as can be written."""
+        return try_report(record, lambda run: render(run, self.title, self._margins(run)),
+                          directory)
+
+    def _margins(self, record: RunRecord) -> list[tuple[str, str]]:
+        found = self.judgement(record).margins
+        return [(label, margin_text(found.get(name), self.margin_unit, self.exact_below))
+                for name, label in self.margins.items()]
+
+
+class JudgedTrial(Trial):
+    """A run that a judge hears, which the system's specification names.
+
+    Class attributes:
+        judge: class of the judge.
+    """
+
+    judges = True
+    judge: ClassVar[type[Judge]]
+
+    def __init__(self, run: RunContext, limit_s: float | None = None,
+                 stream: TextIO | None = None) -> None:
+        super().__init__(run, limit_s, stream)
+        given = {name: value for name, value in run.system.judge.items() if name != "class"}
+        self._judge = self.judge(read_parameters(
+            self.judge.Parameters, given, run.plan.system_file, "$.judge"))
+        self._hears = [(topic.key, getattr(self._judge, method))
+                       for topic, method in self.judge._handlers]
+
+    def sinks(self, clock: Clock) -> list[Sink]:
+        """Return what wants to hear the run's messages: the judge first."""
+
+        def to_judge(topic: Topic[Any], message: Any, header: Header) -> None:
+            for key, hear in self._hears:
+                if key == topic.key:
+                    hear(message, header)
+
+        return [to_judge, *super().sinks(clock)]
+
+    def over(self, now_s: float) -> str | None:
+        """Return why the run is over: what the judge says, or that its time is over."""
+        return self._judge.over(now_s) or super().over(now_s)
+
+    def conclude(self, now_s: float, why: str) -> RunRecord:
+        """Return the record of the run with the judge's verdict, and what became of faults."""
+        verdict = self._judge.verdict()
+        return self.recorder.record(
+            now_s, faults=self.outcomes(), mission="success" if verdict.success else "fail",
+            safety=_SAFETY[verdict.safe],
+            reasons=() if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}"))
+
+    def judgement(self, record: RunRecord) -> Verdict:
+        """Return the judge's verdict."""
+        del record
+        return self._judge.verdict()
 
 
 def trial_class(spec: SystemSpec) -> type[Trial]:
-    """Return what a run of a system is, by the system's application.
+    """Return what a run of a system is: that of its application, or one that its judge hears.
 
     Raises:
-        ValueError: the application, or the class it names, does not exist.
+        ValueError: the application, the judge, or a class that one of them names does not exist.
     """
     path = application_class(spec).trial
-    return import_class(path, Trial, "trial") if path else Trial
+    if path:
+        return import_class(path, Trial, "trial")
+    return _judged_by(str(spec.judge.get("class"))) if judge_class(spec) else Trial
+
+
+@cache
+def _judged_by(path: str) -> type[Trial]:
+    judge = import_class(path, Judge, "$.judge.class")
+    return type(f"{judge.__name__}Trial", (JudgedTrial,), {
+        "__doc__": judge.__doc__, "judge": judge, "margins": judge.margins,
+        "margin_unit": judge.margin_unit, "exact_below": judge.exact_below})

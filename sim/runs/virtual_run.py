@@ -23,8 +23,9 @@ from rampart.actors.run.run_plan import OBSERVER
 from rampart.actors.runtime.actor import Context
 from rampart.sim.faults.injector import INJECTOR, can_be_hit
 from rampart.sim.faults.scenario import PlannedFault
+from rampart.sim.runs.judge import Verdict
 from rampart.sim.runs.record import RunRecord
-from rampart.sim.runs.trial import Judgement, Trial
+from rampart.sim.runs.trial import Trial
 from rampart.sim.virtual.network import NETWORKS, NetworkModel, SeededNetwork
 from rampart.sim.virtual.virtual_bus import Hub, Tap, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualClock, VirtualLoop
@@ -53,7 +54,7 @@ class VirtualResult(msgspec.Struct, frozen=True):
     """
 
     record: RunRecord
-    judgement: Judgement
+    judgement: Verdict
     why: str
     trace: str
     messages: int

@@ -61,10 +61,9 @@ def find_network(name: str) -> NetworkModel:
     Raises:
         ValueError: There is none.
     """
-    try:
-        return NETWORKS[name]
-    except KeyError:
-        raise ValueError(f"unknown network {name!r}; known: {', '.join(NETWORKS)}") from None
+    if name not in NETWORKS:
+        raise ValueError(f"unknown network {name!r}; known: {', '.join(NETWORKS)}")
+    return NETWORKS[name]
 
 
 class SeededNetwork:
@@ -80,7 +79,6 @@ class SeededNetwork:
     def __init__(self, model: NetworkModel, seed: Any, timing: Timing | None = None,
                  local: Sequence[str] = ()) -> None:
         self.model = model
-        self.lost = self.duplicated = self.overtaken = 0
         self._rng = random.Random(f"network {seed}")  # noqa: S311 no secret
         delays_ms = (timing or measured()).message_ms
         self._delay_s = drawer(delays_ms, self._rng)
@@ -92,14 +90,11 @@ class SeededNetwork:
         """Return the one link between two nodes; None if everything arrives at once."""
         if source in self._local or reader in self._local:
             return None
-        ends = (source, reader)
-        link = self._links.get(ends)
-        if link is None:
-            model = self.model
+        ends, model = (source, reader), self.model
+        if ends not in self._links:
             plain = not (model.extra_s or model.loss or model.duplication or model.reordering)
-            link = self._links[ends] = (
-                self._in_order() if plain and model.delay else self._troubled())
-        return link
+            self._links[ends] = self._in_order() if plain and model.delay else self._troubled()
+        return self._links[ends]
 
     def _in_order(self) -> Link:
         """Return a link that delays messages and does no more: most runs have only these."""
@@ -121,10 +116,8 @@ class SeededNetwork:
 
         def arrivals(now_s: float) -> Sequence[float]:
             if model.loss and dice() < model.loss:
-                self.lost += 1
                 return ()
             if model.duplication and dice() < model.duplication:
-                self.duplicated += 1
                 return (arrival(now_s), arrival(now_s))
             return (arrival(now_s),)
 
@@ -137,7 +130,6 @@ class SeededNetwork:
                 at_s += model.extra_s * dice()
             if at_s < last_s:
                 if model.reordering and dice() < model.reordering:
-                    self.overtaken += 1
                     return at_s
                 at_s = last_s
             last_s = at_s

@@ -24,20 +24,6 @@ Posted = Callable[[Any, Any], object]
 """A call that is posted with both its arguments."""
 
 
-class _Selector(selectors.DefaultSelector):
-    """Counts the files it watches: the loop's own wake-up pipe is one, and need not be asked."""
-
-    files = 0
-
-    def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
-        self.files += 1
-        return super().register(fileobj, events, data)
-
-    def unregister(self, fileobj: Any) -> selectors.SelectorKey:
-        self.files -= 1
-        return super().unregister(fileobj)
-
-
 class _Call:
     """A pending call that can be taken back; what asyncio uses of a `Handle`, `TimerHandle`."""
 
@@ -71,8 +57,9 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     """
 
     def __init__(self) -> None:
-        self._files = _Selector()
+        self._files = selectors.DefaultSelector()
         super().__init__(self._files)
+        self._watched = self._files.get_map()  # one is the loop's own wake-up pipe
         self.now_s = 0.0
         self._count = 0
         # When, count, a posted callback and its arguments; or instead of these None, a `_Call`.
@@ -127,7 +114,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _run_once(self) -> None:
         # asyncio's own step, called by `run_forever`, with the waiting left out.
         ready, files = self._ready, self._files  # type: ignore[attr-defined]
-        if files.files > 1:
+        if len(self._watched) > 1:
             self._process_events(files.select(0))  # type: ignore[attr-defined]
         if ready:
             for _ in range(len(ready)):
@@ -140,7 +127,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
     def _let_time_pass(self) -> None:
         """Move the clock from timer to timer and make all calls due, while nothing else is."""
-        timers, ready, files = self._timers, self._ready, self._files  # type: ignore[attr-defined]
+        timers, ready, watched = self._timers, self._ready, self._watched  # type: ignore[attr-defined]
         while timers:
             when, _, callback, first, second = heappop(timers)
             if callback is None and first._cancelled:
@@ -160,7 +147,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
                 if not timers or timers[0][0] > now_s or timers[0][1] > last:
                     break
                 _, _, callback, first, second = heappop(timers)
-            if ready or self._stopping or files.files > 1:  # type: ignore[attr-defined]
+            if ready or self._stopping or len(watched) > 1:  # type: ignore[attr-defined]
                 return
 
     def _make(self, call: _Call) -> None:

@@ -10,11 +10,13 @@ from __future__ import annotations
 import asyncio
 import random
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from itertools import count
 from typing import Any
+
+import msgspec
 
 from rampart.actors.ftm.messages import AdaptedSystem, NodeTable
 from rampart.actors.layout.layout import Layout, adapted_system
@@ -50,41 +52,38 @@ _CHANGES = {
 """What holds or resumes a process: the condition in which it helps, and that after it."""
 
 
-class VirtualProcess:
+class VirtualProcess(msgspec.Struct, eq=False):
     """One process: its actors, with their buses and tasks."""
 
-    def __init__(self, pid: int, names: tuple[str, ...], incarnation: int) -> None:
-        self.pid = pid
-        self.names = names
-        self.incarnation = incarnation
-        self.condition = Condition.STARTING
-        self.actors: list[tuple[Actor, VirtualBus, asyncio.Task[None]]] = []
-        self.holders: list[Callable[[], None]] = []
-        self.gone = False
+    pid: int
+    names: tuple[str, ...]
+    incarnation: int
+    condition: Condition = Condition.STARTING
+    actors: list[tuple[Actor, VirtualBus, asyncio.Task[None]]] = []
+    holders: list[Callable[[], None]] = []
+    gone: bool = False
 
 
+@dataclass(eq=False, slots=True)
 class _Handle(ProcessHandle):
     """The supervisor's hold on a process."""
 
-    def __init__(self, machine: VirtualMachine, process: VirtualProcess,
-                 ended: Callable[[], None]) -> None:
-        self._machine = machine
-        self._process = process
-        self._ended = ended
-        process.holders.append(ended)
+    machine: VirtualMachine
+    process: VirtualProcess
+    ended: Callable[[], None]
 
     def kill(self) -> None:
-        self._machine.kill_process(self._process)
+        self.machine.kill_process(self.process)
 
     def gone(self) -> bool:
-        return self._process.gone
+        return self.process.gone
 
     def stopped(self) -> bool:
-        return self._process.condition is Condition.STOPPED
+        return self.process.condition is Condition.STOPPED
 
     def ignore(self) -> None:
-        if self._ended in self._process.holders:
-            self._process.holders.remove(self._ended)
+        if self.ended in self.process.holders:
+            self.process.holders.remove(self.ended)
 
     close = ignore
 
@@ -199,6 +198,7 @@ class VirtualMachine:
         process = self._processes.get(pid)
         if process is None:
             raise ProcessLookupError(pid)
+        process.holders.append(ended)
         return _Handle(self, process, ended)
 
     def adapt(self, adapted: AdaptedSystem) -> None:

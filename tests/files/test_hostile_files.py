@@ -25,8 +25,7 @@ from PIL import Image
 
 from rampart.actors.osmosis.airport import limits, mask
 from rampart.actors.osmosis.airport.errors import AirportError
-from rampart.actors.recording.bag_reader import BagReader, Summary
-from rampart.actors.recording.bag_repair import repair
+from rampart.actors.recording.bag_reader import BagReader, Summary, repair
 from rampart.actors.recording.bag_writer import BagError
 from rampart.actors.supervision.process_title import parse_title
 from rampart.cli import run as launch

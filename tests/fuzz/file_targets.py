@@ -18,8 +18,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.airport.errors import AirportError
 from rampart.actors.osmosis.airport.formats import load_airport, load_mission
 from rampart.actors.osmosis.airport.mask import allowed_area
-from rampart.actors.recording.bag_reader import BagReader, Summary
-from rampart.actors.recording.bag_repair import repair
+from rampart.actors.recording.bag_reader import BagReader, Summary, repair
 from rampart.actors.recording.bag_writer import BagError, BagWriter
 from rampart.actors.recording.message_form import Forms, header_of, renumbered
 from rampart.actors.recording.run_documents import restore

@@ -60,16 +60,11 @@ def load_mission(name_or_path: str | Path, airport: Airport) -> Mission:
     Raises:
         AirportError: as `load_airport`.
     """
-    text = str(name_or_path)
-    if text in airport.missions:
-        return airport.missions[text]
-    path = Path(name_or_path)
-    if path.suffix == ".miss":
-        mission = foreign.read_mission(path)
-    elif path.suffix == ".toml":
-        mission = toml_format.read_mission(path)
-    else:
+    text, path = str(name_or_path), Path(name_or_path)
+    readers = {".miss": foreign.read_mission, ".toml": toml_format.read_mission}
+    if text in airport.missions or path.suffix not in readers:
         return airport.mission(text)
+    mission = readers[path.suffix](path)
     for problem in mission_problems(mission, airport):
         raise AirportError(problem.line(str(path)))
     return mission

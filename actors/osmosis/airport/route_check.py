@@ -54,16 +54,15 @@ class RouteCheck:
 
     Args:
         airport: map and graph.
-        limits: what a good route keeps to.
     """
 
-    def __init__(self, airport: Airport, limits: RouteLimits | None = None) -> None:
+    def __init__(self, airport: Airport) -> None:
         self._allowed = airport.allowed
         self._boundary = airport.allowed.boundary
         ends = np.reshape(
             [(*airport.nodes[a], *airport.nodes[b]) for a, b in airport.edges], (-1, 4))
         self._from, self._along = ends[:, :2], ends[:, 2:] - ends[:, :2]
-        self._limits = limits or RouteLimits()
+        self._limits = RouteLimits()
         self._of_shape = lru_cache(maxsize=8)(self._find_in_shape)
 
     def fault(self, waypoints: tuple[Point, ...], robot: Point | None, goal: Point | None) -> str:

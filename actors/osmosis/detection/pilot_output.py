@@ -1,11 +1,11 @@
 """DM12: the Safety Pilot's output is wrong, or is not there.
 
-Is what reaches the base what somebody asked the Safety Pilot for?
-The Safety Pilot only ever takes away: it lets a command pass, slows it down, or stops. So each
-component of what the base gets is explained by a command that was given a moment ago, between that
-and zero; exactly that one, while the pilot says that commands pass unchanged; and nothing but zero
-while it says that it stops. When a computer of the command falls silent the pilot goes on with its
-last one for a while, and that one explains what it sends for as long.
+Is what reaches the base what somebody asked the Safety Pilot for? It only ever takes away: it lets
+a command pass, slows it down, or stops. So each component of what the base gets is explained by a
+command that was given a moment ago, between that and zero; exactly that one, while the pilot says
+that commands pass unchanged; and nothing but zero while it says that it stops. When a computer of
+the command falls silent the pilot goes on with its last one for a while, and that one explains what
+it sends for as long.
 
 What the pilot sends at once upon a command may arrive here before the command does. So an output
 is judged when the next one arrives, a period later, when all that explains it has come. One that

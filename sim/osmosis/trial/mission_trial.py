@@ -12,16 +12,18 @@ from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Header
 from rampart.actors.runtime.clock import Clock
+from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.console import MissionConsole
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
 from rampart.sim.osmosis.trial.report import render
 from rampart.sim.osmosis.trial.run_end import RunEnd
+from rampart.sim.runs.judge import Verdict
 from rampart.sim.runs.observer import Sink
 from rampart.sim.runs.record import RunRecord, Safety
 from rampart.sim.runs.report import Written, try_report
-from rampart.sim.runs.trial import Judgement, Trial
+from rampart.sim.runs.trial import Trial
 
 _PATIENCE_S = 60.0
 _SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not known"}
@@ -32,6 +34,7 @@ class MissionTrial(Trial):
 
     recorder: MissionRecorder
     judges = True
+    patient = True
     injector = OsmosisInjector
     tells = MissionConsole
     retunings = {"mechanisms as in the paper": {"RM2": {"latched": True}, "RM5": {"latched": True}}}
@@ -79,14 +82,21 @@ class MissionTrial(Trial):
         return {**super().summary(record),
                 "lights": [msgspec.to_builtins(light) for light in _mission(record).lights]}
 
-    def judgement(self, record: RunRecord) -> Judgement:
+    def judgement(self, record: RunRecord) -> Verdict:
         """Return what ground truth shows: clearances, and when it became unsafe."""
         found = _mission(record)
-        return Judgement(
+        return Verdict(
+            success=found.mission == "success", safe=found.safety == "safe", reasons=found.reasons,
             margins={"obstacle_m": _metres(found.obstacle_clearance_m),
                      "prohibited_m": _metres(found.prohibited_clearance_m)},
             severity=_severity(found.prohibited_s, found.collisions),
             unsafe_s=self.recorder.judge.first_unsafe_s, narrowest_s=found.narrowest_s)
+
+    @classmethod
+    def moments(cls, spec: SystemSpec) -> tuple[float, float]:
+        """Return moments within every mission of the shipped airport."""
+        del spec
+        return 2.0, 120.0
 
     @classmethod
     def upgraded(cls, result: dict[str, Any]) -> dict[str, Any]:

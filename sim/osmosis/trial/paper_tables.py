@@ -135,8 +135,8 @@ class Decided(msgspec.Struct, frozen=True):
 
 def paper_jobs(mission: str = "A", seed: int = 1, system: str = PAPER_SYSTEM) -> list[Job]:
     """Return all runs of tables IV and V; `system` is a shipped one by name, or a path."""
-    return [Job(row=name, system=system, strategy=PAPER_STRATEGY, ftm=condition != CONDITIONS[0],
-                options={"mission": mission, "obstacles": obstacles},
+    return [Job(row=name, system=system, options={"mission": mission, "obstacles": obstacles},
+                strategy=PAPER_STRATEGY, ftm=condition != CONDITIONS[0],
                 retuned=AS_THE_PAPER if condition == CONDITIONS[1] else {},
                 faults=(fault,) if fault else (), seed=seed + i)
             for condition, obstacles, name in product(CONDITIONS, OBSTACLES, FAULTS)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.record import LightResult, MissionRecord
-from rampart.sim.runs.report import environment, lanes_of, ticks_of
+from rampart.sim.runs.report import clock, environment, lanes_of, ticks_of
 
 BELIEVED_APART_M = 1.0
 """Where localization reported the robot is drawn too if it was this far from the truth."""
@@ -25,7 +25,8 @@ def render(run: MissionRecord) -> str:
         run=run, headline=headline(run), view_box=f"{x0:g} {-y1:g} {x1 - x0:g} {y1 - y0:g}",
         track=points(run.track), believed=points(run.believed) if _apart(run) else "",
         rows=_rows(run.lights), counts=counts, measured=counts.total() - counts["not measured"],
-        lanes=lanes_of(run), ticks=ticks_of(run.duration_s))
+        lanes=lanes_of(run), ticks=ticks_of(run.duration_s),
+        marked=[("Goals reached", _reached(run))])
 
 
 def headline(run: MissionRecord) -> str:
@@ -52,6 +53,14 @@ def clearance(value: float | None) -> str:
     if value is None:
         return "–"  # noqa: RUF001
     return f"{EXACT_BELOW_M:g} m or more" if value >= EXACT_BELOW_M else f"{value:.2f} m"
+
+
+def _reached(run: MissionRecord) -> list[tuple[float, str]]:
+    """Return where on the timeline goals were reached, percent, and which."""
+    return [(round(min(99.7, 100 * step.reached_s / run.duration_s), 3),
+             f"step {number} at {clock(step.reached_s)}")
+            for number, step in enumerate(run.steps, 1)
+            if step.reached_s is not None and run.duration_s > 0]
 
 
 def _bounds(run: MissionRecord) -> tuple[float, float, float, float]:

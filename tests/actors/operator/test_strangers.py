@@ -9,6 +9,7 @@ import socket
 import threading
 
 import httpx
+import msgspec
 import pytest
 
 from rampart.actors.web import guests as web_guests
@@ -262,9 +263,9 @@ for _ in range(200):
 """
     async with world.hmi(hmi_port=free_port()) as hmi:
         seen = []
-        fulfil = hmi._server._handlers.came
-        object.__setattr__(hmi._server._handlers, "came",
-                           lambda visitor: (seen.append(visitor), fulfil(visitor))[1])
+        handlers = hmi._server._handlers
+        hmi._server._handlers = msgspec.structs.replace(
+            handlers, came=lambda page: (seen.append(page), handlers.came(page))[1])
         upgrade = code.replace("\\r\\n\\r\\n", "\\r\\n").replace("GET / ", "GET /ws ").replace(
             "b''", 'b"Upgrade: websocket\\r\\nConnection: Upgrade\\r\\nSec-WebSocket-Version: 13'
                    '\\r\\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\\r\\n\\r\\n"')

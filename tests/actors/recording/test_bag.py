@@ -23,13 +23,17 @@ from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.osmosis.recording.views import OsmosisViews
 from rampart.actors.recording import foxglove as fg
-from rampart.actors.recording.bag_reader import BagReader, Summary, key_of
-from rampart.actors.recording.bag_repair import repair
-from rampart.actors.recording.bag_writer import BagError, BagWriter, check_target, open_target
+from rampart.actors.recording.bag_reader import BagReader, Summary, key_of, repair
+from rampart.actors.recording.bag_writer import (
+    BagError,
+    BagWriter,
+    SequenceGaps,
+    check_target,
+    open_target,
+)
 from rampart.actors.recording.json_schema import plain_schema
 from rampart.actors.recording.message_form import Forms
 from rampart.actors.recording.run_documents import collect, restore
-from rampart.actors.recording.sequence_gaps import SequenceGaps
 from rampart.actors.recording.virtual import VirtualRecording
 from rampart.cli.main import main
 from rampart.systems import SHIPPED

@@ -29,14 +29,15 @@ from rampart.sim.campaign.report import (
 )
 from rampart.sim.campaign.statistics import badness, rate
 from rampart.sim.campaign.store import Run
-from rampart.sim.campaign.wording import interval, margin_text, percent, seconds
+from rampart.sim.campaign.wording import interval, percent, seconds
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.trial import paper_tables
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.sim.osmosis.trial.paper_section import section
 from rampart.sim.osmosis.trial.paper_tables import Decided
 from rampart.sim.osmosis.trial.record import MissionRecord, ObstacleSeen, StepResult
-from rampart.sim.runs.trial import Judgement
+from rampart.sim.runs.judge import Verdict
+from rampart.sim.runs.report import margin_text
 from rampart.sim.runs.virtual_run import VirtualResult
 
 ABOUT = Campaign("A campaign", "rampart campaign --runs 3", 7)
@@ -75,9 +76,11 @@ def record_of(made: Run, **more) -> MissionRecord:
 
 
 def made_again(*records: MissionRecord) -> dict[str, VirtualResult]:
+    def verdict(record: MissionRecord) -> Verdict:
+        return Verdict(success=True, safe=True, narrowest_s=record.narrowest_s)
+
     return {record.run_id: VirtualResult(
-        record, Judgement(narrowest_s=record.narrowest_s), "ended", "t", 1, 1.0, (), "")
-        for record in records}
+        record, verdict(record), "ended", "t", 1, 1.0, (), "") for record in records}
 
 
 def paper_page(runs: list[Run], decided: Sequence[Decided] = ()) -> str:

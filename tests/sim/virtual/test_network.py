@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -59,10 +60,8 @@ def test_loss_duplication_and_overtaking_come_as_often_as_said():
     copies = Counter(map(len, found))
     assert copies[0] / 10_000 == pytest.approx(0.1, abs=0.01)
     assert copies[2] / 10_000 == pytest.approx(0.9 * 0.2, abs=0.015)
-    assert (network.lost, network.duplicated) == (copies[0], copies[2])
-    assert network.overtaken > 1000
     times = [at[0] for at in found if at]
-    assert times != sorted(times)
+    assert sum(later < earlier for earlier, later in pairwise(times)) > 1000
 
 
 def test_the_observer_hears_all_at_once_whatever_the_network_does():

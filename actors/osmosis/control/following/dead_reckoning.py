@@ -24,8 +24,6 @@ _ODOMETRY_FRESH_S = 0.2
 _KEPT = 125
 """Readings of odometry, 2.5 s: a pose may be stamped that much earlier."""
 
-_stamp_of = itemgetter(0)
-
 
 class DeadReckoning:
     """Keeps the newest pose and the odometry since. Times are simulated seconds.
@@ -79,5 +77,5 @@ class DeadReckoning:
 
     def _find_start(self) -> tuple[float, Pose2, float] | None:
         """Return the odometry at the pose's stamp; None if it is older than what is kept."""
-        after = bisect_right(self._way, self._stamp_s + 1e-6, key=_stamp_of)
+        after = bisect_right(self._way, self._stamp_s + 1e-6, key=itemgetter(0))
         return self._way[after - 1] if after else None

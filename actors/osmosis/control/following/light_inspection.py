@@ -62,9 +62,6 @@ class InspectionLimits(msgspec.Struct, frozen=True):
     keep_s: float = 120.0
 
 
-_stamp_s = itemgetter(0)
-
-
 def verdict(ratio: float) -> LightVerdict:
     """Return the verdict for a ratio of measured to nominal intensity."""
     if ratio < OUT_BELOW:
@@ -77,14 +74,12 @@ class LightInspection:
 
     Args:
         lights: the lights that may be met.
-        limits: what a measurement needs.
         judged: names of lights that have their measurement already.
     """
 
-    def __init__(self, lights: Iterable[Light], limits: InspectionLimits | None = None,
-                 judged: Iterable[str] = ()) -> None:
+    def __init__(self, lights: Iterable[Light], judged: Iterable[str] = ()) -> None:
         self._lights = tuple(lights)
-        self._limits = limits or InspectionLimits()
+        self._limits = InspectionLimits()
         self._places = np.array([(li.x_m, li.y_m) for li in self._lights]).reshape(-1, 2)
         self._x_m, self._y_m = np.ascontiguousarray(self._places.T)
         self.judged: set[str] = set(judged)
@@ -143,7 +138,7 @@ class LightInspection:
                 samples.append((stamp_s, *place, lux))
 
     def _sensor_at(self, stamp_s: float) -> Point | None:
-        after = bisect.bisect_left(self._poses, stamp_s, key=_stamp_s)
+        after = bisect.bisect_left(self._poses, stamp_s, key=itemgetter(0))
         if after >= len(self._poses):
             return None
         b_s, bx, by, b_yaw = self._poses[after]

@@ -56,11 +56,10 @@ class MotionLoop:
 
     Args:
         max_angular_radps: bound of the sum.
-        limits: how it behaves.
     """
 
-    def __init__(self, max_angular_radps: float, limits: LoopLimits | None = None) -> None:
-        self._limits = limits or LoopLimits()
+    def __init__(self, max_angular_radps: float) -> None:
+        self._limits = LoopLimits()
         self._top = max_angular_radps
         self._poses: list[tuple[float, float, float, float]] = []
         self._rate_radps = 0.0

@@ -91,7 +91,7 @@ class Ramp(msgspec.Struct):
     last: tuple[float, float] = STANDSTILL
 
     def towards(self, linear_mps: float, angular_radps: float, dt_s: float) -> tuple[float, float]:
-        """Return the command nearest to the wish that the limits allow after `dt_s`."""
+        """Return the command nearest to what is asked for that the limits allow after `dt_s`."""
         limits, (linear, angular) = self.limits, self.last
         top, turn = limits.max_linear_mps, limits.max_angular_radps
         rise, fall = limits.acceleration_mps2 * dt_s, limits.deceleration_mps2 * dt_s * 1.5

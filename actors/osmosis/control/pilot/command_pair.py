@@ -68,7 +68,7 @@ class CommandPair:
         self._good_from_s = -math.inf
         self._standby: Command | None = None
         self._standby_s = -math.inf
-        self._lives = [0, 0]
+        self._incarnations = [0, 0]
         self._settled_s = -math.inf
         self._apart_since_s = math.inf
         self._agreed_since_s = -math.inf
@@ -97,7 +97,7 @@ class CommandPair:
         self._compare(now)
 
     def _is_reborn(self, who: int, incarnation: int) -> bool:
-        before, self._lives[who] = self._lives[who], incarnation
+        before, self._incarnations[who] = self._incarnations[who], incarnation
         return 0 < before < incarnation
 
     def _compare(self, now: float) -> None:
