@@ -34,7 +34,7 @@ class QuadrotorFaults(Faults):
                 add_fields={"x_m": 8.0}),
         _sensor("gps-drift", "the GPS drifts north by 0.5 m/s", t.GPS, "corrupt", 60.0,
                 ramp_fields={"y_m": 0.5}),
-        _sensor("gps-dropout", "the GPS has no fix", t.GPS, "drop", 12.0),
+        _sensor("gps-dropout", "the GPS has no fix any more", t.GPS, "drop", math.inf),
         _sensor("barometer-bias", "the barometer says 6 m too little", t.BAROMETER, "corrupt", 30.0,
                 add_fields={"altitude_m": -6.0}),
         _sensor("barometer-stuck", "the barometer repeats itself", t.BAROMETER, "stuck", 60.0),
