@@ -110,7 +110,7 @@ class Pilot(Actor):
             most_tilt_rad: asked of the attitude loop.
         """
 
-        descent_mps: Annotated[float, msgspec.Meta(gt=0, le=1.2)] = 0.8
+        descent_mps: Annotated[float, msgspec.Meta(gt=0, le=1.2)] = 1.0
         level_descent_mps: Annotated[float, msgspec.Meta(gt=0, le=1.2)] = 0.8
         return_mps: Positive = 2.5
         most_tilt_rad: Annotated[float, msgspec.Meta(gt=0, lt=0.8)] = 0.4
@@ -277,7 +277,8 @@ class Pilot(Actor):
     def _by_own_sensors(self, now_s: float, *, hold: bool) -> Vector:
         """Level, and after a while, which may mend what is wrong, gently down."""
         waits = hold and now_s - self._source_s < _HOLD_S
-        wrong_mps = (0.0 if waits else -self.parameters.level_descent_mps) - self._vertical.speed_mps
+        wanted_mps = 0.0 if waits else -self.parameters.level_descent_mps
+        wrong_mps = wanted_mps - self._vertical.speed_mps
         self._rest_mps2 = bounded(self._rest_mps2 + 1.0 * bounded(wrong_mps, 1.0) * STEP_S, 2.5)
         return 0.0, 0.0, bounded(2.0 * wrong_mps + self._rest_mps2, 3.0)
 

@@ -16,7 +16,7 @@ Text = Annotated[str, msgspec.Meta(max_length=200)]
 Quaternion = tuple[float, float, float, float]
 
 
-class Imu(Message):
+class Imu(Message, frozen=True):
     """Angular rate and specific force in `base_link`; at rest the force is 9.81 upwards."""
 
     gyro_x_radps: float
@@ -27,7 +27,7 @@ class Imu(Message):
     accel_z_mps2: float
 
 
-class GpsFix(Message):
+class GpsFix(Message, frozen=True):
     """Position and velocity in `map`; the velocity is measured independently (Doppler)."""
 
     x_m: float
@@ -38,19 +38,19 @@ class GpsFix(Message):
     velocity_z_mps: float
 
 
-class Barometer(Message):
+class Barometer(Message, frozen=True):
     """Height above the place of takeoff."""
 
     altitude_m: float
 
 
-class Heading(Message):
+class Heading(Message, frozen=True):
     """Yaw from the magnetometer, counted from east to north."""
 
     yaw_rad: float
 
 
-class Battery(Message):
+class Battery(Message, frozen=True):
     """State of the battery; `charge` is a share from 0 to 1."""
 
     charge: float
@@ -58,7 +58,7 @@ class Battery(Message):
     current_a: float
 
 
-class Estimate(Message):
+class Estimate(Message, frozen=True):
     """Where the vehicle is, in `map`.
 
     `attitude` turns from `base_link` to `map`; `gps_age_s` is for how long there was no fix.
@@ -75,7 +75,7 @@ class Estimate(Message):
     gps_age_s: float
 
 
-class Goal(Message):
+class Goal(Message, frozen=True):
     """Where to fly, in `map`. `fly` is false before takeoff and after landing."""
 
     fly: bool
@@ -87,14 +87,14 @@ class Goal(Message):
     descent_mps: float
 
 
-class MissionState(Message):
+class MissionState(Message, frozen=True):
     """Step of the mission; before `busy_until_s` it cannot advance, since somebody else flies."""
 
     step: Text
     busy_until_s: float
 
 
-class Setpoint(Message):
+class Setpoint(Message, frozen=True):
     """Acceleration that is asked for in `map`, gravity not included, and yaw."""
 
     fly: bool
@@ -104,13 +104,13 @@ class Setpoint(Message):
     yaw_rad: float
 
 
-class PilotOrder(Message):
+class PilotOrder(Message, frozen=True):
     """The mode in which the pilot is to fly, for whoever sent this; the strictest one holds."""
 
     mode: Text
 
 
-class PilotStatus(Message):
+class PilotStatus(Message, frozen=True):
     """What the pilot does.
 
     Attributes:
@@ -134,20 +134,20 @@ class PilotStatus(Message):
     refused: float
 
 
-class RotorCommand(Message):
+class RotorCommand(Message, frozen=True):
     """Thrust of each rotor, N: front left, front right, rear left, rear right."""
 
     thrust_n: tuple[float, float, float, float]
 
 
-class EscStatus(Message):
+class EscStatus(Message, frozen=True):
     """Age of the command that the speed controllers carry out, and whether the rotors turn."""
 
     command_age_s: float
     turning: bool
 
 
-class Truth(Message):
+class Truth(Message, frozen=True):
     """Where the vehicle really is, in `map`; for judge and tests only.
 
     Attributes:
@@ -173,7 +173,7 @@ class Truth(Message):
     highest_tilt_rad: float
 
 
-class BodyFault(Message):
+class BodyFault(Message, frozen=True):
     """A fault of the vehicle itself.
 
     Attributes:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any
 
 import msgspec
@@ -63,7 +64,7 @@ class World(Actor):
         self._faults: dict[tuple[str, int], tuple[t.BodyFault, float, int]] = {}
         self._ticks = 0
         read: list[tuple[Topic[Any], Callable[[], Any]]] = [
-            (topic, lambda i=i: physics.imu(i)) for i, topic in enumerate(t.IMUS)]
+            (topic, partial(physics.imu, i)) for i, topic in enumerate(t.IMUS)]
         read += [(t.ESC, physics.esc), (t.TRUTH, physics.truth), (t.BAROMETER, physics.barometer),
                  (t.HEADING, physics.heading), (t.GPS, physics.gps), (t.BATTERY, physics.battery)]
         self._readings = [(round(1 / (topic.rate_hz * _TICK_S)), topic, r) for topic, r in read]

@@ -31,7 +31,8 @@ class Bench:
     async def feed(self, seconds, *, estimate=True, setpoint=True, up=0.0, height_m=5.0):
         for _ in range(round(seconds / 0.02)):
             for topic in t.IMUS:
-                self.system.say(topic, t.Imu(noisy(), 0.0, 0.0, 0.0, 0.0, G_MPS2 + noisy()), "world")
+                reading = t.Imu(noisy(), 0.0, 0.0, 0.0, 0.0, G_MPS2 + noisy())
+                self.system.say(topic, reading, "world")
             self.system.say(t.HEADING, t.Heading(0.0), "world")
             self.system.say(t.BAROMETER, t.Barometer(height_m + noisy()), "world")
             if estimate:
