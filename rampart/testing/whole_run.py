@@ -8,6 +8,7 @@ from typing import Any
 from rampart import systems
 from rampart.actors.layout.layout import load_run
 from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.files import working_folder
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.runs.trial import trial_class
 from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun
@@ -31,7 +32,9 @@ def virtual_run(system: str | Path, *faults: str, seconds: float | None = None,
     Raises:
         ValueError: the system or a fault is unsound; one line says where.
     """
-    chosen = RunPlan(system_file=str(systems.find(str(system))), **plan)
+    file = systems.find(str(system))
+    working_folder.admit(file.parent)
+    chosen = RunPlan(system_file=str(file), **plan)
     spec = load_system(chosen)
     trial = trial_class(spec)(load_run(chosen, spec), seconds)
     if not trial.patient and trial.limit_s is None:
