@@ -78,7 +78,8 @@ class Layout:
         own += [load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
                 for n in spec.actors()]
         self.members, self.topics = choose_topics(
-            with_panels(own, spec, plan.system_file), application_class(spec).topics, plan.system_file)
+            with_panels(own, spec, plan.system_file), application_class(spec).topics,
+            plan.system_file)
         self._partners = partners(self.members.values())
 
     def listen(self, node: str) -> str:

@@ -31,8 +31,8 @@ from rampart.actors.operator.state import STALE_S, HmiState
 from rampart.actors.operator.system import draw_system
 from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.actors.web.access import AccessError
 from rampart.actors.runtime.parameters import Panels
+from rampart.actors.web.access import AccessError
 from rampart.manager.spec.panels import MAX_PANELS, Panel
 from rampart.manager.spec.specification import SystemSpec, check_document
 

@@ -69,7 +69,8 @@ class Trace:
         """Add a value, unless the last one is too young; what is no finite number is a gap."""
         if self.points and t_s < self.points[-1][0]:
             self.points.clear()  # the clock was put back: another run
-        if self.points and t_s - self.points[-1][0] < self._step_s or not math.isfinite(t_s):
+        if not math.isfinite(t_s) or (
+                self.points and t_s - self.points[-1][0] < self._step_s):
             return
         number = isinstance(value, int | float) and abs(value) < LARGEST
         self.points.append((round(t_s, 3), float(f"{value:.6g}") if number else None))

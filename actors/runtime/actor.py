@@ -90,7 +90,7 @@ class Actor(Declared):
         self._outlets: dict[str | tuple[str, str], tuple[str, bool]] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
         self._may_publish.update(
-            self.chosen_topic(named.key).key for named in topics_named(self.parameters)["published"])
+            self.chosen_topic(name.key).key for name in topics_named(self.parameters)["published"])
         self._chosen: dict[str, list[Callable[[Any, Header], None]]] = {}
 
     # -- what a subclass may override, besides what `Declared` has ---------------------------------

@@ -233,7 +233,8 @@ def _reachability(spec: SystemSpec) -> Iterator[Finding]:
 
 VALIDATORS: tuple[Validator, ...] = (
     find_wrong_times, _names, _nodes, _detections, _recoveries, _processes, _mechanisms,
-    _reachability, _panels, arbitration_checks.find_wrong_tree, arbitration_checks.find_wrong_policy,
+    _reachability, _panels,
+    arbitration_checks.find_wrong_tree, arbitration_checks.find_wrong_policy,
     arbitration_checks.find_wrong_orders, arbitration_checks.find_contradictions,
     arbitration_checks.find_wrong_compounds, arbitration_checks.find_wrong_precedence,
     find_wrong_budget)

@@ -14,7 +14,7 @@ from rampart.manager.spec.tables import Table
 
 MAX_PANELS = 40
 MAX_KEPT = 32
-"""Fields of all plots and maps together: of each some minutes are kept for pages that open later."""
+"""Fields of all plots and maps together: of each, some minutes are kept for a page that opens."""
 
 FieldText = Annotated[str, msgspec.Meta(pattern=r"^[^:]+:[^:]+\Z", max_length=200)]
 """A field of the messages of a topic, "topic:field"."""

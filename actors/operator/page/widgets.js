@@ -148,6 +148,7 @@ class Past {
   begin(points) { this.points = points ? [...points] : []; }
 
   add({ t, value }) {
+    if (!Number.isFinite(t)) return;
     const last = this.points[this.points.length - 1];
     if (last && t < last[0]) this.points = [];
     if (last && t - last[0] < this.seconds / POINTS) return;

@@ -214,12 +214,12 @@ export default class Drive {
     this.grip = message.grip;
     if (message.text) this.refusal = message.text;
     else if (message.grip === "drives") this.refusal = "";
-    if (this.held && !this.drove && ["waits", "drives"].includes(message.grip)) this.begin(message.grip);
+    if (this.held && !this.drove && ["waits", "drives"].includes(message.grip)) this.go(message.grip);
     this.draw();
   }
 
   /** The present hold was answered and has not driven yet: go on, unless it was pressed too long ago. */
-  begin(grip) {
+  go(grip) {
     if (performance.now() - this.heldSince > PATIENCE_MS) {
       this.release();
       this.barred = true;
