@@ -47,7 +47,8 @@ def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: 
         ways: dict[str, dict[str, Members]] = {"heard": {}, "published": {}}
         for way, named in topics_named(member.parameters).items():
             for one in named:
-                key, where = one.key, f"{file}: {member.name}: {one.where}"
+                table = "" if one.shown_by else member.table
+                key, where = one.key, f"{file}: {member.name}: {one.shown_by}{table}{one.name}"
                 found[key] = topic = _topic(key, every, where)
                 if way == "heard" and topic.is_family and topic in member.actor.inputs():
                     raise ValueError(f"{where}: {member.actor.__name__} hears {key!r} anyway")

@@ -111,6 +111,10 @@ class Actor(Declared):
     def on_peer(self, node: str, incarnation: int, alive: bool) -> None:
         """Runs as a mailbox item when a watched node appears or vanishes."""
 
+    def is_well(self) -> bool:
+        """Whether its heartbeat is to be sent; asked whenever one is due."""
+        return True
+
     # -- what a subclass calls ------------------------------------------------------------------
 
     def hear_topic(self, key: str, handler: Callable[[Any, Header], None]) -> Topic[Any]:
@@ -336,6 +340,8 @@ class Actor(Declared):
             self._bus.publish(topic, key, payload)
 
     def _beat(self) -> None:
+        if not self.is_well():
+            return
         context = self.context
         self.publish(HEARTBEAT, Heartbeat(
             context.pid, self._dispatcher.progress, context.heartbeat_period_s, self._rejected,

@@ -33,6 +33,8 @@ TopicsHeard = Annotated[tuple[str, ...], msgspec.Meta(extra={"names": "topic", "
 TopicPublished = Annotated[
     str, msgspec.Meta(min_length=1, extra={"names": "topic", "way": "published"})]
 """Key of a topic that the node publishes because its parameters say so."""
+TopicsPublished = Annotated[tuple[str, ...], msgspec.Meta(
+    extra={"names": "topic", "way": "published"})]
 FieldName = Annotated[str, msgspec.Meta(
     pattern=r"^[^:]+:[^:]+\Z", extra={"names": "field", "way": "heard"})]
 """A field of the messages of a topic, "topic:field", as of `rampart.actors.bus.fields`."""
@@ -87,12 +89,21 @@ def read_parameters(kind: type[P], given: Mapping[str, Any] | msgspec.Struct, fi
 
 
 class Named(NamedTuple):
-    """A topic that a parameter names: where it does, its key, a field or "", kinds it may be of."""
+    """A topic that a parameter names.
 
-    where: str
+    Attributes:
+        name: of the parameter; of a panel its key.
+        key: of the topic.
+        field: of its messages, or "".
+        kinds: of which the field may be.
+        shown_by: "panel TITLE: " if a panel shows it.
+    """
+
+    name: str
     key: str
     field: str
     kinds: tuple[str, ...] = ANYTHING
+    shown_by: str = ""
 
 
 def topics_named(parameters: msgspec.Struct) -> dict[str, list[Named]]:
@@ -102,10 +113,10 @@ def topics_named(parameters: msgspec.Struct) -> dict[str, list[Named]]:
         said = getattr(parameters, name)
         if marks.get("panels"):
             found["heard"] += [
-                Named(f"panel {panel.title!r}: {shown.key}", *_parts(shown.field), shown.kinds)
+                Named(shown.key, *_parts(shown.field), shown.kinds, f"panel {panel.title!r}: ")
                 for panel in said for shown in panel.fields()]
         elif "way" in marks and said:
-            found[marks["way"]] += [Named(f"parameters.{name}", *_parts(text))
+            found[marks["way"]] += [Named(name, *_parts(text))
                                     for text in ([said] if isinstance(said, str) else said)]
     return found
 

@@ -13,8 +13,9 @@ from rampart.manager.model.gates import WORDS, GateError, detection_gate, recove
 from rampart.manager.model.order import find_cycle
 from rampart.manager.spec import arbitration_checks
 from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
+from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
 from rampart.manager.spec.panels import problem_of
-from rampart.manager.spec.schema import NODE_KINDS, Kind, SystemSpec
+from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import Finding, find_wrong_names, numbered, unknown
 
 Validator = Callable[[SystemSpec], Iterator[Finding]]
@@ -79,6 +80,7 @@ def _names(spec: SystemSpec) -> Iterator[Finding]:
 
 
 def _nodes(spec: SystemSpec) -> Iterator[Finding]:
+    yield from find_wrong_commands(spec.nodes)
     respawners = [SUPERVISOR, *(r.name for r in spec.recoveries)]
     for path, node in numbered("node", spec.nodes):
         kind = node.kind.value

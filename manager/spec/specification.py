@@ -28,8 +28,9 @@ from rampart.files.reading import FileError
 from rampart.manager.model.mechanisms import RecoveryKind
 from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
 from rampart.manager.spec.mobile_robot import Hazard, derive_timeouts
+from rampart.manager.spec.nodes import COMMAND_FIELDS, COMMAND_NODE, NODE_KINDS
 from rampart.manager.spec.panels import MAX_PANELS
-from rampart.manager.spec.schema import NODE_KINDS, TABLES, SystemSpec
+from rampart.manager.spec.schema import TABLES, SystemSpec
 from rampart.manager.spec.tables import Finding, SpecificationError, numbered
 
 ENUMS: dict[tuple[str, str], Iterable[Enum]] = {
@@ -93,6 +94,11 @@ def check_modules(before: SystemSpec, after: SystemSpec) -> None:
             raise ValueError(f"{node.name}: actor = {node.actor!r}: no actor of the system that "
                              "was started is in that module; known modules: "
                              f"{', '.join(sorted(known))}")
+    commands = {node.name: node for node in before.nodes}
+    for new in after.nodes:
+        for field in COMMAND_FIELDS if new.command else ():
+            if getattr(new, field) != getattr(commands.get(new.name), field, None):
+                raise ValueError(f"{new.name}: {field}: of a command nothing changes while it runs")
 
 
 def check_document(document: dict[str, Any], file: str) -> SystemSpec:
@@ -120,7 +126,8 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
         spec = enabled
     if wrong is not None:
         raise _refusal(file, wrong)
-    return spec
+    return replace(spec, nodes=tuple(replace(node, actor=COMMAND_NODE) if node.command else node
+                                     for node in spec.nodes))
 
 
 def _refusal(file: str, finding: Finding) -> SpecificationError:
@@ -232,7 +239,7 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> Findin
             problem += ", or { within_s = ..., hazard = '...' }"
     elif field == "gate":
         problem = "unknown gate; known: 'or', 'and', { at_least = k }"
-    elif "regex" in problem and field == "actor":
+    elif "regex" in problem and field in {"actor", "stand_in"}:
         problem = "expected 'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"
     elif "regex" in problem and "panel" in words:
         problem = "expected 'topic:field', e.g. 'tank/level:height_m'"

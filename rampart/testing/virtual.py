@@ -105,7 +105,8 @@ class VirtualSystem:
         Raises:
             ValueError: the system is unsound, or an actor cannot be imported; one line says where.
         """
-        chosen = RunPlan(system_file=str(systems.find(str(system))), **plan)
+        chosen = RunPlan(**{
+            "system_file": str(systems.find(str(system))), "virtual": True, **plan})
         spec = load_system(chosen)
         context = load_run(chosen, spec)
         return cls(context, Layout(chosen, spec, context.application),
