@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rampart.actors.detection.module import DetectionModule, Monitor
     from rampart.actors.detection.watchdog import Watchdog
     from rampart.actors.ftm.messages import DetectionState, RecoveryCommand
+    from rampart.actors.operator.hmi import Hmi
     from rampart.actors.recovery.holding import HeldOrder
     from rampart.actors.recovery.module import RecoveryModule
     from rampart.actors.recovery.respawn import Respawn
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
         Tick,
     )
     from rampart.manager.arbitration.recovery_track import Command
+    from rampart.manager.spec.panels import Panel
     from rampart.manager.spec.schema import SystemSpec
     from rampart.manager.spec.specification import parse_specification
     from rampart.manager.spec.tables import SpecificationError
@@ -43,7 +45,7 @@ if TYPE_CHECKING:
 __all__ = [
     "STRATEGIES", "Actor", "Application", "Arbiter", "Command", "Context", "Decision",
     "DecisionMade", "DetectionHeard", "DetectionModule", "DetectionState", "Header", "HeldOrder",
-    "Message", "Monitor", "Qos", "RecoveryCommand", "RecoveryHeard", "RecoveryModule", "ResetAsked",
+    "Hmi", "Message", "Monitor", "Panel", "Qos", "RecoveryCommand", "RecoveryHeard", "RecoveryModule", "ResetAsked",
     "Respawn", "RunContext", "SpecificationError", "StateFormat", "Strategy", "SystemSpec", "Tick",
     "Timer", "Topic", "Watchdog", "build_arbiter", "decide", "every", "on", "parse_specification",
     "verify",
@@ -56,6 +58,7 @@ _HOMES = {
     "actors.detection.module": ("DetectionModule", "Monitor"),
     "actors.detection.watchdog": ("Watchdog",),
     "actors.ftm.messages": ("DetectionState", "RecoveryCommand"),
+    "actors.operator.hmi": ("Hmi",),
     "actors.recovery.holding": ("HeldOrder",),
     "actors.recovery.module": ("RecoveryModule",),
     "actors.recovery.respawn": ("Respawn",),
@@ -69,6 +72,7 @@ _HOMES = {
     "manager.arbitration.arbiter_state": ("DecisionMade", "DetectionHeard", "RecoveryHeard",
         "ResetAsked", "Tick"),
     "manager.arbitration.recovery_track": ("Command",),
+    "manager.spec.panels": ("Panel",),
     "manager.spec.schema": ("SystemSpec",),
     "manager.spec.specification": ("parse_specification",),
     "manager.spec.tables": ("SpecificationError",),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 from pathlib import Path
 
 import msgspec
@@ -133,6 +134,27 @@ def test_what_the_page_hears_anyway_can_be_shown_as_well():
     assert shown(found) == [("Rule", "text")]
 
 
+def test_the_examples_of_the_document_are_sound(tmp_path):
+    document = (ROOT / "docs" / "hmi.md").read_text("utf-8")
+    toml, python = (re.findall(rf"```{kind}\n(.*?)```", document, re.DOTALL)[0]
+                    for kind in ("toml", "python"))
+    assert shown(layout(toml)) == [
+        ("Level", "gauge"), ("Level over time", "plot"), ("Pump", "states")]
+    assert [line for line in [str(caught(toml.replace("phase", "phse")))] if line in document]
+    (tmp_path / "page").mkdir()
+    (tmp_path / "page" / "pipes.js").write_text("export default class {}")
+    made: dict = {"__file__": str(tmp_path / "tank.py"), "__name__": "tank"}
+    exec(python, made)  # noqa: S102 the document's
+    assert [p.kind for p in made["TankPage"].panels] == ["gauge", "script"]
+    assert "/robot/pipes.js" in page_files(made["TankPage"].files)
+
+
+def caught(panels: str) -> ValueError:
+    with pytest.raises(ValueError, match=r".") as found:
+        layout(panels)
+    return found.value
+
+
 @pytest.mark.parametrize(("panels", "line"), [
     (panel("Level", 'gauge = "tank/levle:height_m"'),
      "tank.toml: page: panel 'Level': gauge: no actor has a topic 'tank/levle'; the nearest: "
@@ -158,9 +180,7 @@ def test_what_the_page_hears_anyway_can_be_shown_as_well():
      "right"),
 ])
 def test_a_panel_that_names_something_wrong_is_refused_in_one_line(panels, line):
-    with pytest.raises(ValueError, match=r".") as caught:
-        layout(panels)
-    assert str(caught.value) == line
+    assert str(caught(panels)) == line
 
 
 @pytest.mark.parametrize(("rest", "words"), [
@@ -173,10 +193,9 @@ def test_a_panel_that_names_something_wrong_is_refused_in_one_line(panels, line)
     ('map = ["a:x", "a:y"]\nextent_m = [0, 0, 0, 1]', "'Level': extent_m: x0, y0, x1, y1 with"),
 ])
 def test_a_panel_shows_one_thing_and_takes_what_that_needs(rest, words):
-    with pytest.raises(ValueError, match=r".") as caught:
-        layout(panel("Level", rest))
-    assert str(caught.value).startswith("tank.toml: $.panel[0] = ")
-    assert words in str(caught.value)
+    said = str(caught(panel("Level", rest)))
+    assert said.startswith("tank.toml: $.panel[0] = ")
+    assert words in said
 
 
 def test_panels_that_no_node_shows_are_refused():
