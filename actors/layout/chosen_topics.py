@@ -85,15 +85,19 @@ def plots_of(members: Iterable[Member]) -> Iterator[Panel]:
     engine = {topic.key for topic in (*topics.ALL, *BASE_OUTPUTS)}
     own = {t.key: t for m in members for t in m.actor.outputs
            if t.key not in engine and not t.is_family and t.rate_hz > 0}
-    plots = (Panel(title=key[:60], plot=fields) for key, topic in own.items()
-             if (fields := tuple(_numbers(topic))))
+    plots = (Panel(title=f"{key} {unit}"[:60].strip(), plot=tuple(fields[:4]))
+             for key, topic in own.items() for unit, fields in _numbers(topic).items())
     return islice({plot.title: plot for plot in plots}.values(), MOST_PLOTS)
 
 
-def _numbers(topic: Topic[Any]) -> Iterator[str]:
-    """Yield the first numbers of a topic's messages."""
-    kinds = {path: _kind(topic, path) for path in getattr(topic.type, "__struct_fields__", ())}
-    return islice((f"{topic.key}:{path}" for path, kind in kinds.items() if kind == NUMBER), 4)
+def _numbers(topic: Topic[Any]) -> dict[str, list[str]]:
+    """Return the numbers of a topic's messages by their unit, the last word of their names."""
+    found: dict[str, list[str]] = {}
+    for path in getattr(topic.type, "__struct_fields__", ()):
+        if _kind(topic, path) == NUMBER:
+            unit = path.rpartition("_")[2] if "_" in path else ""
+            found.setdefault(unit, []).append(f"{topic.key}:{path}")
+    return found
 
 
 def _kind(topic: Topic[Any], path: str) -> str:

@@ -174,9 +174,9 @@ def import_class(path: str, base: type[T], field: str) -> type[T]:
     try:
         imported = importlib.import_module(module)
     except ImportError as error:
-        hidden = working_folder.why_not()
+        hidden = "; ".join(dict.fromkeys(working_folder.refused.values()))
         hint = _moved(module, name) or (
-            f"; nothing is imported from the working folder: {hidden}" if hidden else "")
+            f"; nothing is imported from there: {hidden}" if hidden else "")
         raise ValueError(f"{field} = {path!r}: {error}{hint}") from None
     except Exception as error:  # a module of the user's own may raise anything
         at = traceback.extract_tb(error.__traceback__)[-1]

@@ -255,6 +255,7 @@ class Place extends Remembering {
   build() {
     super.build();
     this.section.dataset.columns = "2";
+    this.section.dataset.grows = "380";
     this.canvas = svg("svg", { class: "place", role: "img", "aria-label": `${this.declared.title}: a map, x to the right and y upwards` });
     this.grid = svg("path", { class: "grid" }, this.canvas);
     this.track = svg("path", { class: "way" }, this.canvas);
@@ -305,6 +306,8 @@ class Place extends Remembering {
     this.step = STEPS_M.find((step) => this.size / step <= 16) || Math.ceil(this.size / 16);
     this.canvas.setAttribute("viewBox", box);
     let d = "";
+    const over = this.size;  // beyond the extent: the panel may have another shape
+    [x0, y0, x1, y1] = [x0 - over, y0 - over, x1 + over, y1 + over];
     for (let x = Math.ceil(x0 / this.step); x * this.step <= x1; x += 1) d += `M${x * this.step} ${-y1}V${-y0}`;
     for (let y = Math.ceil(y0 / this.step); y * this.step <= y1; y += 1) d += `M${x0} ${-y * this.step}H${x1}`;
     this.grid.setAttribute("d", d || "M0 0");

@@ -87,7 +87,7 @@ async def test_each_kind_of_panel_shows_its_fields_and_whether_they_are_heard(wo
             height = 0.75
             line = f"{BODY.format('Over time')}.querySelector('.plot .s0').getAttribute('d')"
             await tab.until(f"({line}.match(/[ML]/g) || []).length > 2")
-            assert "0.75" in await tab.value(text("Over time"))
+            await tab.until(f"{text('Over time')}.includes('0.75')")
         await tab.until(f"{text('Level')}.includes('(stale)')")
         said.publish(PUMP, Pump(Phase.DRAINING))  # which is not among the states of the panel
         await tab.until(f"{now} === 'draining'")

@@ -120,8 +120,9 @@ def test_a_page_without_panels_plots_the_numbers_of_what_comes_regularly():
     found = layout()
     plots = found.members["page"].parameters.panels
     assert [(p.title, p.plot) for p in plots] == [
-        ("tank/level", ("tank/level:height_m", "tank/level:heading_rad")),
-        ("tank/pump", ("tank/pump:busy_until_s",)), ("tank/valve", ("tank/valve:opening",))]
+        ("tank/level m", ("tank/level:height_m",)),
+        ("tank/level rad", ("tank/level:heading_rad",)),
+        ("tank/pump s", ("tank/pump:busy_until_s",)), ("tank/valve", ("tank/valve:opening",))]
 
 
 def test_the_cell_s_page_has_nothing_to_plot_and_that_is_no_panel():
@@ -144,7 +145,7 @@ def test_the_examples_of_the_document_are_sound(tmp_path):
     (tmp_path / "page").mkdir()
     (tmp_path / "page" / "pipes.js").write_text("export default class {}")
     made: dict = {"__file__": str(tmp_path / "tank.py"), "__name__": "tank"}
-    exec(python, made)  # noqa: S102 the document's
+    exec(python, made)
     assert [p.kind for p in made["TankPage"].panels] == ["gauge", "script"]
     assert "/robot/pipes.js" in page_files(made["TankPage"].files)
 
