@@ -8,13 +8,14 @@ from rampart.actors.foreign.program import check_programs
 from rampart.actors.layout.layout import Layout
 from rampart.actors.layout.system_topics import system_topics
 from rampart.actors.run.run_plan import RunPlan, load_system
-from rampart.manager.spec.nodes import COMMAND_NODE
 from rampart.manager.spec.specification import (
     SpecificationError,
     check_modules,
     parse_specification,
 )
 from tests.documents.test_foreign_nodes import TUG, write_tug
+
+COMMAND_NODE = "rampart.actors.foreign.command_node:CommandNode"
 
 
 def refusal(text: str) -> str:
@@ -34,8 +35,6 @@ WRONG = [
      "of use with a command only, and the node has none"),
     ('actor = "tug:Driver"', "", "driver: actor: missing; say actor = 'module:Class' or command = "
      "['./program', ...]"),
-    ('actor = "tug:Driver"', f'actor = "{COMMAND_NODE}"', f"driver: actor = '{COMMAND_NODE}': say "
-     "command = ['./program', ...] instead"),
     ('actor = "tug:Driver"', 'actor = "tug:Driver"\nfolder = "x"', "driver: folder = 'x': of use "
      "with a command only, and the node has none"),
     (COMMAND, "command = ['']", "wheels: command = ['']: the first is the program, and it has no "
@@ -98,6 +97,8 @@ def tug(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("old", "new", "line"), [
     ("tug:VirtualWheels", "tug:Nobody", "$.node[1].stand_in = 'tug:Nobody': no such actor class; "
      "known: Driver, VirtualWheels"),
+    ("tug:Driver", COMMAND_NODE, f"$.node[0].actor = '{COMMAND_NODE}': say command = "
+     "['./program', ...] instead"),
     ("stand_in", "parameters = { radius_m = 1 }\nstand_in", "$.node[1].parameters.radius_m = 1: "
      "unknown parameter; known: none, its class declares no Parameters")])
 def test_a_stand_in_is_held_to_what_the_file_says_of_it_in_real_runs_too(tug, old, new, line):
