@@ -170,7 +170,7 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
         ftm=not options.no_ftm, options=application_options.chosen(options, kind),
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
         hmi_host=options.hmi_host, hmi_token=token, hmi_token_is_new=token_is_new,
-        waits=options.wait)
+        waits=options.wait, virtual=options.virtual)
     spec = load_system(plan)
     if not options.no_hmi:
         plan = msgspec.structs.replace(plan, faults=faults_of(spec).offered())

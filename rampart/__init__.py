@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rampart.actors.detection.module import DetectionModule, Monitor
     from rampart.actors.detection.watchdog import Watchdog
     from rampart.actors.ftm.messages import DetectionState, RecoveryCommand
+    from rampart.actors.operator.hmi import Hmi
     from rampart.actors.recovery.holding import HeldOrder
     from rampart.actors.recovery.module import RecoveryModule
     from rampart.actors.recovery.respawn import Respawn
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
         Tick,
     )
     from rampart.manager.arbitration.recovery_track import Command
+    from rampart.manager.spec.panels import Panel
     from rampart.manager.spec.schema import SystemSpec
     from rampart.manager.spec.specification import parse_specification
     from rampart.manager.spec.tables import NonNegative, Positive, SpecificationError
@@ -66,12 +68,14 @@ __all__ = [
     "FieldName",
     "Header",
     "HeldOrder",
+    "Hmi",
     "InjectionReport",
     "Judge",
     "Message",
     "Monitor",
     "NonNegative",
     "Order",
+    "Panel",
     "Positive",
     "Qos",
     "RecoveryCommand",
@@ -107,6 +111,7 @@ _HOMES = {
     "actors.detection.module": ("DetectionModule", "Monitor"),
     "actors.detection.watchdog": ("Watchdog",),
     "actors.ftm.messages": ("DetectionState", "RecoveryCommand"),
+    "actors.operator.hmi": ("Hmi",),
     "actors.recovery.holding": ("HeldOrder",),
     "actors.recovery.module": ("RecoveryModule",),
     "actors.recovery.respawn": ("Respawn",),
@@ -122,6 +127,7 @@ _HOMES = {
     "manager.arbitration.arbiter_state": ("DecisionMade", "DetectionHeard", "RecoveryHeard",
         "ResetAsked", "Tick"),
     "manager.arbitration.recovery_track": ("Command",),
+    "manager.spec.panels": ("Panel",),
     "manager.spec.schema": ("SystemSpec",),
     "manager.spec.specification": ("parse_specification",),
     "manager.spec.tables": ("NonNegative", "Positive", "SpecificationError"),

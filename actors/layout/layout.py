@@ -9,14 +9,16 @@ import msgspec
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.zenoh_bus import endpoint
+from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.layout.chosen_topics import choose_topics
+from rampart.actors.layout.chosen_topics import choose_topics, with_panels
 from rampart.actors.layout.wiring import (
     Member,
     import_class,
     load_class,
     load_member,
     partners,
+    topics_of,
 )
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
@@ -78,7 +80,8 @@ class Layout:
         own += [load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
                 for n in spec.actors()]
         self.members, self.topics = choose_topics(
-            own, application_class(spec).topics, plan.system_file)
+            with_panels(own, spec, plan.system_file),
+            (*application_class(spec).topics, *stand_in_topics(spec)), plan.system_file)
         self._partners = partners(self.members.values())
 
     def listen(self, node: str) -> str:
@@ -114,9 +117,21 @@ def load_run(plan: RunPlan, spec: SystemSpec) -> RunContext:
     """Load what all actors of a run have in common; done once, before the fork.
 
     Raises:
-        ValueError: the application's options are unsound; the message names file and value.
+        ValueError: the application's options are unsound, or there is no such program as a node's
+            command names; the message names file and value.
     """
+    check_programs(plan, spec)
     return RunContext(plan, spec, load_document(plan), load_application(plan, spec))
+
+
+def stand_in_topics(spec: SystemSpec) -> list[Topic[Any]]:
+    """Return the topics that are declared by what plays commands in virtual time.
+
+    Raises:
+        ValueError: there is no such class.
+    """
+    classes = [load_class(node.stand_in, field="stand_in") for node in spec.nodes if node.stand_in]
+    return [topic for one in classes for topics in topics_of(one) for topic in topics]
 
 
 def judge_class(spec: SystemSpec) -> type[Handlers] | None:

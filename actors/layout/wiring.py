@@ -19,11 +19,13 @@ import msgspec
 
 import rampart
 from rampart.actors.bus.topic import Members, Topic
+from rampart.actors.foreign.command_node import CommandNode
 from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.files import working_folder
 from rampart.manager.spec.checks import modules
+from rampart.manager.spec.panels import problem_of
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
 T = TypeVar("T")
@@ -37,7 +39,7 @@ _ROOMS_OF_0_6 = ("actors", "manager", "sim")
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One actor of the system: its name, class and parameters.
+    """One actor of the system: its name, class and parameters, and where these are in its table.
 
     `hears` and `publishes` are the topics that its parameters name, as `heard` and `published` have
     them.
@@ -46,6 +48,7 @@ class Member:
     name: str
     actor: type[Actor]
     parameters: Actor.Parameters
+    table: str = "parameters."
     hears: Mapping[str, Members] = field(default_factory=dict)
     publishes: Mapping[str, Members] = field(default_factory=dict)
 
@@ -114,32 +117,53 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
     own = tuple(n.name for n in spec.nodes if n.respawn == node.name)
     derived = {"nodes": own} if own else derived
     try:
-        actor = load_class(node.actor, REPORTS_ON.get(node.kind))
+        if node.command and node.stand_in:  # what is wrong with it is told in real runs, too
+            load_class(node.stand_in, field="stand_in")
+        actor = CommandNode if node.command else load_class(
+            node.actor, REPORTS_ON.get(node.kind))
+        if actor is CommandNode and not node.command:
+            raise ValueError(f"actor = {node.actor!r}: say command = ['./program', ...] instead")
         takes = {field.name for field in msgspec.structs.fields(actor.Parameters)}
     except ValueError as error:
         raise ValueError(f"{file}: {path}.{error}") from None
     except (TypeError, NameError) as error:
         raise ValueError(f"{file}: {path}.actor = {node.actor!r}: Parameters: {error}") from None
+    if node.command:
+        if node.stand_in:
+            load_member(node.in_virtual_time(), spec, file, derived)
+        return Member(node.name, actor, read_parameters(
+            actor.Parameters, node.command_parameters, file, node.name, spec), "")
     given = {name: derived[name] for name in takes & derived.keys()} | node.parameters
+    if shows_panels(actor):
+        given["panels"] = panels = (*getattr(actor, "panels", ()), *spec.panels)
+        if problem := problem_of(panels):
+            raise ValueError(f"{file}: {node.name}: {problem}")
     return Member(node.name, actor, read_parameters(
         actor.Parameters, given, file, f"{path}.parameters", spec))
 
 
-def load_class(path: str, reports_on: Topic[Any] | None = None) -> type[Actor]:
+def shows_panels(actor: type[Actor]) -> bool:
+    """Whether an actor is a page, which shows panels."""
+    return any(field.name == "panels" for field in msgspec.structs.fields(actor.Parameters))
+
+
+def load_class(path: str, reports_on: Topic[Any] | None = None,
+               field: str = "actor") -> type[Actor]:
     """Return the actor class named `module:Class`.
 
     Args:
         path: name of the class.
         reports_on: topic that it has to publish, by which a kind of module is known.
+        field: of the spec, for messages.
 
     Raises:
         ValueError: there is no such class, it is no actor, or one of another kind, or its module
             cannot be imported.
     """
-    found = import_class(path, Actor, "actor")
+    found = import_class(path, Actor, field)
     if reports_on is not None and reports_on not in found.outputs:
-        raise ValueError(f"actor = {path!r}: it does not publish {reports_on.key}, as the modules "
-                         "of this table do")
+        raise ValueError(f"{field} = {path!r}: it does not publish {reports_on.key}, as the "
+                         "modules of this table do")
     return found
 
 

@@ -108,7 +108,7 @@ class VirtualSystem:
         """
         file = systems.find(str(system))
         working_folder.admit(file.parent)
-        chosen = RunPlan(system_file=str(file), **plan)
+        chosen = RunPlan(**{"system_file": str(file), "virtual": True, **plan})
         spec = load_system(chosen)
         context = load_run(chosen, spec)
         return cls(context, Layout(chosen, spec, context.application),

@@ -206,7 +206,7 @@ def virtual_run(job: Job) -> VirtualRun:
     spec = check_document({**document, **chosen}, file)
     plan = RunPlan(
         run_id=job.key, base_port=1024, seed=job.seed, system_file=file, ftm=job.ftm,
-        options=job.options)
+        options=job.options, virtual=True)
     nodes, spec = can_be_hit(spec), tailor(plan, spec)
     application = _application(msgspec.json.encode(plan.options), file)
     kind = trial_class(spec)
