@@ -76,8 +76,6 @@ class Run:
                            options.patience if kind.patient else options.duration, sys.stderr)
         self._plan = plan
         self._scenario = [parse_fault(text) for text in options.fault]
-        if self._scenario:
-            Layout(plan, spec)  # names file and path of an actor that cannot be had
         known = system_topics(spec) if self._scenario else ()
         for i, planned in enumerate(self._scenario):
             action_of(planned, f"f{i}", can_be_hit(spec), known, faults_of(spec))  # not in mid-run

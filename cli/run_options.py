@@ -170,20 +170,14 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
         hmi_host=options.hmi_host, hmi_token=token, hmi_token_is_new=token_is_new,
         waits=options.wait)
     spec = load_system(plan)
+    layout = Layout(plan, spec)
     if not options.no_hmi:
         plan = msgspec.structs.replace(plan, faults=faults_of(spec).offered())
-    if not _has_actor(plan, spec, HMI):
+    if not any(issubclass(member.actor, load_class(HMI)) for member in layout.members.values()):
         refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token_file"),
                f"no node of {spec.name} serves an operator's page")
         plan = msgspec.structs.replace(plan, hmi_port=0)
     return plan, spec
-
-
-def _has_actor(plan: RunPlan, spec: SystemSpec, actor: str) -> bool:
-    """Tell whether a node of the system is of this class, or of one that is derived from it."""
-    return any(node.actor == actor for node in spec.nodes) or any(
-        issubclass(member.actor, load_class(actor))
-        for member in Layout(plan, spec).members.values())
 
 
 def refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:

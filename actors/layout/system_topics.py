@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-import msgspec
-
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
+from rampart.actors.layout.connections import flaw
 from rampart.actors.layout.layout import Layout, application_class
 from rampart.actors.layout.wiring import heard, load_class, published, topics_of
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
@@ -98,16 +97,8 @@ def _beyond(known: Iterable[Topic[Any]], paths: Iterable[str]) -> tuple[Topic[An
         for topic in (*inputs, *outputs):
             if topic.key in common or topic.key in found:
                 continue
-            if reason := _flaw(topic):
+            if reason := flaw(topic):
                 raise ValueError(f"actor = {path!r}: topic {topic.key!r}: {reason}")
             found[topic.key] = topic
     return tuple(found.values())
 
-
-def _flaw(topic: Topic[Any]) -> str:
-    """Return what is wrong with a topic, or an empty text."""
-    if topic.key.count("{name}") > 1:
-        return "one {name} at most is right"
-    if not (isinstance(topic.type, type) and issubclass(topic.type, msgspec.Struct)):
-        return f"type = {topic.type!r}: must be derived from rampart.actors.bus.messages.Message"
-    return ""

@@ -206,12 +206,11 @@ def _reachability(spec: SystemSpec) -> Iterator[Finding]:
             answers.setdefault(name, set()).update(mechanism.recoveries)
     for path, detection in numbered("detection", spec.detections):
         if detection.name not in answers:
-            yield Finding(f"{path}.name", "unreachable: no mechanism uses this detection module",
-                          (detection.name,))
+            yield Finding(path, "unreachable: no mechanism uses this detection module")
     for path, recovery in numbered("recovery", spec.recoveries):
         if recovery.name not in recovering:
-            yield Finding(f"{path}.name", "unreachable: no mechanism and no escalation leads to "
-                          "this recovery", (recovery.name,))
+            yield Finding(path, "unreachable: no mechanism and no escalation leads to this "
+                                "recovery")
     watched = {pair for detection in spec.detections
                for pair in product(detection.watch, answers.get(detection.name, ()))}
     for path, node in numbered("node", spec.nodes):
