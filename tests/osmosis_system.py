@@ -6,6 +6,7 @@ from functools import cache
 from typing import Any, TypeVar
 
 from rampart import systems
+from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import NO_SYSTEM, RunContext
@@ -15,6 +16,10 @@ from rampart.manager.spec.specification import SystemSpec, parse_specification
 from rampart.testing import VirtualSystem
 
 A = TypeVar("A", bound=Actor)
+
+COMMAND = {"topic": "control/command", "subject": "command"}
+POSE = {"topic": "localization/pose", "subject": "localization"}
+"""What `Freshness` of DM2 and DM6 hears."""
 
 
 @cache
@@ -36,7 +41,7 @@ class System(VirtualSystem):
     """Actors that know of `run_context(**known)`."""
 
     def __init__(self, **known: Any) -> None:
-        super().__init__(run_context(**known))
+        super().__init__(run_context(**known), topics=topics.ROBOT)
 
     def start(self, name: str, cls: type[A], **parameters: Any) -> A:
         """Start an actor that can act on the system, `around` it."""

@@ -13,9 +13,6 @@ from rampart.actors.layout.wiring import heard, load_class, published, topics_of
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.manager.spec.specification import SystemSpec
 
-_ANY_RUN = RunPlan()
-"""Which keys a system publishes follows from its spec; nothing in the plan of a run matters."""
-
 _SHIPPED = "rampart."
 """Where the actors that ship are; that their topics are declared is a test's business."""
 
@@ -61,7 +58,7 @@ def published_keys(spec: SystemSpec) -> tuple[str, ...]:
     Raises:
         ValueError: the spec names an actor class that does not exist.
     """
-    members = [m for m in Layout(_ANY_RUN, spec).members.values() if m.name != OBSERVER]
+    members = [m for m in Layout(RunPlan(system_file=spec.name), spec).members.values() if m.name != OBSERVER]
     wanted: dict[str, dict[str, None]] = {}
     for member in members:
         for key, names in heard(member).items():

@@ -45,7 +45,7 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
             topic that makes no sense.
     """
     try:
-        members = Layout(RunPlan(), spec).members.values()
+        members = Layout(RunPlan(system_file=spec.name), spec).members.values()
     except ValueError as error:
         raise UsageError(str(error)) from None
     inputs = {member.name: heard(member) for member in members}

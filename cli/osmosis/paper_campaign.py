@@ -48,8 +48,12 @@ class PaperCampaign(NamedCampaign):
         return kind() if options.paper else None
 
     def jobs(self, base: Job) -> list[Job]:
-        """Return all runs of tables IV and V."""
-        return paper_jobs(base.options["mission"], base.seed, base.system)
+        """Return all runs of tables IV and V.
+
+        Raises:
+            UsageError: the system has no missions.
+        """
+        return paper_jobs(_mission(base), base.seed, base.system)
 
     def section(self, spec: SystemSpec, runs: Sequence[Run]) -> Section:
         """Return the three tables beside ours."""
@@ -84,7 +88,7 @@ class FullCampaign(PaperCampaign):
 
     def jobs(self, base: Job) -> list[Job]:
         """Return the runs of table V on the full system."""
-        return full_jobs(base.options["mission"], base.seed, base.system)
+        return full_jobs(_mission(base), base.seed, base.system)
 
     def section(self, spec: SystemSpec, runs: Sequence[Run]) -> Section:
         """Return table V beside ours."""
@@ -113,6 +117,12 @@ class FullCampaign(PaperCampaign):
     def failed(self, runs: Sequence[Run]) -> bool:
         """Tell whether a row did not end as expected."""
         return not all(cell.agrees for cell in cells(runs))
+
+
+def _mission(base: Job) -> str:
+    if "mission" not in base.options:
+        raise UsageError(f"--system {base.system}: it has no missions as those of the paper")
+    return str(base.options["mission"])
 
 
 def _show_differing(found: Iterable[Cell]) -> None:

@@ -40,6 +40,7 @@ from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan
 from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor, Context
 from rampart.actors.runtime.checkpoint import MemoryCheckpoints, Shelf
+from rampart.actors.runtime.parameters import topics_named
 from rampart.actors.supervision.patience import AT_LEISURE, Usage
 from rampart.cli import systems
 from rampart.cli.look import top_view
@@ -227,7 +228,7 @@ async def _live(of: System, name: str, incarnation: int, shelf: Shelf, stranger:
     more = {SUPERVISOR: [Machine()], OBSERVER: [_sinks(of, clock)]}.get(name, [])
     actor = member.actor(Context(
         name, incarnation, clock, VirtualBus(hub, name, incarnation), member.parameters, of.run,
-        pid=100, checkpoints=MemoryCheckpoints(shelf, incarnation)), *more)
+        pid=100, checkpoints=MemoryCheckpoints(shelf, incarnation), topics=of.layout.topics), *more)
     problems: list[str] = []
 
     def overheard(_now_s: float, source: str, key: str, payload: bytes) -> None:
@@ -242,7 +243,8 @@ async def _live(of: System, name: str, incarnation: int, shelf: Shelf, stranger:
         hub.announce(node, 1, alive=True)
     task = asyncio.create_task(actor.run())
     await asyncio.sleep(stranger.dice.choice((0.0, 1.0)))
-    inputs = [topic for topic in actor.inputs() if actor.listens(topic)]
+    inputs = [*(topic for topic in actor.inputs() if actor.listens(topic)),
+              *(of.layout.topics[key] for _, key, _ in topics_named(actor.parameters)["heard"])]
     for _ in range(MESSAGES):
         topic = stranger.dice.choice(inputs)
         payload = stranger.payload(topic, stranger.header(clock.now()))

@@ -14,7 +14,7 @@ from shapely.geometry import box
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.detection.freshness import CommandFreshness, LocalizationFreshness
+from rampart.actors.detection.freshness import Freshness
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.detection.watchdog import Watchdog
 from rampart.actors.ftm import messages as fm
@@ -35,7 +35,7 @@ from rampart.manager.actor import DECISIONS_PER_INCARNATION, FtmManager
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from rampart.testing import run
 from tests.actors.osmosis.recovery.world import Base, Node, Pilot, Supervisor, hang
-from tests.osmosis_system import System, shipped_system
+from tests.osmosis_system import COMMAND, POSE, System, shipped_system
 
 CONTROL = ("mission_manager", "graph_planner", "osmosis_control")
 OTHERS = ("hmi", "teleoperation")
@@ -126,9 +126,9 @@ class Whole(System):
         self.actors: dict[str, Actor] = {}
         self.modules: dict[str, tuple[type[Actor], dict[str, Any]]] = {
             "DM1": (ProhibitedArea, {"margin_m": 0.6}),
-            "DM2": (CommandFreshness, {"timeout_s": timing.command_timeout_s}),
+            "DM2": (Freshness, {**COMMAND, "timeout_s": timing.command_timeout_s}),
             "DM3": (Bounds, {}),
-            "DM6": (LocalizationFreshness, {"timeout_s": timing.localization_timeout_s}),
+            "DM6": (Freshness, {**POSE, "timeout_s": timing.localization_timeout_s}),
             **{name: (Watchdog, {"watch": watch, "timeout_s": timing.heartbeat_timeout_s})
                for name, watch in WATCH.items()},
             "RM1": (EmergencyStop, {}),

@@ -188,12 +188,13 @@ NO_OPTION = ("{}: no option of the launcher or of tank; --system tank.toml --hel
              "there are")
 REFUSED = [
     (["--virtual"],
-     "--virtual: tank has no mission: its [application] names no class with one"),
-    (["--fault", "kill:pump_controller"],
-     "--fault kill:pump_controller: tank has no mission: its [application] names no class with "
-     "one"),
+     "--virtual: in virtual time a run has to end: give --duration S, or tank an [end] with "
+     "after_s"),
+    (["--fault", "kill:nobody"],
+     "fault 'kill:nobody': no node 'nobody'; there are: supervisor, pump_controller, "
+     "tank_manager, D_LEVEL, D_CRASH, R_SHUT, R_RESTART"),
     (["--patience", "7"],
-     "--patience 7: tank has no mission: its [application] names no class with one"),
+     "--patience 7: tank has no mission: its runs end after --duration S"),
     (["--obstacles", "1"], NO_OPTION.format("--obstacles")),
     (["--wait"], "--wait: no node of tank serves an operator's page"),
     (["--hmi-port", "9000"], "--hmi-port 9000: no node of tank serves an operator's page"),
@@ -211,7 +212,8 @@ def test_an_option_that_would_have_no_effect_is_refused(tmp_path, arguments, lin
 
 OSMOSIS = '[application]\nclass = "rampart.actors.osmosis.application:Osmosis"\n'
 HALF = [
-    ("", [], "--virtual: paper has no mission: its [application] names no class with one"),
+    ("", [], "--virtual: in virtual time a run has to end: give --duration S, or paper an [end] "
+     "with after_s"),
     (OSMOSIS, ["--mission", "A"], "{file}: $.application: Object missing required field `airport`"),
     (OSMOSIS, ["--airport", "vallombre"],
      "{file}: $.application: Object missing required field `mission`"),

@@ -100,8 +100,8 @@ def test_no_name_of_the_first_system_is_in_the_engine_s_code(room):
      "R_RETRACT both claim arm; they cannot run together"),
     ('title = "Pick and place behind a light curtain"\n',
      'title = "x"\nairport = "vallombre"\n',
-     "cell.toml: $.airport = 'vallombre': unknown field; known: name, title, application, robot, "
-     "strategy, shadow, order, timing, layers, supervision, node, detection, recovery, "
+     "cell.toml: $.airport = 'vallombre': unknown field; known: name, title, application, judge, "
+     "end, robot, strategy, shadow, order, timing, layers, supervision, node, detection, recovery, "
      "mechanism, event, orders; what an application is told stands in [application]"),
     ('shadow', 'shadow', None),
 ])

@@ -10,11 +10,11 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import jinja2
 import pytest
+from msgspec.structs import replace
 
 import rampart.sim.osmosis.trial.mission_trial
 from rampart.actors.osmosis.airport.formats import load_airport

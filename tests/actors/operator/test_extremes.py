@@ -314,7 +314,7 @@ async def test_markup_in_every_text_of_the_bus_and_of_the_airport_is_inert(world
         AIRPORT, name=MARKUP, nodes={f"{MARKUP}{n}"[:90]: at for n, at in AIRPORT.nodes.items()},
         edges=(), buildings=tuple(msgspec.structs.replace(b, name=MARKUP)
                                   for b in AIRPORT.buildings),
-        lights=tuple(dataclasses.replace(light, name=f"{MARKUP}{i}", row=MARKUP)
+        lights=tuple(msgspec.structs.replace(light, name=f"{MARKUP}{i}", row=MARKUP)
                      for i, light in enumerate(AIRPORT.lights)),
         missions={MARKUP: Mission(MARKUP, AIRPORT.mission("A").goals)})
     spec = msgspec.structs.replace(SPEC, title=MARKUP, nodes=tuple(

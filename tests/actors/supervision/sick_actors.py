@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from rampart.actors.detection.freshness import CommandFreshness
+from rampart.actors.detection.freshness import Freshness
 from rampart.actors.osmosis.control.following.osmosis_control import OsmosisControl
 from rampart.actors.osmosis.control.pilot.safety_pilot import SafetyPilot
 from rampart.actors.runtime.actor import Actor
@@ -52,7 +52,7 @@ class SickPilot(Sick, SafetyPilot):
     pass
 
 
-class SickModule(Sick, CommandFreshness):
+class SickModule(Sick, Freshness):
     pass
 
 
@@ -73,9 +73,9 @@ def write_sick_system(directory: Path, node: str) -> Path:
     """Write the paper's system in which one node is sick for a while, and soon given up."""
     text = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
     usual, sick = ACTORS[node]
-    assert text.count(f'"{usual}"') == 1
+    assert f'"{usual}"' in text
     file = directory / "sick.toml"
-    file.write_text(text.replace(f'"{usual}"', f'"{sick.__module__}:{sick.__name__}"')
+    file.write_text(text.replace(f'"{usual}"', f'"{sick.__module__}:{sick.__name__}"', 1)
                     + _SOON, encoding="utf-8")
     return file
 

@@ -113,7 +113,6 @@ def test_a_latency_that_does_not_fit_is_refused_though_the_timeout_would():
 
 def test_what_parameters_there_are_is_for_the_classes_to_say():
     spec = parse_specification(edit(
-        ('"rampart.actors.detection.freshness:Freshness"', '"my.own:Freshness"'),
         ('topic = "control/command", ', 'topic = 3, hold_s = -1, anything = [true], ')), FILE)
     assert spec.detections[1].parameters["hold_s"] == -1
 

@@ -541,8 +541,8 @@ def test_a_counterexample_is_shrunk_to_what_it_needs():
     (("--runs", "3", "--patience", "0"), "--patience 0"),
     (("--replay", "ab"), "--out DIR is missing"),
     (("--replay", "ab", "--out", "/nowhere"), "no such directory"),
-    (("--system", "cell", "--paper"), "--system cell: nobody judges its runs"),
-    (("--system", "cell", "--paper", "--full"), "--system cell: nobody judges its runs"),
+    (("--system", "cell", "--paper"), "--system cell: it has no missions"),
+    (("--system", "cell", "--paper", "--full"), "--system cell: it has no missions"),
 ])
 def test_bad_usage_is_one_line_and_exit_code_2(capsys, arguments, words):
     assert rampart(["campaign", *arguments]) == 2

@@ -7,22 +7,20 @@ import math
 
 import pytest
 
-from rampart.actors.detection.freshness import (
-    CommandFreshness,
-    FreshnessMonitor,
-    LocalizationFreshness,
-)
+from rampart.actors.detection.freshness import Freshness, FreshnessMonitor
 from rampart.actors.detection.module import EXCUSE_S, DetectionModule, IllegalTransitionError
 from rampart.actors.detection.stub import StubDetection
 from rampart.actors.ftm import messages as fm
-from rampart.actors.layout.wiring import Member, heard
+from rampart.actors.layout.layout import Layout
+from rampart.actors.layout.wiring import heard
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
+from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header, on
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 from rampart.testing import Ear, play, run, table
 from tests.actors.osmosis.detection.sources import Source
-from tests.osmosis_system import System
+from tests.osmosis_system import COMMAND, POSE, System, shipped_system
 
 # f fresh sample, o the first sample once more, d delayed by 1 s, + stamped 100 s ahead,
 # i infinitely far ahead, n no number
@@ -85,7 +83,7 @@ def test_the_actor_reports_at_once_and_repeats_at_5_hz():
         async with System() as system:
             ear = system.start("ear", Ear)
             source = system.start("source", Source)
-            dm2 = system.start("DM2", CommandFreshness, timeout_s=0.3)
+            dm2 = system.start("DM2", Freshness, **COMMAND, timeout_s=0.3)
             await asyncio.sleep(0.01)
             assert ear.states == ["idle"]
             source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
@@ -108,11 +106,11 @@ def test_a_respawned_module_is_silent_until_it_knows_that_the_topic_is_stale():
     async def scenario() -> None:
         async with System() as system:
             ear = system.start("ear", Ear)
-            system.start("DM6", LocalizationFreshness, timeout_s=0.5)
+            system.start("DM6", Freshness, **POSE, timeout_s=0.5)
             await asyncio.sleep(0.1)
             await system.kill("DM6")
             ear.heard.clear()
-            system.start("DM6", LocalizationFreshness, timeout_s=0.5)
+            system.start("DM6", Freshness, **POSE, timeout_s=0.5)
             await asyncio.sleep(0.45)
             assert ear.heard == []
             await asyncio.sleep(0.1)
@@ -126,11 +124,11 @@ def test_a_respawned_module_is_idle_as_soon_as_it_hears_a_fresh_sample():
         async with System() as system:
             ear = system.start("ear", Ear)
             source = system.start("source", Source)
-            system.start("DM6", LocalizationFreshness)
+            system.start("DM6", Freshness, **POSE, timeout_s=1.0)
             await system.settle()
             await system.kill("DM6")
             ear.heard.clear()
-            system.start("DM6", LocalizationFreshness)
+            system.start("DM6", Freshness, **POSE, timeout_s=1.0)
             await system.settle()
             source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0))
             await system.settle()
@@ -144,11 +142,11 @@ def test_a_respawned_module_whose_first_sample_is_old_never_says_idle():
         async with System() as system:
             ear = system.start("ear", Ear)
             source = system.start("source", Source)
-            system.start("DM6", LocalizationFreshness, timeout_s=0.5)
+            system.start("DM6", Freshness, **POSE, timeout_s=0.5)
             await asyncio.sleep(1.05)
             await system.kill("DM6")
             ear.heard.clear()
-            system.start("DM6", LocalizationFreshness, timeout_s=0.5)
+            system.start("DM6", Freshness, **POSE, timeout_s=0.5)
             await system.settle()
             source.publish(topics.POSE, m.Pose(0.0, 0.0, 0.0), stamp=system.clock.now() - 0.9)
             await asyncio.sleep(0.001)
@@ -162,7 +160,7 @@ def test_a_module_that_was_itself_stopped_may_find_an_old_sample_first_in_its_ma
         async with System() as system:
             ear = system.start("ear", Ear)
             source = system.start("source", Source)
-            system.start("DM2", CommandFreshness, timeout_s=0.3)
+            system.start("DM2", Freshness, **COMMAND, timeout_s=0.3)
             source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
             await asyncio.sleep(0.1)
             loop = asyncio.get_running_loop()
@@ -182,7 +180,7 @@ def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_judges():
         async with System() as system:
             ear = system.start("ear", Ear)
             source = system.start("source", Source)
-            system.start("DM2", CommandFreshness, timeout_s=0.3)
+            system.start("DM2", Freshness, **COMMAND, timeout_s=0.3)
             source.publish(topics.COMMAND, m.Twist(0.5, 0.0))
             await asyncio.sleep(0.1)
             loop = asyncio.get_running_loop()
@@ -199,10 +197,10 @@ def test_a_module_that_was_itself_stopped_reads_its_mail_before_it_judges():
     run(scenario)
 
 
-@pytest.mark.parametrize(("cls", "key"), [
-    (CommandFreshness, "control/command"), (LocalizationFreshness, "localization/pose")])
-def test_each_module_hears_its_own_topic_only(cls, key):
-    assert list(heard(Member("DM", cls, cls.Parameters()))) == [key]
+def test_each_module_hears_its_own_topic_only():
+    members = Layout(RunPlan(), shipped_system()).members
+    assert list(heard(members["DM2"])) == ["control/command"]
+    assert list(heard(members["DM6"])) == ["localization/pose"]
 
 
 @pytest.mark.parametrize("value", ["soon", -1.0, True, None])
@@ -210,7 +208,7 @@ def test_a_timeout_that_is_no_duration_is_refused_by_name(value):
     async def scenario() -> None:
         async with System() as system:
             with pytest.raises(ValueError, match=r"parameters\.timeout_s = .*: expected a number"):
-                system.start("DM2", CommandFreshness, timeout_s=value)
+                system.start("DM2", Freshness, **COMMAND, timeout_s=value)
 
     run(scenario)
 
@@ -290,8 +288,8 @@ def test_it_names_the_suspected_node_and_the_life_that_was_heard_last():
             system.start("localization", Source)
             await system.kill("localization")
             source = system.start("localization", Source)
-            system.start("DM6", LocalizationFreshness, timeout_s=0.3, suspects=["localization"])
-            system.start("DM2", CommandFreshness, timeout_s=0.3, startup_grace_s=0.3,
+            system.start("DM6", Freshness, **POSE, timeout_s=0.3, suspects=["localization"])
+            system.start("DM2", Freshness, **COMMAND, timeout_s=0.3, startup_grace_s=0.3,
                          suspects=["osmosis_control"])
             await system.settle()
             for _ in range(5):
@@ -309,6 +307,6 @@ def test_suspects_that_are_no_names_are_refused():
     async def scenario() -> None:
         async with System() as system:
             with pytest.raises(ValueError, match=r"parameters.suspects = 'x': expected a list"):
-                system.start("DM6", LocalizationFreshness, suspects="x")
+                system.start("DM6", Freshness, **POSE, timeout_s=1.0, suspects="x")
 
     run(scenario)
