@@ -13,6 +13,7 @@ Examples:
   rampart adapt set strategy guarded-repair      change mechanisms while it runs
   rampart live foxglove                          see it in another viewer
   rampart record run.mcap                        keep all that is said; `rampart replay` it
+  rampart check my_system.toml                   is it sound, before it runs? `explain` it
   rampart table                                  what the manager would decide
   rampart tree                                   see fault tree, FTMTree and orders
   rampart campaign --paper                       break it a hundred times, and count
@@ -27,7 +28,14 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 
-from rampart.cli.analyse import cut_set_verbs, decide_verbs, tree_verbs, verify_verb
+from rampart.cli.analyse import (
+    check_verb,
+    cut_set_verbs,
+    decide_verbs,
+    explain_verb,
+    tree_verbs,
+    verify_verb,
+)
 from rampart.cli.look import serving_verbs, topic_verbs
 from rampart.cli.operate import adapt_verb, inject_verbs, node_verbs, operator_verbs
 from rampart.cli.output import NoEffectError, UsageError, warn
@@ -37,7 +45,7 @@ from rampart.files import streams, working_folder
 
 _OF_A_RUN = (node_verbs, topic_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
              record_verbs)
-_OF_A_SYSTEM = (cut_set_verbs, decide_verbs, tree_verbs, verify_verb)
+_OF_A_SYSTEM = (check_verb, explain_verb, cut_set_verbs, decide_verbs, tree_verbs, verify_verb)
 # Each adds its verbs, in this order in the help.
 
 

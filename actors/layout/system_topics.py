@@ -58,7 +58,8 @@ def published_keys(spec: SystemSpec) -> tuple[str, ...]:
     Raises:
         ValueError: the spec names an actor class that does not exist.
     """
-    members = [m for m in Layout(RunPlan(system_file=spec.name), spec).members.values() if m.name != OBSERVER]
+    layout = Layout(RunPlan(system_file=spec.name), spec)
+    members = [m for m in layout.members.values() if m.name != OBSERVER]
     wanted: dict[str, dict[str, None]] = {}
     for member in members:
         for key, names in heard(member).items():

@@ -26,9 +26,9 @@ def add(verbs: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Verify, and show what was found.
 
-    Check a system as `rampart check` does, and its arbitration exhaustively: what each strategy decides
-    for every set of active mechanisms, and every state of the arbiter that
-    carries it out, from when it has heard every module. A property holds, or
+    Check a system as `rampart check` does, and its arbitration exhaustively:
+    what each strategy decides for every set of active mechanisms, and every state
+    of the arbiter that carries it out, from when it has heard every module. A property holds, or
     the shortest counterexamples are shown. docs/verification.md explains the
     properties, and what is not looked at.
 
