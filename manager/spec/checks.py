@@ -220,9 +220,20 @@ def _reachability(spec: SystemSpec) -> Iterator[Finding]:
                           "watches it", (node.respawn,))
 
 
+def _faults(spec: SystemSpec) -> Iterator[Finding]:
+    detections = dict.fromkeys(row.name for row in spec.detections)
+    first: dict[str, str] = {}
+    for path, fault in numbered("fault", spec.faults):
+        if (other := first.setdefault(fault.name, path)) != path:
+            yield Finding(f"{path}.name", f"duplicate name, already at {other}.name", (fault.name,))
+        yield from find_wrong_names(f"{path}.detected_by", fault.detected_by, "detection module",
+                                    detections, "listed twice")
+
+
 VALIDATORS: tuple[Validator, ...] = (
     find_wrong_times, _names, _nodes, _detections, _recoveries, _processes, _mechanisms,
-    _reachability, arbitration_checks.find_wrong_tree, arbitration_checks.find_wrong_policy,
+    _reachability, _faults,
+    arbitration_checks.find_wrong_tree, arbitration_checks.find_wrong_policy,
     arbitration_checks.find_wrong_orders, arbitration_checks.find_contradictions,
     arbitration_checks.find_wrong_compounds, arbitration_checks.find_wrong_precedence,
     find_wrong_budget)

@@ -51,7 +51,7 @@ LARGEST_INTEGER = 2 ** 63 - 1
 """In parameters, which go to an actor as they are, by way of MessagePack."""
 
 MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
-            "orders": 16}
+            "fault": 500, "orders": 16}
 """Of each table; the shipped systems have 31 actors, and checks compare many with many."""
 
 
@@ -238,6 +238,8 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> Findin
             problem += ", or { within_s = ..., hazard = '...' }"
     elif field == "gate":
         problem = "unknown gate; known: 'or', 'and', { at_least = k }"
+    elif "regex" in problem and (table, field) == ("fault", "name"):
+        problem = "expected a name: a small letter, then small letters, digits and hyphens"
     elif "regex" in problem and field == "actor":
         problem = "expected 'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"
     elif "regex" in problem:

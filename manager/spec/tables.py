@@ -136,7 +136,8 @@ class Finding(NamedTuple):
     value: tuple[Any, ...] = ()
 
 
-_IN_A_ROW = re.compile(r"\$\.(node|detection|recovery|mechanism|event)\[(\d+)\](\.|\Z)")
+_NAME = re.compile(r"[A-Za-z][\w-]{0,63}\Z", re.ASCII)
+_IN_A_ROW = re.compile(r"\$\.(node|detection|recovery|mechanism|event|fault)\[(\d+)\](\.|\Z)")
 
 
 def by_name(path: str, document: Mapping[str, Any]) -> str:
@@ -153,8 +154,10 @@ def by_name(path: str, document: Mapping[str, Any]) -> str:
     if not found or path.endswith("].name"):  # which may be there twice
         return path
     try:
-        name = msgspec.convert(document[found[1]][int(found[2])]["name"], Name)
-    except (LookupError, TypeError, msgspec.ValidationError):
+        name = document[found[1]][int(found[2])]["name"]
+    except (LookupError, TypeError):
+        return path
+    if not isinstance(name, str) or not _NAME.match(name):
         return path
     rest = path[found.end():]
     return f"{found[1]} {name}: {rest}" if rest else f"{found[1]} {name}"

@@ -22,7 +22,7 @@ from rampart.cli.look.topic_verbs import in_line, rate_of
 from rampart.cli.main import build_parser, main
 from rampart.cli.operate.inject_verbs import choose
 from rampart.cli.output import UsageError
-from rampart.sim.campaign.job import _document
+from rampart.sim.campaign.job import read_document_of
 from rampart.sim.osmosis.trial.faults import SENSOR_FAULTS
 from tests.porter_actors import write_porter_system
 
@@ -383,6 +383,6 @@ def test_a_file_comes_before_a_system_that_ships_for_all_who_look_for_one(tmp_pa
     (tmp_path / "cell").rmdir()
     (tmp_path / "cell").write_bytes(shipped.DEFAULT.read_bytes())
     assert systems.load("cell").name == "osmosis"
-    _document.cache_clear()  # what a campaign's job runs is what was checked
-    assert _document("cell")[1]["name"] == "osmosis"
-    _document.cache_clear()
+    read_document_of.cache_clear()  # what a campaign's job runs is what was checked
+    assert read_document_of("cell")[1]["name"] == "osmosis"
+    read_document_of.cache_clear()
