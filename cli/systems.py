@@ -10,10 +10,11 @@ from rampart import systems
 from rampart.actors.layout.layout import Layout, application_class, load_application
 from rampart.actors.layout.system_topics import declared_topics, own_topics, system_topics
 from rampart.actors.layout.wiring import REPORTS_ON, import_class, load_member
+from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.run.run_plan import RunPlan
 from rampart.cli.output import UsageError, refusing
 from rampart.cli.robot_lines import RobotLines
-from rampart.cli.verbs import Option, either, option
+from rampart.cli.verbs import Option, either, option, port_of_environment
 from rampart.files import toml
 from rampart.files.reading import FileError, read_text
 from rampart.manager.spec.specification import SystemSpec, parse_specification
@@ -61,6 +62,22 @@ def load(file: str | None) -> SystemSpec:
     except FileError as error:
         raise UsageError(f"{path}: {error}") from None
     return spec
+
+
+def at_hand(file: str | None, port: int | None = None) -> SystemSpec:
+    """Read the system that is meant: one that is named, else that of the run, else the shipped one.
+
+    Args:
+        file: as of `load`.
+        port: base port of the run, if there are several.
+
+    Raises:
+        UsageError: the one that is named cannot be read, or makes no sense.
+    """
+    if file is None:
+        with contextlib.suppress(NoRunError, UsageError):
+            return load(find_run(port or port_of_environment()).system_file)
+    return load(file)
 
 
 @refusing(ValueError, OSError)

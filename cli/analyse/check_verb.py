@@ -9,9 +9,6 @@ from rampart.cli import systems
 from rampart.cli.output import UsageError, print_json, say
 from rampart.cli.verbs import JSON, add_verb
 
-FORMAT = 1
-"""Of what `--json` prints; it grows when a field changes or goes."""
-
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser."""
@@ -38,14 +35,14 @@ def run(options: argparse.Namespace) -> int:
     except UsageError as error:
         if not options.json:
             raise
-        print_json({"format": FORMAT, "sound": False, "problem": str(error)})
+        print_json({"sound": False, "problem": str(error)})
         return 2
     spec = layout.spec
     sizes = {"processes": len(layout.units), "nodes": len(spec.nodes),
              "detection modules": len(spec.detections), "recovery modules": len(spec.recoveries),
              "mechanisms": len(spec.mechanisms)}
     if options.json:
-        print_json({"format": FORMAT, "sound": True, "problem": None, "system": spec.name,
+        print_json({"sound": True, "problem": None, "system": spec.name,
                     "file": layout.plan.system_file,
                     **{name.replace(" ", "_"): count for name, count in sizes.items()}})
     else:

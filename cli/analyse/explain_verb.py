@@ -19,9 +19,6 @@ from rampart.manager.strategies.arrangement import arrange
 from rampart.manager.strategies.escalation import succession
 from rampart.manager.strategies.registry import decide
 
-FORMAT = 1
-"""Of what `--json` prints; it grows when a field changes or goes."""
-
 _LAUNCHER, _SPAWNERS = "launcher", ("spawner_a", "spawner_b")
 
 
@@ -80,7 +77,6 @@ class Consequence(msgspec.Struct, frozen=True):
 class Explanation(msgspec.Struct, frozen=True):
     """What a system is."""
 
-    format: int
     system: str
     title: str
     strategy: str
@@ -122,7 +118,7 @@ def explain(layout: Layout) -> Explanation:
     """Return what a system is."""
     spec = layout.spec
     return Explanation(
-        FORMAT, spec.name, spec.title, spec.strategy, tuple(_processes(layout)),
+        spec.name, spec.title, spec.strategy, tuple(_processes(layout)),
         tuple(_talks(spec)), tuple(_guards(layout)), tuple(_consequences(spec)))
 
 

@@ -162,7 +162,7 @@ class Trial:
         return {
             "mission": record.mission, "safety": record.safety, "reasons": record.reasons,
             "duration_s": round(record.duration_s, 2), "restarts": record.restarts,
-            "given_up": record.given_up,
+            "given_up": record.given_up, "failing": record.failing,
             "decisions": msgspec.to_builtins(record.decisions),
             "faults": [{**msgspec.to_builtins(fault), "effective": fault.effective}
                        for fault in record.faults]}
