@@ -18,7 +18,7 @@ from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 from rampart.cli import systems
-from rampart.cli.output import UsageError, refusing, unknown
+from rampart.cli.output import UsageError, unknown
 from rampart.manager.spec.specification import SystemSpec
 
 MAILBOX = {
@@ -77,19 +77,25 @@ def topics_for(key: str, port: int | None) -> tuple[Topic[Any], ...]:
     """Return the topics among which to look for a key: those of the run's system.
 
     The actors of a system are loaded only for a key that neither the engine nor its application
-    declares. For a run whose system cannot be read here, the topics of the engine are known.
+    declares. Without a run the shipped system is meant, as far as it has the key. For a run whose
+    system cannot be read here, the topics of the engine are known.
 
     Args:
         key: as typed.
         port: base port of the run, if there are several.
 
     Raises:
-        UsageError: there is no run.
+        UsageError: there is no run, and the shipped system has no such topic.
         UnreadableError: the system of the run, or one of its actors, cannot be loaded here, and the
             engine has no such topic.
     """
-    with refusing(NoRunError):
+    try:
         file = find_run(port).system_file
+    except NoRunError as error:
+        shipped = systems.declared(systems.load(None))
+        if _match(key, shipped) is None:
+            raise UsageError(str(error)) from None
+        return shipped
     try:
         spec = systems.load(file)
         known = systems.declared(spec)

@@ -86,8 +86,8 @@ def test_the_list_of_faults_is_of_the_system_that_is_named(capsys):
     assert main(["inject", "--list", "--system", "cell"]) == 0
     told = capsys.readouterr().out
     assert told.endswith("  supervisor, camera, part_finder, motion_planner, arm_controller, "
-                         "gripper, valve, conveyor, cell_manager, D_CURTAIN, D_ENCODER_A, D_ENCODER_B, "
-                         "D_ENCODER_C, D_FORCE, D_VISION, D_MOTION_CRASH, D_VISION_CRASH, "
+                         "gripper, valve, conveyor, cell_manager, D_CURTAIN, D_ENCODER_A, "
+                         "D_ENCODER_B, D_ENCODER_C, D_FORCE, D_VISION, D_MOTION_CRASH, D_VISION_CRASH, "
                          "R_SAFE_TORQUE_OFF, R_HOLD, R_RETRACT, R_OPEN_GRIPPER, R_RESTART_MOTION, "
                          "R_RESTART_VISION\n")
     assert "gps" not in told
