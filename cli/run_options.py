@@ -47,6 +47,7 @@ from rampart.cli.verbs import (
     whole,
     word,
 )
+from rampart.files import working_folder
 from rampart.manager.spec.specification import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
 from rampart.sim.faults.faults import faults_of
@@ -162,6 +163,7 @@ def _system_file(system: str) -> Path:
         what = "is a directory" if found.is_dir() else "no such file"
         raise UsageError(f"--system {system}: {what}; a spec is right, or the name of a "
                          f"shipped one: {systems.names()}")
+    working_folder.admit(found.parent)
     return found
 
 
@@ -181,7 +183,7 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
         ftm=not options.no_ftm, options=application_options.chosen(options, kind),
         hmi_port=0 if options.no_hmi else options.hmi_port, shadow=options.shadow,
         hmi_host=options.hmi_host, hmi_token=token, hmi_token_is_new=token_is_new,
-        waits=options.wait)
+        waits=options.wait, virtual=options.virtual)
     spec = load_system(plan)
     layout = Layout(plan, spec)
     if not options.no_hmi:

@@ -10,9 +10,10 @@ import msgspec
 
 from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.zenoh_bus import endpoint
+from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.layout.chosen_topics import choose_topics
+from rampart.actors.layout.chosen_topics import choose_topics, with_panels
 from rampart.actors.layout.connections import check_connections, check_heard, publishers_of
 from rampart.actors.layout.wiring import (
     Member,
@@ -20,6 +21,7 @@ from rampart.actors.layout.wiring import (
     load_class,
     load_member,
     partners,
+    topics_of,
 )
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
@@ -90,8 +92,10 @@ class Layout:
                  "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
         own += [load_member(n, spec, file, world if n.kind is Kind.WORLD else {})
                 for n in spec.actors()]
-        self.members, self.topics = choose_topics(own, (*kind.topics, *judged), file)
-        self._check(judge, (*ftm_topics.ALL, *kind.topics), file)
+        known = (*kind.topics, *stand_in_topics(spec))
+        self.members, self.topics = choose_topics(
+            with_panels(own, spec, file), (*known, *judged), file)
+        self._check(judge, (*ftm_topics.ALL, *known), file)
         self._partners = partners(self.members.values())
 
     def _check(self, judge: Any, known: Iterable[Topic[Any]],
@@ -153,9 +157,21 @@ def load_run(plan: RunPlan, spec: SystemSpec) -> RunContext:
     """Load what all actors of a run have in common; done once, before the fork.
 
     Raises:
-        ValueError: the application's options are unsound; the message names file and value.
+        ValueError: the application's options are unsound, or there is no such program as a node's
+            command names; the message names file and value.
     """
+    check_programs(plan, spec)
     return RunContext(plan, spec, load_document(plan), load_application(plan, spec))
+
+
+def stand_in_topics(spec: SystemSpec) -> list[Topic[Any]]:
+    """Return the topics that are declared by what plays commands in virtual time.
+
+    Raises:
+        ValueError: there is no such class.
+    """
+    classes = [load_class(node.stand_in, field="stand_in") for node in spec.nodes if node.stand_in]
+    return [topic for one in classes for topics in topics_of(one) for topic in topics]
 
 
 def judge_class(spec: SystemSpec) -> type[Handlers] | None:

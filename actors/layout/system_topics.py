@@ -84,6 +84,9 @@ def _actors(spec: SystemSpec) -> Iterator[str]:
     for part in (spec.nodes, spec.detections, spec.recoveries):
         for one in part:
             yield one.actor
+    for node in spec.nodes:
+        if node.stand_in:
+            yield node.stand_in
 
 
 def _beyond(known: Iterable[Topic[Any]], paths: Iterable[str]) -> tuple[Topic[Any], ...]:

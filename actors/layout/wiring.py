@@ -23,6 +23,7 @@ from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.files import working_folder
+from rampart.manager.spec.panels import problem_of
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
 T = TypeVar("T")
@@ -41,7 +42,7 @@ _ROOMS_OF_0_6 = ("actors", "manager", "sim")
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One actor of the system: its name, class and parameters.
+    """One actor of the system: its name, class and parameters, and where these are in its table.
 
     `hears` and `publishes` are the topics that its parameters name, as `heard` and `published` have
     them.
@@ -50,6 +51,7 @@ class Member:
     name: str
     actor: type[Actor]
     parameters: Actor.Parameters
+    table: str = "parameters."
     kind: Kind = Kind.SUPERVISION
     hears: Mapping[str, Members] = field(default_factory=dict)
     publishes: Mapping[str, Members] = field(default_factory=dict)
@@ -129,38 +131,55 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
     own = tuple(n.name for n in spec.nodes if n.respawn == node.name)
     derived = {"nodes": own} if own else derived
     try:
+        if node.command and node.stand_in:  # what is wrong with it is told in real runs, too
+            load_class(node.stand_in, field="stand_in")
         actor = load_class(node.actor, node.kind)
         takes = {field.name for field in msgspec.structs.fields(actor.Parameters)}
     except ValueError as error:
         raise ValueError(f"{file}: {path}: {error}") from None
     except (TypeError, NameError) as error:
         raise ValueError(f"{file}: {path}: actor = {node.actor!r}: Parameters: {error}") from None
+    if node.command:
+        if node.stand_in:
+            load_member(node.in_virtual_time(), spec, file, derived)
+        return Member(node.name, actor, read_parameters(
+            actor.Parameters, node.command_parameters, file, path, spec), "", node.kind)
     given = {name: derived[name] for name in takes & derived.keys()} | node.parameters
+    if shows_panels(actor):
+        given["panels"] = panels = (*getattr(actor, "panels", ()), *spec.panels)
+        if problem := problem_of(panels):
+            raise ValueError(f"{file}: {node.name}: {problem}")
     return Member(node.name, actor, read_parameters(
-        actor.Parameters, given, file, f"{path}: parameters", spec), node.kind)
+        actor.Parameters, given, file, f"{path}: parameters", spec), kind=node.kind)
 
 
-def load_class(path: str, kind: Kind | None = None) -> type[Actor]:
+def shows_panels(actor: type[Actor]) -> bool:
+    """Whether an actor is a page, which shows panels."""
+    return any(field.name == "panels" for field in msgspec.structs.fields(actor.Parameters))
+
+
+def load_class(path: str, kind: Kind | None = None, field: str = "actor") -> type[Actor]:
     """Return the actor class named `module:Class`.
 
     Args:
         path: name of the class.
         kind: that it has to be of, which is known by what it publishes; None for any.
+        field: of the spec, for messages.
 
     Raises:
         ValueError: there is no such class, it is no actor, or one of another kind, or its module
             cannot be imported.
     """
-    found = import_class(path, Actor, "actor")
+    found = import_class(path, Actor, field)
     own = None if kind is None else REPORTS_ON.get(kind)
     if own is not None and own not in found.outputs:
         who = "the manager does" if kind is Kind.MANAGER else "the modules of this table do"
-        raise ValueError(f"actor = {path!r}: it does not publish {own.key}, as {who}")
+        raise ValueError(f"{field} = {path!r}: it does not publish {own.key}, as {who}")
     for of, topic in REPORTS_ON.items() if kind is not None else ():
         if of is not kind and topic in found.outputs:
-            raise ValueError(f"actor = {path!r}: it publishes {topic.key}, so {_PLACE[of]}")
+            raise ValueError(f"{field} = {path!r}: it publishes {topic.key}, so {_PLACE[of]}")
     if kind is not None and found.node_kind not in {"", kind.value}:
-        raise ValueError(f"actor = {path!r}: it is no {kind.value} node; kind = "
+        raise ValueError(f"{field} = {path!r}: it is no {kind.value} node; kind = "
                          f"{found.node_kind!r} is right")
     return found
 
@@ -176,9 +195,9 @@ def import_class(path: str, base: type[T], field: str, what: str = "") -> type[T
     try:
         imported = importlib.import_module(module)
     except ImportError as error:
-        hidden = working_folder.why_not()
+        hidden = "; ".join(dict.fromkeys(working_folder.refused.values()))
         hint = _moved(module, name) or (
-            f"; nothing is imported from the working folder: {hidden}" if hidden else "")
+            f"; nothing is imported from there: {hidden}" if hidden else "")
         raise ValueError(f"{field} = {path!r}: {error}{hint}") from None
     except Exception as error:  # a module of the user's own may raise anything
         frames = traceback.extract_tb(error.__traceback__)

@@ -118,7 +118,20 @@ def load_document(plan: RunPlan) -> dict[str, Any]:
 
 
 def tailor(plan: RunPlan, spec: SystemSpec) -> SystemSpec:
-    """Return a spec with the baseline's layers off where the plan says so."""
+    """Return a spec with the baseline's layers off, and commands played, where the plan says so.
+
+    Raises:
+        SpecificationError: time is virtual, and a node is a command that nothing plays.
+    """
+    if plan.virtual:
+        nodes = tuple(node.in_virtual_time() for node in spec.nodes)
+        for node in nodes:
+            if node.command:
+                raise SpecificationError(
+                    plan.system_file, f"{node.name}: command", "there are no processes in virtual "
+                    "time; name with stand_in = 'module:Class' the actor that plays it there",
+                    list(node.command))
+        spec = msgspec.structs.replace(spec, nodes=nodes)
     return spec if plan.ftm else msgspec.structs.replace(spec, layers=Layers(
         dead_man=False, safety_pilot_checks=False, manager_watch=False,
         supervisor_respawn=False, ftm=False, checkpoints=False))

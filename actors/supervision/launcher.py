@@ -29,7 +29,7 @@ from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.actors.supervision.guard import Guard
-from rampart.actors.supervision.process_title import kill, kill_leftovers
+from rampart.actors.supervision.process_title import end_commands, kill, kill_leftovers
 from rampart.actors.supervision.spawner import NAMES, Loaded
 from rampart.actors.supervision.spawner_client import (
     START_PATIENCE_S,
@@ -249,6 +249,7 @@ class Launcher:
         deadline = time.monotonic() + 1.0
         while kill_leftovers(self.plan.launcher_pid) and time.monotonic() < deadline:
             time.sleep(0.01)
+        end_commands(self.plan.folder)
         run_folder.remove(self.plan.folder)
         self._reap()
 

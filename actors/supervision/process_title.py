@@ -18,6 +18,8 @@ import setproctitle
 
 from rampart.actors.bus.run_folder import remove
 from rampart.actors.bus.unix_peer import process_state
+from rampart.actors.foreign.program import LOGS
+from rampart.actors.foreign.strays import kill_strays
 
 _TITLE = re.compile(r"^rampart\[(\d{1,5})/(\d{1,10})\] ([\w+.-]+) #(\d{1,20})(?!\d)")
 
@@ -89,4 +91,11 @@ def kill_leftovers(launcher: int) -> list[int]:
 def end_run(launcher: int, folder: str) -> None:
     """Leave nothing of a run whose launcher has ended: neither processes nor its folder."""
     kill_leftovers(launcher)
+    end_commands(folder)
     remove(folder)
+
+
+def end_commands(folder: str) -> None:
+    """SIGKILL what is left of the commands of a run, if it has any."""
+    if os.path.lexists(f"{folder}/{LOGS}"):
+        kill_strays(folder)

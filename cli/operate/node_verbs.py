@@ -5,29 +5,51 @@ Look at the nodes of the run.
 Examples:
   rampart node list
   rampart node list --json
+  rampart node log NODE
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
-from collections.abc import Coroutine
+import contextlib
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from rampart.actors.bus.topic import Topic
+from rampart.actors.foreign.program import LOGS
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.run.run_info import RunInfo
+from rampart.actors.run.run_info import NoRunError, RunInfo, find_run
 from rampart.cli import systems
+from rampart.cli.following import is_over
 from rampart.cli.operate.operator_verbs import Holdings
-from rampart.cli.output import NoEffectError, UsageError, print_json, print_table, say
+from rampart.cli.output import (
+    NoEffectError,
+    UsageError,
+    between,
+    print_json,
+    print_table,
+    refusing,
+    say,
+    say_text,
+    unknown,
+)
 from rampart.cli.robot_lines import RobotLines
 from rampart.cli.run_picture import manager_in_words
 from rampart.cli.session import connect
-from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag
+from rampart.cli.verbs import JSON, PORT, add_family, add_verb, flag, option, whole
+from rampart.files.plain_text import printable
 
+MOST_LINES = 1_000_000
+_LONGEST_LINE = 1 << 16
+_LOOK_S = 0.1
 _WAIT_S = 1.5
 """Simulated seconds to collect states; the rarest comes twice a second."""
 
@@ -37,6 +59,10 @@ def add(verbs: Any) -> None:
     add_verb(verbs, "status", "the run at a glance", status, PORT, JSON)
     node = add_family(verbs, "node", "the nodes of the run", __doc__)
     add_verb(node, "list", "all nodes", node_list, PORT, JSON)
+    add_verb(node, "log", "what the command of a node has printed", node_log, PORT,
+             option("name", metavar="NODE", help="a node that is a command"),
+             whole("--lines", "N", "so many lines from its end (default 50)", 50),
+             flag("--follow", "and what it prints from now on, until the run ends"))
     add_verb(verbs, "top", "the run in the terminal, refreshed four times a second", top, PORT,
              flag("--once", "print one picture and end"),
              flag("--json", "print one picture as JSON and end"),
@@ -64,6 +90,70 @@ print(next(n["pid"] for n in json.load(sys.stdin) if n["name"] == "localization"
         print_table(fm.NodeInfo.__struct_fields__,
                     [msgspec.structs.astuple(node) for node in table.nodes])
     return 0
+
+
+def node_log(options: argparse.Namespace) -> int:
+    """Print the output of a command.
+
+    Show what the command of a node has printed, of all its incarnations.
+    Lines that begin with --- are of the process that keeps it.
+
+    Examples:
+      rampart node log estimator
+      rampart node log estimator --follow
+      rampart node log estimator --lines 1000 | less
+    """
+    between("--lines", options.lines, 0, MOST_LINES)
+    with refusing(NoRunError):
+        run = find_run(options.port)
+    folder = Path(run.folder, LOGS)
+    if options.name not in run.nodes:
+        raise unknown("node", options.name, run.nodes)
+    file = folder / f"{options.name}.log"
+    if not file.is_file():
+        logs = sorted(one.stem for one in folder.glob("*.log"))
+        raise NoEffectError(f"{options.name}: no command, or its output is not kept; there is "
+                            f"output of: {', '.join(logs) or 'none'}")
+    with contextlib.suppress(KeyboardInterrupt):
+        for text in tail(file, options.lines, (lambda: not is_over(run)) if options.follow
+                         else lambda: False):
+            say_text(text)
+    return 0
+
+
+def tail(file: Path, lines: int, follows: Callable[[], bool]) -> Iterator[str]:
+    """Yield the last lines of a log, made fit for a terminal, then what is added to it.
+
+    Args:
+        file: the log; the one before it is `FILE.1`.
+        lines: how many.
+        follows: asked whether to wait for more.
+    """
+    before = file.with_name(f"{file.name}.1")
+    open_log = file.open("rb")
+    try:
+        ended = deque(open_log, maxlen=lines)
+        if len(ended) < lines and before.is_file():
+            with before.open("rb") as earlier:
+                ended.extendleft(reversed(deque(earlier, maxlen=lines - len(ended))))
+        yield from map(_shown, ended)
+        while follows():
+            more = open_log.readline(_LONGEST_LINE)
+            if more:
+                yield _shown(more)
+                continue
+            with contextlib.suppress(OSError):
+                if file.stat().st_ino != os.fstat(open_log.fileno()).st_ino:  # it was rotated
+                    rotated, open_log = open_log, file.open("rb")
+                    yield from map(_shown, rotated)
+                    rotated.close()
+            time.sleep(_LOOK_S)
+    finally:
+        open_log.close()
+
+
+def _shown(line: bytes) -> str:
+    return printable(line.decode(errors="replace").rstrip("\r\n"), keep="\t")
 
 
 async def status(options: argparse.Namespace) -> int:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from enum import StrEnum
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args
 
@@ -21,6 +20,8 @@ from rampart.manager.model.gates import detection_gate, recovery_gate
 from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, RecoveryKind
 from rampart.manager.model.order import PartialOrder, Tree, refine
 from rampart.manager.spec.mobile_robot import Hazard, Robot
+from rampart.manager.spec.nodes import ChildHeartbeat, ChildLimits, ClassPath, Kind, NodeSpec
+from rampart.manager.spec.panels import Panel
 from rampart.manager.spec.tables import (
     DERIVED,
     End,
@@ -33,45 +34,6 @@ from rampart.manager.spec.tables import (
     Table,
     Timing,
 )
-
-ClassPath = Annotated[str, msgspec.Meta(pattern=r"^[a-z_]\w*(\.[a-z_]\w*)*:[A-Z]\w*\Z")]
-
-
-class Kind(StrEnum):
-    """What a node is, which decides who guards it and who brings it back."""
-
-    CONTROL = "control"
-    NON_CONTROL = "non-control"
-    PILOT = "pilot"
-    MANAGER = "manager"
-    WORLD = "world"
-    SUPERVISION = "supervision"
-    DETECTION = "detection"
-    RECOVERY = "recovery"
-
-
-NODE_KINDS = (Kind.CONTROL, Kind.NON_CONTROL, Kind.PILOT, Kind.MANAGER, Kind.WORLD)
-"""What a `[[node]]` can be; the others are the supervisor, and what has a table of its own."""
-
-
-class NodeSpec(Table, frozen=True):
-    """A node: one actor.
-
-    Attributes:
-        name: Unique among nodes, detection and recovery modules.
-        actor: Its class, `module:Class`.
-        kind: What it is.
-        process: Name of the OS process it runs in; "" for one of its own name.
-        respawn: Who brings it back: a recovery module, or "supervisor".
-        parameters: For the actor. A value of a key in `_s` may name a `[timing]` value.
-    """
-
-    name: Name
-    actor: ClassPath
-    kind: Kind
-    process: OptionalName = ""
-    respawn: Name = "supervisor"
-    parameters: dict[str, Any] = {}
 
 
 class DetectionSpec(Table, frozen=True):
@@ -256,6 +218,7 @@ class SystemSpec(Table, frozen=True):
             "" for none.
         order: Name of an order of the recoveries, or several: what the first leaves open the
             next decides. The first is the one that says what is safer.
+        panels: Of the operator's page, besides those of its class.
     """
 
     name: Name
@@ -277,6 +240,7 @@ class SystemSpec(Table, frozen=True):
     events: tuple[EventSpec, ...] = msgspec.field(name="event", default=())
     orders: dict[str, dict[str, tuple[str, ...]]] = {}
     faults: tuple[FaultSpec, ...] = msgspec.field(name="fault", default=())
+    panels: tuple[Panel, ...] = msgspec.field(name="panel", default=())
 
     def without_disabled(self) -> SystemSpec:
         """Return the spec without the mechanisms that are disabled; itself if none is.
@@ -296,9 +260,9 @@ class SystemSpec(Table, frozen=True):
         detection modules, the recovery modules, the FTM Manager) are left out.
         """
         actors = list(self.nodes)
-        actors += [NodeSpec(m.name, m.actor, Kind.DETECTION, m.process, parameters=m.parameters)
+        actors += [NodeSpec(m.name, Kind.DETECTION, m.actor, m.process, parameters=m.parameters)
                    for m in self.detections]
-        actors += [NodeSpec(m.name, m.actor, Kind.RECOVERY, m.process, parameters=m.parameters)
+        actors += [NodeSpec(m.name, Kind.RECOVERY, m.actor, m.process, parameters=m.parameters)
                    for m in self.recoveries]
         tolerance = {Kind.DETECTION, Kind.RECOVERY, Kind.MANAGER}
         return tuple(msgspec.structs.replace(node, process=node.process or node.name)
@@ -363,7 +327,8 @@ class SystemSpec(Table, frozen=True):
         return self.build_order(self.criteria[0])
 
 
-TABLES: dict[str, type[Table]] = {"": SystemSpec, "gate": AtLeast, "against": Within}
+TABLES: dict[str, type[Table]] = {"": SystemSpec, "gate": AtLeast, "against": Within,
+                                  "heartbeat": ChildHeartbeat, "limits": ChildLimits}
 """All tables of a spec by their names in the file; "" is the whole."""
 for _field in msgspec.structs.fields(SystemSpec):
     for _type in (_field.type, *get_args(_field.type)):

@@ -28,8 +28,9 @@ from rampart.files.reading import FileError
 from rampart.manager.model.mechanisms import RecoveryKind
 from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
 from rampart.manager.spec.mobile_robot import Hazard, derive_timeouts
+from rampart.manager.spec.nodes import COMMAND_FIELDS, COMMAND_NODE, NODE_KINDS
+from rampart.manager.spec.panels import MAX_PANELS
 from rampart.manager.spec.schema import (
-    NODE_KINDS,
     TABLES,
     DetectionSpec,
     NodeSpec,
@@ -51,7 +52,7 @@ LARGEST_INTEGER = 2 ** 63 - 1
 """In parameters, which go to an actor as they are, by way of MessagePack."""
 
 MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
-            "fault": 500, "orders": 16}
+            "fault": 500, "orders": 16, "panel": MAX_PANELS}
 """Of each table; the shipped systems have 31 actors, and checks compare many with many."""
 
 
@@ -99,6 +100,11 @@ def check_modules(before: SystemSpec, after: SystemSpec) -> None:
             raise ValueError(f"{node.name}: actor = {node.actor!r}: no actor of the system that "
                              "was started is in that module; known modules: "
                              f"{', '.join(sorted(known))}")
+    commands = {node.name: node for node in before.nodes}
+    for new in after.nodes:
+        for field in COMMAND_FIELDS if new.command else ():
+            if getattr(new, field) != getattr(commands.get(new.name), field, None):
+                raise ValueError(f"{new.name}: {field}: of a command nothing changes while it runs")
 
 
 def check_document(document: dict[str, Any], file: str) -> SystemSpec:
@@ -126,7 +132,8 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
         spec = enabled
     if wrong is not None:
         raise _refusal(file, wrong, document)
-    return spec
+    return replace(spec, nodes=tuple(replace(node, actor=COMMAND_NODE) if node.command else node
+                                     for node in spec.nodes))
 
 
 def _refusal(file: str, finding: Finding, document: Mapping[str, Any]) -> SpecificationError:
@@ -240,8 +247,10 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> Findin
         problem = "unknown gate; known: 'or', 'and', { at_least = k }"
     elif "regex" in problem and (table, field) == ("fault", "name"):
         problem = "expected a name: a small letter, then small letters, digits and hyphens"
-    elif "regex" in problem and field == "actor":
+    elif "regex" in problem and field in {"actor", "stand_in"}:
         problem = "expected 'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"
+    elif "regex" in problem and "panel" in words:
+        problem = "expected 'topic:field', e.g. 'tank/level:height_m'"
     elif "regex" in problem:
         problem = "expected a name: a letter, then letters, digits and underscores"
     return Finding(path, problem.replace("`", ""), (value,))

@@ -57,7 +57,7 @@ given_up   adapted        crashed    -
 
 
 def process(state: State = State.CRASHED, **limits: float) -> SupervisedProcess:
-    unit = Unit("a", (NodeSpec("a", "m:A", Kind.CONTROL), NodeSpec("b", "m:B", Kind.CONTROL)))
+    unit = Unit("a", (NodeSpec("a", Kind.CONTROL, "m:A"), NodeSpec("b", Kind.CONTROL, "m:B")))
     made = SupervisedProcess(unit, RestartPolicy(Supervision(**limits)), Patience(0.2), state)
     if state is not State.RESTARTING:
         made.shown = NodeState(state.value)

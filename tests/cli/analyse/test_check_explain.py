@@ -18,7 +18,7 @@ def said(capsys, *arguments: str, code: int = 0) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize(("name", "sizes"), [
-    ("cell", "21 processes, 8 nodes, 8 detection modules, 6 recovery modules, 6 mechanisms"),
+    ("cell", "22 processes, 9 nodes, 8 detection modules, 6 recovery modules, 6 mechanisms"),
     ("paper", "21 processes, 9 nodes, 7 detection modules, 5 recovery modules, 7 mechanisms")])
 def test_a_sound_system(capsys, name, sizes):
     assert said(capsys, "check", name)[0] == f"{SHIPPED / name}.toml: sound: {sizes}\n"
@@ -28,7 +28,7 @@ def test_a_sound_system_for_scripts(capsys):
     found = json.loads(said(capsys, "check", "cell", "--json")[0])
     assert found == {
         "format": 1, "sound": True, "problem": None, "system": "cell",
-        "file": str(SHIPPED / "cell.toml"), "processes": 21, "nodes": 8, "detection_modules": 8,
+        "file": str(SHIPPED / "cell.toml"), "processes": 22, "nodes": 9, "detection_modules": 8,
         "recovery_modules": 6, "mechanisms": 6}
 
 
@@ -76,7 +76,7 @@ def test_what_a_system_is_in_words(capsys):
     lines = said(capsys, "explain", "cell")[0].splitlines()
     assert lines[0] == ("Pick and place behind a light curtain (cell), strategy guarded-repair")
     for line in (
-            "What is started: 24 processes, 22 nodes",
+            "What is started: 25 processes, 23 nodes",
             "gripper_unit       control      supervisor        gripper (StubNode), valve (StubNode"
             ")",
             "  launcher: supervisor, spawner_a, spawner_b: restarts it",

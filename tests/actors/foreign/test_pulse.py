@@ -1,0 +1,65 @@
+"""When a command counts as hung, and what it may tell its notify socket."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+
+from rampart.actors.foreign.pulse import NotifySocket, Pulse
+
+
+def test_silence_counts_from_the_last_beat():
+    pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
+    pulse.beat()
+    assert [pulse.is_well(n / 10) for n in range(8)] == [True] * 6 + [False] * 2
+    pulse.beat()
+    assert pulse.is_well(0.8)
+
+
+def test_the_first_beat_may_come_later():
+    pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
+    assert [pulse.is_well(n / 10) for n in (0, 10, 20)] == [True] * 3
+    wells = [pulse.is_well(2.0 + n / 10) for n in range(60)]
+    assert wells[40]
+    assert not wells[-1]
+
+
+def test_time_in_which_the_node_itself_stood_still_does_not_count():
+    pulse = Pulse(timeout_s=0.5, first_s=0.5, look_s=0.2)
+    pulse.beat()
+    assert pulse.is_well(0.0)
+    assert pulse.is_well(60.0)
+    assert pulse.is_well(60.1)
+    assert not any(pulse.is_well(60.0 + n / 10) for n in range(5, 10))
+
+
+def test_it_may_say_itself_that_something_is_wrong():
+    pulse = Pulse(timeout_s=0.5, first_s=5.0, look_s=0.2)
+    pulse.beat()
+    pulse.trigger()
+    assert not pulse.is_well(0.0)
+
+
+@pytest.fixture
+def notify():
+    made = NotifySocket("wheels")
+    yield made
+    made.close()
+
+
+def test_assignments_come_in_order_and_several_in_a_datagram(notify):
+    assert notify.take() == []
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as command:
+        for said in (b"READY=1\nSTATUS=up", b"\xff", b"", b"WATCHDOG=1"):
+            command.sendto(said, f"\0{notify.name[1:]}")
+        assert notify.name.startswith("@")
+    assert notify.take() == ["READY=1", "STATUS=up", "�", "WATCHDOG=1"]
+
+
+def test_a_flood_is_taken_in_parts(notify):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as command:
+        for _ in range(8):
+            command.sendto(b"WATCHDOG=1", f"\0{notify.name[1:]}")
+    assert len(notify.take(most=5)) == 5
+    assert len(notify.take(most=5)) == 3

@@ -1,0 +1,98 @@
+"""docs/foreign_nodes.md: its C and its Python are nodes that work, its numbers are right."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import subprocess
+import sys
+
+import msgspec
+import pytest
+
+from rampart.actors.foreign import child, keeper
+from rampart.actors.foreign.channel import MAX_PACKET
+from rampart.manager.spec.nodes import COMMAND_FIELDS, ChildLimits
+from rampart.testing import RealRun, VirtualSystem, run
+from tests import ROOT
+
+TEXT = (ROOT / "docs/foreign_nodes.md").read_text(encoding="utf-8")
+
+
+def block(language: str, begins: str = "") -> str:
+    blocks = re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+    return next(found for found in blocks if found.startswith(begins))
+
+
+TUG = block("toml", "name = \"tug\"")
+
+
+def write_tug(folder, *, compiled: bool = True) -> None:
+    """Write the system of the page into a folder."""
+    (folder / "tug.toml").write_text(TUG)
+    (folder / "cart.py").write_text(block("python", "from rampart"))
+    if compiled:
+        (folder / "wheels.c").write_text(block("c"))
+        subprocess.run(["gcc", "-Wall", "-Wextra", "-Werror", "-o", "wheels", "wheels.c"],
+                       cwd=folder, check=True)
+
+
+def test_each_field_and_each_number_is_on_the_page():
+    for field in (*COMMAND_FIELDS, *ChildLimits.__struct_fields__):
+        assert f"`{field}`" in TEXT
+    assert f"{MAX_PACKET:,} bytes" in TEXT
+    assert f"{child.GRACE_S} s later SIGKILL" in TEXT
+    assert f"{keeper.LOG_BYTES_PER_S // 10**6} MB per second in two files of " in TEXT
+    assert f"of {keeper.LOG_BYTES // 10**6} MB" in TEXT
+
+
+def test_the_stand_in_plays_the_command_in_virtual_time(tmp_path, monkeypatch):
+    write_tug(tmp_path, compiled=False)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    async def scenario():
+        async with VirtualSystem.load(tmp_path / "tug.toml") as system:
+            driver = system.start_node("driver")
+            system.start_node("wheels")
+            await asyncio.sleep(1.0)
+            return msgspec.structs.astuple(driver.seen)
+
+    assert run(scenario) == (5.0, 5.0)
+
+
+@pytest.mark.processes
+def test_the_c_program_is_a_node_and_faults_can_be_put_into_what_it_says(tmp_path):
+    write_tug(tmp_path)
+    with RealRun(tmp_path, "tug.toml") as tug:
+        tug.sleep_until(1)
+        assert heard(tug) == [5.0, 5.0]
+        done = tug.tool("inject", "drop:tug/wheels", "--duration", "1", "--json")
+        assert done.returncode == 0, done.stderr
+        (disturbed,) = msgspec.json.decode(done.stdout)["injections"]
+        assert disturbed["nodes"] == ["wheels"]
+        assert disturbed["affected"] > 0
+
+
+@pytest.mark.processes
+def test_the_plain_zenoh_program_is_a_node(tmp_path):
+    write_tug(tmp_path, compiled=False)
+    (tmp_path / "wheels.py").write_text(block("python", "import json"))
+    (tmp_path / "tug.toml").write_text(TUG.replace(
+        '["./wheels"]', f'[{json.dumps(sys.executable)}, "wheels.py"]').replace(
+        "notify = true", 'key = "wheels/alive"'))
+    with RealRun(tmp_path, "tug.toml") as tug:
+        tug.sleep_until(3)
+        assert heard(tug) == [5.0, 5.0]
+        assert [n["state"] for n in nodes(tug) if n["name"] == "wheels"] == ["running"]
+
+
+def heard(tug: RealRun) -> list[float]:
+    """Return what a stranger hears of the wheels."""
+    done = tug.tool("topic", "echo", "tug/wheels", "-n", "1", "--duration", "10", "--json")
+    said = msgspec.json.decode(done.stdout.splitlines()[-1])
+    return list(said["message"].values())
+
+
+def nodes(tug: RealRun) -> list[dict]:
+    return msgspec.json.decode(tug.tool("node", "list", "--json").stdout)
