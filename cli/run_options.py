@@ -35,6 +35,7 @@ from rampart.actors.web.token_file import SecretError, read_secret
 from rampart.cli import application_options
 from rampart.cli.output import UsageError, between, positive
 from rampart.cli.verbs import add_options, flag, help_of, number, option, several, whole, word
+from rampart.files import working_folder
 from rampart.manager.spec.specification import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
 from rampart.sim.faults.faults import faults_of
@@ -149,6 +150,7 @@ def _system_file(system: str) -> Path:
         what = "is a directory" if found.is_dir() else "no such file"
         raise UsageError(f"--system {system}: {what}; a spec is right, or the name of a "
                          f"shipped one: {systems.names()}")
+    working_folder.admit(found.parent)
     return found
 
 

@@ -11,7 +11,7 @@ from rampart.actors.layout.wiring import REPORTS_ON, import_class, load_member
 from rampart.cli.output import UsageError, refusing
 from rampart.cli.robot_lines import RobotLines
 from rampart.cli.verbs import Option, either, option
-from rampart.files import toml
+from rampart.files import toml, working_folder
 from rampart.files.reading import FileError, read_text
 from rampart.manager.spec.specification import SystemSpec, parse_specification
 
@@ -45,6 +45,7 @@ def load(file: str | None) -> SystemSpec:
         UsageError: it cannot be read, or makes no sense.
     """
     path = DEFAULT if file is None else systems.find(file)
+    working_folder.admit(path.parent)
     try:
         spec = parse_specification(read_text(path, toml.MAX_SIZE), str(path))
         for node in spec.actors():

@@ -1,8 +1,8 @@
-"""Whether actors of one's own are looked for in the working folder.
+"""Whether actors of one's own are looked for in the working folder, and beside a specification.
 
 With `-m` Python puts that folder first on its path, and executes what it finds there: in a folder
-that others can write, their code as this user. So processes of a run are started with `-P`, and the
-folder comes last, if only this user can write it.
+that others can write, their code as this user. So processes of a run are started with `-P`, and
+these folders come last, each if only this user can write it.
 """
 
 from __future__ import annotations
@@ -14,13 +14,21 @@ from pathlib import Path
 
 import rampart
 
+refused: dict[str, str] = {}
+"""Why folders are not searched, by the folder."""
 
-def admit() -> None:
-    """Have modules in the working folder found, after all others, if only this user can write it.
+
+def admit(folder: Path | None = None) -> None:
+    """Have modules in a folder found, after all others, if only this user can write it.
 
     What is installed, and what ships, comes first: a file `json.py` in the folder changes nothing.
+
+    Args:
+        folder: of a specification that the user has named; the working folder if None.
     """
-    if not why_not() and (here := str(Path.cwd())) not in sys.path:
+    if why := why_not(folder):
+        refused[str(folder or "")] = why
+    elif (here := str((folder or Path.cwd()).resolve())) not in sys.path:
         sys.path.append(here)
 
 
@@ -35,13 +43,14 @@ def environment() -> dict[str, str]:
     return found
 
 
-def why_not() -> str:
-    """Return why modules in the working folder are not looked for, "" if they are."""
+def why_not(folder: Path | None = None) -> str:
+    """Return why modules in a folder are not looked for, "" if they are; argument as of `admit`."""
+    what = "the working folder" if folder is None else str(folder)
     try:
-        folder = Path.cwd()
+        folder = folder or Path.cwd()
         found = folder.stat()
     except OSError as error:
-        return f"the working folder is gone ({error.strerror})"
+        return f"{what} is gone ({error.strerror})"
     if found.st_uid != os.getuid():
         return f"{folder} belongs to another user"
     own_group = found.st_gid == os.getgid() == os.getuid()  # a group of this user alone

@@ -89,6 +89,7 @@ class _Comparing(DetectionModule):
 
     def _take(self, place: int, value: Any, header: Header) -> None:
         self._samples[place] = Sample(value, header.stamp)
+        self.monitor.accused = self.accused(self.parameters.suspects, header)
         now_s = self.clock.now()
         oldest_s = now_s - self.parameters.stale_s
         if _NOTHING in self._samples and now_s < self._waits_until_s:

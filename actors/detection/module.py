@@ -19,7 +19,8 @@ from __future__ import annotations
 import math
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from rampart.actors.bus.bounds import NAME_CHARS, clip
+from rampart.actors.bus.bounds import MANY, NAME_CHARS, clip
+from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
 from rampart.actors.ftm.messages import DetectionReport, DetectionState
@@ -93,6 +94,8 @@ class DetectionModule(Actor):
     """
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.DETECTION,)
+    state: DetectionState
+    first_life: bool
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -102,6 +105,7 @@ class DetectionModule(Actor):
         self._told = False
         self._monitor: Monitor | None = None
         self._wake_s = math.inf
+        self._senders: dict[str, int] = Remembered(MANY)
         self._ran_s = self.clock.now()
         self._judges_from_s = 0.0  # before that the system is starting, see `Launcher.start`
 
@@ -158,11 +162,18 @@ class DetectionModule(Actor):
             self.publish(topics.DETECTION, self._report)
 
     def accused(self, suspects: tuple[str, ...], header: Header) -> tuple[str, ...]:
-        """Return the suspects; the one that sent a message by the incarnation that did.
+        """Return the suspects; those that have sent a message by the incarnation that did last.
 
         A later incarnation has done nothing yet, and a recovery leaves it alone.
+
+        Args:
+            suspects: names of nodes.
+            header: of the message that came last.
         """
-        return tuple(f"{name}#{header.incarnation}" if name == header.source else name
+        if not suspects:
+            return ()
+        self._senders[header.source] = header.incarnation
+        return tuple(f"{name}#{self._senders[name]}" if name in self._senders else name
                      for name in suspects)
 
     # -- the monitor ----------------------------------------------------------------------------

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import msgspec
 
 from rampart.actors.bus.fields import Field
 from rampart.actors.bus.topic import Members, Topic
-from rampart.actors.layout.wiring import Member
+from rampart.actors.ftm import topics
+from rampart.actors.layout.wiring import Member, shows_panels
 from rampart.actors.runtime.actor import BASE_OUTPUTS
-from rampart.actors.runtime.parameters import messages_said, topics_named
+from rampart.actors.runtime.parameters import Named, messages_said, topics_named
+from rampart.manager.spec.panels import NUMBER, Panel
+from rampart.manager.spec.schema import SystemSpec
+
+MOST_PLOTS = 8
+"""Panels of a page that declares none."""
 
 
 def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: str
@@ -39,19 +46,65 @@ def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: 
     for member in everyone:
         ways: dict[str, dict[str, Members]] = {"heard": {}, "published": {}}
         for way, named in topics_named(member.parameters).items():
-            for parameter, key, path in named:
-                where = f"{file}: {member.name}: {member.table}{parameter}"
+            for one in named:
+                table = "" if one.shown_by else member.table
+                key, where = one.key, f"{file}: {member.name}: {one.shown_by}{table}{one.name}"
                 found[key] = topic = _topic(key, every, where)
-                if way == "heard" and topic in member.actor.inputs():
+                if way == "heard" and topic.is_family and topic in member.actor.inputs():
                     raise ValueError(f"{where}: {member.actor.__name__} hears {key!r} anyway")
-                if path:
-                    _check_field(topic, path, where)
+                if one.field:
+                    _check_field(topic, one, where)
                 name = topic.member(key)
                 there = ways[way].get(topic.key, ())
                 ways[way][topic.key] = (*(there or ()), name) if name else None
         _check_messages(member, found, file)
         chosen[member.name] = replace(member, hears=ways["heard"], publishes=ways["published"])
     return chosen, found
+
+
+def with_panels(members: Iterable[Member], spec: SystemSpec, file: str) -> list[Member]:
+    """Return the members; a page without panels gets plots of the numbers that the nodes publish.
+
+    Raises:
+        ValueError: the spec has panels, and no node shows them.
+    """
+    everyone = list(members)
+    pages = [member for member in everyone if shows_panels(member.actor)]
+    if spec.panels and not pages:
+        raise ValueError(f"{file}: panel {spec.panels[0].title!r}: no node shows it; one of actor "
+                         "rampart.actors.operator.hmi:Hmi does")
+    nodes = {node.name for node in spec.nodes}
+    plots = tuple(plots_of([m for m in everyone if m.name in nodes and m not in pages]))
+    return [replace(member, parameters=msgspec.structs.replace(member.parameters, panels=plots))
+            if member in pages and not getattr(member.parameters, "panels", ()) else member
+            for member in everyone]
+
+
+def plots_of(members: Iterable[Member]) -> Iterator[Panel]:
+    """Yield a plot of each topic with numbers that comes regularly, the first `MOST_PLOTS`."""
+    engine = {topic.key for topic in (*topics.ALL, *BASE_OUTPUTS)}
+    own = {t.key: t for m in members for t in m.actor.outputs
+           if t.key not in engine and not t.is_family and t.rate_hz > 0}
+    plots = (Panel(title=f"{key} {unit}"[:60].strip(), plot=tuple(fields[:4]))
+             for key, topic in own.items() for unit, fields in _numbers(topic).items())
+    return islice({plot.title: plot for plot in plots}.values(), MOST_PLOTS)
+
+
+def _numbers(topic: Topic[Any]) -> dict[str, list[str]]:
+    """Return the numbers of a topic's messages by their unit, the last word of their names."""
+    found: dict[str, list[str]] = {}
+    for path in getattr(topic.type, "__struct_fields__", ()):
+        if _kind(topic, path) == NUMBER:
+            unit = path.rpartition("_")[2] if "_" in path else ""
+            found.setdefault(unit, []).append(f"{topic.key}:{path}")
+    return found
+
+
+def _kind(topic: Topic[Any], path: str) -> str:
+    try:
+        return Field(topic.type, path).kind
+    except ValueError:
+        return ""  # a list, or what has fields itself
 
 
 def _topic(key: str, known: Mapping[str, Topic[Any]], where: str) -> Topic[Any]:
@@ -74,8 +127,11 @@ def _check_messages(member: Member, chosen: Mapping[str, Topic[Any]], file: str)
                              f"{error}") from None
 
 
-def _check_field(topic: Topic[Any], path: str, where: str) -> None:
+def _check_field(topic: Topic[Any], named: Named, where: str) -> None:
     try:
-        Field(topic.type, path)
+        kind = Field(topic.type, named.field).kind
     except ValueError as error:
         raise ValueError(f"{where}: topic {topic.key}: {error}") from None
+    if kind not in named.kinds:
+        raise ValueError(f"{where}: topic {topic.key}: {named.field} is a {kind}; a "
+                         f"{' or a '.join(named.kinds)} is right")

@@ -11,7 +11,7 @@ from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.zenoh_bus import endpoint
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm.messages import AdaptedSystem
-from rampart.actors.layout.chosen_topics import choose_topics
+from rampart.actors.layout.chosen_topics import choose_topics, with_panels
 from rampart.actors.layout.wiring import (
     Member,
     import_class,
@@ -80,7 +80,8 @@ class Layout:
         own += [load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
                 for n in spec.actors()]
         self.members, self.topics = choose_topics(
-            own, (*application_class(spec).topics, *stand_in_topics(spec)), plan.system_file)
+            with_panels(own, spec, plan.system_file),
+            (*application_class(spec).topics, *stand_in_topics(spec)), plan.system_file)
         self._partners = partners(self.members.values())
 
     def listen(self, node: str) -> str:

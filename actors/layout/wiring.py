@@ -25,6 +25,7 @@ from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.files import working_folder
 from rampart.manager.spec.checks import modules
+from rampart.manager.spec.panels import problem_of
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
 T = TypeVar("T")
@@ -133,8 +134,17 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
         return Member(node.name, actor, read_parameters(
             actor.Parameters, node.command_parameters, file, node.name, spec), "")
     given = {name: derived[name] for name in takes & derived.keys()} | node.parameters
+    if shows_panels(actor):
+        given["panels"] = panels = (*getattr(actor, "panels", ()), *spec.panels)
+        if problem := problem_of(panels):
+            raise ValueError(f"{file}: {node.name}: {problem}")
     return Member(node.name, actor, read_parameters(
         actor.Parameters, given, file, f"{path}.parameters", spec))
+
+
+def shows_panels(actor: type[Actor]) -> bool:
+    """Whether an actor is a page, which shows panels."""
+    return any(field.name == "panels" for field in msgspec.structs.fields(actor.Parameters))
 
 
 def load_class(path: str, reports_on: Topic[Any] | None = None,
@@ -168,9 +178,9 @@ def import_class(path: str, base: type[T], field: str) -> type[T]:
     try:
         imported = importlib.import_module(module)
     except ImportError as error:
-        hidden = working_folder.why_not()
+        hidden = "; ".join(dict.fromkeys(working_folder.refused.values()))
         hint = _moved(module, name) or (
-            f"; nothing is imported from the working folder: {hidden}" if hidden else "")
+            f"; nothing is imported from there: {hidden}" if hidden else "")
         raise ValueError(f"{field} = {path!r}: {error}{hint}") from None
     except Exception as error:  # a module of the user's own may raise anything
         at = traceback.extract_tb(error.__traceback__)[-1]

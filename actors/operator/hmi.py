@@ -7,6 +7,9 @@ is derived from it. What is shown is collected in `state`, the page is served by
 
 from __future__ import annotations
 
+import math
+from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar
 
 import msgspec
@@ -17,22 +20,26 @@ from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
-from rampart.actors.operator.bounds import clip
+from rampart.actors.operator.bounds import Bounds, clip
 from rampart.actors.operator.camera_eye import CameraEye
 from rampart.actors.operator.feed import Feed
 from rampart.actors.operator.operating import Operating
 from rampart.actors.operator.processes import ProcessObserver
 from rampart.actors.operator.requests import REQUESTS, RefusedError, Request, ResetRequest
 from rampart.actors.operator.server import Handlers, PageServer, PortError
-from rampart.actors.operator.state import HmiState
+from rampart.actors.operator.state import STALE_S, HmiState
 from rampart.actors.operator.system import draw_system
 from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
+from rampart.actors.runtime.parameters import Panels
 from rampart.actors.web.access import AccessError
+from rampart.manager.spec.panels import MAX_PANELS, Panel
 from rampart.manager.spec.specification import SystemSpec, check_document
 
 REPEAT_S = 0.5
 """Simulated seconds between repetitions of what was not answered."""
+
+_PANELS = Bounds(text=200, items=max(MAX_PANELS, 40), room=40_000)
 
 
 class Hmi(Actor):
@@ -41,14 +48,31 @@ class Hmi(Actor):
     Class attributes:
         requests: what its page may ask for.
         shown: topics that are heard for the page alone.
+        panels: of the page, besides those that every page has and those of the specification.
+        files: folder of the JavaScript and CSS that `panels` need; None for none.
     """
 
+    class Parameters(Actor.Parameters, frozen=True):
+        """panels: of its class and of the specification, which the loader puts together."""
+
+        panels: Panels = ()
+
+    parameters: Parameters
+    panels: ClassVar[tuple[Panel, ...]] = ()
+    files: ClassVar[Path | None] = None
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
         ftm_topics.RESET, ftm_topics.ADAPT, bus_topics.INJECTION_REQUEST)
     requests: ClassVar[tuple[type[Request], ...]] = REQUESTS
     shown: ClassVar[tuple[Topic[Any], ...]] = (
         ftm_topics.ADAPTED_SYSTEM, ftm_topics.PROCESS_EVENT, ftm_topics.ERROR_REPORT,
         ftm_topics.ADAPTATION, bus_topics.INJECTION_RESULT)
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for panel in cls.panels:
+            if panel.script and not (cls.files and (cls.files / panel.script).is_file()):
+                raise ValueError(f"panel {panel.title!r}: script = {panel.script!r}: no such file "
+                                 f"in {cls.__name__}.files = {str(cls.files)!r}")
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -61,6 +85,10 @@ class Hmi(Actor):
         self._server: PageServer | None = None
         self._observer = ProcessObserver(plan.base_port, plan.launcher_pid)
         self._version = -1
+        self._unheard: list[str] = []
+        self._panels = self.parameters.panels or self.panels
+        if self._port:
+            self._hear_panels()
         self._show_system(run.system, run.adapted.version if run.adapted else 0)
 
     # -- what a robot's page may override --------------------------------------------------------
@@ -77,7 +105,9 @@ class Hmi(Actor):
     def _hello(self) -> dict[str, Any]:
         """Return what a page needs to know to begin; what it is not told of, it does not show."""
         return {"type": "hello", "run_id": self.context.run.plan.run_id, "rate": self.clock.rate,
-                "camera": self._camera is not None}
+                "system": clip(self.context.run.system.name),
+                "camera": self._camera is not None, "tables": self._state.picture.tables,
+                "panels": _PANELS.fit(self._panels)[0], "past": self._state.past()}
 
     def _fulfil(self, request: Request, page: int) -> str | dict[str, Any]:
         """Act on a request of a page, known by its number, and return what to tell it.
@@ -99,6 +129,25 @@ class Hmi(Actor):
         """Send again what was not answered."""
         self._operating.repeat()
 
+    def _hear_panels(self) -> None:
+        """Hear what the panels show, each field once."""
+        kept_s: dict[str, float] = {}
+        for panel in self._panels:
+            for shown in panel.fields():
+                kept_s[shown.field] = max(panel.kept_s, kept_s.get(shown.field, 0.0))
+        for field, past_s in kept_s.items():
+            try:
+                rate_hz = self.chosen_topic(field.partition(":")[0]).rate_hz
+                self.hear_field(field, partial(self._field, field))
+            except ValueError as error:  # checked before the start; a replay may know less
+                self._unheard.append(str(error))
+                continue
+            silent_s = max(STALE_S, 3 / rate_hz) if rate_hz > 0 else math.inf
+            self._state.show_field(field, past_s, silent_s)
+
+    def _field(self, field: str, value: Any, header: Header) -> None:
+        self._state.field(field, value, header.stamp, self.clock.now())
+
     # -- the page -------------------------------------------------------------------------------
 
     def listens(self, topic: Topic[Any]) -> bool:
@@ -111,12 +160,14 @@ class Hmi(Actor):
         if not self._port:
             return
         self._operating.start()
+        for why in self._unheard:
+            self.report_diagnostic("panel", why, self.name)
         plan, operating = self.context.run.plan, self._operating
         try:
             self._server = PageServer(
                 self._port, Feed(self._state, self.clock.now, self._hello, self._look),
                 Handlers(self.requests, operating.introduction, self._fulfil, operating.left),
-                plan.hmi_host, plan.hmi_token, camera=self._camera)
+                plan.hmi_host, plan.hmi_token, camera=self._camera, files=self.files)
         except Exception as error:
             known = isinstance(error, (AccessError, PortError))
             why = str(error) if known else f"{type(error).__name__}: {error}"

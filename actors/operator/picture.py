@@ -154,6 +154,11 @@ class Picture:
         """Return the rows of a table."""
         return self._tables[name].rows()
 
+    @property
+    def tables(self) -> tuple[str, ...]:
+        """Names of the tables, of which the rows are sent that changed."""
+        return tuple(self._tables)
+
     def put_row(self, name: str, row: str, value: Any) -> None:
         """Set a row of a table, None removes it; the same again is no change."""
         if self._tables[name].set(row, value, self.version + 1):

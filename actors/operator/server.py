@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import html
 import socket
 from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
@@ -44,9 +45,10 @@ CLOSE_TIMEOUT_S = 1.0
 
 _PAGE = Path(__file__).with_name("page")
 _TYPES = {".css": "text/css", ".js": "text/javascript"}
-_FILES = {"/": ("index.html", "text/html")} | {
-    f"/{file.name}": (file.name, _TYPES[file.suffix])
-    for file in sorted(_PAGE.iterdir()) if file.suffix in _TYPES}
+_INDEX = "/"
+ROBOT = "/robot/"
+"""Below it are the files of the robot's own panels."""
+_LINKS = "<!-- links -->\n"
 _CAMERA = "/camera.jpg"
 _REFUSAL = ("This page is for the user who runs the robot; you are another one of this machine. "
             "With a token others get in too: launch.py --hmi-token-file FILE.")
@@ -79,6 +81,23 @@ class Handlers(msgspec.Struct, frozen=True):
     left: Callable[[int], None]
 
 
+class _File(msgspec.Struct, frozen=True):
+    content: bytes
+    kind: str
+
+
+def page_files(robot: Path | None) -> dict[str, _File]:
+    """Return the page's files by path, those of the robot's own panels among them."""
+    found = {f"{head}{file.name}": _File(file.read_bytes(), _TYPES[file.suffix])
+             for head, folder in (("/", _PAGE), (ROBOT, robot)) if folder is not None
+             for file in sorted(folder.iterdir()) if file.suffix in _TYPES}
+    links = "".join(
+        f'<link rel="{"stylesheet" if file.kind.endswith("css") else "modulepreload"}" '
+        f'href="{html.escape(path[1:])}">\n' for path, file in found.items())
+    index = (_PAGE / "index.html").read_text(encoding="utf-8").replace(_LINKS, links)
+    return {_INDEX: _File(index.encode(), "text/html"), **found}
+
+
 class PageServer:
     """Serves the operator's page, from when it is made, on the running loop.
 
@@ -89,6 +108,7 @@ class PageServer:
         host: address to bind to.
         token: what everybody has to show; "" for nothing, on loopback only.
         camera: where pictures come from, or None.
+        files: folder of the robot's own JavaScript and CSS, or None.
 
     Raises:
         PortError: the address cannot be bound.
@@ -96,7 +116,7 @@ class PageServer:
     """
 
     def __init__(self, port: int, feed: Feed, handlers: Handlers, host: str, token: str, *,
-                 camera: CameraEye | None) -> None:
+                 camera: CameraEye | None, files: Path | None = None) -> None:
         self._feed = feed
         self._camera = camera
         self._handlers = handlers
@@ -108,16 +128,17 @@ class PageServer:
         names = () if is_loopback(host) else (socket.gethostname(),)
         self._access = Access(host, self.port, token, names)
         self.pages = 0
-        files = {path: (_PAGE / name).read_bytes() for path, (name, _) in _FILES.items()}
+        public = page_files(files)
 
         async def file(request: HttpRequest) -> Response:
-            path = request.url.path
-            return Response(files[path], media_type=_FILES[path][1], headers=_HEADERS)
+            asked = public[request.url.path]
+            return Response(asked.content, media_type=asked.kind, headers=_HEADERS)
 
-        routes = [*(Route(path, file) for path in _FILES), Route(_CAMERA, self._picture),
+        routes = [*(Route(path, file) for path in public), Route(_CAMERA, self._picture),
                   WebSocketRoute("/ws", self._page)]
         self._server = WebServer(
-            Starlette(routes=routes, middleware=[Middleware(_Door, access=self._access)]),
+            Starlette(routes=routes, middleware=[Middleware(
+                _Door, access=self._access, public=frozenset(public))]),
             listening, refusal="" if token else _REFUSAL, known=not token,
             ws_max_size=MAX_MESSAGE_BYTES)
         self._server.start()
@@ -196,8 +217,9 @@ class PageServer:
 class _Door:
     """Turns away foreign hosts and origins, and requests without the token, before all else."""
 
-    def __init__(self, app: ASGIApp, access: Access) -> None:
+    def __init__(self, app: ASGIApp, access: Access, public: frozenset[str]) -> None:
         self._app = app
+        self._public = public
         self._access = access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -212,7 +234,7 @@ class _Door:
         elif not known:
             await PlainTextResponse("Invalid host header", 400)(scope, receive, send)
             return
-        elif scope["path"] not in _FILES and not _has_token(connection, self._access):
+        elif scope["path"] not in self._public and not _has_token(connection, self._access):
             await PlainTextResponse("The token is missing or wrong", 401)(scope, receive, send)
             return
         await self._app(scope, receive, send)

@@ -6,6 +6,8 @@ nothing, and nothing is turned into JSON unless somebody looks (`picture`).
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -23,6 +25,12 @@ STALE_S = 1.5
 _SYSTEM = Bounds(text=40_000, items=1000, room=100_000)
 """Of what was laid out here, of up to 300 boxes (`system`)."""
 
+TRACE_POINTS = 240
+"""Of the past of a number that a page is sent when it opens."""
+
+LARGEST = 1e15
+"""Numbers beyond are not drawn."""
+
 _ROUTINE = ("started", "running")
 _GOOD_NEWS = ("respawned", "resumed", "adopted")
 
@@ -36,9 +44,36 @@ class Heard(msgspec.Struct):
     """When the content was true; only where a page needs it."""
 
 
+def _timed(heard: Heard | None) -> dict[str, Any] | None:
+    return None if heard is None else {
+        "value": heard.value, "stale": heard.stale, "t": round(heard.t, 3)}
+
+
 def as_heard(heard: Heard | None) -> dict[str, Any] | None:
     """Return a section as pages see it."""
     return None if heard is None else {"value": heard.value, "stale": heard.stale}
+
+
+class Trace:
+    """What a number was, lately: one of its values in each interval.
+
+    Args:
+        kept_s: how far back, simulated seconds.
+    """
+
+    def __init__(self, kept_s: float) -> None:
+        self.points: deque[tuple[float, Any]] = deque(maxlen=TRACE_POINTS)
+        self._step_s = kept_s / TRACE_POINTS
+
+    def add(self, t_s: float, value: Any) -> None:
+        """Add a value, unless the last one is too young; what is no finite number is a gap."""
+        if self.points and t_s < self.points[-1][0]:
+            self.points.clear()  # the clock was put back: another run
+        if not math.isfinite(t_s) or (
+                self.points and t_s - self.points[-1][0] < self._step_s):
+            return
+        number = isinstance(value, int | float) and abs(value) < LARGEST
+        self.points.append((round(t_s, 3), float(f"{value:.6g}") if number else None))
 
 
 class HmiState:
@@ -52,6 +87,8 @@ class HmiState:
         self.picture = picture = Picture()
         self._heard_s: dict[str, float] = {}
         self._aged: list[str] = []
+        self._patience_s: dict[str, float] = {}
+        self._traces: dict[str, Trace] = {}
         self._detections: dict[str, fm.DetectionView] = {}
         self._outcomes = 0
         picture.section("system", bounds=_SYSTEM)
@@ -61,6 +98,30 @@ class HmiState:
         picture.section("usage", {})
         picture.journal("decisions")
         picture.journal("events")
+
+    def show_field(self, name: str, kept_s: float, silent_s: float) -> None:
+        """Declare a field of a topic, "topic:field", that panels show.
+
+        Args:
+            name: of the field, and of its section.
+            kept_s: how much of its past pages are shown, s; 0 for none.
+            silent_s: after which silence it is stale, s.
+        """
+        if kept_s:
+            self._traces[name] = Trace(kept_s)
+        self._patience_s[name] = silent_s
+        self.aged(name, show=_timed if kept_s else as_heard)
+
+    def field(self, name: str, value: Any, stamp_s: float, now_s: float) -> None:
+        """Keep the value of a declared field; it may wait for what is urgent."""
+        trace = self._traces.get(name)
+        if trace is not None:
+            trace.add(stamp_s, value)
+        self.put(name, Heard(value, t=stamp_s if trace is not None else 0.0), now_s, urgent=False)
+
+    def past(self) -> dict[str, list[tuple[float, Any]]]:
+        """Return of each field that is plotted what it was: simulated seconds, and its value."""
+        return {name: list(trace.points) for name, trace in self._traces.items()}
 
     def aged(self, *names: str, show: Callable[[Heard | None], Any] = as_heard) -> None:
         """Declare sections that are stale if nothing has been heard for a while."""
@@ -138,7 +199,8 @@ class HmiState:
         """Mark as stale what was not heard for a while; to be called before showing."""
         for name in self._aged:
             heard = self.picture.value(name)
-            if heard is None or heard.stale or now_s - self._heard_s[name] <= STALE_S:
+            if heard is None or heard.stale or now_s - self._heard_s[name] <= (
+                    self._patience_s.get(name, STALE_S)):
                 continue
             self.picture.put(name, msgspec.structs.replace(heard, stale=True))
             if name == "manager":

@@ -35,6 +35,8 @@ from rampart.actors.runtime.actor import Context, Header, on
 from rampart.actors.runtime.parameters import NodeNames
 
 _REQUESTS_PER_INCARNATION = 1_000_000
+_OVERDUE_S, _OVERDUE = 0.25, 0.57
+"""Age at which a heartbeat is overdue: this, or in a faster system this share of its timeout."""
 
 
 class Stage(Enum):
@@ -87,7 +89,7 @@ class RespawnCore:
     """
 
     def __init__(self, nodes: Iterable[str], first_request: int, start_s: float,
-                 overdue_s: float = 0.25, start_timeout_s: float = 1.0) -> None:
+                 overdue_s: float = _OVERDUE_S, start_timeout_s: float = 1.0) -> None:
         self._nodes = {name: _Node(heard_s=start_s) for name in nodes}
         self._next_request = first_request
         self._overdue_s = overdue_s
@@ -250,8 +252,11 @@ class Respawn(RecoveryModule):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._core = RespawnCore(self.parameters.nodes,
-                                 context.incarnation * _REQUESTS_PER_INCARNATION, self.clock.now())
+        # Whoever is silent for long enough to be reported is overdue here as well.
+        overdue_s = min(_OVERDUE_S, _OVERDUE * context.run.system.timing.heartbeat_timeout_s)
+        self._core = RespawnCore(
+            self.parameters.nodes, context.incarnation * _REQUESTS_PER_INCARNATION,
+            self.clock.now(), overdue_s)
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Parameters) -> Members:

@@ -27,6 +27,7 @@ from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT
 from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
+from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.context import Context
 from rampart.actors.runtime.declaration import BASE_INPUTS, BASE_OUTPUTS, Declared, every, on
 from rampart.actors.runtime.injection import InjectedFaults
@@ -48,6 +49,8 @@ _STRANGE_HELLOS_PER_S = 5
 
 def _all_of(handlers: Sequence[Callable[[Any, Header], None]]) -> Callable[[Any, Header], None]:
     """Return a handler that calls some in order; a message is for one receiver of an actor."""
+    if len(handlers) == 1:
+        return handlers[0]
 
     def handle(message: Any, header: Header) -> None:
         for handler in handlers:
@@ -58,6 +61,10 @@ def _all_of(handlers: Sequence[Callable[[Any, Header], None]]) -> Callable[[Any,
 
 class Actor(Declared):
     """Base of every node, detection module, recovery module and manager."""
+
+    context: Context
+    name: str
+    clock: Clock
 
     def __init__(self, context: Context) -> None:
         self.context = context
@@ -88,7 +95,7 @@ class Actor(Declared):
         self._outlets: dict[str | tuple[str, str], tuple[str, bool]] = {}
         self._may_publish = {t.key for t in (*self.outputs, *BASE_OUTPUTS)}
         self._may_publish.update(
-            self.chosen_topic(key).key for _, key, _ in topics_named(self.parameters)["published"])
+            self.chosen_topic(name.key).key for name in topics_named(self.parameters)["published"])
         self._chosen: dict[str, list[Callable[[Any, Header], None]]] = {}
 
     # -- what a subclass may override, besides what `Declared` has ---------------------------------
@@ -254,7 +261,8 @@ class Actor(Declared):
         for topic, method in self._handlers:
             if not self.listens(topic):
                 continue
-            handler = getattr(self, method)
+            # A topic that its parameters name as well comes once, for all who want it.
+            handler = _all_of([getattr(self, method), *self._chosen.pop(topic.key, ())])
             names = self.names(topic, self.name, self.parameters) if topic.is_family else None
             for key in [topic.pattern] if names is None else map(topic.at, names):
                 self._bus.subscribe(topic, key, self._receiver(topic, handler))
@@ -353,8 +361,8 @@ class Actor(Declared):
     @on(INJECT)
     def _on_injection(self, order: Injection, _header: Header) -> None:
         topic = self.published(order.topic, self.name, self.parameters) or (
-            next((self.context.topics[key] for _, key, _ in
-                  topics_named(self.parameters)["published"] if key == order.topic), None))
+            next((self.context.topics[named.key] for named in
+                  topics_named(self.parameters)["published"] if named.key == order.topic), None))
         if topic is not None:
             self._injections.order(order, topic)
 

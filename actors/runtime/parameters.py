@@ -15,6 +15,7 @@ import msgspec
 from msgspec import inspect
 
 from rampart.manager.spec.budget import find_false_alarm
+from rampart.manager.spec.panels import ANYTHING, Panel
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import Name, SpecificationError
 
@@ -41,6 +42,8 @@ OptionalFieldName = Annotated[str, msgspec.Meta(
     pattern=r"^([^:]+:[^:]+)?\Z", extra={"names": "field", "way": "heard"})]
 FieldNames = Annotated[tuple[FieldName, ...], msgspec.Meta(min_length=1, extra={
     "names": "field", "way": "heard"})]
+Panels = Annotated[tuple[Panel, ...], msgspec.Meta(extra={"panels": True, "way": "heard"})]
+"""Panels of the operator's page; the node hears what they show."""
 
 MessageOf = Annotated[dict[str, Any], msgspec.Meta(extra={"message_of": "topic"})]
 """Fields of a message on the topic that the parameter `topic` names."""
@@ -85,20 +88,42 @@ def read_parameters(kind: type[P], given: Mapping[str, Any] | msgspec.Struct, fi
     raise SpecificationError(file, f"{path}.{name}", problem, *value)
 
 
-def topics_named(parameters: msgspec.Struct) -> dict[str, list[tuple[str, str, str]]]:
-    """Return which topics a node's parameters have it hear and publish.
+class Named(NamedTuple):
+    """A topic that a parameter names.
 
-    Returns:
-        For "heard" and "published": name of the parameter, key of a topic, and a field or "".
+    Attributes:
+        name: of the parameter; of a panel its key.
+        key: of the topic.
+        field: of its messages, or "".
+        kinds: of which the field may be.
+        shown_by: "panel TITLE: " if a panel shows it.
     """
-    found: dict[str, list[tuple[str, str, str]]] = {"heard": [], "published": []}
+
+    name: str
+    key: str
+    field: str
+    kinds: tuple[str, ...] = ANYTHING
+    shown_by: str = ""
+
+
+def topics_named(parameters: msgspec.Struct) -> dict[str, list[Named]]:
+    """Return which topics a node's parameters have it hear and publish, by "heard", "published"."""
+    found: dict[str, list[Named]] = {"heard": [], "published": []}
     for name, marks in _marks(type(parameters)).items():
         said = getattr(parameters, name)
-        if "way" in marks and said:
-            for text in [said] if isinstance(said, str) else said:
-                key, _, field = text.partition(":")
-                found[marks["way"]].append((name, key, field))
+        if marks.get("panels"):
+            found["heard"] += [
+                Named(shown.key, *_parts(shown.field), shown.kinds, f"panel {panel.title!r}: ")
+                for panel in said for shown in panel.fields()]
+        elif "way" in marks and said:
+            found[marks["way"]] += [Named(name, *_parts(text))
+                                    for text in ([said] if isinstance(said, str) else said)]
     return found
+
+
+def _parts(text: str) -> tuple[str, str]:
+    key, _, field = text.partition(":")
+    return key, field
 
 
 class Said(NamedTuple):

@@ -242,6 +242,7 @@ def main() -> int:
     name, lifeline = sys.argv[1], int(sys.argv[2])
     working_folder.admit()
     plan = msgspec.json.decode(sys.stdin.buffer.read(), type=RunPlan)
+    working_folder.admit(Path(plan.system_file).parent)
     try:
         spec = load_system(plan)
         run = load_run(plan, spec)

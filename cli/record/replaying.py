@@ -286,7 +286,9 @@ class Replay:
             run = replace(run, application=self._known.kind.restored(folder))
         kind = page_of(self._known.system)
         page: type[Hmi] = ReplayPage if kind is Hmi else type("ReplayPage", (ReplayPage, kind), {})
-        return page(Context(PAGE, 1, clock, SharedBus(bus), run=run))
+        return page(Context(
+            PAGE, 1, clock, SharedBus(bus), {"panels": (*kind.panels, *run.system.panels)}, run,
+            topics={topic.key: topic for topic in self._known.topics}))
 
 
 def recorded_system(files: Sequence[File]) -> tuple[dict[str, Any], Known]:

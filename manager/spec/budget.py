@@ -28,18 +28,10 @@ from rampart.manager.spec.mobile_robot import (
     time_to_obstacle_s,
 )
 from rampart.manager.spec.schema import Kind, SystemSpec, Within
-from rampart.manager.spec.tables import Finding, Timing, numbered
+from rampart.manager.spec.tables import PERIODS, Finding, Timing, numbered
 
 PERIODS_TO_MISS = 3
 """A timeout shorter than so many periods would take a late message for a lost one."""
-
-_PERIODS = {
-    "heartbeat_timeout_s": "heartbeat_period_s", "command_timeout_s": "control_period_s",
-    "localization_timeout_s": "control_period_s", "scan_timeout_s": "control_period_s",
-    "dead_man_timeout_s": "control_period_s", "manager_timeout_s": "manager_period_s",
-    "detection_silence_timeout_s": "detection_period_s",
-}
-"""The period of what each timeout of `[timing]` waits for."""
 
 
 class Budget(msgspec.Struct, frozen=True):
@@ -116,17 +108,18 @@ def _of_mechanisms(spec: SystemSpec) -> Iterator[Budget]:
 
 
 def _of_guards(spec: SystemSpec) -> Iterator[Budget]:
-    """Draw up the budgets of a mobile robot's guards beside the mechanisms."""
+    """Draw up the budgets of the guards that a mobile robot's pilot is, beside the mechanisms."""
     timing, layers = spec.timing, spec.layers
-    pilot = next((node.name for node in spec.nodes if node.kind is Kind.PILOT), "pilot")
+    pilot = next((node.name for node in spec.nodes if node.kind is Kind.PILOT), "")
     hits = time_to_obstacle_s(spec.robot), "the robot hits an obstacle"
     drifts = time_left(spec.robot, Hazard.DRIFT, math.inf)
     cycle_s = timing.control_period_s  # of the pilot: one to see, one to command
     for name, switched_on, (left_s, hazard), detection_s, decision_s in (
-            (pilot, True, hits, cycle_s, cycle_s),
-            ("blind_pilot", layers.safety_pilot_checks, hits, timing.scan_timeout_s, cycle_s),
-            ("dead_man", layers.dead_man, hits, timing.dead_man_timeout_s, 0.0),
-            ("manager_watch", layers.manager_watch and layers.ftm, drifts,
+            (pilot, bool(pilot), hits, cycle_s, cycle_s),
+            ("blind_pilot", pilot and layers.safety_pilot_checks, hits, timing.scan_timeout_s,
+             cycle_s),
+            ("dead_man", pilot and layers.dead_man, hits, timing.dead_man_timeout_s, 0.0),
+            ("manager_watch", pilot and layers.manager_watch and layers.ftm, drifts,
              timing.manager_timeout_s, cycle_s),
             ("silent_detection", layers.ftm, drifts, timing.detection_silence_timeout_s,
              timing.arbitration_s)):
@@ -139,11 +132,6 @@ def find_wrong_times(spec: SystemSpec) -> Iterator[Finding]:
     timing = spec.timing
     if spec.mobile is not None:
         yield from find_too_little_room(spec.mobile)
-    else:
-        for field, value in msgspec.structs.asdict(timing).items():
-            if math.isnan(value):
-                yield Finding(f"$.timing.{field}", "missing; it is derived from [robot], and this "
-                                                   "system has none")
     if timing.release_hold_max_s < timing.release_hold_s:
         yield Finding("$.timing.release_hold_max_s", "must be no less than release_hold_s = "
                       f"{timing.release_hold_s}", (timing.release_hold_max_s,))
@@ -158,7 +146,7 @@ def find_wrong_times(spec: SystemSpec) -> Iterator[Finding]:
 
 def find_false_alarms(timing: Timing) -> Iterator[Finding]:
     """Find timeouts so tight that a healthy system trips them."""
-    for field, period_field in _PERIODS.items():
+    for field, period_field in PERIODS.items():
         value = getattr(timing, field)
         problem = find_false_alarm(timing, value, period_field)
         if problem:

@@ -14,6 +14,7 @@ from rampart.manager.model.order import find_cycle
 from rampart.manager.spec import arbitration_checks
 from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
 from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
+from rampart.manager.spec.panels import problem_of
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import Finding, find_wrong_names, numbered, unknown
 
@@ -199,6 +200,15 @@ def _recoveries(spec: SystemSpec) -> Iterator[Finding]:
                           f"{', '.join(sorted(used))}", (sorted(recovery.disables),))
 
 
+def _panels(spec: SystemSpec) -> Iterator[Finding]:
+    for path, panel in numbered("panel", spec.panels):
+        if panel.script is not None:
+            yield Finding(f"{path}.script", f"{panel.title!r}: only the class of a page has "
+                          "scripts; a field of a topic is right, e.g. gauge", (panel.script,))
+    if problem := problem_of(spec.panels):
+        yield Finding("$.panel", problem)
+
+
 def _reachability(spec: SystemSpec) -> Iterator[Finding]:
     answers: dict[str, set[str]] = {}  # to a detection module: recoveries
     recovering = {recovery.escalate_to for recovery in spec.recoveries}
@@ -225,7 +235,8 @@ def _reachability(spec: SystemSpec) -> Iterator[Finding]:
 
 VALIDATORS: tuple[Validator, ...] = (
     find_wrong_times, _names, _nodes, _detections, _recoveries, _processes, _mechanisms,
-    _reachability, arbitration_checks.find_wrong_tree, arbitration_checks.find_wrong_policy,
+    _reachability, _panels,
+    arbitration_checks.find_wrong_tree, arbitration_checks.find_wrong_policy,
     arbitration_checks.find_wrong_orders, arbitration_checks.find_contradictions,
     arbitration_checks.find_wrong_compounds, arbitration_checks.find_wrong_precedence,
     find_wrong_budget)

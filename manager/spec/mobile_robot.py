@@ -26,7 +26,7 @@ from enum import StrEnum
 
 import msgspec
 
-from rampart.manager.spec.tables import Finding, NonNegative, Positive, Table, Timing
+from rampart.manager.spec.tables import PERIODS, Finding, NonNegative, Positive, Table, Timing
 
 SHARE = 0.9
 """Of the time that is left, a derived timeout takes this much."""
@@ -138,11 +138,16 @@ def time_left(robot: Robot, hazard: Hazard, margin_m: float) -> tuple[float, str
     return left_s, _WORDS[hazard]
 
 
+PERIODS_WAITED = 5
+"""Of what a timeout waits for, in a system that has no [robot] to derive it from."""
+
+
 def derive_timeouts(robot: Robot | None, timing: Timing) -> Timing:
     """Fill in the timeouts that a spec leaves out.
 
     Args:
-        robot: Speeds and distances; None leaves timing as it is.
+        robot: Speeds and distances; without one a timeout is `PERIODS_WAITED` periods of what it
+            waits for.
         timing: With NaN where a value is to be derived; values that are given are kept, and
             those derived follow from them.
 
@@ -151,7 +156,9 @@ def derive_timeouts(robot: Robot | None, timing: Timing) -> Timing:
         even negative; `check` and `find_false_alarms` then refuse it.
     """
     if robot is None:
-        return timing
+        return msgspec.structs.replace(timing, **{
+            field: PERIODS_WAITED * getattr(timing, period) for field, period in PERIODS.items()
+            if math.isnan(getattr(timing, field))})
     drift = time_to_drift_s(robot)
     noticed_s = SHARE * (drift - timing.arbitration_s - timing.actuation_s)
     cycle_s, obstacle = timing.control_period_s, time_to_obstacle_s(robot)

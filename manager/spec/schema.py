@@ -21,6 +21,7 @@ from rampart.manager.model.mechanisms import Contract, Mechanism, Mechanisms, Re
 from rampart.manager.model.order import PartialOrder, Tree, refine
 from rampart.manager.spec.mobile_robot import Hazard, Robot
 from rampart.manager.spec.nodes import ChildHeartbeat, ChildLimits, ClassPath, Kind, NodeSpec
+from rampart.manager.spec.panels import Panel
 from rampart.manager.spec.tables import (
     DERIVED,
     End,
@@ -180,6 +181,7 @@ class SystemSpec(Table, frozen=True):
             "" for none.
         order: Name of an order of the recoveries, or several: what the first leaves open the
             next decides. The first is the one that says what is safer.
+        panels: Of the operator's page, besides those of its class.
     """
 
     name: Name
@@ -200,6 +202,7 @@ class SystemSpec(Table, frozen=True):
     mechanisms: tuple[MechanismSpec, ...] = msgspec.field(name="mechanism", default=())
     events: tuple[EventSpec, ...] = msgspec.field(name="event", default=())
     orders: dict[str, dict[str, tuple[str, ...]]] = {}
+    panels: tuple[Panel, ...] = msgspec.field(name="panel", default=())
 
     def without_disabled(self) -> SystemSpec:
         """Return the spec without the mechanisms that are disabled; itself if none is.

@@ -29,6 +29,7 @@ from rampart.manager.model.mechanisms import RecoveryKind
 from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
 from rampart.manager.spec.mobile_robot import Hazard, derive_timeouts
 from rampart.manager.spec.nodes import COMMAND_FIELDS, NODE_KINDS
+from rampart.manager.spec.panels import MAX_PANELS
 from rampart.manager.spec.schema import TABLES, SystemSpec
 from rampart.manager.spec.tables import Finding, SpecificationError, numbered
 
@@ -45,7 +46,7 @@ LARGEST_INTEGER = 2 ** 63 - 1
 """In parameters, which go to an actor as they are, by way of MessagePack."""
 
 MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
-            "orders": 16}
+            "orders": 16, "panel": MAX_PANELS}
 """Of each table; the shipped systems have 31 actors, and checks compare many with many."""
 
 
@@ -239,6 +240,8 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> Findin
         problem = "unknown gate; known: 'or', 'and', { at_least = k }"
     elif "regex" in problem and field in {"actor", "stand_in"}:
         problem = "expected 'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"
+    elif "regex" in problem and "panel" in words:
+        problem = "expected 'topic:field', e.g. 'tank/level:height_m'"
     elif "regex" in problem:
         problem = "expected a name: a letter, then letters, digits and underscores"
     return Finding(path, problem.replace("`", ""), (value,))

@@ -55,6 +55,8 @@ class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Timing(Table, frozen=True):
     """All times, in seconds. Those that default to `DERIVED` follow from the robot if left out.
 
+    In a system without a [robot] they are five periods of what they wait for (`PERIODS`).
+
     Attributes:
         heartbeat_period_s: Between two heartbeats of an actor.
         control_period_s: Between two commands, poses or scans.
@@ -93,6 +95,15 @@ class Timing(Table, frozen=True):
     startup_grace_s: NonNegative = 5.0
     release_hold_s: NonNegative = 0.5
     release_hold_max_s: NonNegative = 10.0
+
+
+PERIODS = {
+    "heartbeat_timeout_s": "heartbeat_period_s", "command_timeout_s": "control_period_s",
+    "localization_timeout_s": "control_period_s", "scan_timeout_s": "control_period_s",
+    "dead_man_timeout_s": "control_period_s", "manager_timeout_s": "manager_period_s",
+    "detection_silence_timeout_s": "detection_period_s",
+}
+"""The period of what each timeout of `[timing]` waits for."""
 
 
 class Layers(Table, frozen=True):

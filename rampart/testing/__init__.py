@@ -8,8 +8,9 @@ from rampart.testing.real_run import HEEDS_SIGNALS, RealRun
 from rampart.testing.timeline import Ear, play, table, wake
 from rampart.testing.virtual import Heard, VirtualSystem, run, turns
 from rampart.testing.waiting import eventually, wait_until
+from rampart.testing.whole_run import virtual_run
 
 __all__ = [
     "HEEDS_SIGNALS", "Ear", "Heard", "RealRun", "VirtualSystem", "eventually", "free_base_port",
-    "free_port", "play", "run", "table", "turns", "wait_until", "wake",
+    "free_port", "play", "run", "table", "turns", "virtual_run", "wait_until", "wake",
 ]

@@ -24,6 +24,7 @@ from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import MemoryCheckpoints, NoCheckpoints, Shelf
 from rampart.actors.runtime.clock import Clock
+from rampart.files import working_folder
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 from rampart.sim.virtual.virtual_loop import VirtualLoop
 
@@ -105,8 +106,9 @@ class VirtualSystem:
         Raises:
             ValueError: the system is unsound, or an actor cannot be imported; one line says where.
         """
-        chosen = RunPlan(**{
-            "system_file": str(systems.find(str(system))), "virtual": True, **plan})
+        file = systems.find(str(system))
+        working_folder.admit(file.parent)
+        chosen = RunPlan(**{"system_file": str(file), "virtual": True, **plan})
         spec = load_system(chosen)
         context = load_run(chosen, spec)
         return cls(context, Layout(chosen, spec, context.application),

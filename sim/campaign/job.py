@@ -19,7 +19,7 @@ from rampart.actors.layout.layout import application_class, load_application
 from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system, tailor
-from rampart.files import toml
+from rampart.files import toml, working_folder
 from rampart.files.reading import read_text
 from rampart.manager.spec.adaptation import Action, Change, adapt
 from rampart.manager.spec.specification import check_document, read_document
@@ -239,6 +239,7 @@ def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
 def _document(system: str) -> tuple[str, dict[str, Any]]:
     """Return path and document of a system spec."""
     file = systems.find(system)
+    working_folder.admit(file.parent)
     return str(file), read_document(read_text(file, toml.MAX_SIZE), str(file))
 
 

@@ -102,6 +102,8 @@ class Injector(Actor):
             action = action_of(planned, f"f{i}", nodes, known, faults)
             self.planned.append(PlannedAction(
                 planned, action, FaultWatch(action if isinstance(action, tuple) else ())))
+        self._may_publish.update(  # a robot orders its own faults on topics of its own
+            order.topic.key for fault in self.planned for order in fault.watch.orders)
         self._begun = 0
 
     def outcomes(self) -> tuple[FaultOutcome, ...]:

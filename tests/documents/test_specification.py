@@ -34,8 +34,9 @@ from rampart.manager.spec.specification import (
     parse_specification,
     read_document,
 )
+from rampart.manager.spec.tables import End
 from rampart.manager.strategies.registry import STRATEGIES
-from rampart.testing import run
+from rampart.testing import run, virtual_run
 from tests import ROOT
 from tests.osmosis_system import System
 
@@ -44,7 +45,7 @@ EXAMPLE = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 MODULES = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 
 
-@pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, Supervision, NodeSpec,
+@pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, Supervision, End, NodeSpec,
                                    DetectionSpec, RecoverySpec, MechanismSpec, EventSpec, Within])
 def test_every_field_is_described(table):
     missing = [f.encode_name for f in msgspec.structs.fields(table)
@@ -65,8 +66,7 @@ def toml(value: object) -> str:
 
 @pytest.mark.parametrize(("heading", "table", "also"), [
     ("Top level", SystemSpec, set()), ("`[robot]`", Robot, set()),
-    ("`[timing]`", Timing, {f.name for f in msgspec.structs.fields(Timing)
-                            if f.name.endswith("timeout_s")}),
+    ("`[timing]`", Timing, set()), ("`[end]`", End, set()),
     ("`[layers]`", Layers, set()), ("`[supervision]`", Supervision, set()),
     ("`[[node]]`", NodeSpec, set()),
     ("`[[detection]]`", DetectionSpec, {"within_s"}), ("`[[recovery]]`", RecoverySpec, set()),
@@ -90,14 +90,12 @@ def test_what_is_required_and_what_is_the_default_are_as_in_the_code(heading, ta
 
 
 def test_the_least_that_is_a_system_is_what_the_document_says():
-    timeouts = "".join(f"{f.name} = 1.0\n" for f in msgspec.structs.fields(Timing)
-                       if f.name.endswith("timeout_s"))
-    text = f"""name = "x"\ntitle = "x"\n[timing]\n{timeouts}
+    text = """name = "x"\ntitle = "x"
 [[node]]\nname = "m"\nactor = "rampart.manager.actor:FtmManager"\nkind = "manager"
 [[detection]]\nname = "D"\ntitle = "D"\nactor = "a.b:C"\nwithin_s = 0.1
 [[recovery]]\nname = "R"\ntitle = "R"\nactor = "a.b:C"\nkind = "forward"
 [[mechanism]]\nname = "M"\ndetect = "D"\nrecover = "R"\nevent = "e"
-against = {{ within_s = 5.0, hazard = "h" }}
+against = { within_s = 5.0, hazard = "h" }
 [[event]]\nname = "e"
 [orders.safer]\n"""
     parse_specification(text, "x.toml")
@@ -148,6 +146,31 @@ def test_the_modules_of_one_s_own_that_it_shows_work(tmp_path, monkeypatch):
             assert module.state is DetectionState.IDLE
 
     run(scenario)
+
+
+JUDGE = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)[1]
+JUDGED = re.findall(r"```toml\n(.*?)```", DOCUMENT, re.DOTALL)[1]
+
+
+@pytest.mark.parametrize(("brim_m", "safe", "margin_m", "why"), [
+    (1.5, True, 0.3, "its time is over"), (1.0, False, -0.2, "the tank runs over")])
+def test_the_judge_that_it_shows_judges(tmp_path, brim_m, safe, margin_m, why):
+    names = {"tank_actors": f"doc_actors_{safe}", "tank_judge": f"doc_judge_{safe}"}
+    system = EXAMPLE.replace(
+        "rampart.actors.runtime.stub_node:StubNode", "tank_actors:Gauge").replace(
+        "rampart.actors.detection.stub:StubDetection", "tank_actors:LevelTooHigh") + JUDGED.replace(
+        "1.5", str(brim_m))
+    for file, text in (("tank_actors.py", MODULES), ("tank_judge.py", JUDGE),
+                       ("tank.toml", system)):
+        for name, fresh in names.items():  # modules of this name may have been imported before
+            file, text = file.replace(name, fresh), text.replace(name, fresh)  # noqa: PLW2901
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    done = virtual_run(tmp_path / "tank.toml")
+    assert done.failures == ()
+    assert done.why == why
+    assert done.judgement.safe is done.judgement.success is safe
+    assert done.judgement.margins == {"brim": pytest.approx(margin_m)}
+    assert (done.record.duration_s > 599) == safe
 
 
 @pytest.mark.parametrize("text", ["DM1 and DM3", "DM1 or (DM2 and not DM3)",

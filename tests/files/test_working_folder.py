@@ -56,3 +56,27 @@ def test_a_folder_that_is_gone_is_not_searched(tmp_path, monkeypatch):
     working_folder.admit()
     assert sys.path == before
     assert working_folder.why_not() == "the working folder is gone (No such file or directory)"
+
+
+TANK = (ROOT / "docs" / "modules.md").read_text(encoding="utf-8")
+TANK_ACTORS = TANK.split("```python\n")[1].split("```")[0]
+TANK_TOML = TANK.split("```toml\n")[1].split("```")[0]
+
+
+@pytest.mark.parametrize(("mode", "code"), [(0o755, 0), (0o757, 2)])
+def test_modules_beside_a_specification_are_found_if_nobody_else_can_put_them_there(
+        tmp_path, mode, code):
+    there, here = tmp_path / "there", tmp_path / "here"
+    there.mkdir()
+    here.mkdir()
+    (there / "tank.py").write_text(TANK_ACTORS)
+    (there / "tank.toml").write_text(TANK_TOML)
+    there.chmod(mode)
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "rampart.cli.main", "run", "--system", "../there/tank.toml",
+         "--virtual", "--duration", "2"], cwd=here, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True)
+    assert done.returncode == code, done.stderr
+    assert code == 0 or done.stderr.endswith(
+        "node[0].actor = 'tank:Pump': No module named 'tank'; nothing is imported from there: "
+        "others can write ../there (mode 757)\n")

@@ -72,9 +72,9 @@ def test_no_name_of_the_first_system_is_in_the_engine_s_code(room):
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
-    ("heartbeat_timeout_s = 0.3\n", "",
-     "cell.toml: $.timing.heartbeat_timeout_s: missing; it is derived from [robot], and this "
-     "system has none"),
+    ("heartbeat_timeout_s = 0.3\n", "heartbeat_timeout_s = 0.1\n",
+     "cell.toml: $.timing.heartbeat_timeout_s = 0.1: would raise false alarms; at least 0.300 s, "
+     "3 periods of heartbeat_period_s = 0.100 s, is right"),
     ('against = { within_s = 0.45, hazard = "a hand is within the arm\'s reach" }',
      'against = "drift"',
      "cell.toml: $.mechanism[0].against: 'drift', which it is if left out, needs a [robot]; "

@@ -1,17 +1,17 @@
-// The operator's page: shows the picture that the HMI pushes, asks for resets, missions, orders.
+// The operator's page: shows the picture that the HMI pushes, asks for what the operator wants.
 
 import { $, Memory, clock, element, pill, say } from "./dom.js";
 import { NO_TOKEN, protocols } from "./access.js";
+import { Arrangement } from "./arrange.js";
 import { Camera } from "./camera.js";
 import { DecisionLog, EventLog, LINES } from "./log.js";
-import { AirportMap } from "./map.js";
 import { ProcessTable } from "./nodes.js";
 import { Operating } from "./operate.js";
+import { Panels } from "./panels.js";
 import { FaultTree, Order } from "./tree.js";
 
 const LOGS = ["decisions", "events"];
-const TABLES = ["lights"];   // of which the rows arrive that changed, null for one that is gone
-const map = new AirportMap($("map"));
+const panels = new Panels(new Arrangement($("main")), { send, toast });
 const tree = new FaultTree($("tree"));
 const order = new Order($("order"));
 const processes = new ProcessTable($("nodes"));
@@ -26,7 +26,10 @@ let picture = {};            // all that was heard, by section
 let fresh = { decisions: [], events: [] };  // lines of the logs that are not shown yet
 const changed = new Set();   // sections that are not shown yet
 let frame = 0;
-let notOnMap = {};           // what the map has not room for, and how many
+let tables = [];             // sections of which the rows arrive that changed, null for one that is gone
+let ready = false;           // whether the panels of this connection are there
+let tooMuch = {};            // what the HMI had no room for when it began, and how many
+let introduction = null;     // what the HMI offers this page: it comes before the panels are there
 let socket = null;           // null between two attempts
 let retryMs = 500;
 let lastHeard = 0;
@@ -52,7 +55,8 @@ function lost(why) {
   socket.onclose = socket.onmessage = null;
   socket.close();
   socket = null;
-  operating.offline();
+  ready = false;
+  panels.offline();
   link("bad", why);
   setTimeout(connect, retryMs);
   retryMs = Math.min(retryMs * 1.5, 4000);
@@ -79,7 +83,8 @@ function send(wish) {
 function receive(message) {
   if (message.type === "hello") hello(message);
   else if (message.type === "state") take(message);
-  else if (operating.receive(message)) return;
+  else if (operating.receive(message)) introduction = message;
+  else if (panels.receive(message)) return;
   else if (message.text) toast(message.text);
 }
 
@@ -89,10 +94,17 @@ function take(message) {
   link("good", "live");
   for (const [name, value] of Object.entries(message)) {
     if (LOGS.includes(name)) fresh[name] = [...fresh[name], ...value].slice(-LINES);
-    else if (TABLES.includes(name)) picture[name] = merged(picture[name], value);
+    else if (tables.includes(name)) picture[name] = merged(picture[name], value);
     else picture[name] = value;
     changed.add(name);
   }
+  panels.take(message);
+  soon();
+}
+
+/** Draw with the next frame; a page that is hidden has seen it, one that has no panels yet has not. */
+function soon() {
+  if (!ready) return;
   if (document.hidden) seen();
   else if (!frame) frame = requestAnimationFrame(draw);
 }
@@ -103,7 +115,7 @@ function merged(rows, news) {
 
 function draw() {
   frame = 0;
-  if (!connected()) return;
+  if (!connected() || !ready) return;
   show(picture);
   changed.clear();
   seen();
@@ -115,10 +127,7 @@ function seen() {
   socket.send(`{"type":"seen","version":${picture.version}}`);
 }
 
-document.addEventListener("visibilitychange", () => {
-  if (document.hidden) seen();
-  else if (!frame) frame = requestAnimationFrame(draw);
-});
+document.addEventListener("visibilitychange", soon);
 
 function toast(text) {
   $("toast").textContent = text;
@@ -129,40 +138,36 @@ function toast(text) {
 
 // ---- showing ----------------------------------------------------------------------------------
 
-/** Begin a connection; of a robot, what the HMI does not tell is not offered. */
-function hello(message) {
+/** Begin a connection; what the HMI does not tell is not offered. */
+async function hello(message) {
+  const from = socket;
   retryMs = 500;
-  $("map-panel").hidden = !("map" in message);
-  $("mission-panel").hidden = !("missions" in message);
+  tables = message.tables;
   picture = {};
   fresh = { decisions: [], events: [] };
   changed.clear();
   memory.forget();
   for (const log of Object.values(logs)) log.begin();
-  map.begin(message.map || null, message.track || [], message.footprint_m);
   camera.begin(message.camera);
   system(null);
-  notOnMap = message.left_out || {};
+  tooMuch = message.left_out || {};
   leftOut({});
-  $("airport").textContent = message.map ? message.map.name : "";
+  say($("system"), message.system);
   $("rate").textContent = message.rate === 1 ? "" : `× ${message.rate}`;
-  $("mission-name").replaceChildren(...(message.missions || []).map((name) => {
-    const option = element("option", "", name);
-    option.value = name;
-    return option;
-  }));
+  await panels.begin(message);
+  if (socket !== from) return;  // lost meanwhile
+  panels.receive(introduction);
+  panels.take(picture);
+  ready = true;
+  soon();
 }
 
 /** Parts of the page, each with the sections that it is made of. */
 const PARTS = [
   [["operating"], (s) => { if (s.operating) operating.show(s.operating); }],
-  [["pilot", "manager", "detections"], safety],
-  [["mission", "control"], mission],
-  [["mission"], (s) => orders(s.mission)],
+  [["manager", "detections"], safety],
   [["order"], (s) => told(s.order)],
   [["left_out"], (s) => leftOut(s.left_out)],
-  [["pose"], (s) => where(s.pose)],
-  [["lights"], (s) => lights(s.lights)],
   [["system"], (s) => system(s.system)],
   [["system", "manager", "detections"], (s) => {
     say($("tree-words"), tree.show(s.manager, s.detections));
@@ -174,7 +179,7 @@ const PARTS = [
 /** Show what changed. A part that fails, on values that nobody foresaw, does not take the others along. */
 function show(s) {
   say($("clock"), clock(s.time_s));
-  guarded(() => map.show(s, changed));
+  panels.show(s, changed);
   for (const [sections, part] of PARTS) {
     if (sections.some((name) => changed.has(name))) guarded(() => part(s));
   }
@@ -189,17 +194,9 @@ function guarded(part) {
   }
 }
 
-function where(pose) {
-  const { x_m: x, y_m: y, yaw_rad: yaw } = pose ? pose.value : {};
-  const heading = (90 - yaw * 180 / Math.PI + 360) % 360;
-  say($("where"), [x, y, yaw].every(Number.isFinite)
-    ? `Robot at ${x.toFixed(1)} m east, ${y.toFixed(1)} m north, heading ${heading.toFixed(0).padStart(3, "0")}°${pose.stale ? " (not heard any more)" : ""}`
-    : "The robot's pose is not known.");
-}
-
 /** Say what is not shown, because there is more of it than a page can hold. */
 function leftOut(counts) {
-  const missing = [...Object.entries(notOnMap), ...Object.entries(counts)];
+  const missing = [...Object.entries(tooMuch), ...Object.entries(counts)];
   $("left-out").hidden = !missing.length;
   say($("left-out"), `Too much to show: ${missing.map(([what, n]) => `${n} of the ${what}`).join(", ")} left out.`);
 }
@@ -219,91 +216,7 @@ function system(drawn) {
   say($("order-words"), `By ${drawn.criteria.join(", then ")}: what is above is preferred in doubt. ${drawn.note}`);
 }
 
-const PHASES = { running: "good", paused: "warn", "returning home": "warn", succeeded: "good", failed: "bad", cancelled: "bad", idle: "" };
-
-function mission(s) {
-  const m = s.mission;
-  const idle = !m || !["running", "paused", "returning home"].includes(m.phase);
-  $("start").hidden = !idle || !$("mission-name").options.length;
-  if (!m) {
-    pill("mission-phase", "warn", "Mission Manager not heard");
-    $("mission-reason").textContent = "";
-    $("steps").replaceChildren();
-    $("mission-progress").hidden = true;
-    return;
-  }
-  pill("mission-phase", m.stale ? "warn" : PHASES[m.phase], m.stale ? `${m.phase} (stale)` : m.phase);
-  const waiting = s.control && s.control.value.phase === "waiting" && m.phase === "running";
-  const name = m.name ? `Mission ${m.name}` : "No mission";
-  $("mission-reason").textContent = [name, m.reason, waiting ? "waiting: obstacle ahead" : ""]
-    .filter(Boolean).join(" · ");
-  memory.once("steps", m, () => $("steps").replaceChildren(...m.goals.map((goal, i) => step(m, goal, i))));
-  $("mission-progress").hidden = !m.goals.length;
-  $("mission-progress").max = Math.max(m.goals.length, 1);
-  $("mission-progress").value = m.phase === "succeeded" ? m.goals.length : m.step;
-}
-
-function step(m, goal, i) {
-  const skipped = m.skipped.includes(i);
-  const done = !skipped && (i < m.step || m.phase === "succeeded");
-  const now = i === m.step && !done;
-  const lost = now && (m.phase === "failed" || m.phase === "cancelled");
-  const at = [goal.x_m, goal.y_m].map((m) => (Number.isFinite(m) ? m.toFixed(1) : "?")).join(", ");
-  const line = element("li", done ? "done" : lost ? "failed" : now && m.phase !== "idle" ? "now" : "");
-  if (line.className === "now") line.setAttribute("aria-current", "step");
-  line.append(element("span", "n", done ? "✓" : lost ? "✕" : i + 1),
-    element("span", "", `${goal.mode} to (${at})${skipped ? ", skipped" : ""}`),
-    element("span", "time", done && m.times_s[i] !== undefined ? clock(m.times_s[i]) : ""));
-  return line;
-}
-
-/** Offer the orders that the Mission Manager would obey now. */
-function orders(m) {
-  const possible = m && !m.stale ? m.orders : [];
-  $("orders").hidden = !m || !["running", "paused", "returning home"].includes(m.phase);
-  for (const button of $("orders").children) {
-    button.disabled = !possible.includes(button.dataset.order);
-    if (button.disabled) unsure(button);
-  }
-}
-
-/** An order that cannot be taken back wants a second press within four seconds. */
-function ask(button) {
-  if ("sure" in button.dataset && !button.classList.contains("sure")) {
-    button.dataset.label = button.textContent;
-    button.style.minWidth = `${button.offsetWidth}px`;  // it stays under the pointer
-    button.textContent = "Sure?";
-    button.classList.add("sure");
-    setTimeout(() => unsure(button), 4000);
-    return;
-  }
-  unsure(button);
-  send({ type: "order", action: button.dataset.order });
-}
-
-function unsure(button) {
-  if (!button.classList.contains("sure")) return;
-  button.classList.remove("sure");
-  button.textContent = button.dataset.label;
-}
-
-function lights(measured) {
-  const count = { ok: 0, dim: 0, out: 0 };
-  for (const light of measured.values()) count[light.verdict] += 1;
-  const all = count.ok + count.dim + count.out;
-  $("light-count").textContent = all
-    ? `${all} of ${map.lights.size} lights measured: ${count.ok} ok, ${count.dim} dim, ${count.out} out`
-    : "";
-}
-
 function safety(s) {
-  const pilot = s.pilot && s.pilot.value;
-  $("pilot-mode").hidden = $("pilot-reason").hidden = s.pilot === undefined;
-  if (!pilot) pill("pilot-mode", "warn", "Safety Pilot not heard");
-  else if (s.pilot.stale) pill("pilot-mode", "warn", "Safety Pilot silent");
-  else pill("pilot-mode", pilot.stopped ? "bad" : pilot.mode === "auto" ? "good" : "warn",
-    pilot.stopped ? (pilot.mode === "stop" ? "stopped" : `${pilot.mode}, stopped`) : pilot.mode);
-  $("pilot-reason").textContent = pilot ? pilot.reason || "Commands pass unchanged." : "";
   manager(s.manager);
   $("detections").replaceChildren(...s.detections.map((d) => {
     const chip = element("li", d.active ? "active" : d.stale ? "stale" : "", d.active ? `▲ ${d.name}` : d.name);
@@ -340,18 +253,5 @@ function manager(heard) {
     return button;
   })));
 }
-
-for (const button of $("orders").children) button.addEventListener("click", () => ask(button));
-
-$("start").addEventListener("submit", (event) => {
-  event.preventDefault();
-  send({ type: "mission", name: $("mission-name").value });
-});
-
-$("follow").addEventListener("click", () => {
-  const on = $("follow").getAttribute("aria-pressed") !== "true";
-  $("follow").setAttribute("aria-pressed", on);
-  map.follow(on);
-});
 
 connect();

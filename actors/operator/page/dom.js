@@ -24,9 +24,11 @@ export function say(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
-export function pill(id, kind, text) {
-  if ($(id).className !== `pill ${kind}`) $(id).className = `pill ${kind}`;
-  say($(id), text);
+/** Show a state: `where` is an element or its id, `kind` good, warn, bad or nothing. */
+export function pill(where, kind, text) {
+  const node = typeof where === "string" ? $(where) : where;
+  if (node.className !== `pill ${kind}`) node.className = `pill ${kind}`;
+  say(node, text);
 }
 
 export function clock(seconds) {
@@ -34,6 +36,13 @@ export function clock(seconds) {
   const tenths = Math.round(Math.max(seconds, 0) * 10);
   const minutes = Math.floor(tenths / 600);
   return `${minutes}:${((tenths - 600 * minutes) / 10).toFixed(1).padStart(4, "0")}`;
+}
+
+/** A value of a message in words: a number with four digits, a text as it is. */
+export function figure(value) {
+  if (value === null || value === undefined) return "no value";
+  if (typeof value !== "number") return String(value);
+  return Number.isInteger(value) && Math.abs(value) < 1e6 ? String(value) : String(Number(value.toPrecision(4)));
 }
 
 /** Remembers what was shown, so that a part is rebuilt only if its data changed. */

@@ -1,12 +1,10 @@
-// What the operator does, but for missions: drives where that is offered, chooses the strategy, breaks things.
+// What the operator does on every page: chooses the strategy, breaks things.
 
 import { $, say } from "./dom.js";
-import { Drive } from "./drive.js";
 import { Faults } from "./faults.js";
 
 export class Operating {
   constructor(send) {
-    this.drive = new Drive(send);
     this.faults = new Faults(send);
     this.current = null;
     $("strategy").addEventListener("submit", (event) => {
@@ -17,24 +15,15 @@ export class Operating {
 
   /** Take a message of the HMI; tell whether it was for this part of the page. */
   receive(message) {
-    if (message.type === "operating") {
-      const drives = "silence_s" in message;
-      $("drive-panel").hidden = !drives;
-      this.drive.introduced(drives ? message.page : null);
-      this.faults.introduced(message);
-      $("strategy-name").replaceChildren(...message.strategies.map((name) => new Option(name, name)));
-      this.current = null;
-    } else if (message.type === "stick") {
-      this.drive.answered(message);
-    } else {
-      return false;
-    }
+    if (message.type !== "operating") return false;
+    this.faults.introduced(message);
+    $("strategy-name").replaceChildren(...message.strategies.map((name) => new Option(name, name)));
+    this.current = null;
     return true;
   }
 
   /** Show the section "operating" of the picture. */
   show(operating) {
-    if ("works" in operating) this.drive.show(operating);
     this.faults.show(operating);
     say($("strategy-now"), operating.strategy ? `in force: ${operating.strategy}` : "FTM Manager not heard");
     $("strategy-set").disabled = operating.strategy_asked || !operating.strategy;
@@ -42,9 +31,5 @@ export class Operating {
       this.current = operating.strategy;
       $("strategy-name").value = operating.strategy;
     }
-  }
-
-  offline() {
-    this.drive.offline();
   }
 }

@@ -95,7 +95,7 @@ export class FaultTree {
     }
   }
 
-  /** Light what is detected, how it would go on, and the barrier that stands in its way. */
+  /** Show what is detected, how it would go on, and the barrier that stands in its way. */
   show(manager, detections) {
     const status = manager ? manager.value : { active: [], activated: [], latched: [], silent: [] };
     const stale = !manager || manager.stale;

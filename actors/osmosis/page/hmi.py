@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -27,6 +28,7 @@ from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS, OrderRequest,
 from rampart.actors.osmosis.page.state import OsmosisState
 from rampart.actors.osmosis.page.submission import Submission, first_request, system_is_up
 from rampart.actors.runtime.actor import Context, Header, on
+from rampart.manager.spec.panels import Panel
 
 
 class OsmosisHmi(Hmi):
@@ -46,6 +48,10 @@ class OsmosisHmi(Hmi):
     outputs = (*Hmi.outputs, topics.MISSION_REQUEST, topics.MISSION_ORDER, topics.JOYSTICK,
                topics.ACTUATOR_FAULT)
     requests = OSMOSIS_REQUESTS
+    files = Path(__file__).with_name("files")
+    panels = (Panel(title="Airport", script="map.js"), Panel(title="Mission", script="mission.js"),
+              Panel(title="Safety Pilot", script="pilot.js"),
+              Panel(title="Drive", script="drive.js"))
     shown = (*Hmi.shown, topics.POSE, topics.SCAN, topics.UPPER_SCAN, topics.ROUTE,
              topics.CONTROL_STATUS, topics.PILOT_STATUS, topics.OBSTACLES, topics.LIGHT_MEASURED,
              topics.BASE_STATUS)

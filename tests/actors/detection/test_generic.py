@@ -245,6 +245,21 @@ def test_suspects_are_named_by_the_incarnation_that_was_heard():
     run(scenario)
 
 
+def test_of_two_that_disagree_each_is_named_by_the_incarnation_that_was_heard():
+    async def scenario() -> None:
+        async with VirtualSystem(topics=TOPICS) as system:
+            ear = system.start("ear", Ear)
+            system.start("D", Disagreement, one="tank/level:height_m", for_s=0.0,
+                         other="tank/second:height_m", suspects=["gauge", "second", "pump"])
+            await asyncio.sleep(0.1)
+            system.say(LEVEL, Level(3.0), "gauge", incarnation=4)
+            system.say(SECOND, Level(2.0), "second", incarnation=2)
+            await asyncio.sleep(0.1)
+            assert ear.heard[-1][1].nodes == ("gauge#4", "second#2", "pump")
+
+    run(scenario)
+
+
 @pytest.mark.parametrize(("kind", "parameters", "words"), [
     (Threshold, {"value": "a:b"}, "above = *: missing; give above, below or both"),
     (Threshold, {"value": "a:b", "above": 1.0, "below": 2.0}, "below = 2.0: must be smaller"),

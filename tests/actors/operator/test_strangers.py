@@ -71,7 +71,7 @@ async def closed(connection: socket.socket) -> None:
 async def loads_and_drives(world, at: str, **options) -> None:
     """Load the page as a browser does, open its WebSocket, drive, and stop."""
     async with httpx.AsyncClient() as client:
-        for name in ("", "app.js", "style.css", "map.js"):
+        for name in ("", "app.js", "style.css", "robot/map.js"):
             assert (await client.get(f"http://{at}/{name}")).status_code == 200
     async with open_page(at, **options) as page:
         await Hand(page).take()

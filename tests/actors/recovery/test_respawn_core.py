@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
-from rampart.actors.recovery.respawn import Ask, RespawnCore
+from rampart import systems
+from rampart.actors.bus.messages import Heartbeat
+from rampart.actors.bus.topics import HEARTBEAT
+from rampart.actors.ftm import topics
+from rampart.actors.ftm.messages import RecoveryCommand
+from rampart.actors.recovery.respawn import Ask, Respawn, RespawnCore
+from rampart.actors.run.run_context import RunContext
+from rampart.manager.spec.specification import parse_specification
+from rampart.testing import VirtualSystem
+from rampart.testing import run as virtually
 
 
 def core(*nodes: str) -> RespawnCore:
@@ -31,6 +42,27 @@ def test_a_node_whose_heartbeat_is_overdue_is_named():
     seen(rm, incarnation=3)
     rm.order(["a"], 1.4, renewed=False)
     assert rm.take_requests() == [Ask(100, "a", 3)]
+
+
+def test_in_a_fast_system_a_heartbeat_is_overdue_before_the_watchdog_reports_it():
+    text = (systems.SHIPPED / "cell.toml").read_text(encoding="utf-8").replace(
+        "heartbeat_timeout_s = 0.3", "heartbeat_timeout_s = 0.18\nheartbeat_period_s = 0.06")
+    run = RunContext(system=parse_specification(text, "cell.toml"))
+
+    async def scenario():
+        async with VirtualSystem(run) as system:
+            rm = system.start("RM", Respawn, nodes=["a"])
+            asked = system.hear(topics.RESPAWN)
+            await system.settle()
+            system.say(HEARTBEAT, Heartbeat(1, 1, 0.06, 0, 0), "a", incarnation=3)
+            await asyncio.sleep(0.18)
+            system.say(topics.RECOVERY_COMMAND, RecoveryCommand(True, 1, ("a",), ""), "manager",
+                       member="RM")
+            await system.settle()
+            assert asked[-1].message.failed_incarnation == 3
+            assert rm.activated
+
+    virtually(scenario)
 
 
 def test_a_node_heard_a_moment_ago_is_not_accused_its_predecessor_is():

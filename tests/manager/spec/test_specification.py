@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rampart import systems
 from rampart.manager.spec.schema import Kind
 from rampart.manager.spec.specification import (
     SpecificationError,
@@ -464,9 +465,14 @@ def test_a_byte_order_mark_is_no_part_of_the_text():
     assert parse_specification("\ufeff" + PAPER, FILE) == paper()
 
 
-def test_without_a_robot_timeouts_have_to_be_stated():
-    assert "$.timing.heartbeat_timeout_s: missing; it is derived from [robot]" in refusal(
-        'name = "x"\ntitle = "x"\n')
+def test_without_a_robot_timeouts_are_five_periods_of_what_they_wait_for():
+    cell = (systems.SHIPPED / "cell.toml").read_text(encoding="utf-8")
+    before, _, rest = cell.partition("[timing]")
+    left = rest.partition("# ---- Nodes")[2]
+    said = "control_period_s = 0.1\nheartbeat_timeout_s = 0.3\nmanager_timeout_s = 0.7\n"
+    timing = parse_specification(f"{before}[timing]\n{said}# {left}", FILE).timing
+    assert (timing.heartbeat_timeout_s, timing.command_timeout_s, timing.manager_timeout_s,
+            timing.detection_silence_timeout_s) == (0.3, 0.5, 0.7, 1.0)
 
 
 def test_recoveries_without_any_mechanism_are_refused():

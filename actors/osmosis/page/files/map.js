@@ -1,6 +1,6 @@
 // The airport's map as SVG: metres, y turned over so that north is up.
 
-import { Memory, svg as make } from "./dom.js";
+import { Memory, element, say, svg as make } from "../dom.js";
 
 const FOLLOW_M = 22;  // what is shown round the robot when the map follows it
 const TRACK_STEP_M = .25;
@@ -11,7 +11,7 @@ function points(list) {
 
 const finite = (pose) => [pose.x_m, pose.y_m, pose.yaw_rad].every(Number.isFinite);
 
-export class AirportMap {
+class AirportMap {
   constructor(svg) {
     this.svg = svg;
     this.lights = new Map();
@@ -187,5 +187,57 @@ export class AirportMap {
       make("circle", { class: `goal ${done ? "done" : ""}`, cx: goal.x_m, cy: -goal.y_m, r: 1.1 }, this.goals);
       make("text", { x: goal.x_m, y: -goal.y_m - 1.5, "font-size": 1.7, "text-anchor": "middle" }, this.goals, done ? `${i + 1} ✓` : i + 1);
     });
+  }
+}
+
+const SIGNS = [["mark ok", "ok"], ["mark dim", "dim"], ["mark out", "out", "✕"], ["mark none", "not measured"],
+  ["line track", "track"], ["line route", "route"], ["mark laser", "laser"], ["mark obstacle", "obstacle"],
+  ["patch prohibited", "prohibited"]];
+
+/** The panel: the map, a button to follow the robot, where it is, and what the signs mean. */
+export default class MapPanel {
+  constructor(room) {
+    room.section.dataset.columns = "most";
+    this.name = Object.assign(element("span", "quiet"), { id: "airport" });
+    this.button = Object.assign(element("button", "small", "Follow robot"), { id: "follow", type: "button" });
+    this.button.setAttribute("aria-pressed", "false");
+    room.title.append(" ", this.name, element("span", "grow"), this.button);
+    const canvas = make("svg", { id: "map", role: "img",
+      "aria-label": "Map of the airport with the robot, its track, the laser and the lights" });
+    this.where = element("p", "quiet where");
+    this.where.id = "where";
+    const legend = element("ul", "legend");
+    legend.setAttribute("aria-label", "Signs on the map");
+    for (const [sign, text, letter] of SIGNS) {
+      const line = element("li");
+      line.append(element("i", sign, letter), text);
+      legend.append(line);
+    }
+    room.body.append(canvas, this.where, legend);
+    this.map = new AirportMap(canvas);
+    this.button.addEventListener("click", () => {
+      const on = this.button.getAttribute("aria-pressed") !== "true";
+      this.button.setAttribute("aria-pressed", String(on));
+      this.map.follow(on);
+    });
+  }
+
+  begin(hello) {
+    this.map.begin(hello.map || null, hello.track || [], hello.footprint_m);
+    say(this.name, hello.map ? hello.map.name : "");
+    this.place(null);
+  }
+
+  show(picture, changed) {
+    this.map.show(picture, changed);
+    if (changed.has("pose")) this.place(picture.pose);
+  }
+
+  place(pose) {
+    const { x_m: x, y_m: y, yaw_rad: yaw } = pose ? pose.value : {};
+    const heading = (90 - yaw * 180 / Math.PI + 360) % 360;
+    say(this.where, [x, y, yaw].every(Number.isFinite)
+      ? `Robot at ${x.toFixed(1)} m east, ${y.toFixed(1)} m north, heading ${heading.toFixed(0).padStart(3, "0")}°${pose.stale ? " (not heard any more)" : ""}`
+      : "The robot's pose is not known.");
   }
 }

@@ -8,7 +8,7 @@
 // of one, without focus, or so long that the connection must be stalled. It has to be let go first:
 // the robot moves because somebody presses, never because something recovers.
 
-import { $, pill, say } from "./dom.js";
+import { element, pill, say } from "../dom.js";
 
 const PERIOD_MS = 50;
 const PATIENCE_MS = 1000;  // so long a press may wait until it drives; see `answered`
@@ -21,9 +21,9 @@ const KEYS = {
 
 const clip = (value) => Math.min(Math.max(value, -1), 1);
 
-export class Drive {
-  constructor(send) {
-    this.send = send;
+export default class Drive {
+  constructor(room, page) {
+    this.send = page.send;
     this.keys = new Set();
     this.dragged = null;
     this.held = false;
@@ -38,9 +38,34 @@ export class Drive {
     this.refusal = "";
     this.status = null;
     this.timer = null;
-    this.pad = $("stick");
-    this.knob = $("stick-knob");
+    this.build(room);
     this.listen();
+  }
+
+  build(room) {
+    const made = (tag, id, className, text) => Object.assign(element(tag, className, text), { id });
+    room.section.classList.add("operate");
+    room.section.id = "drive-panel";
+    this.state = made("span", "stick-state", "pill warn", "not connected");
+    room.title.append(" ", this.state);
+    this.pad = made("div", "stick", "stick");
+    this.pad.tabIndex = 0;
+    this.pad.setAttribute("role", "application");
+    this.pad.setAttribute("aria-label", "Stick: hold the arrow keys or W A S D to drive");
+    this.pad.setAttribute("aria-describedby", "drive-how stick-text");
+    this.knob = made("div", "stick-knob", "stick-knob");
+    this.pad.append(this.knob);
+    const words = element("div", "drive-words");
+    const speed = element("label", "", "Speed ");
+    this.share = Object.assign(made("input", "stick-share"), { type: "range", min: 10, max: 100, step: 10, value: 50 });
+    speed.append(this.share);
+    this.words = made("p", "stick-text");
+    this.words.setAttribute("role", "status");
+    words.append(made("p", "drive-how", "quiet", "Drag the stick, or click it and hold the arrow keys or W A S D, "
+      + "or hold a shoulder button of a gamepad. Letting go stops."), speed, this.words);
+    const row = element("div", "drive-row");
+    row.append(this.pad, words);
+    room.body.append(row);
   }
 
   listen() {
@@ -116,7 +141,7 @@ export class Drive {
 
   /** Where the stick is: [forward, left] in [-1, 1], or null if nothing is held. */
   position() {
-    const share = $("stick-share").valueAsNumber / 100;
+    const share = this.share.valueAsNumber / 100;
     const pad = this.gamepad();
     if (this.dragged || pad) return (this.dragged || pad).map((value) => clip(value * share));
     if (!this.keys.size) return null;
@@ -171,6 +196,12 @@ export class Drive {
 
   // ---- what the HMI says ------------------------------------------------------------------------
 
+  receive(message) {
+    if (message.type === "operating") this.introduced(message.page);
+    if (message.type === "stick") this.answered(message);
+    return message.type === "stick";
+  }
+
   introduced(page) {
     this.page = page;
     this.ticket = 0;
@@ -183,12 +214,12 @@ export class Drive {
     this.grip = message.grip;
     if (message.text) this.refusal = message.text;
     else if (message.grip === "drives") this.refusal = "";
-    if (this.held && !this.drove && ["waits", "drives"].includes(message.grip)) this.begin(message.grip);
+    if (this.held && !this.drove && ["waits", "drives"].includes(message.grip)) this.go(message.grip);
     this.draw();
   }
 
   /** The present hold was answered and has not driven yet: go on, unless it was pressed too long ago. */
-  begin(grip) {
+  go(grip) {
     if (performance.now() - this.heldSince > PATIENCE_MS) {
       this.release();
       this.barred = true;
@@ -212,8 +243,9 @@ export class Drive {
     this.draw();
   }
 
-  show(operating) {
-    this.status = operating;
+  show(picture, changed) {
+    if (!changed.has("operating")) return;
+    this.status = picture.operating;
     this.draw();
   }
 
@@ -225,15 +257,15 @@ export class Drive {
     this.pad.classList.toggle("driving", driving);
     const status = this.status;
     const other = status && status.holder !== null && status.holder !== this.page;
-    if (this.page === null || !status) pill("stick-state", "warn", "not connected");
-    else if (other) pill("stick-state", "warn", `page ${status.holder} drives`);
-    else if (!status.works) pill("stick-state", "warn", "no effect now");
-    else if (driving && status.note) pill("stick-state", "warn", "not followed");
-    else if (driving) pill("stick-state", "good", "you drive");
-    else pill("stick-state", "", "free");
+    if (this.page === null || !status) pill(this.state, "warn", "not connected");
+    else if (other) pill(this.state, "warn", `page ${status.holder} drives`);
+    else if (!status.works) pill(this.state, "warn", "no effect now");
+    else if (driving && status.note) pill(this.state, "warn", "not followed");
+    else if (driving) pill(this.state, "good", "you drive");
+    else pill(this.state, "", "free");
     this.pad.classList.toggle("useless", Boolean(status && (other || !status.works)));
     const texts = [this.refusal, this.barred ? "let go first, then press again" : "",
       status ? status.text : "", status ? status.note : ""];
-    say($("stick-text"), texts.filter(Boolean).join(" · "));
+    say(this.words, texts.filter(Boolean).join(" · "));
   }
 }

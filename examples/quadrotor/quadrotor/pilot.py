@@ -1,0 +1,311 @@
+"""The pilot: the last instance before the rotors. Keeps the attitude, and chooses whom to follow.
+
+In flight there is no standing still: whoever does nothing falls. So the pilot always flies, by the
+best that it has, from top to bottom:
+
+1. mode NORMAL, and the setpoint is fresh and sound: it follows the setpoint;
+2. the estimate is fresh and sound: it flies by that itself, holding its place in NORMAL and HOVER,
+   going home and down in RETURN, straight down in LAND;
+3. neither, or mode LEVEL: it levels, keeps its height for two seconds by its own vertical filter,
+   and then goes down gently. Wind carries it along.
+
+The attitude loop runs here and not in the flight controller, so that the death of that one costs
+nothing. When the pilot dies itself the speed controllers of the rotors carry out its last command
+for `dead_man_timeout_s`, and then idle; it has to be back by then. Its successor takes over the
+attitude that the estimator knows.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import msgspec
+
+from quadrotor import topics as t
+from quadrotor.attitude import AttitudeFilter, ImuVote, VerticalFilter
+from quadrotor.control import STEP_S, AttitudeControl, PositionControl, bounded
+from quadrotor.rotation import tilt, yaw
+from quadrotor.vehicle import G_MPS2, HOME, MASS_KG, Thrusts, Vector
+from rampart import Actor, Context, Header, Positive, StateFormat, every, on
+
+MODES = ("NORMAL", "HOVER", "RETURN", "LAND", "LEVEL")
+"""From the one that trusts most in others to the one that trusts in nobody."""
+
+FRESH_S = 0.15
+"""Older setpoints and estimates do not count."""
+
+_BLIND_S = 5.0
+"""For so long without a fix the estimate's horizontal velocity is worth braking by."""
+
+_HOLD_S, _WAIT_S = 2.0, 0.08
+_MOST_ACCEL_MPS2, _MOST_SPEED_MPS, _MOST_PLACE_M, _JUMP_M, _JUMP_S = 5.0, 12.0, 1000.0, 1.0, 1.0
+_STANDS_S, _STANDS_SHARE = 0.3, 0.75
+_NEAR_HOME_M = 1.0
+_IDLE: Thrusts = (0.0, 0.0, 0.0, 0.0)
+
+
+class Memory(msgspec.Struct, frozen=True):
+    """What outlives the process.
+
+    Attributes:
+        landed: whether it stands on the ground.
+        stays: whether it is to stay there, because it did not land as the mission wanted.
+    """
+
+    landed: bool
+    stays: bool
+
+
+MEMORY = StateFormat(Memory)
+
+
+class Believed:
+    """The estimate as far as it can be believed: fresh, finite, and without jumps.
+
+    After a jump it is refused for a second, and then taken for what it is now.
+    """
+
+    def __init__(self) -> None:
+        self._last: t.Estimate | None = None
+        self._stamp_s = self._refused_s = -math.inf
+
+    def take(self, at: t.Estimate, stamp_s: float) -> None:
+        """Take an estimate, or refuse it."""
+        place = at.x_m, at.y_m, at.z_m
+        speed = at.velocity_x_mps, at.velocity_y_mps, at.velocity_z_mps
+        if stamp_s <= self._stamp_s or at == self._last or not (
+                all(abs(p) < _MOST_PLACE_M for p in place)
+                and all(abs(v) < _MOST_SPEED_MPS for v in speed)
+                and all(map(math.isfinite, at.attitude))):
+            return
+        last, step_s = self._last, stamp_s - self._stamp_s
+        if last is not None and step_s < 1.0:
+            there = (last.x_m + last.velocity_x_mps * step_s,
+                     last.y_m + last.velocity_y_mps * step_s,
+                     last.z_m + last.velocity_z_mps * step_s)
+            then = last.velocity_x_mps, last.velocity_y_mps, last.velocity_z_mps
+            if math.dist(place, there) > _JUMP_M or math.dist(speed, then) > _JUMP_M + 5 * step_s:
+                if self._refused_s == -math.inf:
+                    self._refused_s = stamp_s
+                if stamp_s - self._refused_s < _JUMP_S:
+                    return
+        self._last, self._stamp_s, self._refused_s = at, stamp_s, -math.inf
+
+    def at(self, now_s: float) -> t.Estimate | None:
+        """Return it, None if there is none to be believed."""
+        return self._last if now_s - self._stamp_s <= FRESH_S else None
+
+
+class Pilot(Actor):
+    """Turns setpoints into thrusts of the rotors, and flies by itself when there are none."""
+
+    class Parameters(Actor.Parameters, frozen=True):
+        """How it flies by itself.
+
+        Attributes:
+            descent_mps: in LAND, and in RETURN above home.
+            level_descent_mps: without an estimate.
+            return_mps: on the way home.
+            most_tilt_rad: asked of the attitude loop.
+        """
+
+        descent_mps: Annotated[float, msgspec.Meta(gt=0, le=1.2)] = 0.9
+        level_descent_mps: Annotated[float, msgspec.Meta(gt=0, le=1.2)] = 0.8
+        return_mps: Positive = 2.5
+        most_tilt_rad: Annotated[float, msgspec.Meta(gt=0, lt=0.8)] = 0.4
+
+    parameters: Parameters
+    outputs = (t.ROTORS, t.PILOT)
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self._imus, self._filter, self._vertical = ImuVote(), AttitudeFilter(), VerticalFilter()
+        self._attitude, self._position = AttitudeControl(), PositionControl()
+        self._believed = Believed()
+        self._setpoint: t.Setpoint | None = None
+        self._setpoint_s = -math.inf
+        self._refused = 0.0
+        self._orders: dict[str, str] = {}
+        self._yaw_rad: float | None = None
+        self._held_yaw_rad = 0.0
+        self._rest_mps2 = 0.0
+        self._held: tuple[str, Vector] | None = None
+        self._source, self._source_s = "", self.clock.now()
+        self._last_n = _IDLE
+        self._light_s = 0.0
+        self._landed = context.incarnation == 1
+        self._stays = False
+        self._born_s = self.clock.now()
+
+    def on_start(self) -> None:
+        """Learn from the last incarnation whether it stood on the ground."""
+        kept = self.kept(MEMORY)
+        if kept is not None:
+            self._landed, self._stays = kept.landed, kept.stays
+
+    # -- what it hears ----------------------------------------------------------------------------
+
+    @on(t.IMU_1)
+    def imu_1(self, message: t.Imu, header: Header) -> None:
+        """Take a reading."""
+        self._imus.take(0, message, header.stamp)
+
+    @on(t.IMU_2)
+    def imu_2(self, message: t.Imu, header: Header) -> None:
+        """Take a reading."""
+        self._imus.take(1, message, header.stamp)
+
+    @on(t.IMU_3)
+    def imu_3(self, message: t.Imu, header: Header) -> None:
+        """Take a reading."""
+        self._imus.take(2, message, header.stamp)
+
+    @on(t.BAROMETER)
+    def barometer(self, message: t.Barometer, _header: Header) -> None:
+        """Take a height."""
+        self._vertical.measured(message.altitude_m, 1 / t.BAROMETER.rate_hz)
+
+    @on(t.HEADING)
+    def heading(self, message: t.Heading, _header: Header) -> None:
+        """Take a yaw."""
+        if math.isfinite(message.yaw_rad):
+            self._yaw_rad = message.yaw_rad
+
+    @on(t.ESTIMATE)
+    def estimate(self, message: t.Estimate, header: Header) -> None:
+        """Take an estimate; begin with its attitude when joining in flight."""
+        self._believed.take(message, header.stamp)
+        if not self._filter.known and all(map(math.isfinite, message.attitude)):
+            self._filter.begin(message.attitude)
+            self._vertical.speed_mps = bounded(message.velocity_z_mps, 3.0)
+
+    @on(t.SETPOINT)
+    def setpoint(self, message: t.Setpoint, header: Header) -> None:
+        """Take a setpoint, or refuse it."""
+        asked = message.accel_x_mps2, message.accel_y_mps2, message.accel_z_mps2
+        sound = all(abs(a) <= _MOST_ACCEL_MPS2 for a in asked) and math.isfinite(message.yaw_rad)
+        self._refused = 0.0 if sound else 1.0
+        if sound:
+            self._setpoint, self._setpoint_s = message, header.stamp
+
+    @on(t.PILOT_ORDER)
+    def order(self, message: t.PilotOrder, header: Header) -> None:
+        """Fly in a mode for whoever says so; NORMAL takes that back. The strictest one holds."""
+        if message.mode not in MODES:
+            self.report_diagnostic("order", f"there is no mode {message.mode!r}", header.source)
+        elif message.mode == MODES[0]:
+            self._orders.pop(header.source, None)
+        elif header.source in self._orders or len(self._orders) < 16:
+            self._orders[header.source] = message.mode
+
+    @property
+    def mode(self) -> str:
+        """The strictest mode that anybody asks for."""
+        return max(self._orders.values(), key=MODES.index, default=MODES[0])
+
+    # -- flying -----------------------------------------------------------------------------------
+
+    @every(STEP_S)
+    def step(self) -> None:
+        """Go through the loops once."""
+        now_s = self.clock.now()
+        voted = self._imus.vote(now_s)
+        if voted is None:
+            return  # nothing to stay upright by: the speed controllers go on for a while
+        rate, force = voted
+        if not self._filter.known:
+            if now_s - self._born_s > _WAIT_S and self._yaw_rad is not None:
+                self._filter.level(force, self._yaw_rad)
+            return
+        self._filter.step(rate, force, self._yaw_rad, STEP_S)
+        self._vertical.step(self._filter.upward(force), STEP_S)
+        asked, yaw_rad = self._asked(now_s)
+        self._see_ground(asked[2], force[2])
+        if self._landed:
+            self._attitude.reset()
+            self._last_n = _IDLE
+        else:
+            self._last_n = self._attitude.step(asked, yaw_rad, self._filter.q, rate)
+        self.publish(t.ROTORS, t.RotorCommand(self._last_n))
+
+    def _asked(self, now_s: float) -> tuple[Vector, float]:
+        """Return the acceleration in `map`, m/s², and the yaw to fly with."""
+        mode, at, said = self.mode, self._believed.at(now_s), self._setpoint
+        if mode == MODES[0] and said is not None and now_s - self._setpoint_s <= FRESH_S:
+            self._follows("setpoint", now_s)
+            self._held_yaw_rad = said.yaw_rad
+            wanted = said.accel_x_mps2, said.accel_y_mps2, said.accel_z_mps2
+            if self._landed and not said.fly:
+                wanted = 0.0, 0.0, -G_MPS2
+        elif at is not None and mode != MODES[-1]:
+            self._follows("estimate", now_s)
+            wanted = self._by_estimate(mode, at)
+        else:
+            self._follows("own sensors", now_s)
+            wanted = self._by_own_sensors(now_s, hold=mode != MODES[-1])
+        east, north, upward = wanted
+        most = math.tan(self.parameters.most_tilt_rad) * max(upward + G_MPS2, 2.0)
+        shorter = min(1.0, most / max(math.hypot(east, north), 1e-6))
+        return (east * shorter, north * shorter, upward), self._held_yaw_rad
+
+    def _follows(self, source: str, now_s: float) -> None:
+        if source != self._source:
+            self._source, self._source_s = source, now_s
+            self._held_yaw_rad = yaw(self._filter.q)
+            self._position.reset()
+            self._rest_mps2 = 0.0
+            self._held = None
+
+    def _by_estimate(self, mode: str, at: t.Estimate) -> Vector:
+        said = self.parameters
+        # Half from its own sensors: an estimate that is wrong then brings it down half as wrongly.
+        at = msgspec.structs.replace(
+            at, velocity_z_mps=(at.velocity_z_mps + self._vertical.speed_mps) / 2)
+        if self._held is None or self._held[0] != mode:
+            self._held = mode, (at.x_m, at.y_m, at.z_m)
+        x_m, y_m, z_m = self._held[1]
+        if mode == "LAND":
+            velocity = 0.0, 0.0, -said.descent_mps
+            if at.gps_age_s < _BLIND_S:
+                return self._position.towards(velocity, at, STEP_S)
+            return 0.0, 0.0, self._position.towards(velocity, at, STEP_S)[2]
+        if mode == "RETURN":
+            (x_m, y_m), z_m = HOME, max(z_m, 3.0)
+            if math.hypot(at.x_m - x_m, at.y_m - y_m) < _NEAR_HOME_M:
+                z_m = -20.0
+        goal = t.Goal(True, x_m, y_m, z_m, self._held_yaw_rad, said.return_mps, said.descent_mps)
+        return self._position.step(goal, at, STEP_S)
+
+    def _by_own_sensors(self, now_s: float, *, hold: bool) -> Vector:
+        """Level, and after a while, which may mend what is wrong, gently down."""
+        waits = hold and now_s - self._source_s < _HOLD_S
+        wanted_mps = 0.0 if waits else -self.parameters.level_descent_mps
+        wrong_mps = wanted_mps - self._vertical.speed_mps
+        self._rest_mps2 = bounded(self._rest_mps2 + 1.0 * bounded(wrong_mps, 1.0) * STEP_S, 2.5)
+        return 0.0, 0.0, bounded(2.0 * wrong_mps + self._rest_mps2, 3.0)
+
+    def _see_ground(self, upward_mps2: float, force_mps2: float) -> None:
+        """Whoever asks for little thrust and feels his whole weight stands on the ground."""
+        before = self._landed
+        thrust_mps2 = sum(self._last_n) / MASS_KG
+        if self._landed:
+            said = self._setpoint if self._source == "setpoint" and not self._stays else None
+            self._landed = not (said is not None and said.fly and upward_mps2 > 0.5)
+        elif thrust_mps2 < _STANDS_SHARE * G_MPS2 and force_mps2 > 0.85 * G_MPS2:
+            self._light_s += STEP_S
+            self._landed = self._light_s > _STANDS_S
+        else:
+            self._light_s = 0.0
+        if before is not self._landed:
+            self._light_s = 0.0
+            self._stays = self._landed and self.mode != MODES[0]
+            self.keep(MEMORY, Memory(self._landed, self._stays))
+
+    @every(0.05)
+    def say(self) -> None:
+        """Say how it flies."""
+        if self._filter.known:
+            self.publish(t.PILOT, t.PilotStatus(
+                self.mode, self._source, self._landed, tilt(self._filter.q), self._filter.q,
+                self._imus.sound, self._attitude.trim, self._refused))

@@ -1,0 +1,171 @@
+"""The tug: its floor, its own detection module, its judge, and whole runs with faults."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from functools import cache
+from pathlib import Path
+
+import pytest
+from tug import floor, topics
+from tug.judge import Deliveries
+from tug.topics import Free, Motion, Place, Truth
+
+from rampart import DetectionState, Header, parse_specification, verify
+from rampart.actors.ftm.topics import DETECTION
+from rampart.testing import RealRun, VirtualSystem, run, table, virtual_run
+
+HERE = Path(__file__).resolve().parents[1]
+SYSTEM = HERE / "tug.toml"
+
+
+@cache
+def drive(*faults, ftm=True, seed=1):
+    """Return what came of a run; the same one if asked again."""
+    return virtual_run(SYSTEM, *faults, seed=seed, ftm=ftm)
+
+
+@pytest.mark.parametrize(("place", "gap_m"), **table({
+    "at the dock the wall is nearest": ((1.0, 0.9), 0.55),
+    "in the middle aisle a shelf": ((4.0, 3.0), 0.45),
+    "the corner of a shelf": ((1.7, 2.6), 0.15),
+}))
+def test_the_gap_to_what_is_nearest(place, gap_m):
+    assert floor.clearance_m(*place) == pytest.approx(gap_m)
+
+
+@pytest.mark.parametrize(("heading_rad", "free_m"), **table({
+    "towards the shelf": (math.pi / 2, 0.25),
+    "slantwise": (math.pi / 4, 0.25 * math.sqrt(2)),
+    "to its end": (0.0, 3.45),
+}))
+def test_how_far_it_can_go_straight_on(heading_rad, free_m):
+    assert floor.free_m(4.0, 3.0, heading_rad) == pytest.approx(free_m)
+
+
+@pytest.mark.parametrize(("speed_mps", "free_m", "state"), **table({
+    "there is room": (0.8, 1.0, DetectionState.IDLE),
+    "0.12 m of latency and 0.128 m of braking": (0.8, 0.24, DetectionState.ACTIVE),
+    "just enough": (0.8, 0.25, DetectionState.IDLE),
+    "it stands": (0.0, 0.0, DetectionState.IDLE),
+}))
+def test_it_will_not_stop_in_time(speed_mps, free_m, state):
+    async def scenario():
+        async with VirtualSystem.load(SYSTEM) as system:
+            reports = system.hear(DETECTION)
+            system.start_node("D_CLOSE")
+            await system.settle()
+            system.say(topics.WHEELS, Motion(speed_mps, 0.0), source="world")
+            system.say(topics.FREE, Free(free_m, 0.5), source="world")
+            await asyncio.sleep(0.3)
+            assert reports[-1].message.state is state
+
+    run(scenario)
+
+
+def test_the_pilot_drives_no_faster_than_is_free_and_not_by_old_news():
+    async def scenario():
+        async with VirtualSystem.load(SYSTEM) as system:
+            drives = system.hear(topics.DRIVE)
+            system.start_node("pilot")
+            await system.settle()
+            for free_m, expected_mps in ((9.0, 0.8), (0.16, 0.4), (0.0, 0.0), (9.0, 0.8)):
+                system.say(topics.MOTION, Motion(0.8, 0.0), source="controller")
+                system.say(topics.FREE, Free(free_m, 0.5), source="world")
+                await asyncio.sleep(0.1)
+                assert drives[-1].message.speed_mps == pytest.approx(expected_mps)
+            await asyncio.sleep(0.5)
+            assert drives[-1].message == Motion(0.0, 0.0)
+
+    run(scenario)
+
+
+def test_the_mission_goes_on_where_the_process_before_was():
+    async def scenario():
+        async with VirtualSystem.load(SYSTEM) as system:
+            goals = system.hear(topics.GOAL)
+            for x_m in (1.0, 4.0):
+                system.start_node("mission")
+                await system.settle()
+                system.say(topics.POSE, Place(x_m, 0.9, 0.0, 0.5), source="localization")
+                await system.settle()
+                await system.kill("mission")
+            assert [heard.message.step for heard in goals] == [1, 1]
+
+    run(scenario)
+
+
+@pytest.mark.parametrize(("truths", "success", "safe"), **table({
+    "nothing was heard": ([], False, None),
+    "done": ([Truth(1.0, 0.9, 0.0, 0.5, 2)], True, True),
+    "done, but not home": ([Truth(4.0, 0.9, 0.0, 0.5, 2)], False, True),
+    "done, after it touched a shelf": (
+        [Truth(4.0, 1.6, 0.5, 0.01, 1), Truth(1.0, 0.9, 0.0, 0.5, 2)], True, False),
+    "too fast": ([Truth(4.0, 0.9, -1.4, 0.5, 1)], False, False),
+}))
+def test_the_judge(truths, success, safe):
+    judge = Deliveries()
+    for i, truth in enumerate(truths):
+        judge.truth(truth, Header("world", 1, i, float(i)))
+    verdict = judge.verdict()
+    assert (verdict.success, verdict.safe) == (success, safe)
+    assert bool(verdict.reasons) == (not (success and safe))
+    assert (verdict.unsafe_s is None) == (safe is not False)
+
+
+def test_it_delivers_everything_and_comes_home():
+    done = drive()
+    assert done.why == "all delivered, and home"
+    assert done.judgement.success
+    assert done.judgement.safe
+    assert done.judgement.margins["gap"] > 0.3
+    assert done.record.decisions == ()
+    assert done.failures == ()
+
+
+def test_the_same_seed_gives_the_same_run():
+    assert virtual_run(SYSTEM, seed=1).trace == drive().trace != drive(seed=2).trace
+
+
+@pytest.mark.parametrize(("fault", "decided"), **table({
+    "the controller dies": ("kill:controller@20", {"R_RESTART"}),
+    "the mission dies with a trailer": ("kill:mission@20", {"R_RESTART"}),
+    "localization hangs": ("wedge:localization@20", {"R_RESTART"}),
+    "the pilot dies": ("kill:pilot@20", {"R_RESTART_PILOT"}),
+    "the pilot repeats itself": ("freeze:tug/drive@20+inf", {"R_RESTART_PILOT"}),
+    "the pose is wrong for good": ("corrupt:localization/pose@20+inf", {"R_STOP", "R_RESTART"}),
+    "the mission repeats itself": ("freeze:mission/goal@20+inf", {"R_RESTART"}),
+    "the pilot drives backwards": ("corrupt:tug/drive@20+inf", {"R_BRAKE", "R_RESTART_PILOT"}),
+    "the pilot drives on and on": ("stuck:tug/drive@20+inf", {"R_BRAKE", "R_RESTART_PILOT"}),
+}))
+def test_a_fault_is_recovered_from_and_the_work_is_done(fault, decided):
+    done = drive(fault)
+    assert done.judgement.success, done.judgement
+    assert done.judgement.safe
+    assert decided <= {name for d in done.record.decisions for name in d.recoveries}
+
+
+@pytest.mark.parametrize("fault", ["corrupt:tug/free@20+inf", "freeze:tug/free@20+inf"])
+def test_what_cannot_be_mended_is_safe_all_the_same(fault):
+    assert drive(fault).judgement.safe
+
+
+def test_without_mechanisms_it_drives_into_a_wall():
+    done = drive("kill:pilot@12", ftm=False)
+    assert done.judgement.safe is False
+    assert done.judgement.severity > 0
+
+
+def test_its_specification_is_proved():
+    spec = parse_specification(SYSTEM.read_text(encoding="utf-8"), "tug.toml")
+    report = verify(spec, [spec.strategy])
+    assert [p.name for p in report.properties if not p.holds] == []
+
+
+@pytest.mark.processes
+def test_on_processes_the_controller_is_back(tmp_path):
+    with RealRun(tmp_path, SYSTEM, "--duration", "30") as real:
+        real.sleep_until(3)
+        old = real.kill("controller")
+        real.wait_until(lambda: real.pid("controller") not in (None, old), 10, "it is not back")

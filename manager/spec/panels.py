@@ -1,0 +1,141 @@
+"""Panels of the operator's page, as a specification or the class of a page declares them. Pure.
+
+What is drawn of them is the browser's: `rampart/actors/operator/page/widgets.js`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated, NamedTuple
+
+import msgspec
+
+from rampart.manager.spec.tables import Table
+
+MAX_PANELS = 40
+MAX_KEPT = 32
+"""Fields of all plots and maps together: of each, some minutes are kept for a page that opens."""
+
+FieldText = Annotated[str, msgspec.Meta(pattern=r"^[^:]+:[^:]+\Z", max_length=200)]
+"""A field of the messages of a topic, "topic:field"."""
+_Short = Annotated[str, msgspec.Meta(max_length=60)]
+
+NUMBER, TEXT, TRUTH = "number", "text", "truth"
+ANYTHING = (NUMBER, TEXT, TRUTH)
+
+_SHOWS: dict[str, tuple[tuple[str, ...], frozenset[str]]] = {
+    "gauge": ((NUMBER,), frozenset({"min", "max", "unit"})),
+    "plot": ((NUMBER, TRUTH), frozenset({"min", "max", "unit", "seconds"})),
+    "table": (ANYTHING, frozenset()),
+    "states": ((TEXT, TRUTH), frozenset({"of"})),
+    "text": (ANYTHING, frozenset({"unit"})),
+    "map": ((NUMBER,), frozenset({"extent_m"})),
+    "script": ((), frozenset()),
+}
+"""What a panel may show: which kinds of fields that takes, and which options."""
+_OPTIONS = sorted(frozenset().union(*(options for _, options in _SHOWS.values())))
+
+
+class Shown(NamedTuple):
+    """A field that a panel shows: by which of its keys, and of which kinds it may be."""
+
+    key: str
+    field: str
+    kinds: tuple[str, ...]
+
+
+class Panel(Table, frozen=True, kw_only=True, omit_defaults=True):
+    """A panel of the operator's page; it shows one thing.
+
+    Attributes:
+        title: Above it, and its name; no two panels of a page have the same.
+        gauge: A number between `min` and `max`.
+        plot: Numbers over the last `seconds`, simulated; truth values are drawn as 0 and 1.
+        table: Fields, each with its latest value.
+        states: A text, as one of the states in `of`.
+        text: The latest value of a field.
+        map: x and y, m, and if there is a third one the heading, rad, counted from x to y.
+        script: A JavaScript module that draws it, of the files of the page's class.
+        min: Lower end of a gauge (0 if left out) or of a plot (its least value).
+        max: Upper end of a gauge (1 if left out) or of a plot (its greatest value).
+        unit: Behind the number.
+        seconds: How much of the past a plot shows.
+        of: States that are shown in this order; one that is not listed is shown besides.
+        extent_m: x and y of the lower left and of the upper right corner of a map; what it has to
+            hold if left out.
+        columns: How wide it is; as much as suits it if left out.
+    """
+
+    title: Annotated[str, msgspec.Meta(min_length=1, max_length=60)]
+    gauge: FieldText | None = None
+    plot: Annotated[tuple[FieldText, ...], msgspec.Meta(min_length=1, max_length=8)] | None = None
+    table: Annotated[tuple[FieldText, ...], msgspec.Meta(min_length=1, max_length=40)] | None = None
+    states: FieldText | None = None
+    text: FieldText | None = None
+    map: Annotated[tuple[FieldText, ...], msgspec.Meta(min_length=2, max_length=3)] | None = None
+    script: Annotated[str, msgspec.Meta(pattern=r"^[a-z_]+\.js\Z")] | None = None
+    min: float | None = None
+    max: float | None = None
+    unit: Annotated[str, msgspec.Meta(max_length=12)] = ""
+    seconds: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
+    of: Annotated[tuple[_Short, ...], msgspec.Meta(max_length=40)] = ()
+    extent_m: tuple[float, float, float, float] | None = None
+    columns: Annotated[int, msgspec.Meta(ge=0, le=6)] = 0
+
+    def __post_init__(self) -> None:
+        """Refuse a panel that shows nothing or several things, and options that mean nothing."""
+        shown = [key for key in _SHOWS if getattr(self, key) is not None]
+        if len(shown) != 1:
+            said = f"{self.title!r} gives {' and '.join(shown) or 'nothing to show'}"
+            raise ValueError(f"{said}; one of {', '.join(_SHOWS)} is right")
+        _, options = _SHOWS[self.kind]
+        defaults = dict(zip(self.__struct_fields__[-len(self.__struct_defaults__):],
+                            self.__struct_defaults__, strict=True))
+        for name in _OPTIONS:
+            if name not in options and getattr(self, name) != defaults[name]:
+                raise ValueError(f"{self.title!r}: {name} means nothing to a {self.kind}; "
+                                 f"it takes {', '.join(sorted(options)) or 'no options'}")
+        low, high = self._ends()
+        if low is not None and high is not None and not low < high:
+            raise ValueError(f"{self.title!r}: min = {low:g} is not below max = {high:g}")
+        box = self.extent_m
+        if box is not None and not (box[0] < box[2] and box[1] < box[3]):
+            raise ValueError(f"{self.title!r}: extent_m: x0, y0, x1, y1 with x0 < x1 and y0 < y1 "
+                             "is right")
+
+    @property
+    def kind(self) -> str:
+        """What it shows: the key that is given."""
+        return next(key for key in _SHOWS if getattr(self, key) is not None)
+
+    @property
+    def kept_s(self) -> float:
+        """How much of the past it shows, s; 0 for the present alone."""
+        return self.seconds if self.plot else 600.0 if self.map else 0.0
+
+    def fields(self) -> Iterator[Shown]:
+        """Yield the fields that it shows."""
+        kinds, _ = _SHOWS[self.kind]
+        value = getattr(self, self.kind)
+        if kinds:
+            for field in (value,) if isinstance(value, str) else value:
+                yield Shown(self.kind, field, kinds)
+
+    def _ends(self) -> tuple[float | None, float | None]:
+        if self.gauge is None:
+            return self.min, self.max
+        return (0.0 if self.min is None else self.min, 1.0 if self.max is None else self.max)
+
+
+def problem_of(panels: Sequence[Panel]) -> str:
+    """Return what is wrong with the panels of a page together, "" if nothing."""
+    titles = [panel.title for panel in panels]
+    twice = next((title for title in titles if titles.count(title) > 1), None)
+    if twice is not None:
+        return f"panel {twice!r}: there are two of this title; each panel needs its own"
+    if len(panels) > MAX_PANELS:
+        return f"{len(panels)} panels; at most {MAX_PANELS} are right"
+    kept = sum(1 for panel in panels if panel.kept_s for _ in panel.fields())
+    if kept > MAX_KEPT:
+        return f"panels: {kept} fields in plots and maps; at most {MAX_KEPT} together are right"
+    return ""

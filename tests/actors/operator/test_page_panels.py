@@ -1,0 +1,208 @@
+"""Panels in a real Chromium: what they show, where they are, folded, moved, and hostile."""
+
+from __future__ import annotations
+
+import json
+from contextlib import asynccontextmanager
+
+import pytest
+
+from rampart.manager.spec.panels import Panel
+from tests.actors.operator.browser import browser
+from tests.actors.operator.extremes import MARKUP
+from tests.actors.operator.page import LIVE, events, page, speaking_world
+from tests.actors.operator.test_panels import PANELS, Speaks, hmi
+from tests.actors.operator.world import repeated, served
+from tests.tank import LEVEL, PUMP, VALVE, Level, Phase, Pump, Valve
+
+pytestmark = pytest.mark.page
+
+SHOWN = (*PANELS[:2], Panel(title="Pump", states="tank/pump:phase", of=("idle", "filling")),
+         *PANELS[3:], Panel(title="Where", map=("tank/level:height_m", "tank/level:heading_rad",
+                                                "tank/level:heading_rad")))
+BODY = "document.querySelector('[data-name=\"{}\"] .inside')"
+NAMES = ("[...document.querySelectorAll('main > .panel')].filter((p) => !p.hidden)"
+         ".map((p) => p.dataset.name)")
+HOLES = """(() => {
+  const main = document.getElementById('main').getBoundingClientRect();
+  const boxes = [...document.querySelectorAll('main > .panel')].filter((p) => !p.hidden)
+    .map((p) => p.getBoundingClientRect());
+  const found = [];
+  for (let i = 0; i < boxes.length; i += 1) for (let j = 0; j < i; j += 1) {
+    const [a, b] = [boxes[i], boxes[j]];
+    if (a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1
+        && b.top < a.bottom - 1) found.push(`${i} lies on ${j}`);
+  }
+  for (const p of document.querySelectorAll('main > .panel:not([hidden])')) {
+    const inside = p.querySelector('.inside');
+    if (inside.scrollHeight > p.clientHeight) found.push(`${p.dataset.name} overflows`);
+  }
+  const area = boxes.reduce((sum, b) => sum + (b.width + 12) * (b.height + 12), 0);
+  const room = (main.width - 36 + 12) * (main.height - 28 + 12);
+  if (area < 0.98 * room) found.push(`${(100 * area / room).toFixed(1)} % are filled`);
+  if (main.bottom < innerHeight - 2) found.push('the window is not filled');
+  return found.join();
+})()"""
+
+
+@pytest.fixture
+async def world():
+    async with speaking_world() as made:
+        yield made
+
+
+@asynccontextmanager
+async def tank(world, panels=SHOWN, **look):
+    """A page with panels of a tank, and one who says what they show."""
+    said = Speaks(world.context("speaks", 1))
+    async with world.running(said), world.running(hmi(world, panels)) as made, browser() as tab:
+        await tab.show(f"http://{await served(made)}/", **look)
+        await tab.until(LIVE)
+        yield tab, said
+        assert tab.errors == []
+
+
+def text(name: str) -> str:
+    return f"{BODY.format(name)}.textContent"
+
+
+async def test_each_kind_of_panel_shows_its_fields_and_whether_they_are_heard(world):
+    async with tank(world) as (tab, said):
+        assert "not heard" in await tab.value(text("Level"))
+        height = 0.25
+
+        def say() -> None:
+            said.publish(LEVEL, Level(height, (1.0, 3.5), 0.5))
+            said.publish(PUMP, Pump(Phase.FILLING))
+            said.publish(VALVE, Valve(True))
+
+        async with repeated(say):
+            await tab.until(f"{text('Level')}.startsWith('0.25')")
+            meter = f"{BODY.format('Level')}.querySelector('[role=meter]')"
+            await tab.until(f"{meter}.getAttribute('aria-valuenow') === '0.25'")
+            now = f"{BODY.format('Pump')}.querySelector('[aria-current]')?.textContent"
+            await tab.until(f"{now} === 'filling'")
+            await tab.until(f"{text('All')}.includes('3.5') && {text('All')}.includes('true')")
+            await tab.until(f"{text('Where')}.includes('x 0.25 m, y 0.50 m, heading 29°')")
+            height = 0.75
+            line = f"{BODY.format('Over time')}.querySelector('.plot .s0').getAttribute('d')"
+            await tab.until(f"({line}.match(/[ML]/g) || []).length > 2")
+            await tab.until(f"{text('Over time')}.includes('0.75')")
+        await tab.until(f"{text('Level')}.includes('(stale)')")
+        said.publish(PUMP, Pump(Phase.DRAINING))  # which is not among the states of the panel
+        await tab.until(f"{now} === 'draining'")
+
+
+async def test_a_page_that_opens_later_shows_the_past(world):
+    async with tank(world) as (tab, said):
+        async with repeated(lambda: said.publish(LEVEL, Level(0.5))):
+            line = f"{BODY.format('Over time')}.querySelector('.plot .s0').getAttribute('d')"
+            await tab.until(f"({line}.match(/[ML]/g) || []).length > 50")
+        await tab.call("Page.reload")
+        await tab.until(f"{LIVE} && ({line}?.match(/[ML]/g) || []).length > 10")
+
+
+@pytest.mark.parametrize(("width", "height"), [(1920, 1080), (1366, 768), (1100, 700)])
+async def test_panels_fill_the_window_and_none_lies_on_another(world, width, height):
+    async with tank(world, width=width, height=height) as (tab, said), repeated(world.others.busy):
+        said.publish(LEVEL, Level(0.5))
+        await tab.until(f"{events('active')} === ''")
+        await tab.until("document.querySelectorAll('#nodes tr').length > 0")
+        await tab.until(f"{HOLES} === ''", 5)
+        await tab.value("document.querySelector('.tool.fold').click()")
+        await tab.until(f"{HOLES} === ''", 5)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1920, 1080), (1366, 768)])
+async def test_so_do_those_of_a_robot_with_panels_of_its_own(world, width, height):
+    async with page(world, width=width, height=height) as tab, repeated(world.others.busy):
+        await tab.until(f"{events('active')} === 'FTM4'")
+        await tab.until("document.querySelectorAll('#nodes tr').length > 0")
+        await tab.until(f"{HOLES} === ''", 5)
+
+
+async def press(tab, name: str) -> None:
+    for kind in ("rawKeyDown", "keyUp"):
+        await tab.call("Input.dispatchKeyEvent", type=kind, key=name, code=name)
+
+
+async def test_by_keyboard_a_panel_is_moved_and_folded_and_the_page_remembers(world):
+    async with tank(world) as (tab, _):
+        before = await tab.value(NAMES)
+        assert before[:3] == ["Level", "Over time", "Pump"]
+        await tab.value("document.querySelector('[data-name=\"Pump\"] .tool.move').focus()")
+        await press(tab, "ArrowUp")
+        assert (await tab.value(NAMES))[:3] == ["Level", "Pump", "Over time"]
+        assert await tab.value("document.getElementById('arrange-said').textContent") == (
+            f"Pump: place 2 of {len(before)}")
+        await press(tab, "ArrowLeft")
+        focus = "document.activeElement.closest('.panel').dataset.name"
+        assert await tab.value(focus) == "Pump"
+        await tab.value("document.querySelector('[data-name=\"Level\"] .tool.fold').click()")
+        await tab.call("Page.reload")
+        await tab.until(f"{LIVE} && {NAMES}[0] === 'Pump'")
+        folded = BODY.format("Level") + ".checkVisibility()"
+        assert await tab.value(folded) is False
+        expanded = ("document.querySelector('[data-name=\"Level\"] .tool.fold')"
+                    ".getAttribute('aria-expanded')")
+        assert await tab.value(expanded) == "false"
+        await tab.value("document.getElementById('arrange-reset').click()")
+        assert await tab.value(NAMES) == before
+        assert await tab.value(folded) is True
+
+
+async def test_by_mouse_a_panel_is_dragged_to_where_another_one_is(world):
+    async with tank(world, width=1920, height=1080) as (tab, _):
+        await tab.until(f"{HOLES} === ''", 5)
+        at = ("JSON.stringify((() => {{ const b = document.querySelector('[data-name=\"{}\"] {}')"
+              ".getBoundingClientRect(); return [b.left + b.width / 2, b.top + 8]; }})())")
+        fro = json.loads(await tab.value(at.format("Level", ".tool.move")))
+        to = json.loads(await tab.value(at.format("Pump", "h2")))
+        for kind, (x, y) in (("mousePressed", fro), ("mouseMoved", to), ("mouseReleased", to)):
+            await tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left",
+                           buttons=1, clickCount=1)
+        await tab.until(f"{NAMES}[2] === 'Level'")
+
+
+@pytest.mark.parametrize("kept", [
+    "{", "null", "7", '{"order": 3, "folded": {}}', '{"order": [null, "Pump", "Pump", "x"]}',
+    '{"order": ["__proto__", "Pump"], "folded": ["<b>", "Pump"]}'])
+async def test_nonsense_in_the_browser_s_memory_does_no_harm(world, kept):
+    async with tank(world) as (tab, _):
+        before = await tab.value(NAMES)
+        key = await tab.value("document.querySelector('.tool.fold').click();"
+                              "Object.keys(localStorage)[0]")
+        await tab.value(f"localStorage.setItem({json.dumps(key)}, {json.dumps(kept)})")
+        await tab.call("Page.reload")
+        await tab.until(f"{LIVE} && {NAMES}.length === {len(before)}")
+        assert sorted(await tab.value(NAMES)) == sorted(before)
+
+
+async def test_markup_in_a_field_a_title_or_a_state_is_inert(world):
+    panels = (Panel(title=MARKUP[:60], text="manager/status:strategy", unit="<b>"),
+              Panel(title="List", table=("manager/status:strategy",)),
+              Panel(title="States", states="manager/status:strategy", of=(MARKUP[:60], "a")))
+    async with tank(world, panels) as (tab, _):
+        from rampart.actors.ftm import messages as fm
+        from rampart.actors.ftm import topics
+
+        async with repeated(lambda: world.others.publish(
+                topics.MANAGER_STATUS, fm.ManagerStatus((), (), (), (), MARKUP, 1))):
+            for name in ("List", "States"):
+                await tab.until(f"{text(name)}.includes('<img src=x')")
+        assert await tab.value(f"{NAMES}[0]") == MARKUP[:60]
+        assert await tab.value("document.images.length") == 0
+        assert await tab.value("document.querySelectorAll('body script').length") == 0
+        assert await tab.value("document.querySelectorAll('main b').length") == 0
+        assert await tab.value("window.broken === undefined") is True
+        assert [url for url in tab.requests if url.endswith("/x")] == []
+
+
+async def test_a_panel_that_fails_takes_nothing_else_along(world):
+    async with tank(world) as (tab, said):
+        await tab.value(f"Object.defineProperty({BODY.format('Level')}.querySelector('.figure'),"
+                        " 'textContent', { get() { throw Error('broken on purpose'); } })")
+        async with repeated(lambda: said.publish(LEVEL, Level(0.5, (4.5,)))):
+            await tab.until(f"{text('All')}.includes('4.5')")
+        assert tab.errors != []  # it is said
+        tab.errors.clear()

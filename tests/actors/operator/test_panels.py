@@ -1,0 +1,338 @@
+"""Panels that a specification or a page's class declares: checked at load, heard, and bounded."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from rampart.actors.layout.layout import Layout
+from rampart.actors.operator.hmi import Hmi
+from rampart.actors.operator.server import page_files
+from rampart.actors.operator.state import STALE_S, TRACE_POINTS, HmiState
+from rampart.actors.osmosis.page.hmi import OsmosisHmi
+from rampart.actors.run.run_plan import RunPlan
+from rampart.actors.runtime.actor import Actor
+from rampart.manager.spec.panels import MAX_KEPT, MAX_PANELS, Panel
+from rampart.manager.spec.specification import parse_specification
+from rampart.testing import eventually, free_port
+from tests import ROOT
+from tests.actors.operator.extremes import LONG, MARKUP, messages
+from tests.actors.operator.world import Others
+from tests.tank import GAUGE, LEVEL, PUMP, TOPICS, VALVE, Level, Phase, Pump
+
+SYSTEM = """
+name = "tank"
+title = "A tank"
+[timing]
+heartbeat_timeout_s = 0.5
+command_timeout_s = 1.0
+localization_timeout_s = 1.0
+scan_timeout_s = 1.0
+dead_man_timeout_s = 1.0
+manager_timeout_s = 1.0
+detection_silence_timeout_s = 1.0
+[[node]]
+name = "pump"
+actor = "tests.actors.operator.test_panels:Works"
+kind = "control"
+[[node]]
+name = "manager"
+actor = "rampart.manager.actor:FtmManager"
+kind = "manager"
+[[detection]]
+name = "D"
+title = "d"
+actor = "rampart.actors.detection.stub:StubDetection"
+within_s = 0.2
+[[recovery]]
+name = "R"
+title = "r"
+actor = "rampart.actors.recovery.stub:StubRecovery"
+kind = "forward"
+[[mechanism]]
+name = "M"
+detect = "D"
+recover = "R"
+event = "overflow"
+against = { within_s = 60.0, hazard = "it runs over" }
+[[event]]
+name = "overflow"
+[orders.safer]
+R = []
+"""
+PAGE = """
+[[node]]
+name = "page"
+actor = "rampart.actors.operator.hmi:Hmi"
+kind = "non-control"
+"""
+
+
+class Works(Actor):
+    """Publishes what there is to show."""
+
+    outputs = (LEVEL, PUMP, VALVE, GAUGE)
+
+
+class Speaks(Others):
+    """Says what the tests want."""
+
+    outputs = (*Others.outputs, LEVEL, PUMP, VALVE)
+
+
+class OwnHmi(Hmi):
+    """A page with a panel of its class."""
+
+    panels = (Panel(title="Own", gauge="tank/level:height_m", max=3.0),)
+
+
+def layout(panels: str = "", page: str = PAGE) -> Layout:
+    text = SYSTEM + page + panels
+    return Layout(RunPlan(system_file="tank.toml"), parse_specification(text, "tank.toml"))
+
+
+def shown(found: Layout) -> list[tuple[str, str]]:
+    return [(p.title, p.kind) for p in found.members["page"].parameters.panels]
+
+
+def panel(title: str, rest: str) -> str:
+    return f'[[panel]]\ntitle = "{title}"\n{rest}\n'
+
+
+# ---- at load ------------------------------------------------------------------------------------
+
+
+def test_the_page_hears_what_the_panels_of_class_and_specification_show():
+    found = layout(panel("Pump", 'states = "tank/pump:phase"\nof = ["idle", "filling"]'),
+                   PAGE.replace("rampart.actors.operator.hmi:Hmi", f"{__name__}:OwnHmi"))
+    assert shown(found) == [("Own", "gauge"), ("Pump", "states")]
+    assert found.topics == {"tank/level": LEVEL, "tank/pump": PUMP}
+    assert "pump" in found._partners["page"]
+
+
+def test_a_page_without_panels_plots_the_numbers_of_what_comes_regularly():
+    found = layout()
+    plots = found.members["page"].parameters.panels
+    assert [(p.title, p.plot) for p in plots] == [
+        ("tank/level m", ("tank/level:height_m",)),
+        ("tank/level rad", ("tank/level:heading_rad",)),
+        ("tank/pump s", ("tank/pump:busy_until_s",)), ("tank/valve", ("tank/valve:opening",))]
+
+
+def test_the_cell_s_page_has_nothing_to_plot_and_that_is_no_panel():
+    spec = parse_specification((ROOT / "systems" / "cell.toml").read_text("utf-8"), "cell.toml")
+    assert Layout(RunPlan(), spec).members["hmi"].parameters.panels == ()
+
+
+def test_what_the_page_hears_anyway_can_be_shown_as_well():
+    found = layout(panel("Rule", 'text = "manager/status:strategy"'))
+    assert shown(found) == [("Rule", "text")]
+
+
+def test_the_examples_of_the_document_are_sound(tmp_path):
+    document = (ROOT / "docs" / "hmi.md").read_text("utf-8")
+    toml, python = (re.findall(rf"```{kind}\n(.*?)```", document, re.DOTALL)[0]
+                    for kind in ("toml", "python"))
+    assert shown(layout(toml)) == [
+        ("Level", "gauge"), ("Level over time", "plot"), ("Pump", "states")]
+    assert [line for line in [str(caught(toml.replace("phase", "phse")))] if line in document]
+    (tmp_path / "page").mkdir()
+    (tmp_path / "page" / "pipes.js").write_text("export default class {}")
+    made: dict = {"__file__": str(tmp_path / "tank.py"), "__name__": "tank"}
+    exec(python, made)
+    assert [p.kind for p in made["TankPage"].panels] == ["gauge", "script"]
+    assert "/robot/pipes.js" in page_files(made["TankPage"].files)
+
+
+def caught(panels: str) -> ValueError:
+    with pytest.raises(ValueError, match=r".") as found:
+        layout(panels)
+    return found.value
+
+
+@pytest.mark.parametrize(("panels", "line"), [
+    (panel("Level", 'gauge = "tank/levle:height_m"'),
+     "tank.toml: page: panel 'Level': gauge: no actor has a topic 'tank/levle'; the nearest: "
+     "tank/level, tank/valve"),
+    (panel("Level", 'plot = ["tank/level:height_m", "tank/level:hieght_m"]'),
+     "tank.toml: page: panel 'Level': plot: topic tank/level: hieght_m: Level has no field "
+     "'hieght_m'; did you mean height_m?"),
+    (panel("Level", 'gauge = "tank/pump:phase"'),
+     "tank.toml: page: panel 'Level': gauge: topic tank/pump: phase is a text; a number is right"),
+    (panel("Pump", 'states = "tank/level:height_m"'),
+     "tank.toml: page: panel 'Pump': states: topic tank/level: height_m is a number; a text or a "
+     "truth is right"),
+    (panel("Level", 'gauge = "tank/level:height_m"') * 2,
+     "tank.toml: $.panel: panel 'Level': there are two of this title; each panel needs its own"),
+    (panel("Map", 'script = "map.js"'),
+     "tank.toml: $.panel[0].script = 'map.js': 'Map': only the class of a page has scripts; a "
+     "field of a topic is right, e.g. gauge"),
+    (panel("Level", 'gauge = "tank/level"'),
+     "tank.toml: $.panel[0].gauge = 'tank/level': expected 'topic:field', e.g. "
+     "'tank/level:height_m'"),
+    ("".join(panel(f"P{i}", f'plot = {["tank/level:height_m"] * 8}') for i in range(5)),
+     f"tank.toml: $.panel: panels: 40 fields in plots and maps; at most {MAX_KEPT} together are "
+     "right"),
+])
+def test_a_panel_that_names_something_wrong_is_refused_in_one_line(panels, line):
+    assert str(caught(panels)) == line
+
+
+@pytest.mark.parametrize(("rest", "words"), [
+    ("", "'Level' gives nothing to show; one of gauge, plot, table, states, text, map, script is "
+     "right"),
+    ('gauge = "a:b"\ntext = "a:b"', "'Level' gives gauge and text; one of "),
+    ('gauge = "a:b"\nseconds = 3', "'Level': seconds means nothing to a gauge; it takes max, min, "
+     "unit"),
+    ('gauge = "a:b"\nmin = 2', "'Level': min = 2 is not below max = 1"),
+    ('map = ["a:x", "a:y"]\nextent_m = [0, 0, 0, 1]', "'Level': extent_m: x0, y0, x1, y1 with"),
+])
+def test_a_panel_shows_one_thing_and_takes_what_that_needs(rest, words):
+    said = str(caught(panel("Level", rest)))
+    assert said.startswith("tank.toml: $.panel[0] = ")
+    assert words in said
+
+
+def test_panels_that_no_node_shows_are_refused():
+    with pytest.raises(ValueError, match=r"^tank.toml: panel 'Level': no node shows it; one of "
+                                         r"actor rampart.actors.operator.hmi:Hmi does\Z"):
+        layout(panel("Level", 'gauge = "tank/level:height_m"'), "")
+
+
+def test_more_panels_than_a_page_has_room_for_are_refused():
+    many = "".join(panel(f"P{i}", 'text = "tank/level:height_m"') for i in range(MAX_PANELS + 1))
+    with pytest.raises(ValueError, match=rf"tank.toml: \$.panel: {MAX_PANELS + 1} of them; at "
+                                         rf"most {MAX_PANELS} are right"):
+        layout(many)
+
+
+def test_a_script_that_is_not_there_is_noticed_when_the_class_is_made():
+    with pytest.raises(ValueError, match=r"panel 'Map': script = 'nothing.js': no such file in "
+                                         r"Wrong.files = '.*files'"):
+        type("Wrong", (Hmi,), {"files": OsmosisHmi.files,
+                               "panels": (Panel(title="Map", script="nothing.js"),)})
+
+
+# ---- what is heard ------------------------------------------------------------------------------
+
+
+PANELS = (Panel(title="Level", gauge="tank/level:height_m"),
+          Panel(title="Over time", plot=("tank/level:height_m", "tank/pump:running"), seconds=600),
+          Panel(title="Pump", states="tank/pump:phase"),
+          Panel(title="All", table=("tank/level:cells[max]", "tank/valve:shut")),
+          Panel(title="Rule", text="manager/status:strategy"))
+
+
+def hmi(world, panels=PANELS, kind: type[Hmi] = Hmi) -> Hmi:
+    from rampart.actors.ftm import topics
+
+    known = {t.key: t for t in (*TOPICS, *topics.ALL)}
+    return kind(dataclasses.replace(
+        world.context("hmi", 1, hmi_port=free_port()), topics=known,
+        parameters={"panels": panels}))
+
+
+def told(page: Hmi, now_s: float = 0.0) -> dict:
+    page._state.grow_old(now_s)
+    return json.loads(msgspec.json.encode(page._state.picture.changes(0)))
+
+
+async def test_the_latest_value_of_each_field_is_shown_and_what_was_plotted_lately(world):
+    world.others = Speaks(world.context("speaks", 1))
+    async with world.running(world.others), world.running(hmi(world)) as page:
+        for height in (0.1, 0.2, 0.3):
+            world.others.publish(LEVEL, Level(height, (1.0, height)))
+            await eventually(
+                lambda h=height: (v := page._state.picture.value("tank/level:height_m"))
+                is not None and v.value == h)
+        world.others.publish(PUMP, Pump(Phase.FILLING))
+        world.say_latched("RM1")
+        await eventually(lambda: page._state.picture.value("tank/pump:phase") is not None
+                         and page._state.picture.value("manager/status:strategy") is not None)
+        assert page._state.latched == ("RM1",)  # the page's own handler hears it too
+        now = told(page)
+        assert now["tank/level:height_m"]["value"] == 0.3
+        assert now["tank/level:cells[max]"] == {"value": 1.0, "stale": False}
+        assert now["tank/pump:phase"]["value"] == "filling"
+        assert now["tank/valve:shut"] is None
+        assert now["manager/status:strategy"]["value"] == "safety-first"
+        past = page._hello()["past"]
+        assert past["tank/level:height_m"][0][1] == 0.1
+        assert past.keys() == {"tank/level:height_m", "tank/pump:running"}
+
+
+async def test_no_message_ends_the_page_and_what_it_keeps_is_bounded(world):
+    world.others = Speaks(world.context("speaks", 1))
+    async with world.running(world.others), world.running(hmi(world)) as page:
+        for topic in (LEVEL, PUMP, VALVE):
+            for message in messages(topic.type):
+                world.others.publish(topic, message)
+        for _ in range(50):
+            world.others.publish(LEVEL, Level(math.nan, (math.inf,) * 2_000))
+        await eventually(lambda: page._state.picture.value("tank/valve:shut") is not None)
+        assert not page._dispatcher._ended.done()
+        assert len(msgspec.json.encode(page._hello())) < 100_000
+        assert len(page._server._feed.frame(0)) < 100_000
+
+
+async def test_a_field_that_is_not_known_is_said_and_the_rest_is_shown(world):
+    strange = (Panel(title="Strange", text="no/topic:x"), *PANELS)
+    async with world.running(hmi(world, strange)) as page:
+        await eventually(lambda: any(d.context == "panel" for d in world.others.diagnostics))
+        assert "hmi: no topic 'no/topic'" in {d.reason for d in world.others.diagnostics}
+        assert page._hello()["panels"][0]["title"] == "Strange"
+
+
+def test_the_past_is_thinned_ends_and_begins_anew_when_time_goes_back():
+    state = HmiState()
+    state.show_field("a:b", 60.0, STALE_S)
+    for i in range(10_000):
+        state.field("a:b", float(i), i / 100, i / 100)
+    points = state.past()["a:b"]
+    assert len(points) == TRACE_POINTS
+    assert points[-1][0] - points[0][0] == pytest.approx(60.0, rel=0.1)
+    state.field("a:b", 7.0, 1.0, 1.0)
+    assert state.past()["a:b"] == [(1.0, 7.0)]
+    for t, value in ((2.0, math.nan), (3.0, 1e300), (4.0, "x"), (math.nan, 1.0)):
+        state.field("a:b", value, t, t)
+    assert state.past()["a:b"] == [(1.0, 7.0), (2.0, None), (3.0, None), (4.0, None)]
+
+
+def test_a_field_is_stale_by_the_rate_of_its_topic():
+    state = HmiState()
+    state.show_field("slow:x", 0.0, 30.0)
+    state.show_field("event:x", 0.0, math.inf)
+    for name in ("slow:x", "event:x"):
+        state.field(name, MARKUP + LONG, 0.0, 0.0)
+    state.grow_old(29.0)
+    assert not state.picture.value("slow:x").stale
+    state.grow_old(1e6)
+    assert state.picture.value("slow:x").stale
+    assert not state.picture.value("event:x").stale
+
+
+# ---- what is served -----------------------------------------------------------------------------
+
+
+def test_a_robot_s_files_are_served_beside_the_page_s_and_named_in_its_head():
+    plain, own = page_files(None), page_files(OsmosisHmi.files)
+    assert not [path for path in plain if path.startswith("/robot/")]
+    assert own.keys() - plain.keys() == {
+        f"/robot/{file.name}" for file in Path(OsmosisHmi.files).iterdir()}
+    head = own["/"].content.decode()
+    assert '<link rel="stylesheet" href="robot/osmosis.css">' in head
+    assert '<link rel="modulepreload" href="robot/map.js">' in head
+    assert '<link rel="modulepreload" href="app.js">' in head
+
+
+def test_the_engine_s_page_knows_no_robot():
+    words = ("airport", "lights", "mission", "runway", "osmosis")
+    for path, file in page_files(None).items():
+        text = file.content.decode().lower()
+        assert [word for word in words if word in text] == [], path
