@@ -90,18 +90,26 @@ class Log:
         return True
 
     def _open(self) -> None:
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
-            os.replace(self._path, f"{self._path}.1")  # noqa: PTH105 nothing is imported for it
+        """Open the file, or the next one; whoever looks finds one of that name at any time."""
+        kept, self._file = self._file, -1
+        if kept >= 0:
+            os.close(kept)
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
-        self._file = os.open(self._path, flags, 0o600)
-        self._size = os.fstat(self._file).st_size
-        if self._size > self._most // 2:  # of an earlier process: there is room for a full half
-            os.close(self._file)
-            os.replace(self._path, f"{self._path}.1")  # noqa: PTH105
-            self._file = os.open(self._path, flags, 0o600)
-            self._size = 0
+        if kept < 0:
+            file = os.open(self._path, flags, 0o600)
+            self._size = os.fstat(file).st_size
+            if self._size <= self._most // 2:  # else there is no full half for this process
+                self._file = file
+                return
+            os.close(file)
+        fresh, before = f"{self._path}~", f"{self._path}.1"
+        self._file = os.open(fresh, flags | os.O_TRUNC, 0o600)
+        self._size = 0
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(before)  # noqa: PTH108 nothing is imported for it
+        with contextlib.suppress(FileNotFoundError):
+            os.link(self._path, before)
+        os.replace(fresh, self._path)  # noqa: PTH105
 
 
 def descendants(of: int) -> list[int]:

@@ -133,8 +133,8 @@ def tail(file: Path, lines: int, follows: Callable[[], bool]) -> Iterator[str]:
     open_log = file.open("rb")
     try:
         ended = deque(open_log, maxlen=lines)
-        if len(ended) < lines and before.is_file():
-            with before.open("rb") as earlier:
+        if len(ended) < lines:
+            with contextlib.suppress(FileNotFoundError), before.open("rb") as earlier:
                 ended.extendleft(reversed(deque(earlier, maxlen=lines - len(ended))))
         yield from map(_shown, ended)
         while follows():

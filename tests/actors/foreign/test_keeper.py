@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from functools import partial
 
 import pytest
 
@@ -30,6 +31,27 @@ def test_output_goes_on_in_a_second_file_and_never_beyond(tmp_path, clock):
     assert {entry.name for entry in tmp_path.iterdir()} == {"a.log", "a.log.1"}
     assert (before.read_bytes() + file.read_bytes()).endswith(b"000000099\n")
     assert b"000000085\n" in before.read_bytes() + file.read_bytes()
+
+
+def test_there_is_a_file_of_its_name_at_any_moment(tmp_path, clock, monkeypatch):
+    file = tmp_path / "a.log"
+    log = Log(str(file), most=100)
+    seen = []
+
+    def watched(real, *given):
+        seen.append(file.exists())
+        done = real(*given)
+        seen.append(file.exists())
+        return done
+
+    for name in ("unlink", "link", "replace", "open"):
+        monkeypatch.setattr(keeper.os, name, partial(watched, getattr(os, name)))
+    log.write(b"x" * 60)
+    seen.clear()
+    for _ in range(5):
+        log.write(b"x" * 60)
+    assert seen
+    assert all(seen)
 
 
 def test_a_flood_is_counted_where_it_is_too_much_and_the_count_is_told(tmp_path, clock):
