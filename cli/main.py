@@ -3,6 +3,7 @@
 Look at a running system, disturb it, and ask the arbiter.
 
 Examples:
+  rampart new courier                            a folder with a robot of your own
   rampart run --virtual --seed 7                 start a system; `rampart run --help`
   rampart status                                 the run at a glance
   rampart top                                    the run in the terminal, live
@@ -27,6 +28,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 
+from rampart.cli import new
 from rampart.cli.analyse import cut_set_verbs, decide_verbs, tree_verbs, verify_verb
 from rampart.cli.look import serving_verbs, topic_verbs
 from rampart.cli.operate import adapt_verb, inject_verbs, node_verbs, operator_verbs
@@ -49,6 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
     """
     parser = argparse.ArgumentParser(prog="rampart", **help_of(__doc__))
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    new.add(verbs)
     verbs.add_parser("run", add_help=False, help="start a system: the same as launch.py")
     for module in _OF_A_RUN:
         module.add(verbs)

@@ -94,6 +94,8 @@ class DetectionModule(Actor):
     """
 
     outputs: ClassVar[tuple[Topic[Any], ...]] = (topics.DETECTION,)
+    state: DetectionState
+    first_life: bool
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

@@ -86,7 +86,8 @@ def _actors(spec: SystemSpec) -> Iterator[str]:
     """Yield the paths of all actor classes of a system."""
     for part in (spec.nodes, spec.detections, spec.recoveries):
         for one in part:
-            yield one.actor
+            if one.actor:
+                yield one.actor
     for node in spec.nodes:
         if node.stand_in:
             yield node.stand_in

@@ -19,6 +19,7 @@ import msgspec
 
 import rampart
 from rampart.actors.bus.topic import Members, Topic
+from rampart.actors.foreign.command_node import CommandNode
 from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import read_parameters
@@ -118,7 +119,10 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
     try:
         if node.command and node.stand_in:  # what is wrong with it is told in real runs, too
             load_class(node.stand_in, field="stand_in")
-        actor = load_class(node.actor, REPORTS_ON.get(node.kind))
+        actor = CommandNode if node.command else load_class(
+            node.actor, REPORTS_ON.get(node.kind))
+        if actor is CommandNode and not node.command:
+            raise ValueError(f"actor = {node.actor!r}: say command = ['./program', ...] instead")
         takes = {field.name for field in msgspec.structs.fields(actor.Parameters)}
     except ValueError as error:
         raise ValueError(f"{file}: {path}.{error}") from None

@@ -27,6 +27,7 @@ from rampart.actors.bus.messages import Diagnostic, Heartbeat, Hello, Injection
 from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import DIAGNOSTIC, HEARTBEAT, HELLO, INJECT
 from rampart.actors.runtime.checkpoint import Keeper, S, StateFormat
+from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.context import Context
 from rampart.actors.runtime.declaration import BASE_INPUTS, BASE_OUTPUTS, Declared, every, on
 from rampart.actors.runtime.injection import InjectedFaults
@@ -60,6 +61,10 @@ def _all_of(handlers: Sequence[Callable[[Any, Header], None]]) -> Callable[[Any,
 
 class Actor(Declared):
     """Base of every node, detection module, recovery module and manager."""
+
+    context: Context
+    name: str
+    clock: Clock
 
     def __init__(self, context: Context) -> None:
         self.context = context

@@ -43,6 +43,17 @@ def every(period_s: float) -> Callable[[F], F]:
     return mark
 
 
+def _is_marked(member: object) -> bool:
+    return hasattr(member, "_rampart_topics") or hasattr(member, "_rampart_period_s")
+
+
+def _has_unmarked(base: type, name: str) -> bool:
+    """Whether a class has something of a name, or promises it, that is no handler."""
+    found = vars(base)
+    return (name in found and not _is_marked(found[name])) or name in found.get(
+        "__annotations__", {})
+
+
 class Handlers:
     """Base of what hears topics by methods that are marked with `on`, or acts by `every`."""
 
@@ -51,6 +62,11 @@ class Handlers:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        for name, member in vars(cls).items():
+            if _is_marked(member) and (base := next(
+                    (b for b in cls.__mro__[1:] if _has_unmarked(b, name)), None)):
+                raise TypeError(f"{cls.__name__}.{name}: {base.__name__} has something of this "
+                                "name already; call the handler something else")
         handlers: dict[tuple[str, str], tuple[Topic[Any], str]] = {}
         periodic: dict[str, float] = {}
         for base in reversed(cls.__mro__):

@@ -59,7 +59,8 @@ def run(options: argparse.Namespace) -> int:
 def _show(spec: SystemSpec, report: Report, seconds: float) -> None:
     strategies = list(report.permissiveness)
     say(f"{spec.title} ({report.system}): {report.active_sets} active sets, "
-        f"{report.states} states of the arbiter, in {seconds:.1f} s\n")
+        f"{report.states} states of the arbiter, in {seconds:.1f} s")
+    say()
     found = {(p.name, p.strategy): p for p in report.properties}
     rows = []
     for name, meaning in MEANING.items():

@@ -34,10 +34,6 @@ NODE_KINDS = (Kind.CONTROL, Kind.NON_CONTROL, Kind.PILOT, Kind.MANAGER, Kind.WOR
 """What a `[[node]]` can be; the others are the supervisor, and what has a table of its own."""
 
 
-COMMAND_NODE = "rampart.actors.foreign.command_node:CommandNode"
-"""The actor that is a node for the rest of the system, and runs its command."""
-
-
 class ChildHeartbeat(Table, frozen=True):
     """By what a command shows that it turns: one of the three, and how long it may be silent.
 
@@ -82,7 +78,7 @@ class NodeSpec(Table, frozen=True):
     Attributes:
         name: Unique among nodes, detection and recovery modules.
         kind: What it is.
-        actor: Its class, `module:Class`; of one that has a command, `COMMAND_NODE`.
+        actor: Its class, `module:Class`; "" of one that has a command.
         process: Name of the OS process it runs in; "" for one of its own name.
         respawn: Who brings it back: a recovery module, or "supervisor".
         parameters: For the actor, or for that which stands in for the command. A value of a key
@@ -150,8 +146,6 @@ def _wrong(node: NodeSpec) -> Iterator[tuple[Any, ...]]:
         yield from _wrong_heartbeat(node)
         yield from _wrong_keys(node)
         return
-    if node.actor == COMMAND_NODE:
-        yield "actor", "say command = ['./program', ...] instead", node.actor
     for field in COMMAND_FIELDS:
         if (value := getattr(node, field)) != _NO_COMMAND[field]:
             yield field, "of use with a command only, and the node has none", _plain(value)

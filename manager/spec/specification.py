@@ -28,7 +28,7 @@ from rampart.files.reading import FileError
 from rampart.manager.model.mechanisms import RecoveryKind
 from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
 from rampart.manager.spec.mobile_robot import Hazard, derive_timeouts
-from rampart.manager.spec.nodes import COMMAND_FIELDS, COMMAND_NODE, NODE_KINDS
+from rampart.manager.spec.nodes import COMMAND_FIELDS, NODE_KINDS
 from rampart.manager.spec.panels import MAX_PANELS
 from rampart.manager.spec.schema import TABLES, SystemSpec
 from rampart.manager.spec.tables import Finding, SpecificationError, numbered
@@ -126,8 +126,7 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
         spec = enabled
     if wrong is not None:
         raise _refusal(file, wrong)
-    return replace(spec, nodes=tuple(replace(node, actor=COMMAND_NODE) if node.command else node
-                                     for node in spec.nodes))
+    return spec
 
 
 def _refusal(file: str, finding: Finding) -> SpecificationError:

@@ -31,7 +31,7 @@ TUG = block("toml", "name = \"tug\"")
 def write_tug(folder, *, compiled: bool = True) -> None:
     """Write the system of the page into a folder."""
     (folder / "tug.toml").write_text(TUG)
-    (folder / "tug.py").write_text(block("python", "from rampart"))
+    (folder / "cart.py").write_text(block("python", "from rampart"))
     if compiled:
         (folder / "wheels.c").write_text(block("c"))
         subprocess.run(["gcc", "-Wall", "-Wextra", "-Werror", "-o", "wheels", "wheels.c"],

@@ -110,7 +110,7 @@ class Pilot(Actor):
             most_tilt_rad: asked of the attitude loop.
         """
 
-        descent_mps: Annotated[float, msgspec.Meta(gt=0, le=1.2)] = 1.0
+        descent_mps: Annotated[float, msgspec.Meta(gt=0, le=1.2)] = 0.9
         level_descent_mps: Annotated[float, msgspec.Meta(gt=0, le=1.2)] = 0.8
         return_mps: Positive = 2.5
         most_tilt_rad: Annotated[float, msgspec.Meta(gt=0, lt=0.8)] = 0.4
@@ -259,6 +259,9 @@ class Pilot(Actor):
 
     def _by_estimate(self, mode: str, at: t.Estimate) -> Vector:
         said = self.parameters
+        # Half from its own sensors: an estimate that is wrong then brings it down half as wrongly.
+        at = msgspec.structs.replace(
+            at, velocity_z_mps=(at.velocity_z_mps + self._vertical.speed_mps) / 2)
         if self._held is None or self._held[0] != mode:
             self._held = mode, (at.x_m, at.y_m, at.z_m)
         x_m, y_m, z_m = self._held[1]

@@ -17,6 +17,16 @@ UNSAFE_WITHOUT = ("battery-drain:20@4", "gps-dropout@10", "kill:pilot@10", "stop
                   "drop:rotors@10", "stuck:rotors@10", "stuck:setpoint@10", "stuck:estimate@10")
 
 
+IN_CI = {"weak-rotor@10", "gps-bias@10", "imu-bias@8", "kill:pilot@10", "wedge:pilot@6.2",
+         "kill:estimator@10", "stuck:setpoint@10", "corrupt:estimate@10", "drop:rotors@10"}
+"""Flown with every change; the others with `make test-slow`."""
+
+
+def chosen(faults):
+    return [fault if fault in IN_CI else pytest.param(fault, marks=pytest.mark.slow)
+            for fault in faults]
+
+
 def sound(flight):
     assert flight.failures == ()
     assert all(fault.effective for fault in flight.record.faults)
@@ -31,6 +41,7 @@ def test_a_round_without_faults_succeeds_and_nobody_intervenes():
     assert flight.judgement.margins["ceiling_m"] > 15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_on_other_days_it_succeeds_too(seed):
     assert sound(fly(seed=seed)).success
@@ -44,19 +55,20 @@ def test_the_same_seed_is_the_same_flight_to_the_byte():
     assert fly("kill:pilot@10", seconds=15.0, seed=4).trace != first
 
 
-@pytest.mark.parametrize("fault", [*VEHICLE, *SENSORS, *TOPICS])
+@pytest.mark.parametrize("fault", chosen([*VEHICLE, *SENSORS, *TOPICS]))
 def test_a_fault_does_no_harm(fault):
     assert sound(fly(fault)).safe
 
 
-@pytest.mark.parametrize("fault", PROCESSES)
+@pytest.mark.parametrize("fault", chosen(PROCESSES))
 def test_a_process_that_fails_costs_not_even_the_mission(fault):
     assert sound(fly(fault)).success
 
 
 @pytest.mark.parametrize(("fault", "mechanism", "recovery"), [
-    ("weak-rotor@10", "M_TRIM", "R_LAND"), ("battery-drain@8", "M_CHARGE", "R_RETURN"),
-    ("gps-bias@10", "M_POSITION", "R_LAND"), ("gps-dropout@10", "M_GPS_SILENT", "R_HOVER"),
+    ("weak-rotor@10", "M_TRIM", "R_LAND"), ("gps-bias@10", "M_POSITION", "R_LAND"),
+    pytest.param("battery-drain@8", "M_CHARGE", "R_RETURN", marks=pytest.mark.slow),
+    pytest.param("gps-dropout@10", "M_GPS_SILENT", "R_HOVER", marks=pytest.mark.slow),
     ("imu-bias@8", "M_IMU", "R_RETURN"), ("kill:pilot@10", "M_PILOT", "R_PILOT"),
     ("kill:estimator@10", "M_ESTIMATE", "R_RESTART"),
     ("stuck:setpoint@10", "M_SETPOINT", "R_RESTART")])
@@ -66,16 +78,18 @@ def test_the_mechanism_against_a_fault_is_the_one_that_acts(fault, mechanism, re
     assert first.recoveries == (recovery,)
 
 
+@pytest.mark.slow
 def test_a_short_loss_of_the_gps_costs_a_pause_and_no_more():
     assert sound(fly("gps-dropout@10+2")).success
 
 
+@pytest.mark.slow
 def test_two_faults_at_once_do_no_harm():
     assert sound(fly("drop:estimate@8", "kill:pilot@9")).safe
     assert sound(fly("gps-dropout@8", "imu-bias@9")).safe
 
 
-@pytest.mark.parametrize("fault", UNSAFE_WITHOUT)
+@pytest.mark.parametrize("fault", chosen(UNSAFE_WITHOUT))
 def test_without_mechanisms_a_fault_does_harm_that_it_does_not_do_with_them(fault):
     assert sound(fly(fault)).safe
     assert fly(fault, ftm=False).judgement.safe is False

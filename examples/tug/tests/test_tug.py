@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import math
 from functools import cache
@@ -169,3 +170,23 @@ def test_on_processes_the_controller_is_back(tmp_path):
         real.sleep_until(3)
         old = real.kill("controller")
         real.wait_until(lambda: real.pid("controller") not in (None, old), 10, "it is not back")
+
+
+def python_lines(text):
+    """Return how many lines have code: no blanks, comments or docstrings."""
+    documents = {line for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Expr)
+                 and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+                 for line in range(node.lineno, node.end_lineno + 1)}
+    return sum(1 for number, line in enumerate(text.splitlines(), 1)
+               if line.strip() and not line.strip().startswith("#") and number not in documents)
+
+
+def test_it_is_as_small_as_the_page_says():
+    page = (HERE / "README.md").read_text(encoding="utf-8")
+    python = sum(python_lines(file.read_text(encoding="utf-8"))
+                 for file in (HERE / "tug").glob("*.py"))
+    said = [line for line in SYSTEM.read_text(encoding="utf-8").splitlines()
+            if line.strip() and not line.startswith("#")]
+    assert python < 300
+    assert f"{python} lines of Python" in page
+    assert f"{len(said)} lines of specification" in page

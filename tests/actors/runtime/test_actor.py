@@ -19,6 +19,7 @@ from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.bus import Bus, BusError
 from rampart.actors.bus.envelope import ArrivalGuard, encode
 from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.detection.module import DetectionModule
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.layout.layout import SUPERVISOR_CLASS, Layout
@@ -26,6 +27,7 @@ from rampart.actors.layout.wiring import load_class
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import Osmosis
+from rampart.actors.recovery.module import RecoveryModule
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_system
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
@@ -358,3 +360,26 @@ def test_a_process_is_given_the_heartbeat_period_of_the_spec():
     node = make_actor(layout, "DM2", 1, RunContext(plan, layout.spec), loop)
     loop.close()
     assert node.context.heartbeat_period_s == 0.123
+
+
+@pytest.mark.parametrize(("base", "name"), [
+    (Actor, "clock"), (Actor, "publish"), (DetectionModule, "state"), (DetectionModule, "activate"),
+    (RecoveryModule, "state"), (RecoveryModule, "act")])
+def test_a_handler_with_a_name_that_the_base_class_has_is_refused(base, name):
+    """Before, the base class's value took its place, or it that of the base class, in silence."""
+    with pytest.raises(TypeError, match=rf"^Own\.{name}: \w+ has something of this name already"):
+        type("Own", (base,), {name: every(1.0)(lambda self: None)})
+
+
+def test_a_handler_may_be_replaced_by_one_of_a_derived_class():
+    class First(Actor):
+        @every(1.0)
+        def work(self) -> None:
+            """Work."""
+
+    class Second(First):
+        @every(2.0)
+        def work(self) -> None:
+            """Work less."""
+
+    assert Second._periodic[-1] == (2.0, "work")

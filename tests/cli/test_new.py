@@ -1,0 +1,165 @@
+"""`rampart new`: what it makes works at once, and it changes nothing that is there."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+from rampart.cli import new
+from rampart.cli.main import main
+from tests import ROOT
+
+
+@pytest.fixture(autouse=True)
+def _a_path_of_its_own(monkeypatch):
+    """`rampart` admits the working folder, and a robot that another test has made lies there."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes()
+            for file in sorted(folder.rglob("*")) if file.is_file()}
+
+
+def made(folder: Path, monkeypatch, name: str = "courier") -> Path:
+    monkeypatch.chdir(folder)
+    assert main(["new", name]) == 0
+    return folder / name
+
+
+def test_what_it_makes_is_tested_typed_and_clean(tmp_path, monkeypatch, capsys):
+    robot = made(tmp_path, monkeypatch)
+    assert capsys.readouterr().out.startswith("courier/ is a robot that runs: cd courier, then ")
+    assert {Path(name).name for name in contents(robot)} == {
+        "courier.toml", "topics.py", "nodes.py", "world.py", "judge.py", "__init__.py",
+        "test_courier.py", "Makefile", "README.md", "pyproject.toml", ".gitignore"}
+    assert not [name for name, text in contents(robot).items() if b"@NAME@" in text]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-W", "ignore", "-p", "no:cacheprovider", "-m",
+         "not processes"], cwd=robot, env=environment, text=True, capture_output=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.splitlines()[-1].startswith("14 passed, 1 deselected")
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--config-file", str(ROOT / "pyproject.toml"),
+         "-p", "courier", "--cache-dir", str(tmp_path / "cache")], cwd=robot, text=True,
+        env={**environment, "MYPYPATH": str(robot)}, capture_output=True, check=False)
+    assert done.returncode == 0, done.stdout
+    done = subprocess.run(
+        [sys.executable, "-m", "ruff", "check", "--config", str(ROOT / "pyproject.toml"),
+         "--no-cache", "courier"], cwd=robot, text=True, capture_output=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.processes
+def test_what_it_makes_runs_on_processes(tmp_path, monkeypatch):
+    robot = made(tmp_path, monkeypatch)
+    command = f"{Path(sys.executable).with_name('rampart')} run --json --duration 4"
+    rule = (robot / "Makefile").read_text().replace("$(RAMPART) run", command)
+    (robot / "Makefile").write_text(rule)
+    done = subprocess.run(["make", "run"], cwd=robot, text=True, capture_output=True, check=False,
+                          env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert json.loads(done.stdout.splitlines()[-1])["safety"] == "safe", done.stderr
+
+
+@pytest.mark.parametrize("name", ["Courier", "9lives", "a-b", "a b", "", "../x", "/tmp/x", "class",
+                                  "x" * 32, "naïve"])
+def test_a_name_that_no_package_can_have_is_refused_in_one_line(tmp_path, monkeypatch, capsys,
+                                                                 name):
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", name]) == 2
+    assert capsys.readouterr().err == (
+        f"rampart: NAME {name!r}: must be small letters, digits and _, a letter first, at most 31 "
+        "of them, and no word of Python's: it is the name of a package\n")
+    assert contents(tmp_path) == {}
+
+
+@pytest.mark.parametrize("name", ["json", "rampart", "numpy", "tests", "controller"])
+def test_a_name_that_is_taken_is_refused(tmp_path, monkeypatch, capsys, name):
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", name]) == 2
+    assert capsys.readouterr().err == (
+        f"rampart: NAME {name!r}: another module or node has this name already\n")
+    assert contents(tmp_path) == {}
+
+
+@pytest.mark.parametrize("there", ["folder", "empty folder", "file", "dangling link"])
+def test_what_is_there_is_never_overwritten(tmp_path, monkeypatch, capsys, there):
+    place = tmp_path / "courier"
+    if there == "file":
+        place.write_text("mine")
+    elif there == "dangling link":
+        place.symlink_to(tmp_path / "gone")
+    else:
+        place.mkdir()
+    if there == "folder":
+        (place / "nodes.py").write_text("mine")
+    before = contents(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "courier"]) == 2
+    assert capsys.readouterr().err == (
+        "rampart: courier: is there already; nothing was changed\n")
+    assert contents(tmp_path) == before
+    assert not (tmp_path / "gone").exists()
+
+
+def test_a_disk_that_fills_up_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
+    def full(folder, _name):
+        (folder / "courier.toml").write_text("half of it")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(new, "fill", full)
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "courier"]) == 2
+    assert capsys.readouterr().err == "rampart: courier: No space left on device\n"
+    assert not (tmp_path / "courier").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_from_a_wheel_in_an_empty_environment_outside_of_the_checkout(tmp_path):
+    """Rampart itself comes from the wheel; what it depends on, from the environment of this test.
+
+    That one's folder of packages is on the path by a .pth file, in which no other .pth counts: so
+    the checkout, which is installed there as such, is not.
+    """
+    source = tmp_path / "source"
+    shutil.copytree(ROOT, source, symlinks=True, ignore=shutil.ignore_patterns(
+        ".venv", ".git", "*.egg-info", "reports", "__pycache__", ".*_cache"))
+    subprocess.run([sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir",
+                    str(tmp_path), str(source)], check=True)
+    shutil.rmtree(source)
+    (wheel,) = tmp_path.glob("rampart-*.whl")
+    home = tmp_path / "empty"
+    venv.create(home, with_pip=False)
+    python = home / "bin" / "python"
+    subprocess.run([sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet",
+                    "--no-deps", "--no-index", str(wheel)], check=True)
+    (packages,) = home.glob("lib/python*/site-packages")
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    environment = {name: value for name, value in os.environ.items()
+                   if not name.startswith(("PYTHON", "PYTEST", "VIRTUAL_ENV"))}
+    environment["PATH"] = f"{home / 'bin'}{os.pathsep}{environment['PATH']}"
+
+    def call(*command: str, where: Path = tmp_path) -> str:
+        done = subprocess.run(command, cwd=where, env=environment, text=True, capture_output=True,
+                              check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    assert call(str(python), "-c", "import rampart; print(rampart.__file__)").startswith(
+        str(packages))
+    call("rampart", "new", "courier")
+    robot = tmp_path / "courier"
+    assert "14 passed" in call("make", "test", "PYTHON=python -W ignore", where=robot) \
+        or "15 passed" in call("make", "test", where=robot)
+    assert "success" in call("rampart", "run", "--system", "courier.toml", "--virtual", "--json",
+                             where=robot)
