@@ -14,6 +14,7 @@ Examples:
   rampart adapt set strategy guarded-repair      change mechanisms while it runs
   rampart live foxglove                          see it in another viewer
   rampart record run.mcap                        keep all that is said; `rampart replay` it
+  rampart check my_system.toml                   is it sound, before it runs? `explain` it
   rampart table                                  what the manager would decide
   rampart tree                                   see fault tree, FTMTree and orders
   rampart campaign --paper                       break it a hundred times, and count
@@ -29,7 +30,14 @@ from collections.abc import Sequence
 from importlib.metadata import entry_points
 
 from rampart.cli import new
-from rampart.cli.analyse import cut_set_verbs, decide_verbs, tree_verbs, verify_verb
+from rampart.cli.analyse import (
+    check_verb,
+    cut_set_verbs,
+    decide_verbs,
+    explain_verb,
+    tree_verbs,
+    verify_verb,
+)
 from rampart.cli.look import serving_verbs, topic_verbs
 from rampart.cli.operate import adapt_verb, inject_verbs, node_verbs, operator_verbs
 from rampart.cli.output import NoEffectError, UsageError, warn
@@ -39,7 +47,7 @@ from rampart.files import streams, working_folder
 
 _OF_A_RUN = (node_verbs, topic_verbs, inject_verbs, operator_verbs, serving_verbs, adapt_verb,
              record_verbs)
-_OF_A_SYSTEM = (cut_set_verbs, decide_verbs, tree_verbs, verify_verb)
+_OF_A_SYSTEM = (check_verb, explain_verb, cut_set_verbs, decide_verbs, tree_verbs, verify_verb)
 # Each adds its verbs, in this order in the help.
 
 
@@ -88,6 +96,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
+def _as_if_last(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> list[str]:
+    """Return arguments with `--port` and `--json` of a family behind the verb that takes them."""
+    verbs = next(action.choices for action in parser._actions
+                 if isinstance(action, argparse._SubParsersAction))
+    family = verbs.get(arguments[0]) if arguments else None
+    if family is None or not any(
+            isinstance(action, argparse._SubParsersAction) for action in family._actions):
+        return list(arguments)
+    first, rest = arguments[0], list(arguments[1:])
+    early: list[str] = []
+    while rest and (rest[0] == "--json" or rest[0].partition("=")[0] == "--port"):
+        taken = 2 if rest[0] == "--port" else 1
+        early, rest = early + rest[:taken], rest[taken:]
+    return [first, *rest[:1], *early, *rest[1:]]
+
+
 def _run(arguments: Sequence[str]) -> int:
     working_folder.admit()  # for actors of one's own, as in the processes of a run
     try:
@@ -96,7 +120,8 @@ def _run(arguments: Sequence[str]) -> int:
 
             options = campaign_verb.parse(arguments[1:])
         else:
-            options = build_parser().parse_args(arguments)
+            parser = build_parser()
+            options = parser.parse_args(_as_if_last(parser, arguments))
         return int(options.run(options))
     except (UsageError, NoEffectError) as error:
         warn(str(error))

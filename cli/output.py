@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
@@ -23,9 +24,22 @@ class NoEffectError(Exception):
     """It was asked for, and nothing came of it; one line. Exit code 1."""
 
 
+FORMAT = 1
+"""Of every JSON object that a verb prints, see docs/json.md; it grows when a field changes."""
+
+_LISTED = 12
+_NEAREST = 3
+
+
 def unknown(what: str, value: str, known: Iterable[str]) -> UsageError:
-    """Return the error for a name that is none; it lists those that are."""
-    return UsageError(f"unknown {what} {value!r}; known: {', '.join(known) or 'none'}")
+    """Return the error for a name that is none; it lists those that are, or the nearest of many."""
+    names = list(known)
+    if len(names) <= _LISTED:
+        return UsageError(f"unknown {what} {value!r}; known: {', '.join(names) or 'none'}")
+    near = difflib.get_close_matches(value, names, _NEAREST, 0.4)
+    return UsageError(f"unknown {what} {value!r}; " + (
+        f"the nearest of {len(names)}: {', '.join(near)}" if near else
+        f"none of {len(names)} is like it"))
 
 
 @contextlib.contextmanager
@@ -101,8 +115,18 @@ def progress() -> Iterator[Callable[[str], None]]:
         show("")
 
 
-def print_json(data: Any, *, indent: bool = True) -> None:
-    """Print data as JSON; NaN and infinity become null."""
+def print_json(data: Any, *, indent: bool = True, names: bool = False) -> None:
+    """Print data as JSON; NaN and infinity become null.
+
+    Args:
+        data: a struct or dictionary is printed with its `format` first.
+        indent: on several lines.
+        names: a dictionary by names that are nobody's to choose, to which nothing can be added.
+    """
+    if isinstance(data, msgspec.Struct) and not data.__struct_config__.array_like:
+        data = msgspec.to_builtins(data)
+    if isinstance(data, dict) and not names:
+        data = {"format": FORMAT, **data}
     text = msgspec.json.encode(data)
     say_text((msgspec.json.format(text, indent=2) if indent else text).decode())
 

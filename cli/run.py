@@ -26,7 +26,7 @@ from rampart.actors.recording.virtual import VirtualRecording
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import RunPlan, load_document
 from rampart.actors.supervision.launcher import LaunchError
-from rampart.cli.output import UsageError
+from rampart.cli.output import FORMAT, UsageError
 from rampart.cli.run_options import ERROR_LOG, parse, plan_of, refuse
 from rampart.files import streams, working_folder
 from rampart.files.plain_text import one_line
@@ -76,8 +76,6 @@ class Run:
                            options.patience if kind.patient else options.duration, sys.stderr)
         self._plan = plan
         self._scenario = [parse_fault(text) for text in options.fault]
-        if self._scenario:
-            Layout(plan, spec)  # names file and path of an actor that cannot be had
         known = system_topics(spec) if self._scenario else ()
         for i, planned in enumerate(self._scenario):
             action_of(planned, f"f{i}", can_be_hit(spec), known, faults_of(spec))  # not in mid-run
@@ -148,14 +146,19 @@ class Run:
             more |= {"report": str(report.html) if report.html else None,
                      "record": str(report.data) if report.data else None,
                      "report_error": report.problem or None}
-            print(json.dumps({**self._trial.summary(record), **more}), flush=True)
+            print(json.dumps({"format": FORMAT, **self._trial.summary(record), **more}), flush=True)
             if why := streams.lost_result():
                 _say(f"stdout: {why}: the result is lost")
+        for node in dict.fromkeys((*record.given_up, *record.failing)):
+            _say(f"{node} " + ("was given up" if node in record.given_up else
+                               "ends as soon as it has started, again and again") +
+                 f"; it was restarted {record.restarts.get(node, 0)} times")
+        broken = bool(failure or record.given_up or record.failing)
         if not self._trial.judges:
-            return EXIT_FAILED if failure or record.given_up else EXIT_SUCCESS
+            return EXIT_FAILED if broken else EXIT_SUCCESS
         if record.safety != "safe":
             return EXIT_UNSAFE if record.safety == "unsafe" else EXIT_NOT_KNOWN
-        return EXIT_SUCCESS if record.mission == "success" else EXIT_FAILED
+        return EXIT_SUCCESS if record.mission == "success" and not broken else EXIT_FAILED
 
 
 def _say(text: str) -> None:

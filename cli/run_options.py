@@ -7,9 +7,10 @@ while it runs, from another shell:
   kill-node NODE                                    kill a node and watch it come back
   rampart inject --list                             the faults that can be injected
   rampart status                                    what the robot and its nodes are doing
-exit code: 0 success and safe, 1 mission failed but safe, 2 bad usage or spec, 3 unsafe,
-4 safety not known: no ground truth ever came. A report that cannot be written and output that
-nobody reads change none of them; with --json, "report_error" says why there is no "report"
+exit code: 0 success and safe, 1 mission failed but safe, or a node was given up or kept failing,
+2 bad usage or spec, 3 unsafe, 4 safety not known: no ground truth ever came. A report that cannot
+be written and output that nobody reads change none of them; with --json, "report_error" says why
+there is no "report"
 """
 
 from __future__ import annotations
@@ -34,7 +35,18 @@ from rampart.actors.web.access import Access, AccessError, is_loopback, new_toke
 from rampart.actors.web.token_file import SecretError, read_secret
 from rampart.cli import application_options
 from rampart.cli.output import UsageError, between, positive
-from rampart.cli.verbs import add_options, flag, help_of, number, option, several, whole, word
+from rampart.cli.verbs import (
+    PORT_VARIABLE,
+    add_options,
+    flag,
+    help_of,
+    number,
+    option,
+    port_option,
+    several,
+    whole,
+    word,
+)
 from rampart.files import working_folder
 from rampart.manager.spec.specification import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
@@ -78,8 +90,9 @@ _OPTIONS = (
          f"characters or more, to keep it over several runs; or set {TOKEN_VARIABLE} to it "
          "(default: a random one; for yourself on this machine none is needed)", ""),
     option("--hmi-token", nargs="?", const="", help=argparse.SUPPRESS),  # refused
-    whole("--port", "PORT", "number that tells runs on this machine apart; no port is opened "
-          f"(default: {DEFAULT_PORT})", DEFAULT_PORT),
+    port_option("--port", "number that tells runs on this machine apart; no port is opened "
+                f"(default: that of {PORT_VARIABLE}, else {DEFAULT_PORT})", DEFAULT_PORT,
+                metavar="PORT"),
     number("--patience", "S", "simulated seconds without progress after which the mission counts "
            "as failed (default: 60)", 60.0),
     number("--duration", "S", "simulated seconds after which a system without a mission ends "
@@ -172,20 +185,14 @@ def plan_of(options: argparse.Namespace, kind: type[Application]) -> tuple[RunPl
         hmi_host=options.hmi_host, hmi_token=token, hmi_token_is_new=token_is_new,
         waits=options.wait, virtual=options.virtual)
     spec = load_system(plan)
+    layout = Layout(plan, spec)
     if not options.no_hmi:
         plan = msgspec.structs.replace(plan, faults=faults_of(spec).offered())
-    if not _has_actor(plan, spec, HMI):
+    if not any(issubclass(member.actor, load_class(HMI)) for member in layout.members.values()):
         refuse(options, ("wait", "hmi_port", "hmi_host", "hmi_token_file"),
                f"no node of {spec.name} serves an operator's page")
         plan = msgspec.structs.replace(plan, hmi_port=0)
     return plan, spec
-
-
-def _has_actor(plan: RunPlan, spec: SystemSpec, actor: str) -> bool:
-    """Tell whether a node of the system is of this class, or of one that is derived from it."""
-    return any(node.actor == actor for node in spec.nodes) or any(
-        issubclass(member.actor, load_class(actor))
-        for member in Layout(plan, spec).members.values())
 
 
 def refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+from collections.abc import Iterator
 
 from rampart import systems
-from rampart.actors.layout.layout import application_class
+from rampart.actors.layout.layout import Layout, application_class, load_application
 from rampart.actors.layout.system_topics import declared_topics, own_topics, system_topics
 from rampart.actors.layout.wiring import REPORTS_ON, import_class, load_member
+from rampart.actors.run.run_info import NoRunError, find_run
+from rampart.actors.run.run_plan import RunPlan
 from rampart.cli.output import UsageError, refusing
 from rampart.cli.robot_lines import RobotLines
-from rampart.cli.verbs import Option, either, option
+from rampart.cli.verbs import Option, either, option, port_of_environment
 from rampart.files import toml, working_folder
 from rampart.files.reading import FileError, read_text
 from rampart.manager.spec.specification import SystemSpec, parse_specification
+from rampart.sim.faults.faults import faults_of
+from rampart.sim.runs.trial import trial_class
 
 DEFAULT = systems.DEFAULT
 
@@ -57,6 +63,57 @@ def load(file: str | None) -> SystemSpec:
     except FileError as error:
         raise UsageError(f"{path}: {error}") from None
     return spec
+
+
+def at_hand(file: str | None, port: int | None = None) -> SystemSpec:
+    """Read the system that is meant: one that is named, else that of the run, else the shipped one.
+
+    Args:
+        file: as of `load`.
+        port: base port of the run, if there are several.
+
+    Raises:
+        UsageError: the one that is named cannot be read, or makes no sense.
+    """
+    if file is None:
+        with contextlib.suppress(NoRunError, UsageError):
+            return load(find_run(port or port_of_environment()).system_file)
+    return load(file)
+
+
+@refusing(ValueError, OSError)
+def check(file: str | None) -> Layout:
+    """Check all of a system that can be checked before it runs: everything it names is imported.
+
+    Args:
+        file: path, or name of a shipped system; None for the shipped default.
+
+    Returns:
+        Its actors, as a run of it would have them.
+
+    Raises:
+        UsageError: something would not work; one line.
+    """
+    spec = load(file)
+    plan = RunPlan(system_file=str(DEFAULT if file is None else systems.find(file)))
+    layout = Layout(plan, spec)
+    application = load_application(plan, spec)
+    application.check(spec, virtual=False)
+    with _of(plan):
+        system_topics(spec)
+        trial_class(spec)
+        faults_of(spec)
+        lines_of(spec)
+    return layout
+
+
+@contextlib.contextmanager
+def _of(plan: RunPlan) -> Iterator[None]:
+    """Name the file in what is wrong with the classes of its application."""
+    try:
+        yield
+    except (ValueError, UsageError) as error:
+        raise UsageError(f"{plan.system_file}: {error}") from None
 
 
 # Users are told what the actors or the application of a system lack.

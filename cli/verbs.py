@@ -10,6 +10,7 @@ import argparse
 import asyncio
 import importlib
 import inspect
+import os
 from collections.abc import Callable, Coroutine, Iterable
 from types import ModuleType
 from typing import Any
@@ -71,8 +72,34 @@ def add_options(parser: argparse._ActionsContainer, options: Iterable[Option]) -
         add(parser)
 
 
-_WHICH_RUN = "base port of the run, if there are several on this machine"
-PORT = whole("--port", "N", _WHICH_RUN)
+PORT_VARIABLE = "RAMPART_PORT"
+_PORT_DIGITS = 5
+_WHICH_RUN = ("base port of the run, if there are several on this machine (default: what "
+              f"{PORT_VARIABLE} of the environment says)")
+
+
+def port_of_environment() -> int | None:
+    """Return the base port that the environment names, None if none.
+
+    Raises:
+        UsageError: it is none.
+    """
+    said = os.environ.get(PORT_VARIABLE, "")
+    if said and not (said.isascii() and said.isdecimal() and len(said) <= _PORT_DIGITS):
+        raise UsageError(f"{PORT_VARIABLE}={said}: a whole number is right, the base port of a run")
+    return int(said) if said else None
+
+
+def port_option(name: str, text: str, otherwise: int | None = None, **fields: Any) -> Option:
+    """Return an option with a base port as its value; the default is what the environment says."""
+    def add(parser: argparse._ActionsContainer) -> object:
+        return parser.add_argument(name, type=int, help=text, **fields,
+                                   default=port_of_environment() or otherwise)
+
+    return add
+
+
+PORT = port_option("--port", _WHICH_RUN, metavar="N")
 JSON = flag("--json", "print JSON")
 JSON_FORMAT = option("--json", action="store_const", dest="format", const="json",
                      help="the same as --format json")
@@ -89,7 +116,7 @@ def served(port: int, what: str) -> tuple[Option, ...]:
         whole("--port", "N", f"port to serve on (default {port})", port),
         word("--host", "ADDRESS", "address to serve on (default 127.0.0.1; whoever reaches it may "
              f"{what})", "127.0.0.1"),
-        option("--run", dest="of", type=int, metavar="N", help=_WHICH_RUN))
+        port_option("--run", _WHICH_RUN, dest="of", metavar="N"))
 
 
 def add_verb(verbs: Any, name: str, text: str, run: Run, *options: Option, doc: str = "") -> None:

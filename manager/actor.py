@@ -23,7 +23,7 @@ from rampart.actors.bus.bounds import DOCUMENT_CHARS, clip
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import messages as m
 from rampart.actors.ftm import topics
-from rampart.actors.layout.wiring import REPORTS_ON, load_member
+from rampart.actors.layout.layout import Layout
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.runtime.checkpoint import StateFormat
 from rampart.manager.arbitration.arbiter import build_arbiter
@@ -170,9 +170,7 @@ class FtmManager(Actor):
         file = f"{self._system.name}.toml"
         document, system = adapt(self._document, change, file)
         check_modules(self._system, system)
-        for node in system.actors():
-            if node.kind in REPORTS_ON:
-                load_member(node, system, file)
+        Layout(replace(self.context.run.plan, system_file=file), system)
         if busy := self.arbiter_state.busy:
             return f"not in the middle of a recovery: {', '.join(busy)}; try again when it is over"
         text = msgspec.json.encode(document).decode()

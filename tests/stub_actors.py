@@ -20,20 +20,53 @@ from tests import ROOT
 
 
 class Idler(Actor):
-    """Beats its heart and does nothing else; it may stand in every table of a spec."""
+    """Beats its heart and does nothing else."""
 
     class Parameters(Actor.Parameters, frozen=True, forbid_unknown_fields=False):
         """It takes any, and heeds none."""
 
-    outputs = (topics.POSE, ftm_topics.DETECTION, ftm_topics.RECOVERY)
+
+class IdlePose(Idler):
+    """As the localization."""
+
+    outputs = (topics.POSE,)
+
+
+class IdleDetection(Idler):
+    """As a detection module."""
+
+    outputs = (ftm_topics.DETECTION,)
+
+
+class IdleRecovery(Idler):
+    """As a recovery module."""
+
+    outputs = (ftm_topics.RECOVERY,)
+
+
+class IdleManager(Idler):
+    """As the manager."""
+
+    outputs = (ftm_topics.MANAGER_STATUS,)
+
+
+_IDLE = {"localization": "IdlePose", "ftm_manager": "IdleManager", "detection": "IdleDetection",
+         "recovery": "IdleRecovery"}
 
 
 def write_stub_system(directory: Path) -> Path:
-    """Write the shipped system with every actor replaced by an `Idler`."""
+    """Write the shipped system with every actor replaced by an `Idler` of its kind."""
     text = (ROOT / "systems" / "paper.toml").read_text(encoding="utf-8")
+
+    def idle(row: re.Match[str]) -> str:
+        kind = _IDLE.get(row["name"]) or _IDLE.get(row["table"], "Idler")
+        return f'{row["head"]}actor = "tests.stub_actors:{kind}"'
+
     file = directory / "stub.toml"
-    file.write_text(re.sub(r'^actor = "[^"]+"', 'actor = "tests.stub_actors:Idler"', text,
-                           flags=re.MULTILINE), encoding="utf-8")
+    file.write_text(re.sub(
+        r'(?m)^(?P<head>\[\[(?P<table>\w+)\]\]\n'
+        r'(?:(?!\[)(?!actor)(?:name = "(?P<name>\w+)")?.*\n)*?)'
+        r'actor = "[^"]+"', idle, text), encoding="utf-8")
     return file
 
 

@@ -16,6 +16,7 @@ exception, of a request, of names joined) is shortened with `clip` where the mes
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -87,6 +88,19 @@ def clip(text: str, chars: int = TEXT_CHARS) -> str:
 def bare(kind: Any) -> Any:
     """Return the type of a field without its bounds; those of its parts are left."""
     return kind.__origin__ if hasattr(kind, "__metadata__") else kind
+
+
+NARROW = 1e6
+"""A range that is wider says what a message can mean at all, and nothing of what is usual."""
+
+
+def narrow_range(metas: Sequence[msgspec.Meta]) -> tuple[float, float] | None:
+    """Return the least and the greatest number that a field declares; None if it does not."""
+    low = [b for m in metas for b in (m.ge, m.gt) if b is not None]
+    high = [b for m in metas for b in (m.le, m.lt) if b is not None]
+    if not low or not high or not 0 < min(high) - max(low) < NARROW:
+        return None
+    return float(max(low)), float(min(high))
 
 
 def oversized(value: Any, budget: int, depth: int) -> bool:

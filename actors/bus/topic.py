@@ -46,6 +46,9 @@ class Topic(Generic[T]):
         rate_hz: nominal publication rate in simulated time; 0 means on event.
         frame: `map`, `odom`, `base_link` (REP-105) or `""`.
         doc: one sentence for `topics.md`.
+        outside: tools, or the driver of a device, publish it: no node of the system has to.
+        several: more than one node may publish it. Commands always may be given by several; of
+            what is measured, or is the case, the latest message wins, so that is one node's to say.
     """
 
     key: str
@@ -54,6 +57,8 @@ class Topic(Generic[T]):
     rate_hz: float
     frame: str
     doc: str
+    outside: bool = False
+    several: bool = False
 
     @property
     def is_family(self) -> bool:

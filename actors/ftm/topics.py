@@ -24,14 +24,15 @@ DECISION = Topic("manager/decision", m.DecisionRecord, Qos.COMMAND, 0, "",
 SHADOW = Topic("manager/shadow", m.ShadowRecord, Qos.COMMAND, 0, "",
                "What the strategy in shadow would have decided, where it differs.")
 ADAPT = Topic("manager/adapt", m.AdaptationRequest, Qos.COMMAND, 0, "",
-              "Change a module, a mechanism or the strategy while running.")
+              "Change a module, a mechanism or the strategy while running.", outside=True)
 ADAPTATION = Topic("manager/adaptation", m.AdaptationAnswer, Qos.COMMAND, 0, "",
                    "Whether a change was made, and why not.")
 ADAPTED_SYSTEM = Topic("manager/system", m.AdaptedSystem, Qos.STATE, 1, "",
                        "The changed system, whole; silent while nothing was changed.")
 MANAGER_STATUS = Topic("manager/status", m.ManagerStatus, Qos.STATE, 10, "",
                        "The FTM Manager's view; its silence stops the robot.")
-RESET = Topic("manager/reset", m.Reset, Qos.COMMAND, 0, "", "Release a latched recovery.")
+RESET = Topic("manager/reset", m.Reset, Qos.COMMAND, 0, "", "Release a latched recovery.",
+              outside=True)
 
 # Runtime and supervision.
 NODES = Topic("supervisor/nodes", m.NodeTable, Qos.STATE, 2, "", "The supervisor's node table.")
@@ -44,7 +45,7 @@ PROCESS_EVENT = Topic("supervisor/event", m.ProcessEvent, Qos.COMMAND, 0, "",
 
 # Stand-ins for modules that are not written yet.
 STUB_TRIGGER = Topic("stub/trigger", m.StubTrigger, Qos.COMMAND, 0, "",
-                     "Make the stand-in of a detection module active or idle.")
+                     "Make the stand-in of a detection module active or idle.", outside=True)
 
 ALL: tuple[Topic[Any], ...] = (
     *bus_topics.ALL, *(v for v in globals().values() if isinstance(v, Topic)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -10,8 +11,10 @@ import msgspec
 from rampart.actors.bus.topic import Topic
 from rampart.actors.bus.zenoh_bus import endpoint
 from rampart.actors.foreign.program import check_programs
+from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import AdaptedSystem
 from rampart.actors.layout.chosen_topics import choose_topics, with_panels
+from rampart.actors.layout.connections import check_connections, check_heard, publishers_of
 from rampart.actors.layout.wiring import (
     Member,
     import_class,
@@ -24,8 +27,10 @@ from rampart.actors.run.application import Application
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR, RunPlan, load_document, tailor
 from rampart.actors.runtime.declaration import Handlers
+from rampart.actors.runtime.parameters import read_parameters
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 from rampart.manager.spec.specification import check_document, check_modules
+from rampart.manager.spec.tables import Layers
 
 SUPERVISOR_CLASS = "rampart.actors.supervision.supervisor:Supervisor"
 
@@ -57,7 +62,8 @@ class Layout:
 
     Raises:
         ValueError: an actor class named in the spec does not exist, cannot be imported, belongs
-            into another table, or does not take its parameters.
+            into another table, or does not take its parameters; one hears what nobody publishes, or
+            publishes what another one does; the judge is none, or hears nothing.
     """
 
     def __init__(self, plan: RunPlan, spec: SystemSpec,
@@ -68,21 +74,55 @@ class Layout:
             name: Unit(name, nodes) for name, nodes in spec.processes().items()}
         self.unit_of: dict[str, str] = {
             node.name: unit.name for unit in self.units.values() for node in unit.nodes}
+        file = plan.system_file
         supervisor = load_class(SUPERVISOR_CLASS)
-        observer = load_class(application_class(spec).observer)
-        judged = {"judged": [topic.key for topic in judged_topics(spec, observer)]}
+        try:
+            kind = application_class(spec)
+            observer = load_class(kind.observer)
+            judge = judge_class(spec)
+            judged = judged_topics(spec, observer)
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from None
         heard = msgspec.convert({"nodes": tuple(self.unit_of)}, supervisor.Parameters)
         own = [Member(SUPERVISOR, supervisor, heard),
-               Member(OBSERVER, observer, msgspec.convert(judged, observer.Parameters))]
+               Member(OBSERVER, observer, msgspec.convert(
+                   {"judged": [topic.key for topic in judged]}, observer.Parameters))]
         world = {"seed": plan.seed, **(application or Application()).world_parameters(),
                  "dead_man": spec.layers.dead_man,
                  "dead_man_timeout_s": spec.timing.dead_man_timeout_s}
-        own += [load_member(n, spec, plan.system_file, world if n.kind is Kind.WORLD else {})
+        own += [load_member(n, spec, file, world if n.kind is Kind.WORLD else {})
                 for n in spec.actors()]
+        known = (*kind.topics, *stand_in_topics(spec))
         self.members, self.topics = choose_topics(
-            with_panels(own, spec, plan.system_file),
-            (*application_class(spec).topics, *stand_in_topics(spec)), plan.system_file)
+            with_panels(own, spec, file), (*known, *judged), file)
+        self._check(judge, (*ftm_topics.ALL, *known), file)
         self._partners = partners(self.members.values())
+
+    def _check(self, judge: Any, known: Iterable[Topic[Any]],
+               file: str) -> None:
+        """Check who hears and publishes what; raises as the constructor."""
+        members = list(self.members.values())
+        others: list[Member] = []
+        silent: list[str] = []
+        if not self.spec.layers.ftm:  # its modules are not started, and what they say is not missed
+            everyone = msgspec.structs.replace(self.spec, layers=Layers()).actors()
+            others = [load_member(node, self.spec, file) for node in everyone
+                      if node.name not in self.members]
+            silent = [topic.key for topic in ftm_topics.ALL]
+        said = publishers_of((*members, *others))
+        declared = check_connections(members, said, known, silent, file)
+        if judge is None:
+            return
+        if application_class(self.spec).trial:
+            raise ValueError(f"{file}: $.judge: the application says by itself what a run was "
+                             "worth; leave it out")
+        given = {name: value for name, value in self.spec.judge.items() if name != "class"}
+        read_parameters(judge.Parameters, given, file, "$.judge")
+        for topic in judge.inputs():
+            who = f"$.judge: {judge.__name__}"
+            declared.add(topic, who)
+            if topic not in judge.optional_inputs and topic.key not in silent:
+                check_heard(f"{file}: {who}", topic, None, said)
 
     def listen(self, node: str) -> str:
         """Return the endpoint on which a node listens."""
@@ -143,7 +183,13 @@ def judge_class(spec: SystemSpec) -> type[Handlers] | None:
     path = spec.judge.get("class")
     if spec.judge and path is None:
         raise ValueError("$.judge.class: missing; name a class derived from rampart.Judge")
-    return import_class(str(path), Handlers, "$.judge.class") if spec.judge else None
+    if not spec.judge:
+        return None
+    found = import_class(str(path), Handlers, "$.judge.class", "judge")
+    if not callable(getattr(found, "verdict", None)):
+        raise ValueError(f"$.judge.class = {path!r}: no judge; name a class derived from "
+                         "rampart.Judge")
+    return found
 
 
 def judged_topics(spec: SystemSpec, observer: type[Handlers]) -> list[Topic[Any]]:

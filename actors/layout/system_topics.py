@@ -5,17 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-import msgspec
-
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm import topics
+from rampart.actors.layout.connections import flaw
 from rampart.actors.layout.layout import Layout, application_class
 from rampart.actors.layout.wiring import heard, load_class, published, topics_of
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
 from rampart.manager.spec.specification import SystemSpec
-
-_ANY_RUN = RunPlan()
-"""Which keys a system publishes follows from its spec; nothing in the plan of a run matters."""
 
 _SHIPPED = "rampart."
 """Where the actors that ship are; that their topics are declared is a test's business."""
@@ -62,7 +58,8 @@ def published_keys(spec: SystemSpec) -> tuple[str, ...]:
     Raises:
         ValueError: the spec names an actor class that does not exist.
     """
-    members = [m for m in Layout(_ANY_RUN, spec).members.values() if m.name != OBSERVER]
+    layout = Layout(RunPlan(system_file=spec.name), spec)
+    members = [m for m in layout.members.values() if m.name != OBSERVER]
     wanted: dict[str, dict[str, None]] = {}
     for member in members:
         for key, names in heard(member).items():
@@ -102,16 +99,8 @@ def _beyond(known: Iterable[Topic[Any]], paths: Iterable[str]) -> tuple[Topic[An
         for topic in (*inputs, *outputs):
             if topic.key in common or topic.key in found:
                 continue
-            if reason := _flaw(topic):
+            if reason := flaw(topic):
                 raise ValueError(f"actor = {path!r}: topic {topic.key!r}: {reason}")
             found[topic.key] = topic
     return tuple(found.values())
 
-
-def _flaw(topic: Topic[Any]) -> str:
-    """Return what is wrong with a topic, or an empty text."""
-    if topic.key.count("{name}") > 1:
-        return "one {name} at most is right"
-    if not (isinstance(topic.type, type) and issubclass(topic.type, msgspec.Struct)):
-        return f"type = {topic.type!r}: must be derived from rampart.actors.bus.messages.Message"
-    return ""

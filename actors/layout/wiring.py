@@ -24,15 +24,19 @@ from rampart.actors.ftm import topics
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.files import working_folder
-from rampart.manager.spec.checks import modules
 from rampart.manager.spec.panels import problem_of
 from rampart.manager.spec.schema import Kind, NodeSpec, SystemSpec
 
 T = TypeVar("T")
 
 REPORTS_ON: Mapping[Kind, Topic[Any]] = {
-    Kind.DETECTION: topics.DETECTION, Kind.RECOVERY: topics.RECOVERY}
-"""What modules of the tables `[[detection]]` and `[[recovery]]` publish."""
+    Kind.DETECTION: topics.DETECTION, Kind.RECOVERY: topics.RECOVERY,
+    Kind.MANAGER: topics.MANAGER_STATUS}
+"""What an actor of such a kind publishes, and no other does."""
+
+_PLACE = {Kind.DETECTION: "it belongs into [[detection]]",
+          Kind.RECOVERY: "it belongs into [[recovery]]",
+          Kind.MANAGER: "kind = 'manager' is right"}
 
 _ROOMS_OF_0_6 = ("actors", "manager", "sim")
 
@@ -49,8 +53,19 @@ class Member:
     actor: type[Actor]
     parameters: Actor.Parameters
     table: str = "parameters."
+    kind: Kind = Kind.SUPERVISION
     hears: Mapping[str, Members] = field(default_factory=dict)
     publishes: Mapping[str, Members] = field(default_factory=dict)
+
+    @property
+    def where(self) -> str:
+        """What it is called in messages: by table and name."""
+        return where(self.kind, self.name)
+
+
+def where(kind: Kind, name: str) -> str:
+    """Return what an actor is called in messages: by table and name."""
+    return f"{kind.value if kind in {Kind.DETECTION, Kind.RECOVERY} else 'node'} {name}"
 
 
 def published(member: Member) -> dict[str, Members]:
@@ -113,33 +128,32 @@ def load_member(node: NodeSpec, spec: SystemSpec, file: str,
         ValueError: there is no such class, or it does not take a parameter; the message is one
             line and names file, path and value.
     """
-    path = next(path for path, name, *_ in modules(spec) if name == node.name)
+    path = where(node.kind, node.name)
     own = tuple(n.name for n in spec.nodes if n.respawn == node.name)
     derived = {"nodes": own} if own else derived
     try:
         if node.command and node.stand_in:  # what is wrong with it is told in real runs, too
             load_class(node.stand_in, field="stand_in")
-        actor = CommandNode if node.command else load_class(
-            node.actor, REPORTS_ON.get(node.kind))
+        actor = CommandNode if node.command else load_class(node.actor, node.kind)
         if actor is CommandNode and not node.command:
             raise ValueError(f"actor = {node.actor!r}: say command = ['./program', ...] instead")
         takes = {field.name for field in msgspec.structs.fields(actor.Parameters)}
     except ValueError as error:
-        raise ValueError(f"{file}: {path}.{error}") from None
+        raise ValueError(f"{file}: {path}: {error}") from None
     except (TypeError, NameError) as error:
-        raise ValueError(f"{file}: {path}.actor = {node.actor!r}: Parameters: {error}") from None
+        raise ValueError(f"{file}: {path}: actor = {node.actor!r}: Parameters: {error}") from None
     if node.command:
         if node.stand_in:
             load_member(node.in_virtual_time(), spec, file, derived)
         return Member(node.name, actor, read_parameters(
-            actor.Parameters, node.command_parameters, file, node.name, spec), "")
+            actor.Parameters, node.command_parameters, file, path, spec), "", node.kind)
     given = {name: derived[name] for name in takes & derived.keys()} | node.parameters
     if shows_panels(actor):
         given["panels"] = panels = (*getattr(actor, "panels", ()), *spec.panels)
         if problem := problem_of(panels):
             raise ValueError(f"{file}: {node.name}: {problem}")
     return Member(node.name, actor, read_parameters(
-        actor.Parameters, given, file, f"{path}.parameters", spec))
+        actor.Parameters, given, file, f"{path}: parameters", spec), kind=node.kind)
 
 
 def shows_panels(actor: type[Actor]) -> bool:
@@ -147,13 +161,12 @@ def shows_panels(actor: type[Actor]) -> bool:
     return any(field.name == "panels" for field in msgspec.structs.fields(actor.Parameters))
 
 
-def load_class(path: str, reports_on: Topic[Any] | None = None,
-               field: str = "actor") -> type[Actor]:
+def load_class(path: str, kind: Kind | None = None, field: str = "actor") -> type[Actor]:
     """Return the actor class named `module:Class`.
 
     Args:
         path: name of the class.
-        reports_on: topic that it has to publish, by which a kind of module is known.
+        kind: that it has to be of, which is known by what it publishes; None for any.
         field: of the spec, for messages.
 
     Raises:
@@ -161,14 +174,21 @@ def load_class(path: str, reports_on: Topic[Any] | None = None,
             cannot be imported.
     """
     found = import_class(path, Actor, field)
-    if reports_on is not None and reports_on not in found.outputs:
-        raise ValueError(f"{field} = {path!r}: it does not publish {reports_on.key}, as the "
-                         "modules of this table do")
+    own = None if kind is None else REPORTS_ON.get(kind)
+    if own is not None and own not in found.outputs:
+        who = "the manager does" if kind is Kind.MANAGER else "the modules of this table do"
+        raise ValueError(f"{field} = {path!r}: it does not publish {own.key}, as {who}")
+    for of, topic in REPORTS_ON.items() if kind is not None else ():
+        if of is not kind and topic in found.outputs:
+            raise ValueError(f"{field} = {path!r}: it publishes {topic.key}, so {_PLACE[of]}")
+    if kind is not None and found.node_kind not in {"", kind.value}:
+        raise ValueError(f"{field} = {path!r}: it is no {kind.value} node; kind = "
+                         f"{found.node_kind!r} is right")
     return found
 
 
-def import_class(path: str, base: type[T], field: str) -> type[T]:
-    """Return the class named `module:Class`, which has to be derived from `base`.
+def import_class(path: str, base: type[T], field: str, what: str = "") -> type[T]:
+    """Return the class named `module:Class`, which has to be derived from `base`: `what` it is.
 
     Raises:
         ValueError: there is no such class, or its module cannot be imported; `field` and `path`
@@ -183,7 +203,9 @@ def import_class(path: str, base: type[T], field: str) -> type[T]:
             f"; nothing is imported from there: {hidden}" if hidden else "")
         raise ValueError(f"{field} = {path!r}: {error}{hint}") from None
     except Exception as error:  # a module of the user's own may raise anything
-        at = traceback.extract_tb(error.__traceback__)[-1]
+        frames = traceback.extract_tb(error.__traceback__)
+        at = next((frame for frame in reversed(frames) if not frame.filename.startswith(
+            (str(Path(rampart.__file__).parent), "<frozen"))), frames[-1])
         where = "" if isinstance(error, SyntaxError) else f" ({at.filename}, line {at.lineno})"
         raise ValueError(f"{field} = {path!r}: {module} cannot be imported: "
                          f"{type(error).__name__}: {error}{where}") from None
@@ -191,7 +213,8 @@ def import_class(path: str, base: type[T], field: str) -> type[T]:
     if not (isinstance(found, type) and issubclass(found, base)):
         known = [key for key, value in vars(imported).items() if isinstance(value, type)
                  and issubclass(value, base) and value.__module__ == module]
-        raise ValueError(f"{field} = {path!r}: no such {base.__name__.lower()} class; known: "
+        raise ValueError(f"{field} = {path!r}: no such {what or base.__name__.lower()} class; "
+                         "known: "
                          f"{', '.join(known) or 'none'}")
     return found
 

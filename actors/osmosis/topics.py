@@ -10,16 +10,21 @@ from rampart.actors.osmosis import messages as m
 
 # Summit XL layer: a real robot's driver stands behind these keys just as well.
 ABSOLUTE_POSE = Topic("summit_xl/absolute_pose", m.Pose, Qos.SENSOR, 20, "map",
-                      "Absolute localization that the simulator offers, as in the paper.")
-ODOMETRY = Topic("summit_xl/odom", m.Odometry, Qos.SENSOR, 50, "odom", "Wheel odometry.")
-IMU = Topic("summit_xl/imu", m.Imu, Qos.SENSOR, 50, "base_link", "Inertial measurement unit.")
-GPS = Topic("summit_xl/gps", m.GpsFix, Qos.SENSOR, 10, "map", "RTK-GPS receiver.")
-SCAN = Topic("summit_xl/scan", m.LaserScan, Qos.SENSOR, 20, "base_link", "2D laser scanner.")
+                      "Absolute localization that the simulator offers, as in the paper.",
+                      outside=True)
+ODOMETRY = Topic("summit_xl/odom", m.Odometry, Qos.SENSOR, 50, "odom", "Wheel odometry.",
+                 outside=True)
+IMU = Topic("summit_xl/imu", m.Imu, Qos.SENSOR, 50, "base_link", "Inertial measurement unit.",
+            outside=True)
+GPS = Topic("summit_xl/gps", m.GpsFix, Qos.SENSOR, 10, "map", "RTK-GPS receiver.", outside=True)
+SCAN = Topic("summit_xl/scan", m.LaserScan, Qos.SENSOR, 20, "base_link", "2D laser scanner.",
+             outside=True)
 UPPER_SCAN = Topic("summit_xl/upper_scan", m.LaserScan, Qos.SENSOR, 20, "base_link",
-                   "A second laser scanner above the first, where the robot has one.")
-LIGHT = Topic("summit_xl/light", m.LightSample, Qos.SENSOR, 20, "base_link", "Light sensor.")
+                   "A second laser scanner above the first, where the robot has one.", outside=True)
+LIGHT = Topic("summit_xl/light", m.LightSample, Qos.SENSOR, 20, "base_link", "Light sensor.",
+              outside=True)
 BASE_STATUS = Topic("summit_xl/status", m.BaseStatus, Qos.STATE, 10, "base_link",
-                    "Brake, dead man and wheel speeds.")
+                    "Brake, dead man and wheel speeds.", outside=True)
 BASE_COMMAND = Topic("summit_xl/command", m.BaseCommand, Qos.SENSOR, 20, "base_link",
                      "Velocity command; when it ceases the base brakes.")
 BRAKE = Topic("summit_xl/brake", m.BrakeCommand, Qos.COMMAND, 5, "base_link",
@@ -30,7 +35,7 @@ BRAKE = Topic("summit_xl/brake", m.BrakeCommand, Qos.COMMAND, 5, "base_link",
 MISSION_REQUEST = Topic("mission/request", m.MissionRequest, Qos.COMMAND, 0, "map",
                         "A mission from the operator.")
 MISSION_ORDER = Topic("mission/order", m.MissionOrder, Qos.COMMAND, 0, "",
-                      "Pause, resume, replan, skip, cancel or return home.")
+                      "Pause, resume, replan, skip, cancel or return home.", outside=True)
 MISSION_ORDER_ANSWER = Topic("mission/order_answer", m.MissionOrderAnswer, Qos.COMMAND, 0, "",
                              "Whether an order was obeyed, and why not.")
 MISSION_STATUS = Topic("mission/status", m.MissionStatus, Qos.STATE, 2, "map",
@@ -49,7 +54,7 @@ POSE = Topic("localization/pose", m.Pose, Qos.SENSOR, 20, "map", "The robot's po
 LOCALIZATION_STATUS = Topic("localization/status", m.LocalizationStatus, Qos.STATE, 5, "map",
                             "What the pose rests on, and how sure it is.")
 JOYSTICK = Topic("teleoperation/joystick", m.Joystick, Qos.SENSOR, 20, "",
-                 "The operator's stick, wherever it is.")
+                 "The operator's stick, wherever it is.", outside=True)
 TELEOP_COMMAND = Topic("teleoperation/command", m.Twist, Qos.SENSOR, 20, "base_link",
                        "Velocity from the stick; silent while the dead man is released.")
 
@@ -62,9 +67,9 @@ PILOT_STATUS = Topic("pilot/status", m.PilotStatus, Qos.STATE, 5, "",
 # World: ground truth is for the judge, never for the controller.
 TRUTH = Topic("world/truth", m.GroundTruth, Qos.STATE, 20, "map", "Ground truth.")
 OBSTACLE = Topic("world/obstacle", m.ObstacleCommand, Qos.COMMAND, 0, "map",
-                 "Put an obstacle into the world or take it away.")
+                 "Put an obstacle into the world or take it away.", outside=True)
 ACTUATOR_FAULT = Topic("world/actuator_fault", m.ActuatorFault, Qos.COMMAND, 0, "",
-                       "Put a fault of the base's actuators in force or end it.")
+                       "Put a fault of the base's actuators in force or end it.", outside=True)
 OBSTACLES = Topic("world/obstacles", m.ObstacleList, Qos.STATE, 1, "map",
                   "Obstacles present, for maps shown to people.")
 

@@ -13,12 +13,13 @@ import math
 import sys
 from array import array
 from collections.abc import Callable, Iterator
+from functools import cache
 from random import Random
 from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.bounds import bare
+from rampart.actors.bus.bounds import bare, narrow_range
 from rampart.actors.bus.messages import Injection
 
 Change = Callable[[float], float]
@@ -78,6 +79,7 @@ def corrupt(body: Any, order: Injection, elapsed_s: float, draw: Random) -> Any:
         InjectionError: no such field, or the value does not fit it.
     """
     data = msgspec.to_builtins(body, builtin_types=(bytes,))
+    kind: Any = type(body)
     for path, value in order.set_fields.items():
         for holder, name in _places(data, path):
             fill = is_array(name, type(holder[name])) and not isinstance(value, bytes)
@@ -88,8 +90,10 @@ def corrupt(body: Any, order: Injection, elapsed_s: float, draw: Random) -> Any:
         (order.noise_fields, lambda x, sigma: x + draw.gauss(0.0, sigma)))
     for fields, change in changes:
         for path, by in fields.items():
+            within = _within(kind, path)
             for holder, name in _places(data, path):
-                holder[name] = _changed(name, holder[name], lambda x: change(x, by))  # noqa: B023
+                holder[name] = _changed(
+                    name, holder[name], lambda x: _turned(x, change(x, by), within))  # noqa: B023
     for path in order.keep_ends:
         for holder, name in _places(data, path):
             if len(holder[name]) > 2:
@@ -106,6 +110,27 @@ def wrap(angle_rad: float) -> float:
         return angle_rad
     turned = math.remainder(angle_rad, 2 * math.pi)
     return math.pi if turned <= -math.pi else turned
+
+
+@cache
+def _within(kind: Any, path: str) -> tuple[float, float] | None:
+    """Return the range that a field declares, None if none; that of its elements if it has some."""
+    declared = field_type(kind, path)
+    metas: tuple[msgspec.Meta, ...] = ()
+    while True:
+        metas += tuple(m for m in getattr(declared, "__metadata__", ())
+                       if isinstance(m, msgspec.Meta))
+        declared = bare(declared)
+        if getattr(declared, "__origin__", None) not in (tuple, list):
+            return narrow_range(metas)
+        declared = declared.__args__[0]
+
+
+def _turned(true: float, wrong: float, within: tuple[float, float] | None) -> float:
+    """Return a wrong number; one beyond its range is wrong in the other direction, within it."""
+    if within is None or within[0] <= wrong <= within[1] or not math.isfinite(wrong):
+        return wrong
+    return min(max(true - (wrong - true), within[0]), within[1])
 
 
 def _changed(name: str, value: Any, change: Change) -> Any:

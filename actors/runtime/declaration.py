@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import inspect
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
@@ -24,7 +26,13 @@ BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT, HELLO)
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:
-    """Declare a method as the handler of a topic: `handler(self, message, header)`."""
+    """Declare a method as the handler of a topic: `handler(self, message, header)`.
+
+    Raises:
+        TypeError: what it is given is no topic.
+    """
+    if not isinstance(topic, Topic):
+        raise TypeError(f"@on({getattr(topic, '__name__', topic)}): a Topic is right")
 
     def mark(function: F) -> F:
         function.__dict__.setdefault("_rampart_topics", []).append(topic)
@@ -34,7 +42,14 @@ def on(topic: Topic[Any]) -> Callable[[F], F]:
 
 
 def every(period_s: float) -> Callable[[F], F]:
-    """Declare a method to be called each `period_s` simulated seconds, first after one period."""
+    """Declare a method to be called each `period_s` simulated seconds, first after one period.
+
+    Raises:
+        ValueError: the period is no time that can pass.
+    """
+    if not isinstance(period_s, int | float) or not 0 < period_s < math.inf:
+        raise ValueError(f"@every({getattr(period_s, '__name__', period_s)}): a period above 0, in "
+                         "simulated seconds, is right")
 
     def mark(function: F) -> F:
         function.__dict__["_rampart_period_s"] = period_s
@@ -55,8 +70,14 @@ def _has_unmarked(base: type, name: str) -> bool:
 
 
 class Handlers:
-    """Base of what hears topics by methods that are marked with `on`, or acts by `every`."""
+    """Base of what hears topics by methods that are marked with `on`, or acts by `every`.
 
+    Class attributes:
+        optional_inputs: topics that it hears where somebody publishes them, and does without where
+            nobody does. Of all others that is refused before a run: it is a typo.
+    """
+
+    optional_inputs: ClassVar[tuple[Topic[Any], ...]] = ()
     _handlers: ClassVar[tuple[tuple[Topic[Any], str], ...]] = ()
     _periodic: ClassVar[tuple[tuple[float, str], ...]] = ()
 
@@ -75,6 +96,9 @@ class Handlers:
                     handlers[(topic.key, name)] = (topic, name)
                 if hasattr(member, "_rampart_period_s"):
                     periodic[name] = member._rampart_period_s
+        for name, arguments in (*((name, 3) for _, name in handlers.values()),
+                                *((name, 1) for name in periodic)):
+            _check_call(cls, name, arguments)
         cls._handlers = tuple(handlers.values())
         cls._periodic = tuple((period, name) for name, period in periodic.items())
 
@@ -84,11 +108,33 @@ class Handlers:
         return tuple(dict.fromkeys(topic for topic, _ in cls._handlers))
 
 
+_OF_HANDLER = {1: "(self)", 3: "(self, message, header)"}
+
+
+def _check_call(cls: type, name: str, arguments: int) -> None:
+    """Refuse a handler that does nothing when it is called, or cannot be called.
+
+    Raises:
+        TypeError: it is one.
+    """
+    function = getattr(cls, name)
+    what = f"{cls.__name__}.{name}"
+    if inspect.iscoroutinefunction(function):
+        raise TypeError(f"{what} is an async def, which would never run; a handler is a plain def")
+    if inspect.isgeneratorfunction(function) or inspect.isasyncgenfunction(function):
+        raise TypeError(f"{what} has a yield, and would never run; a handler is a plain def")
+    try:
+        inspect.signature(function).bind(*range(arguments))
+    except TypeError:
+        raise TypeError(f"{what}: def {name}{_OF_HANDLER[arguments]} is right") from None
+
+
 class Declared(Handlers):
     """Base of all actors, as far as their classes alone tell.
 
     Class attributes:
         outputs: topics it publishes; publishing another one raises.
+        node_kind: what a node of this class has to be, "" for anything.
         Parameters: what the system spec may say of it, by field: type, range and default. A class
             that takes more derives its own from that of its base class.
     """
@@ -98,6 +144,7 @@ class Declared(Handlers):
 
     parameters: Parameters
     outputs: ClassVar[tuple[Topic[Any], ...]] = ()
+    node_kind: ClassVar[str] = ""
 
     @classmethod
     def names(cls, topic: Topic[Any], name: str, parameters: Any) -> Members:  # noqa: ARG003

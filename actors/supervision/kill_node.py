@@ -75,7 +75,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("node", nargs="?", help="name of the node, e.g. osmosis_control")
     parser.add_argument("--signal", default="KILL", type=str.upper, metavar="SIG",
                         help="KILL (default), STOP, CONT, TERM, SEGV or WEDGE")
-    parser.add_argument("--port", type=int, help="base port of the run, if there are several")
+    parser.add_argument("--port", type=int, default=os.environ.get("RAMPART_PORT") or None,
+                        help="base port of the run, if there are several (default: RAMPART_PORT "
+                             "of the environment)")
     parser.add_argument("--list", action="store_true", help="list the nodes of the run(s)")
     parser.add_argument("--json", action="store_true", help="print JSON")
     return parser

@@ -51,7 +51,7 @@ def show_runs(spec: SystemSpec, runs: Sequence[Run], made: int, named: NamedCamp
 def show_faults(groups: Mapping[str, Sequence[str]], *, as_json: bool) -> int:
     """Print the faults that there are, by kind; return the exit code."""
     if as_json:
-        print_json(groups)
+        print_json(groups, names=True)
         return 0
     for kind, names in groups.items():
         say(f"{kind} ({len(names)})")

@@ -22,6 +22,7 @@ from rampart.cli.output import (
     NoEffectError,
     UsageError,
     print_json,
+    refusing,
     say,
     say_text,
     unknown,
@@ -29,6 +30,7 @@ from rampart.cli.output import (
 )
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import STRATEGIES
+from rampart.sim.campaign.content import content_of, with_content
 from rampart.sim.campaign.execute import BackendError, JobError, execute
 from rampart.sim.campaign.job import Job, RunResult, run_virtually, virtual_run
 from rampart.sim.campaign.named import NamedCampaign
@@ -55,10 +57,13 @@ def campaign(options: argparse.Namespace) -> int:
     if options.search is not None:
         if not trial_class(spec).margins:
             raise UsageError(f"--search: {spec.name} has no judge that measures margins")
-        bases = _base_jobs(options, spec)
+        with refusing(ValueError):
+            bases = with_content(_base_jobs(options, spec))
         return hunt(options, _groups(options, spec), bases, faults_of(spec),
                     _moments(spec, bases[0]))
-    name, jobs = _choose(options, spec)
+    name, chosen = _choose(options, spec)
+    with refusing(ValueError):
+        jobs = with_content(chosen)
     named: NamedCampaign | None = options.named[0] if options.named else None
     directory = Path(options.out) if options.out else Path("reports") / f"campaign-{name}"
     try:
@@ -287,6 +292,7 @@ def _replay(options: argparse.Namespace) -> int:
     try:
         run = virtual_run(found.job)
         again = run.run()
+        changed = found.job.content not in {"", content_of(found.job)}
     except ValueError as error:
         raise UsageError(f"--replay {options.replay}: {' '.join(str(error).split())}") from None
     same = again.trace == found.result.trace
@@ -295,16 +301,23 @@ def _replay(options: argparse.Namespace) -> int:
         raise UsageError(f"report: {problem}")
     if options.json:
         print_json({"run": found.job.key, "job": found.job, "same_trace": same,
-                    "report": str(html), "record": str(data)})
+                    "content_changed": changed, "report": str(html), "record": str(data)})
     else:
         say_text(f"{found.job.key}: {found.job.text()}\n"
             f"{again.record.mission}, {again.record.safety}; "
             f"{'; '.join(again.record.reasons) or 'as it should be'}\n"
-            f"{'the same run, to the byte' if same else 'NOT the same run: the program changed'}\n"
+            f"{_told(same=same, changed=changed)}\n"
             f"Report: {html}")
     if not same:
         raise NoEffectError(f"run {found.job.key}: the trace is not the one in the store")
     return 0
+
+
+def _told(*, same: bool, changed: bool) -> str:
+    if same:
+        return "the same run, to the byte"
+    return "NOT the same run: " + ("system, files or code are not those of then" if changed else
+                                   "the program changed")
 
 
 def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path,

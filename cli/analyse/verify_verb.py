@@ -26,9 +26,9 @@ def add(verbs: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Verify, and show what was found.
 
-    Check the arbitration of a system exhaustively: what each strategy decides
-    for every set of active mechanisms, and every state of the arbiter that
-    carries it out, from when it has heard every module. A property holds, or
+    Check a system as `rampart check` does, and its arbitration exhaustively:
+    what each strategy decides for every set of active mechanisms, and every state
+    of the arbiter that carries it out, from when it has heard every module. A property holds, or
     the shortest counterexamples are shown. docs/verification.md explains the
     properties, and what is not looked at.
 
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> int:
     exit code: 0 verified, whatever was found; with --strict 1 if a property of the
     system's strategy (or of one given by --strategy) fails; 2 bad usage or bad spec
     """
-    spec = systems.load(options.system)
+    spec = systems.check(options.system).spec
     if options.together < 1:
         raise UsageError(f"--together {options.together}: a number from 1 up is right")
     start = time.monotonic()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import msgspec
 
@@ -45,7 +45,7 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
             topic that makes no sense.
     """
     try:
-        members = Layout(RunPlan(), spec).members.values()
+        members = Layout(RunPlan(system_file=spec.name), spec).members.values()
     except ValueError as error:
         raise UsageError(str(error)) from None
     inputs = {member.name: heard(member) for member in members}
@@ -77,26 +77,43 @@ def topics_for(key: str, port: int | None) -> tuple[Topic[Any], ...]:
     """Return the topics among which to look for a key: those of the run's system.
 
     The actors of a system are loaded only for a key that neither the engine nor its application
-    declares. Without a run the shipped system is meant, as for one that cannot be read here.
+    declares. Without a run the shipped system is meant, as far as it has the key. For a run whose
+    system cannot be read here, the topics of the engine are known.
 
     Args:
         key: as typed.
         port: base port of the run, if there are several.
 
     Raises:
-        UsageError: the system of the run, or one of its actors, cannot be loaded.
+        UsageError: there is no run, and the shipped system has no such topic.
+        UnreadableError: the system of the run, or one of its actors, cannot be loaded here, and the
+            engine has no such topic.
     """
-    shipped = systems.declared(systems.load(None))
     try:
-        spec = systems.load(find_run(port).system_file)
-        known = systems.declared(spec)
-    except NoRunError:
-        return shipped
-    except UsageError:
+        file = find_run(port).system_file
+    except NoRunError as error:
+        shipped = systems.declared(systems.load(None))
         if _match(key, shipped) is None:
-            raise
+            raise UsageError(str(error)) from None
         return shipped
-    return known if _match(key, known) is not None else systems.topics_of(spec)
+    try:
+        spec = systems.load(file)
+        known = systems.declared(spec)
+        return known if _match(key, known) is not None else systems.topics_of(spec)
+    except UsageError as error:
+        if _match(key, topics.ALL) is None:
+            raise UnreadableError(str(error)) from None
+        return topics.ALL
+
+
+def of_any_type(key: str) -> tuple[Topic[Any], str]:
+    """Return a topic of which nothing but the key is known, and its full key expression."""
+    short = key.removeprefix("/").removeprefix(f"{ROOT}/")
+    return Topic(short, cast("Any", Any), Qos.COMMAND, 0.0, "", ""), f"{ROOT}/{short}"
+
+
+class UnreadableError(UsageError):
+    """What a key carries is not known here; its messages describe themselves."""
 
 
 def _match(key: str, known: Sequence[Topic[Any]]) -> tuple[Topic[Any], str] | None:

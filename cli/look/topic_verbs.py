@@ -5,9 +5,9 @@ a family as detection/DM1 for one member or 'detection/*' for all.
 
 Examples:
   rampart topic list
-  rampart topic echo localization/pose -n 3
-  rampart topic hz control/command
-  rampart topic info plan/route
+  rampart topic echo KEY -n 3
+  rampart topic hz KEY
+  rampart topic info KEY
 """
 
 from __future__ import annotations
@@ -26,11 +26,17 @@ import msgspec
 from rampart.actors.bus.bounds import MANY
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.limits import Remembered
-from rampart.actors.bus.topic import ROOT
+from rampart.actors.bus.topic import ROOT, Topic
 from rampart.cli import systems
 from rampart.cli.following import LOOK_S, is_over
 from rampart.cli.look import topic_catalogue as catalogue
-from rampart.cli.look.topic_catalogue import check_member, resolve, topics_for
+from rampart.cli.look.topic_catalogue import (
+    UnreadableError,
+    check_member,
+    of_any_type,
+    resolve,
+    topics_for,
+)
 from rampart.cli.output import NoEffectError, positive, print_json, print_table, say, say_text, warn
 from rampart.cli.session import Session, connect, pause
 from rampart.cli.verbs import JSON, PORT, add_family, add_verb, either, flag, number, option, word
@@ -48,7 +54,8 @@ def add(verbs: Any) -> None:
     add_verb(topic, "list", "all topics (needs no run)", topic_list, systems.choice(),
              either(JSON, flag("--markdown", "print topics.md")))
     add_verb(topic, "info", "the contract of one topic (needs no run)", topic_info, key,
-             word("--system", "FILE", "system spec; default the shipped one"), JSON)
+             word("--system", "FILE", "system spec; default that of the run, else the shipped one"),
+             JSON)
     add_verb(topic, "echo", "print messages as they come", topic_echo, PORT, key,
              option("-n", "--count", type=int, metavar="N", help="end after N messages"),
              number("--duration", "S", "end after S real seconds"),
@@ -67,7 +74,7 @@ def topic_list(options: argparse.Namespace) -> int:
       rampart topic list
       rampart topic list --markdown > topics.md
     """
-    spec = systems.load(options.system)
+    spec = systems.at_hand(options.system)
     if options.markdown:
         say_text(catalogue.markdown(spec).rstrip("\n"))
         return 0
@@ -90,7 +97,7 @@ def topic_info(options: argparse.Namespace) -> int:
       rampart topic info control/command
       rampart topic info detection/DM1
     """
-    spec = systems.load(options.system)
+    spec = systems.at_hand(options.system)
     topic, _ = resolve(options.key, systems.topics_of(spec))
     use = next(u for u in catalogue.uses(spec) if u.topic is topic)
     if options.json:
@@ -121,7 +128,7 @@ async def topic_echo(options: argparse.Namespace) -> int:
       rampart topic echo 'detection/*' --duration 5
       rampart topic echo plan/route -n 1 --json
     """
-    topic, key = resolve(options.key, topics_for(options.key, options.port))
+    topic, key = _topic_of(options)
     positive("--count", options.count)
     positive("--duration", options.duration)
     done = asyncio.Event()
@@ -176,7 +183,7 @@ async def topic_hz(options: argparse.Namespace) -> int:
       rampart topic hz control/command
       rampart topic hz 'heartbeat/*' --duration 3 --json
     """
-    topic, key = resolve(options.key, topics_for(options.key, options.port))
+    topic, key = _topic_of(options)
     positive("--duration", options.duration)
     arrivals: Remembered[str, deque[float]] = Remembered(MANY)
     duration_s = options.duration or (3.0 if options.json else None)
@@ -203,6 +210,15 @@ async def topic_hz(options: argparse.Namespace) -> int:
     if not arrivals:
         raise _nothing_came(options.key, duration_s)
     return 0
+
+
+def _topic_of(options: argparse.Namespace) -> tuple[Topic[Any], str]:
+    """Return the topic of the run that is meant; one of unknown type if its class is not here."""
+    try:
+        return resolve(options.key, topics_for(options.key, options.port))
+    except UnreadableError as error:
+        warn(f"{error}; messages are shown as they describe themselves")
+        return of_any_type(options.key)
 
 
 def rate_of(times_s: list[float]) -> dict[str, Any]:

@@ -12,17 +12,17 @@ import msgspec
 from rampart.actors.bus.bounds import bare
 from rampart.actors.bus.topic import ROOT, Topic
 from rampart.actors.layout.system_topics import find_topic, published_keys
-from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.runtime.corruption import InjectionError, field_type, is_array
 from rampart.actors.runtime.injection import MODES, flaw
 from rampart.cli import systems
 from rampart.cli.look.topic_catalogue import resolve, topics_for
-from rampart.cli.operate.injecting import run_fault
+from rampart.cli.operate.injecting import hit_process, run_fault
 from rampart.cli.output import UsageError, positive, print_json, print_table, refusing, say
 from rampart.cli.verbs import JSON, PORT, add_verb, flag, group, number, option, several, word
 from rampart.manager.spec.specification import SystemSpec
 from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
-from rampart.sim.faults.faults import faults_of
+from rampart.sim.faults.faults import PROCESS_FAULTS, faults_of
+from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.topic_faults import modes_of, systematic_faults
 
 _DEFAULT_DURATION_S = 5.0
@@ -33,9 +33,11 @@ def add(verbs: Any) -> None:
     """Add the verb to the parser."""
     add_verb(
         verbs, "inject", "inject a fault", inject, PORT,
-        option("fault", nargs="?", metavar="FAULT", help="a name from --list, or MODE:TOPIC"),
+        option("fault", nargs="?", metavar="FAULT", help="a name from --list, MODE:TOPIC, "
+               "kill:NODE, stop:NODE or wedge:NODE"),
         flag("--list", "list the catalogue (needs no run)"),
-        word("--system", "FILE", "for --list: system spec; default the shipped one"),
+        word("--system", "FILE", "for --list: system spec; default that of the run, else the "
+             "shipped one"),
         number("--duration", "S", "simulated seconds, inf for permanent; default the fault's own, "
                f"else {_DEFAULT_DURATION_S:g}"),
         flag("--at-once", "return as soon as the fault is in force; do not wait for its end"),
@@ -73,31 +75,34 @@ def inject(options: argparse.Namespace) -> int | Coroutine[Any, Any, int]:
     Ctrl-C ends the fault at once. Durations are simulated seconds.
 
     Examples:
-      rampart inject --list                           what there is
-      rampart inject command-out-of-bounds --duration 3
-      rampart inject prohibited-area --at-once
-      rampart inject laser-stuck --duration inf       permanent: until the node's process ends
-      rampart inject gps-dropout --on 1 --off 4 --duration 30
-                                                      intermittent: 1 s without GPS, 4 s with
-      rampart inject drop:localization/pose           any mode on any topic ...
-      rampart inject corrupt:plan/route --seed 7      ... one of its numbers: odd seeds, one each
-      rampart inject drop:control/command --share 0.3 three messages in ten are lost
+      rampart inject --list                           what there is in the system at hand
+      rampart inject FAULT --duration 3               one that has a name
+      rampart inject FAULT --at-once
+      rampart inject stuck:TOPIC --duration inf       permanent: until the node's process ends
+      rampart inject drop:TOPIC --on 1 --off 4 --duration 30
+                                                      intermittent: 1 s without, 4 s with
+      rampart inject corrupt:TOPIC --seed 7           one of its numbers: odd seeds, one each
+      rampart inject drop:TOPIC --share 0.3           three messages in ten are lost
+      rampart inject kill:NODE                        a process: it is gone at once ...
+      rampart inject stop:NODE --duration 2           ... or stands still, and then goes on
     your own:
-      rampart inject --topic localization/pose --mode delay --delay 0.8
-      rampart inject --topic summit_xl/scan --mode restamp --stamp=-0.2
+      rampart inject --topic KEY --mode delay --delay 0.8
+      rampart inject --topic KEY --mode restamp --stamp=-0.2
                                                       stamped 0.2 s before the truth
-      rampart inject --topic localization/pose --mode corrupt --ramp x_m=0.25
-      rampart inject --topic control/command --mode corrupt --set angular_radps=2.5
-      rampart inject --topic summit_xl/scan --mode corrupt --add ranges_f32=0.4 \
+      rampart inject --topic KEY --mode corrupt --ramp x_m=0.25
+      rampart inject --topic KEY --mode corrupt --set angular_radps=2.5
+      rampart inject --topic KEY --mode corrupt --add ranges_f32=0.4 \
                      --noise ranges_f32=0.2
     Fields are those of `rampart topic info TOPIC`; one inside another is written pose.x_m.
     """
     if options.list:
-        _print_catalogue(systems.load(options.system), as_json=options.json)
+        _print_catalogue(systems.at_hand(options.system, options.port), as_json=options.json)
         return 0
     if options.system is not None:
         raise UsageError(f"--system {options.system}: goes with --list; a fault is injected into "
                          "the run that there is")
+    if (options.fault or "").partition(":")[0] in PROCESS_FAULTS:
+        return hit_process(options)
     fault = choose(options)
     positive("--duration", options.duration, "must be seconds above 0, or inf")
     return run_fault(fault, options)
@@ -129,22 +134,16 @@ def _known_fault(options: argparse.Namespace) -> Fault:
     _, colon, key = options.fault.partition(":")
     known = topics_for(key, options.port) if colon else ()
     with refusing(UnknownFaultError):
-        return faults_of(_system(options.port)).find(options.fault, options.seed or 0, known)
-
-
-def _system(port: int | None) -> SystemSpec:
-    """Return the system of the run; the shipped one, if there is none to read."""
-    try:
-        return systems.load(find_run(port).system_file)
-    except (NoRunError, UsageError):
-        return systems.load(None)
+        faults = faults_of(systems.at_hand(None, options.port))
+        return faults.find(options.fault, options.seed or 0, known)
 
 
 def _own_fault(options: argparse.Namespace) -> Fault:
     topic, key = resolve(options.topic, topics_for(options.topic, options.port))
     if "*" in key:
+        spec = systems.at_hand(None, options.port)
         with refusing(ValueError):
-            members = [k for k in published_keys(_system(options.port)) if find_topic(k, (topic,))]
+            members = [k for k in published_keys(spec) if find_topic(k, (topic,))]
         raise UsageError(f"--topic {options.topic}: name one member of the family, "
                          f"e.g. {next(iter(members), topic.key)}")
     if options.mode not in MODES:
@@ -222,7 +221,15 @@ def _print_catalogue(spec: SystemSpec, *, as_json: bool) -> None:
     say(f"any topic, as MODE:TOPIC; MODE is one of {', '.join(MODES)}:")
     print_table(("topic", "modes"), list(_modes_by_topic(keys, known).items()))
     say()
-    say("crashes: kill-node NODE, or kill -9 PID")
+    others = [name for names in faults.others.values() for name in names]
+    if others:
+        say("of the robot, for --fault of a run and in campaigns:")
+        for name in others:
+            say(f"  {name}")
+        say()
+    say("any process: kill:NODE, stop:NODE, wedge:NODE; and slow:NODE in virtual time; NODE is one "
+        "of")
+    say(f"  {', '.join(can_be_hit(spec))}")
 
 
 def _modes_by_topic(keys: tuple[str, ...], known: tuple[Topic[Any], ...]) -> dict[str, str]:

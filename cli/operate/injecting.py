@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
+import math
+import os
+import signal
 import uuid
 
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.envelope import Header
 from rampart.actors.bus.messages import InjectionReport
+from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.runtime.fault_watch import FaultWatch, Order
+from rampart.actors.supervision.kill_node import SignalError, signal_node
 from rampart.cli.look.topic_catalogue import check_member
-from rampart.cli.output import NoEffectError, print_json, say
+from rampart.cli.output import NoEffectError, UsageError, positive, print_json, refusing, say
 from rampart.cli.session import Session, connect, pause
 from rampart.sim.faults.disturbance import Fault
+
+STOPPED_S = 5.0
+"""Simulated seconds for which `stop:NODE` stops a process unless told otherwise."""
 
 _TAKE_HOLD_S = 1.5
 """Real seconds within which a publisher answers, even when it is just being respawned."""
@@ -70,6 +79,50 @@ async def run_fault(fault: Fault, options: argparse.Namespace) -> int:
                 topic = watch.orders[0].place
                 say(f"{fault.name}: affects {topic}, and goes on" if watch.unfinished else
                     f"{fault.name}: over, {watch.affected} messages on {topic} affected")
+    return 0
+
+
+async def hit_process(options: argparse.Namespace) -> int:
+    """Do to a process of the run what `kill:NODE`, `stop:NODE` or `wedge:NODE` says.
+
+    Raises:
+        UsageError: there is no run or no such node, or an option does not go with it.
+    """
+    what, _, node = options.fault.partition(":")
+    if "@" in node or "+" in node:
+        raise UsageError(f"{options.fault}: here it is injected now; --duration S says how long")
+    if what == "slow":
+        raise UsageError(f"{options.fault}: only in virtual time: --virtual --fault "
+                         f"{options.fault}; how slow a real process is, is up to the machine")
+    if what != "stop" and options.duration is not None:
+        raise UsageError(f"--duration {options.duration:g}: {what} has no end; whoever brings the "
+                         "node back says when")
+    for name in ("topic", "mode", "share", "on", "off", "seed", "delay", "stamp", "set", "add",
+                 "ramp", "noise", "keep_ends"):
+        if getattr(options, name) not in (None, []):
+            raise UsageError(f"--{name.replace('_', '-')} goes with a fault of a topic, not with "
+                             f"{options.fault}")
+    positive("--duration", options.duration, "must be seconds above 0, or inf")
+    lasts_s = math.inf if what != "stop" else options.duration or STOPPED_S
+    if options.at_once and math.isfinite(lasts_s):
+        raise UsageError("--at-once: a process that is stopped has to be continued by somebody; "
+                         "leave it out, or say --duration inf")
+    with refusing(NoRunError):
+        run = find_run(options.port)
+    with refusing(SignalError):
+        victim = signal_node(node, what.upper(), run.base_port)
+    if not options.json:
+        say(f"{options.fault}: pid {victim.pid}, incarnation {victim.incarnation}"
+            + (f", for {lasts_s:g} s" if math.isfinite(lasts_s) else ""))
+    if math.isfinite(lasts_s):
+        try:
+            await asyncio.sleep(lasts_s / run.rate)
+        finally:
+            with contextlib.suppress(ProcessLookupError):  # it was replaced meanwhile
+                os.kill(victim.pid, signal.SIGCONT)
+    if options.json:
+        print_json({"fault": options.fault, "effective": True, "node": node, "pid": victim.pid,
+                    "incarnation": victim.incarnation, "duration_s": lasts_s})
     return 0
 
 

@@ -218,12 +218,11 @@ def _reachability(spec: SystemSpec) -> Iterator[Finding]:
             answers.setdefault(name, set()).update(mechanism.recoveries)
     for path, detection in numbered("detection", spec.detections):
         if detection.name not in answers:
-            yield Finding(f"{path}.name", "unreachable: no mechanism uses this detection module",
-                          (detection.name,))
+            yield Finding(path, "unreachable: no mechanism uses this detection module")
     for path, recovery in numbered("recovery", spec.recoveries):
         if recovery.name not in recovering:
-            yield Finding(f"{path}.name", "unreachable: no mechanism and no escalation leads to "
-                          "this recovery", (recovery.name,))
+            yield Finding(path, "unreachable: no mechanism and no escalation leads to this "
+                                "recovery")
     watched = {pair for detection in spec.detections
                for pair in product(detection.watch, answers.get(detection.name, ()))}
     for path, node in numbered("node", spec.nodes):
@@ -233,9 +232,19 @@ def _reachability(spec: SystemSpec) -> Iterator[Finding]:
                           "watches it", (node.respawn,))
 
 
+def _faults(spec: SystemSpec) -> Iterator[Finding]:
+    detections = dict.fromkeys(row.name for row in spec.detections)
+    first: dict[str, str] = {}
+    for path, fault in numbered("fault", spec.faults):
+        if (other := first.setdefault(fault.name, path)) != path:
+            yield Finding(f"{path}.name", f"duplicate name, already at {other}.name", (fault.name,))
+        yield from find_wrong_names(f"{path}.detected_by", fault.detected_by, "detection module",
+                                    detections, "listed twice")
+
+
 VALIDATORS: tuple[Validator, ...] = (
     find_wrong_times, _names, _nodes, _detections, _recoveries, _processes, _mechanisms,
-    _reachability, _panels,
+    _reachability, _faults, _panels,
     arbitration_checks.find_wrong_tree, arbitration_checks.find_wrong_policy,
     arbitration_checks.find_wrong_orders, arbitration_checks.find_contradictions,
     arbitration_checks.find_wrong_compounds, arbitration_checks.find_wrong_precedence,

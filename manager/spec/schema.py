@@ -27,6 +27,7 @@ from rampart.manager.spec.tables import (
     End,
     Layers,
     Name,
+    NonNegative,
     OptionalName,
     Positive,
     Supervision,
@@ -168,6 +169,42 @@ class EventSpec(Table, frozen=True):
         return 1 if self.gate == "or" else max(1, len(self.of))
 
 
+class FaultSpec(Table, frozen=True):
+    """A fault of the system that has a name: what happens to one topic; see `Injection`.
+
+    Attributes:
+        name: As it is typed, e.g. "gauge-stuck".
+        title: For people.
+        topic: Key below `rampart/`, where it is published.
+        mode: What happens to its messages: "drop", "corrupt" and so on.
+        kind: By which faults are listed and drawn: "sensor", "actuator" and so on.
+        duration_s: How long it lasts unless told otherwise, simulated seconds.
+        set: For corrupt: field → value that takes the place of the true one.
+        add: For corrupt: field → what is added.
+        ramp: For corrupt: field → what is added per simulated second.
+        noise: For corrupt: field → standard deviation.
+        keep_ends: For corrupt: lists of which the first and last element stay.
+        delay_s: For delay.
+        stamp_s: For restamp: ahead, or behind if below 0.
+        detected_by: Detection modules that should see it.
+    """
+
+    name: Annotated[str, msgspec.Meta(pattern=r"^[a-z][a-z0-9-]{0,63}\Z")]
+    title: str
+    topic: str
+    mode: str
+    kind: Name = "named"
+    duration_s: Positive = 10.0
+    set: dict[str, Any] = {}
+    add: dict[str, float] = {}
+    ramp: dict[str, float] = {}
+    noise: dict[str, float] = {}
+    keep_ends: tuple[str, ...] = ()
+    delay_s: NonNegative = 0.0
+    stamp_s: float = 0.0
+    detected_by: tuple[Name, ...] = ()
+
+
 class SystemSpec(Table, frozen=True):
     """A whole system. In the file the arrays of tables are called by the singular.
 
@@ -202,6 +239,7 @@ class SystemSpec(Table, frozen=True):
     mechanisms: tuple[MechanismSpec, ...] = msgspec.field(name="mechanism", default=())
     events: tuple[EventSpec, ...] = msgspec.field(name="event", default=())
     orders: dict[str, dict[str, tuple[str, ...]]] = {}
+    faults: tuple[FaultSpec, ...] = msgspec.field(name="fault", default=())
     panels: tuple[Panel, ...] = msgspec.field(name="panel", default=())
 
     def without_disabled(self) -> SystemSpec:

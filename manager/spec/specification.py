@@ -30,8 +30,14 @@ from rampart.manager.spec.checks import find_nonsense, find_nonsense_of_rest
 from rampart.manager.spec.mobile_robot import Hazard, derive_timeouts
 from rampart.manager.spec.nodes import COMMAND_FIELDS, NODE_KINDS
 from rampart.manager.spec.panels import MAX_PANELS
-from rampart.manager.spec.schema import TABLES, SystemSpec
-from rampart.manager.spec.tables import Finding, SpecificationError, numbered
+from rampart.manager.spec.schema import (
+    TABLES,
+    DetectionSpec,
+    NodeSpec,
+    RecoverySpec,
+    SystemSpec,
+)
+from rampart.manager.spec.tables import Finding, SpecificationError, by_name
 
 ENUMS: dict[tuple[str, str], Iterable[Enum]] = {
     ("node", "kind"): NODE_KINDS, ("recovery", "kind"): RecoveryKind,
@@ -46,7 +52,7 @@ LARGEST_INTEGER = 2 ** 63 - 1
 """In parameters, which go to an actor as they are, by way of MessagePack."""
 
 MAX_ROWS = {"node": 1000, "detection": 1000, "recovery": 500, "mechanism": 1000, "event": 5000,
-            "orders": 16, "panel": MAX_PANELS}
+            "fault": 500, "orders": 16, "panel": MAX_PANELS}
 """Of each table; the shipped systems have 31 actors, and checks compare many with many."""
 
 
@@ -112,11 +118,11 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
             sense.
     """
     for finding in chain(_find_unwritable(document), _find_misshapen(document)):
-        raise _refusal(file, finding)
+        raise _refusal(file, finding, document)
     try:
         spec = msgspec.convert(document, SystemSpec)
     except msgspec.ValidationError as error:
-        raise _refusal(file, _explain(error, document)) from None
+        raise _refusal(file, _explain(error, document), document) from None
     spec = replace(spec, timing=derive_timeouts(spec.mobile, spec.timing))
     spec = _resolve_timing_names(spec, file)
     wrong = find_nonsense(spec)
@@ -125,12 +131,13 @@ def check_document(document: dict[str, Any], file: str) -> SystemSpec:
         wrong = find_nonsense_of_rest(enabled) if enabled is not spec else None
         spec = enabled
     if wrong is not None:
-        raise _refusal(file, wrong)
+        raise _refusal(file, wrong, document)
     return spec
 
 
-def _refusal(file: str, finding: Finding) -> SpecificationError:
-    return SpecificationError(file, finding.path, finding.problem, *finding.value)
+def _refusal(file: str, finding: Finding, document: Mapping[str, Any]) -> SpecificationError:
+    return SpecificationError(
+        file, by_name(finding.path, document), finding.problem, *finding.value)
 
 
 def _find_unwritable(document: dict[str, Any]) -> Iterator[Finding]:
@@ -194,21 +201,20 @@ def _resolve_timing_names(spec: SystemSpec, file: str) -> SystemSpec:
                                                  f"{', '.join(times)}", value)
         return times[value]
 
-    def resolved(path: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
-        return {key: resolve(value, f"{path}.parameters.{key}") if key.endswith("_s") else value
-                for key, value in parameters.items()}
+    def resolved(table: str, row: NodeSpec | DetectionSpec | RecoverySpec) -> dict[str, Any]:
+        where = f"{table} {row.name}: parameters"
+        return {key: resolve(value, f"{where}.{key}") if key.endswith("_s") else value
+                for key, value in row.parameters.items()}
 
     detections = []
-    for path, row in numbered("detection", spec.detections):
-        parameters = resolved(path, row.parameters)
-        within_s = resolve(row.within_s, f"{path}.within_s")
+    for row in spec.detections:
+        parameters = resolved("detection", row)
+        within_s = resolve(row.within_s, f"detection {row.name}: within_s")
         if math.isnan(within_s):
             within_s = parameters.get("timeout_s", within_s)
         detections.append(replace(row, within_s=within_s, parameters=parameters))
-    nodes = (replace(row, parameters=resolved(path, row.parameters))
-             for path, row in numbered("node", spec.nodes))
-    recoveries = (replace(row, parameters=resolved(path, row.parameters))
-                  for path, row in numbered("recovery", spec.recoveries))
+    nodes = (replace(row, parameters=resolved("node", row)) for row in spec.nodes)
+    recoveries = (replace(row, parameters=resolved("recovery", row)) for row in spec.recoveries)
     return replace(spec, nodes=tuple(nodes), detections=tuple(detections),
                    recoveries=tuple(recoveries))
 
@@ -238,6 +244,8 @@ def _explain(error: msgspec.ValidationError, document: dict[str, Any]) -> Findin
             problem += ", or { within_s = ..., hazard = '...' }"
     elif field == "gate":
         problem = "unknown gate; known: 'or', 'and', { at_least = k }"
+    elif "regex" in problem and (table, field) == ("fault", "name"):
+        problem = "expected a name: a small letter, then small letters, digits and hyphens"
     elif "regex" in problem and field in {"actor", "stand_in"}:
         problem = "expected 'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"
     elif "regex" in problem and "panel" in words:

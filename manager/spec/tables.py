@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
@@ -144,6 +145,33 @@ class Finding(NamedTuple):
     path: str
     problem: str
     value: tuple[Any, ...] = ()
+
+
+_NAME = re.compile(r"[A-Za-z][\w-]{0,63}\Z", re.ASCII)
+_IN_A_ROW = re.compile(r"\$\.(node|detection|recovery|mechanism|event|fault)\[(\d+)\](\.|\Z)")
+
+
+def by_name(path: str, document: Mapping[str, Any]) -> str:
+    """Return where something is, by the name of its table rather than by its place.
+
+    Args:
+        path: In the file, e.g. `$.node[2].kind`.
+        document: The file.
+
+    Returns:
+        For example `node pump: kind`; the path, if it is not in such a table, or that has no name.
+    """
+    found = _IN_A_ROW.match(path)
+    if not found or path.endswith("].name"):  # which may be there twice
+        return path
+    try:
+        name = document[found[1]][int(found[2])]["name"]
+    except (LookupError, TypeError):
+        return path
+    if not isinstance(name, str) or not _NAME.match(name):
+        return path
+    rest = path[found.end():]
+    return f"{found[1]} {name}: {rest}" if rest else f"{found[1]} {name}"
 
 
 def unknown(path: str, value: str, what: str, known: Collection[str]) -> Finding:

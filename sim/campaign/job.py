@@ -48,6 +48,8 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         seed: Of everything random.
         patience_s: See `PATIENCE_S`.
         duration_s: How long a run without a mission takes; None for what the spec says.
+        content: Digest of what else goes into the run, see `rampart.sim.campaign.content`; a
+            result that is stored for another one is none of this job.
     """
 
     row: str
@@ -61,6 +63,7 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     seed: int = 1
     patience_s: float = PATIENCE_S
     duration_s: float | None = None
+    content: str = ""
 
     @property
     def key(self) -> str:
@@ -199,7 +202,7 @@ def virtual_run(job: Job) -> VirtualRun:
     Raises:
         ValueError: The job makes no sense: no such system, mission, fault.
     """
-    file, document = _document(job.system)
+    file, document = read_document_of(job.system)
     for name, values in job.retuned.items():
         document = adapt(document, Change(Action.RETUNE, name, values), file)[0]
     chosen = {"strategy": job.strategy} if job.strategy else {}
@@ -236,7 +239,7 @@ def latencies(record: RunRecord, injected_s: float | None) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=8)
-def _document(system: str) -> tuple[str, dict[str, Any]]:
+def read_document_of(system: str) -> tuple[str, dict[str, Any]]:
     """Return path and document of a system spec."""
     file = systems.find(system)
     working_folder.admit(file.parent)
@@ -250,22 +253,27 @@ def faults_of_system(system: str) -> Faults:
     Raises:
         ValueError: there is no such system, or it is unsound.
     """
-    file, document = _document(system)
+    file, document = read_document_of(system)
     return faults_of(check_document(document, file))
 
 
 @lru_cache(maxsize=8)
 def application_of_system(system: str) -> type[Application]:
     """Return the application of a system; arguments and errors as of `faults_of_system`."""
-    file, document = _document(system)
+    file, document = read_document_of(system)
     return application_class(check_document(document, file))
 
 
 @lru_cache(maxsize=8)
 def trial_of_system(system: str) -> type[Trial]:
     """Return what a run of a system is; arguments and errors as of `faults_of_system`."""
-    file, document = _document(system)
+    file, document = read_document_of(system)
     return trial_class(check_document(document, file))
+
+
+def application_of_job(job: Job) -> Application:
+    """Return the application of a job's run; raises as `faults_of_system`."""
+    return _application(msgspec.json.encode(job.options), read_document_of(job.system)[0])
 
 
 @lru_cache(maxsize=8)

@@ -44,12 +44,12 @@ def fault_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
     groups: dict[str, tuple[str, ...]] = {}
     for fault in faults.named.values():
         groups[fault.group] = (*groups.get(fault.group, ()), fault.name)
-    return {
-        **groups,
-        "topic": tuple(f.name for f in systematic_faults(keys, system_topics(spec))),
-        "process": tuple(f"{what}:{node}" for what, node in product(PROCESS_FAULTS, nodes)),
-        **faults.others,
-    }
+    for kind, names in {
+            "topic": tuple(f.name for f in systematic_faults(keys, system_topics(spec))),
+            "process": tuple(f"{what}:{node}" for what, node in product(PROCESS_FAULTS, nodes)),
+            **faults.others}.items():
+        groups[kind] = (*groups.get(kind, ()), *names)
+    return groups
 
 
 def cross(jobs: Sequence[Job], faults: Iterable[PlannedFault | None], seeds: Iterable[int]

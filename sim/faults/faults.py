@@ -15,10 +15,13 @@ import msgspec
 from rampart.actors.bus.topic import Topic
 from rampart.actors.ftm.messages import FaultOrder, NamedFault
 from rampart.actors.layout.layout import application_class
+from rampart.actors.layout.system_topics import find_topic, published_keys, system_topics
 from rampart.actors.layout.wiring import import_class
+from rampart.actors.runtime.injection import flaw
 from rampart.manager.spec.schema import SystemSpec
-from rampart.sim.faults.disturbance import Fault, UnknownFaultError
-from rampart.sim.faults.topic_faults import topic_fault
+from rampart.sim.faults.disturbance import Disturbance, Fault, UnknownFaultError
+from rampart.sim.faults.topic_faults import closed, topic_fault
+from rampart.sim.faults.wrong_numbers import Sizes
 
 PROCESS_FAULTS = ("kill", "stop", "wedge", "slow")
 
@@ -32,16 +35,18 @@ class Faults:
         others: by kind, faults that are no disturbances of topics, as a campaign draws them.
         titled: those that the operator's page offers: name → kind and title.
         kinds: all kinds in the order in which they are shown, and how they are called.
+        sizes: how wrong numbers can be, if the robot knows better than their fields say.
         intruder: a fault whose last part is a number that a search may choose to add, and the
             range of the number; None for none.
     """
 
-    named: ClassVar[Mapping[str, Fault]] = {}
+    named: Mapping[str, Fault] = {}
     left_out: ClassVar[Mapping[str, str]] = {}
     others: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     titled: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    kinds: ClassVar[Mapping[str, str]] = {"none": "no fault", "topic": "topics",
+    kinds: Mapping[str, str] = {"none": "no fault", "topic": "topics",
                                           "process": "processes", "several": "several at once"}
+    sizes: ClassVar[Sizes] = Sizes()
     intruder: ClassVar[tuple[str, float, float] | None] = None
 
     def own(self, fault: str, injection: str, duration_s: float | None) -> object | None:
@@ -76,7 +81,7 @@ class Faults:
             return self.named[name].varied(seed=seed)
         mode, colon, key = name.partition(":")
         if colon:
-            return topic_fault(mode, key, seed, known)
+            return topic_fault(mode, key, seed, known, self.sizes)
         if name in self.left_out:
             raise UnknownFaultError(f"no fault {name!r}: {self.left_out[name]}")
         near = difflib.get_close_matches(name, self.named, 1)
@@ -116,7 +121,43 @@ def faults_of(spec: SystemSpec) -> Faults:
     """Return the faults of the robot that a system is for.
 
     Raises:
-        ValueError: its application, or the class of faults that this names, does not exist.
+        ValueError: its application, or the class of faults that this names, does not exist, or a
+            fault of the specification makes no sense.
     """
     path = application_class(spec).faults
-    return import_class(path, Faults, "faults")() if path else Faults()
+    found = import_class(path, Faults, "faults")() if path else Faults()
+    if not spec.faults:
+        return found
+    found.named = {**found.named, **_specified(spec, found)}
+    more = {row.kind: f"{row.kind} faults" for row in spec.faults}
+    found.kinds = {**found.kinds, **{kind: title for kind, title in more.items()
+                                     if kind not in found.kinds}}
+    return found
+
+
+def _specified(spec: SystemSpec, faults: Faults) -> dict[str, Fault]:
+    """Return the faults that a specification names.
+
+    Raises:
+        ValueError: one makes no sense in the system; the message names it.
+    """
+    known, published = system_topics(spec), published_keys(spec)
+    made = {}
+    for row in spec.faults:
+        what = Disturbance(
+            row.topic, row.mode, row.delay_s, set_fields=row.set, ramp_fields=row.ramp,
+            keep_ends=row.keep_ends, add_fields=row.add, noise_fields=row.noise,
+            stamp_s=row.stamp_s)
+        topic = find_topic(row.topic, known)
+        if row.name in faults.named:
+            raise ValueError(f"fault {row.name}: the robot has one of this name")
+        reason = closed(row.topic)
+        if topic is None or not (reason or row.topic in published):
+            near = difflib.get_close_matches(row.topic, published, 3)
+            hint = f"; the nearest: {', '.join(near)}" if near else ""
+            raise ValueError(f"fault {row.name}: topic = {row.topic!r}: no node publishes it{hint}")
+        if reason := reason or flaw(what.order("", row.duration_s), topic.type):
+            raise ValueError(f"fault {row.name}: {reason}")
+        made[row.name] = Fault(row.name, row.title, (what,), row.detected_by, row.duration_s,
+                               row.kind)
+    return made

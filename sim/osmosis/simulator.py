@@ -66,6 +66,7 @@ class Simulator(Actor):
 
     parameters: Parameters
     outputs = (*_JOBS, ftm_topics.HOLDS)
+    node_kind = "world"
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

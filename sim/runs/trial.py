@@ -162,7 +162,7 @@ class Trial:
         return {
             "mission": record.mission, "safety": record.safety, "reasons": record.reasons,
             "duration_s": round(record.duration_s, 2), "restarts": record.restarts,
-            "given_up": record.given_up,
+            "given_up": record.given_up, "failing": record.failing,
             "decisions": msgspec.to_builtins(record.decisions),
             "faults": [{**msgspec.to_builtins(fault), "effective": fault.effective}
                        for fault in record.faults]}
@@ -248,11 +248,16 @@ def trial_class(spec: SystemSpec) -> type[Trial]:
     """Return what a run of a system is: that of its application, or one that its judge hears.
 
     Raises:
-        ValueError: the application, the judge, or a class that one of them names does not exist.
+        ValueError: the application, the judge, or a class that one of them names does not exist,
+            or the specification says when a mission ends.
     """
     path = application_class(spec).trial
     if path:
-        return import_class(path, Trial, "trial")
+        found = import_class(path, Trial, "trial")
+        if found.patient and spec.end.after_s is not None:
+            raise ValueError(f"{spec.name}: $.end.after_s = {spec.end.after_s:g}: a mission ends "
+                             "by itself; leave it out")
+        return found
     return _judged_by(str(spec.judge.get("class"))) if judge_class(spec) else Trial
 
 

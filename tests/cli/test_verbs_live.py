@@ -115,6 +115,7 @@ async def run(monkeypatch, sockets):
     info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), sockets, names,
                    "r1", 0, "test run", plan={"mission": "AB"})
     monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: info)
+    monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)  # those of others
     async with AsyncExitStack() as stack:
         nodes = []
         for name, cls in (("simulator", Everything), ("DM1", Bystander)):

@@ -19,6 +19,7 @@ from rampart.manager.model.gates import GateError, detection_gate
 from rampart.manager.spec.schema import (
     DetectionSpec,
     EventSpec,
+    FaultSpec,
     Layers,
     MechanismSpec,
     NodeSpec,
@@ -46,7 +47,8 @@ MODULES = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)[0]
 
 
 @pytest.mark.parametrize("table", [SystemSpec, Robot, Timing, Layers, Supervision, End, NodeSpec,
-                                   DetectionSpec, RecoverySpec, MechanismSpec, EventSpec, Within])
+                                   DetectionSpec, RecoverySpec, MechanismSpec, EventSpec, FaultSpec,
+                                   Within])
 def test_every_field_is_described(table):
     missing = [f.encode_name for f in msgspec.structs.fields(table)
                if not re.search(rf"[`\[ ]{f.encode_name}\b", DOCUMENT)]
@@ -70,7 +72,8 @@ def toml(value: object) -> str:
     ("`[layers]`", Layers, set()), ("`[supervision]`", Supervision, set()),
     ("`[[node]]`", NodeSpec, set()),
     ("`[[detection]]`", DetectionSpec, {"within_s"}), ("`[[recovery]]`", RecoverySpec, set()),
-    ("`[[mechanism]]`", MechanismSpec, set()), ("`[[event]]`", EventSpec, {"gate"})])
+    ("`[[mechanism]]`", MechanismSpec, set()), ("`[[event]]`", EventSpec, {"gate"}),
+    ("`[[fault]]`", FaultSpec, set())])
 def test_what_is_required_and_what_is_the_default_are_as_in_the_code(heading, table, also):
     section = DOCUMENT.partition("### What has to be there\n")[2].partition("\n### ")[0]
     text = " ".join(re.findall(rf"^- {re.escape(heading)}: (.*?)(?=^- |\Z)", section,

@@ -93,7 +93,7 @@ def test_a_module_of_one_s_own_that_cannot_be_imported_is_one_line_with_file_pat
                     str(free_base_port()), "--report", str(tmp_path / "report"))
     assert done.returncode == 2, done.stderr
     assert len(done.stderr.splitlines()) == 1, done.stderr
-    assert f"{tmp_path}/own.toml: $.detection[2].actor = 'own:Level': " in done.stderr
+    assert f"{tmp_path}/own.toml: detection DM3: actor = 'own:Level': " in done.stderr
     assert cause.replace("HERE", str(tmp_path)) in done.stderr
     assert not (tmp_path / "report").exists()
 
@@ -132,7 +132,7 @@ def test_a_parameter_that_an_actor_of_one_s_own_does_not_take_is_one_line_before
                     str(free_base_port()), "--report", str(tmp_path / "report"))
     assert done.returncode == 2, done.stderr
     assert len(done.stderr.splitlines()) == 1, done.stderr
-    assert f"{tmp_path}/own.toml: $.detection[2].{words}" in done.stderr
+    assert f"{tmp_path}/own.toml: detection DM3: {words}" in done.stderr
     assert not (tmp_path / "report").exists()
 
 

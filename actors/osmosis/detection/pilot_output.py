@@ -195,6 +195,7 @@ class PilotOutput(DetectionModule):
         hold_s: NonNegative = PilotLimits().hold_s
 
     parameters: Parameters
+    optional_inputs = (topics.STANDBY_COMMAND,)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

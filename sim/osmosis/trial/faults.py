@@ -12,6 +12,7 @@ from rampart.actors.runtime.fault_watch import Order
 from rampart.sim.faults.disturbance import Disturbance, Fault
 from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.scenario import ScenarioError, number
+from rampart.sim.faults.wrong_numbers import Sizes
 from rampart.sim.osmosis.robot import WHEEL_NAMES
 from rampart.sim.osmosis.trial.sensor_faults import LEFT_OUT, SENSOR_FAULTS
 
@@ -56,12 +57,20 @@ class SuddenObstacle:
     duration_s: float
 
 
+SIZES = Sizes((
+    ("_m", 0.5, 3.0), ("_rad", 0.3, 1.5), ("_mps", 0.2, 0.8), ("_radps", 0.2, 1.0),
+    ("_mps2", 0.5, 2.0), ("_s", 1.0, 10.0), ("_lux", 200.0, 1000.0), ("_cd", 50.0, 150.0),
+    ("_f32", 0.3, 1.5), ("waypoints", 0.5, 3.0), ("", 0.1, 0.5)), ("_s", "_lux", "_cd"))
+"""By which the numbers of Osmosis' messages, and of the engine's on Osmosis, are wrong."""
+
+
 class OsmosisFaults(Faults):
     """Besides disturbances of topics: `stuck-wheel[:WHEEL]`, `weak-wheel[:WHEEL[:STRENGTH]]`,
     `brake-failure[:STRENGTH]` for the actuators, `obstacle-ahead[:METRES]` for the world.
     """  # noqa: D205 names that must not be broken
 
     named = {**PAPER_FAULTS, **SENSOR_FAULTS}
+    sizes = SIZES
     left_out = LEFT_OUT
     others = {
         "actuator": (*(f"stuck-wheel:{wheel}" for wheel in _WHEELS),

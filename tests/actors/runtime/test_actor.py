@@ -311,21 +311,21 @@ def test_no_actor_takes_a_name_that_the_base_needs_for_itself():
 
 @pytest.mark.parametrize(("old", "new", "message"), [
     ("rampart.actors.osmosis.page.hmi:OsmosisHmi", "rampart.actors.osmosis.page.hmi:Hm",
-     "$.node[4].actor = 'rampart.actors.osmosis.page.hmi:Hm': no such actor class; "
+     "node hmi: actor = 'rampart.actors.osmosis.page.hmi:Hm': no such actor class; "
      "known: OsmosisHmi"),
     ("rampart.actors.osmosis.page.hmi:OsmosisHmi", "rampart.actors.operator.himi:Hmi",
-     "$.node[4].actor = 'rampart.actors.operator.himi:Hmi': No module named "
+     "node hmi: actor = 'rampart.actors.operator.himi:Hmi': No module named "
      "'rampart.actors.operator.himi'"),
     ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.runtime.stub_node:StubNode",
-     "$.detection[2].actor = 'rampart.actors.runtime.stub_node:StubNode': it does not publish "
+     "detection DM3: actor = 'rampart.actors.runtime.stub_node:StubNode': it does not publish "
      "detection/{name}, as "
      "the modules of this table do"),
     ("rampart.actors.osmosis.detection.bounds:Bounds", "rampart.actors.recovery.stub:StubRecovery",
-     "$.detection[2].actor = 'rampart.actors.recovery.stub:StubRecovery': it does not publish "
+     "detection DM3: actor = 'rampart.actors.recovery.stub:StubRecovery': it does not publish "
      "detection/"),
     ("rampart.actors.osmosis.recovery.controlled_stop:ControlledStop",
      "rampart.actors.detection.stub:StubDetection",
-     "$.recovery[1].actor = 'rampart.actors.detection.stub:StubDetection': it does not publish "
+     "recovery RM2: actor = 'rampart.actors.detection.stub:StubDetection': it does not publish "
      "recovery/"),
 ])
 def test_a_class_that_is_not_there_or_of_another_table_is_named_with_its_place(

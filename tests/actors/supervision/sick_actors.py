@@ -14,7 +14,7 @@ from rampart.actors.runtime.actor import Actor
 from rampart.manager.actor import FtmManager
 from rampart.manager.spec.tables import Supervision
 from tests import ROOT
-from tests.stub_actors import Idler, write_stub_system
+from tests.stub_actors import IdleDetection, Idler, write_stub_system
 
 SICK_S = (14.0, 40.0)
 """Simulated seconds, far longer than it takes to be given up."""
@@ -42,6 +42,10 @@ class SickIdler(Idler):
     def on_start(self) -> None:
         if self.context.incarnation > 1 and not Path(os.environ[WELL]).exists():
             raise RuntimeError("sick")
+
+
+class SickIdleDetection(SickIdler, IdleDetection):
+    pass
 
 
 class SickControl(Sick, OsmosisControl):
@@ -85,8 +89,8 @@ def write_sick_stubs(directory: Path, *nodes: str) -> Path:
     text = write_stub_system(directory).read_text(encoding="utf-8")
     for node in nodes:
         at = text.index(f'"{node}"')
-        text = text[:at] + text[at:].replace("tests.stub_actors:Idler",
-                                               f"{SickIdler.__module__}:SickIdler", 1)
+        text = text[:at] + text[at:].replace("tests.stub_actors:Idle",
+                                             f"{SickIdler.__module__}:SickIdle", 1)
     file = directory / "sick.toml"
     file.write_text(text + _SOON, encoding="utf-8")
     return file

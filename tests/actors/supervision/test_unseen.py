@@ -89,7 +89,7 @@ async def test_what_a_nodes_callbacks_and_forgotten_tasks_raise_is_told_and_it_g
     text = system.read_text()
     at = text.index('name = "localization"')
     system.write_text(text[:at] + text[at:].replace(
-        "tests.stub_actors:Idler", "tests.actors.supervision.test_unseen:Stumbler", 1))
+        "tests.stub_actors:IdlePose", "tests.actors.supervision.test_unseen:Stumbler", 1))
     async with launched(stub_plan(system)) as launcher:
         said = ""
         async with asyncio.timeout(20):

@@ -27,7 +27,7 @@ def test_the_papers_system_is_listed_with_its_barriers():
 def test_counts_are_json_for_scripts():
     done = rampart("cut-sets", "paper", "--count", "--json")
     assert json.loads(done.stdout) == {
-        "top": "moving_inside_prohibited_area", "minimal_cut_sets": 7}
+        "format": 1, "top": "moving_inside_prohibited_area", "minimal_cut_sets": 7}
 
 
 def test_what_is_exported_is_read_again(tmp_path):

@@ -94,22 +94,22 @@ def test_a_gate_and_an_order_and_a_strategy_are_changed():
      "safety-first, simultaneous"),
     ("set", "order", {"value": "comfort"},
      "paper.toml: $.order = 'comfort': unknown order; known: safer"),
-    ("disable", "RM1", {}, "paper.toml: $.recovery[1].escalate_to = 'RM1': RM2 escalates to it, "
+    ("disable", "RM1", {}, "paper.toml: recovery RM2: escalate_to = 'RM1': RM2 escalates to it, "
                            "and it is disabled"),
-    ("disable", "FTM1", {}, "paper.toml: $.mechanism[1].event = 'command_calculation_error': "
+    ("disable", "FTM1", {}, "paper.toml: mechanism FTM2: event = 'command_calculation_error': "
                             "FTM3: the FTMTree has 3 roots: FTM2, FTM3, FTM6; exactly one mechanism"
                             " may have no other above it, e.g. one on the top event"),
     ("retune", "DM2", {"timeout_s": 5.0},
      "paper.toml: $.timing: the time budget does not fit: FTM2 needs 5.150 s (detection 5.000 + "
      "arbitration 0.050 + actuation 0.100) of 1.250 s before the robot drifts out of the corridor"),
     ("retune", "FTM3", {"against": {"within_s": 5.0, "hazard": "x", "typo": 1}},
-     "paper.toml: $.mechanism[2].against.typo = 1: unknown field; known: within_s, hazard"),
+     "paper.toml: mechanism FTM3: against.typo = 1: unknown field; known: within_s, hazard"),
     ("retune", "FTM3", {"detect": "DM3 and not DM3"},
-     "paper.toml: $.mechanism[2].detect = 'DM3 and not DM3': it can never be active"),
+     "paper.toml: mechanism FTM3: detect = 'DM3 and not DM3': it can never be active"),
     ("retune", "RM3", {"deadline_s": "soon"},
-     "paper.toml: $.recovery[2].deadline_s = 'soon': Expected float, got str"),
+     "paper.toml: recovery RM3: deadline_s = 'soon': Expected float, got str"),
     ("replace", "DM1", {"parameters": 3},
-     "paper.toml: $.detection[0].parameters = 3: Expected object, got int"),
+     "paper.toml: detection DM1: parameters = 3: Expected object, got int"),
 ])
 def test_refused_in_one_line(action, name, values, message):
     with pytest.raises((ChangeError, SpecificationError)) as caught:
@@ -292,12 +292,12 @@ def test_in_the_middle_of_a_recovery_it_is_refused_and_afterwards_it_is_not():
      '{"actor": "rampart.actors.osmosis.control.localization.localization:Localization"}',
      "it does not publish recovery/{name}/state, as the modules of this table do"),
     ("retune", "DM4", '{"timeout_s": 0.01}',
-     "paper.toml: $.detection[3].parameters.timeout_s = 0.01: would raise false alarms; at least "
+     "paper.toml: detection DM4: parameters.timeout_s = 0.01: would raise false alarms; at least "
      "0.420 s, 3 periods of heartbeat_period_s = 0.140 s, is right"),
     ("retune", "DM1", '{"hold_s": -1}',
-     "paper.toml: $.detection[0].parameters.hold_s = -1: expected a number, 0 or more"),
+     "paper.toml: detection DM1: parameters.hold_s = -1: expected a number, 0 or more"),
     ("retune", "DM3", '{"hold": 1}',
-     "paper.toml: $.detection[2].parameters.hold = 1: unknown parameter; known: hold_s, suspects"),
+     "paper.toml: detection DM3: parameters.hold = 1: unknown parameter; known: hold_s, suspects"),
 ])
 def test_what_is_refused_changes_nothing(action, name, values, words):
     async def scenario(system: Whole, engineer: Engineer) -> None:

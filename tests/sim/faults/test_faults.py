@@ -37,7 +37,7 @@ def find_fault(name: str, seed: int = 0, known: tuple[Topic[Any], ...] = topics.
 
 
 def topic_fault(mode: str, key: str, seed: int = 0) -> Fault:
-    return topic_fault_of(mode, key, seed, topics.ALL)
+    return topic_fault_of(mode, key, seed, topics.ALL, OsmosisFaults.sizes)
 
 
 SIMPLE = {

@@ -25,6 +25,8 @@ class SafetyPilot(Actor):
     """
 
     outputs = (topics.BASE_COMMAND, topics.PILOT_STATUS, ftm_topics.HOLDS)
+    optional_inputs = (topics.STANDBY_COMMAND,)
+    node_kind = "pilot"
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

@@ -12,7 +12,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.control.pilot.laser_pair import LaserCheck
 from rampart.sim.campaign.job import Job, run_job
 from rampart.sim.faults.scenario import parse_fault
-from rampart.sim.faults.topic_faults import topic_fault
+from rampart.sim.osmosis.trial.faults import OsmosisFaults
 
 
 def judge(references, period_s=0.05):
@@ -68,7 +68,8 @@ def test_once_the_laser_is_right_again_the_mission_goes_on():
 @pytest.mark.parametrize("field", ["angle_min_rad", "angle_increment_rad", "ranges_f32"])
 def test_one_wrong_number_of_one_laser_hides_no_obstacle_from_a_robot_with_two(field):
     seed = next(seed for seed in range(1, 999, 2) for offsets in [
-        topic_fault("corrupt", "summit_xl/scan", seed, topics.ALL).disturbances[0].add_fields]
+        OsmosisFaults().find("corrupt:summit_xl/scan", seed, topics.ALL
+                             ).disturbances[0].add_fields]
         if offsets.get(field, 0) > 0)
     wrong = msgspec.structs.replace(parse_fault("corrupt:summit_xl/scan@13+inf"), seed=seed)
     result = run_job(Job(row="x", options={"mission": "A"}, seed=1,

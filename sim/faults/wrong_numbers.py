@@ -1,0 +1,103 @@
+"""How wrong a number in a message can be and still be one that a node could have sent.
+
+A field says so itself: by its range (`Annotated[float, Meta(ge=0, le=1)]`), by its unit
+(`Meta(extra={"unit": "m"})`), or by the unit at the end of its name. A robot that knows better has
+a table of its own (`Faults.sizes`), which counts first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from random import Random
+from typing import Any, NamedTuple
+
+import msgspec
+
+from rampart.actors.bus.bounds import bare, narrow_range
+from rampart.actors.runtime.corruption import is_array
+
+OF_RANGE = (0.05, 0.3)
+"""Of a field's range, the least and greatest share that it is wrong by."""
+
+UNITS: dict[str, tuple[float, float]] = {
+    "m": (0.5, 3.0), "cm": (5.0, 50.0), "mm": (5.0, 50.0), "rad": (0.3, 1.5), "deg": (15.0, 90.0),
+    "mps": (0.2, 0.8), "mps2": (0.5, 2.0), "radps": (0.2, 1.0), "s": (1.0, 10.0),
+    "ms": (100.0, 2000.0), "hz": (1.0, 20.0), "kg": (0.5, 5.0), "n": (5.0, 50.0),
+    "nm": (1.0, 10.0), "pa": (1e3, 2e4), "bar": (0.2, 1.0), "k": (5.0, 40.0),
+    "degc": (5.0, 40.0), "v": (1.0, 10.0), "a": (0.5, 5.0), "w": (10.0, 200.0),
+    "percent": (10.0, 50.0)}
+"""Unit, in lower case → least and greatest amount of a field that declares no range."""
+
+NO_UNIT = (0.1, 0.5)
+"""Of numbers without range and unit, such as ratios and stick positions."""
+
+NEVER_NEGATIVE = frozenset({"s", "ms", "hz", "kg", "k"})
+"""Of such a unit a number only grows, as does one that its type keeps from being negative."""
+
+
+class Sizes(NamedTuple):
+    """A robot's own sizes.
+
+    Attributes:
+        by_end: End of a field's path → least and greatest amount; the first that fits counts.
+        only_grow: Ends of those that are only made larger.
+    """
+
+    by_end: tuple[tuple[str, float, float], ...] = ()
+    only_grow: tuple[str, ...] = ()
+
+
+class Number(NamedTuple):
+    """A number in a message: its path, its type without bounds, and what is declared of it."""
+
+    path: str
+    kind: Any
+    metas: tuple[msgspec.Meta, ...]
+
+    @property
+    def unit(self) -> str:
+        """What is declared, else the last word of its name, in lower case."""
+        for meta in self.metas:
+            if unit := (meta.extra or {}).get("unit"):
+                return str(unit).lower()
+        return self.path.removesuffix("_f32").rpartition("_")[2].lower()
+
+
+def plausible_offsets(kind: type[msgspec.Struct], draw: Random, sizes: Sizes = Sizes()  # noqa: B008
+                      ) -> dict[str, float]:
+    """Return an offset for every number in a message type: path → amount, never 0."""
+    return {number.path: _offset(number, draw, sizes) for number in numbers(kind)}
+
+
+def _offset(number: Number, draw: Random, sizes: Sizes) -> float:
+    own = next(((a, b) for end, a, b in sizes.by_end if number.path.endswith(end)), None)
+    span = narrow_range(number.metas)
+    if own is not None:
+        grows = number.path.endswith(sizes.only_grow)
+    else:
+        grows = span is None and (number.unit in NEVER_NEGATIVE
+                                  or any(m.ge == 0 or m.gt == 0 for m in number.metas))
+    sign = 1.0 if grows else draw.choice((-1.0, 1.0))
+    if own is None and span is not None:
+        width = span[1] - span[0]
+        if number.kind is int:
+            return sign * draw.randint(1, max(1, int(OF_RANGE[1] * width)))
+        return sign * float(f"{width * draw.uniform(*OF_RANGE):.3g}")
+    if number.kind is int:
+        return draw.randint(1, 3)
+    least, most = own or UNITS.get(number.unit, NO_UNIT)
+    return round(sign * draw.uniform(least, most), 3)
+
+
+def numbers(kind: Any, path: str = "", metas: tuple[msgspec.Meta, ...] = ()) -> Iterator[Number]:
+    """Yield each number in a type, through structs and sequences."""
+    metas += tuple(m for m in getattr(kind, "__metadata__", ()) if isinstance(m, msgspec.Meta))
+    kind = bare(kind)
+    if getattr(kind, "__origin__", None) in (tuple, list):
+        yield from numbers(kind.__args__[0], path, metas)
+    elif isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        for f in msgspec.structs.fields(kind):
+            if f.name != "pid":
+                yield from numbers(f.type, f"{path}.{f.name}" if path else f.name)
+    elif kind in (int, float) or is_array(path, kind):
+        yield Number(path, kind, metas)

@@ -1,0 +1,225 @@
+"""What a system's actors say to each other is checked before a run, and refused in one line."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import textwrap
+
+import pytest
+
+from rampart.actors.layout.layout import Layout
+from rampart.actors.run.run_plan import RunPlan, load_system
+from rampart.systems import SHIPPED
+
+HEAD = """
+from rampart import Actor, Header, Message, Qos, Topic, every, on
+from rampart.sim.runs.judge import Judge, Verdict
+
+class Level(Message):
+    level_m: float
+
+class Flow(Message):
+    flow: float
+
+LEVEL = Topic("tank/level", Level, Qos.SENSOR, 10, "", "Level.")
+LEVLE = Topic("tank/levle", Level, Qos.SENSOR, 10, "", "A typo.")
+AGAIN = Topic("tank/level", Flow, Qos.SENSOR, 10, "", "The same key.")
+SHARED = Topic("tank/level", Level, Qos.SENSOR, 10, "", "Level.", several=True)
+VALVE = Topic("tank/valve/{name}", Flow, Qos.STATE, 10, "", "Each valve's.")
+ORDER = Topic("tank/order", Flow, Qos.COMMAND, 0, "", "Orders.")
+
+class Gauge(Actor):
+    outputs = (LEVEL,)
+
+class Second(Gauge):
+    pass
+
+class Pump(Actor):
+    @on(LEVEL)
+    def level(self, message, header):
+        pass
+"""
+NODE = '[[node]]\nname = "{}"\nactor = "tank_here:{}"\nkind = "{}"\n'
+TIMEOUTS = "".join(f"{name}_timeout_s = 1.0\n" for name in (
+    "heartbeat", "command", "localization", "scan", "dead_man", "manager"))
+SPEC = 'name = "tank"\ntitle = "A tank"\n[timing]\n' + TIMEOUTS + (
+    "detection_silence_timeout_s = 1.0\n[layers]\nftm = false\n[orders.safer]\n"
+    '[[event]]\nname = "overflow"\n')
+
+
+@pytest.fixture
+def tank(tmp_path, monkeypatch):
+    """Return a function that lays out a tank: more code, its nodes by class, and more TOML."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def laid_out(code: str, *nodes: str, more: str = "", kind: str = "control") -> Layout:
+        (tmp_path / "tank_here.py").write_text(HEAD + textwrap.dedent(code))
+        rows = "".join(NODE.format(name.lower(), name, kind) for name in nodes)
+        (tmp_path / "tank.toml").write_text(SPEC + rows + more)
+        sys.modules.pop("tank_here", None)
+        importlib.invalidate_caches()
+        plan = RunPlan(system_file=str(tmp_path / "tank.toml"))
+        return Layout(plan, load_system(plan))
+
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    yield laid_out
+    sys.modules.pop("tank_here", None)
+
+
+def line_of(call, *arguments, **options) -> str:
+    with pytest.raises(ValueError, match=r".") as caught:
+        call(*arguments, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value).partition("tank.toml: ")[2]
+
+
+HEARS = "class Reader(Actor):\n    @on({})\n    def level(self, message, header): pass\n"
+
+
+def test_a_topic_that_nothing_publishes_is_a_typo(tank):
+    assert line_of(tank, HEARS.format("LEVLE"), "Gauge", "Reader") == (
+        "node reader: hears 'tank/levle', which nothing publishes; did you mean 'tank/level'? What "
+        "a node can do without is named in optional_inputs of its class")
+    assert line_of(tank, HEARS.format("LEVEL"), "Reader").startswith(
+        "node reader: hears 'tank/level', which nothing publishes; What a node can do without")
+
+
+@pytest.mark.parametrize("code", [
+    HEARS.format("LEVLE") + "    optional_inputs = (LEVLE,)\n",
+    'OUTSIDE = Topic("tank/stick", Level, Qos.SENSOR, 10, "", "A tool\'s.", outside=True)\n'
+    + HEARS.format("OUTSIDE"), HEARS.format("LEVEL")])
+def test_what_a_node_can_do_without_or_what_comes_from_outside_is_no_typo(tank, code):
+    assert "reader" in tank(code, "Gauge", "Reader").members
+
+
+FAMILY = """
+class Valve(Actor):
+    outputs = (VALVE,)
+
+class Reader(Actor):
+    @on(VALVE)
+    def level(self, message, header): pass
+
+    @classmethod
+    def names(cls, topic, name, parameters):
+        return {}
+"""
+
+
+def test_each_member_of_a_family_that_is_heard_has_to_be_published(tank):
+    assert "reader" in tank(FAMILY.format('("valve",)'), "Valve", "Reader").members
+    assert "reader" in tank(FAMILY.format("None"), "Valve", "Reader").members
+    assert line_of(tank, FAMILY.format('("valve", "vlave")'), "Valve", "Reader").startswith(
+        "node reader: hears 'tank/valve/vlave', which nothing publishes; did you mean "
+        "'tank/valve/valve'? ")
+
+
+def test_one_key_with_two_types(tank):
+    assert line_of(tank, HEARS.format("AGAIN"), "Gauge", "Reader") == (
+        "node reader: topic 'tank/level' is tank_here:Flow of qos sensor, and tank_here:Level of "
+        "qos sensor to node gauge; declare it once, and import it")
+
+
+def test_two_publishers_of_what_is_one_node_s_to_say(tank):
+    assert line_of(tank, "", "Gauge", "Second", "Pump") == (
+        "node second: publishes 'tank/level', as node gauge does; of a topic of qos sensor the "
+        "latest message counts, so that one may (or several = True in the Topic)")
+    both = "class Other(Actor):\n    outputs = ({},)\n\nclass Third(Other): pass\n"
+    for allowed in ("ORDER", "SHARED", "VALVE"):
+        assert len(tank(both.format(allowed), "Other", "Third").members) == 4
+    same = ("    @classmethod\n    def output_names(cls, topic, name, parameters): return "
+            "('inlet',)\n\nclass Third(Other): pass\n")
+    assert line_of(tank, f"class Other(Actor):\n    outputs = (VALVE,)\n{same}", "Other",
+                   "Third").startswith("node third: publishes 'tank/valve/{name}', as node other")
+
+
+@pytest.mark.parametrize(("code", "cause"), [
+    (HEARS.format("LEVEL").replace("def", "async def"),
+     "TypeError: Reader.level is an async def, which would never run; a handler is a plain def"),
+    ("class Reader(Pump):\n    async def level(self, message, header): pass\n",
+     "TypeError: Reader.level is an async def, which would never run; a handler is a plain def"),
+    (HEARS.format("LEVEL").replace("pass", "yield"),
+     "TypeError: Reader.level has a yield, and would never run; a handler is a plain def"),
+    (HEARS.format("LEVEL").replace(", header", ""),
+     "TypeError: Reader.level: def level(self, message, header) is right"),
+    (HEARS.format("Level"), "TypeError: @on(Level): a Topic is right"),
+    ("class Reader(Actor):\n    @every(0)\n    def tick(self): pass\n",
+     "ValueError: @every(0): a period above 0, in simulated seconds, is right"),
+    ("class Reader(Actor):\n    @every(-0.5)\n    def tick(self): pass\n",
+     "ValueError: @every(-0.5): a period above 0, in simulated seconds, is right"),
+    ("class Reader(Actor):\n    @every\n    def tick(self): pass\n",
+     "ValueError: @every(tick): a period above 0, in simulated seconds, is right"),
+])
+def test_a_handler_that_would_never_run(tank, code, cause):
+    line = line_of(tank, code, "Reader")
+    assert line.startswith(
+        f"node reader: actor = 'tank_here:Reader': tank_here cannot be imported: {cause} (")
+    assert "/tank_here.py, line " in line
+
+
+def test_an_actor_of_the_wrong_kind(tank):
+    assert line_of(tank, "", "Gauge", kind="manager").startswith(
+        "node gauge: actor = 'tank_here:Gauge': it does not publish manager/status, as the manager "
+        "does")
+    module = ("from rampart.actors.detection.stub import StubDetection\n"
+              "class Detects(StubDetection): pass\n"
+              "class World(Gauge):\n    node_kind = 'world'\n")
+    assert line_of(tank, module, "Detects") == (
+        "node detects: actor = 'tank_here:Detects': it publishes detection/{name}, so it belongs "
+        "into [[detection]]")
+    assert line_of(tank, module, "World", kind="pilot") == (
+        "node world: actor = 'tank_here:World': it is no pilot node; kind = 'world' is right")
+    assert "world" in tank(module, "World", kind="world").members
+
+
+JUDGE = """
+class Fair(Judge):
+    @on({})
+    def level(self, message, header): pass
+"""
+
+
+@pytest.mark.parametrize(("said", "line"), [
+    ("", "$.judge.class: missing; name a class derived from rampart.Judge"),
+    ('class = "tank_here:Fiar"\n', "$.judge.class = 'tank_here:Fiar': no such judge class; "
+     "known: Gauge, Second, Pump, Fair"),
+    ('class = "tank_here:Pump"\n', "$.judge.class = 'tank_here:Pump': no judge; name a class "
+     "derived from rampart.Judge"),
+    ('class = "tank_here:Fair"\nlitres = 3\n', "$.judge.litres = 3: unknown parameter; known: "
+              "none, "
+     "its class declares no Parameters"),
+    ('class = "tank_here:Fair"\n', "$.judge: Fair hears 'tank/levle', which nothing publishes; did "
+     "you mean 'tank/level'? What a node can do without is named in optional_inputs of its class"),
+])
+def test_a_judge_that_cannot_judge(tank, said, line):
+    more = f"[judge]\n{said or 'litres = 3'}"
+    assert line_of(tank, JUDGE.format("LEVLE"), "Gauge", more=more) == line
+
+
+def test_a_judge_has_the_topic_of_who_publishes_it(tank):
+    more = '[judge]\nclass = "tank_here:Fair"\n'
+    assert line_of(tank, JUDGE.format("AGAIN"), "Gauge", more=more) == (
+        "$.judge: Fair: topic 'tank/level' is tank_here:Flow of qos sensor, and tank_here:Level of "
+        "qos sensor to node gauge; declare it once, and import it")
+
+
+def test_a_judge_hears_what_is_published(tank):
+    more = '[judge]\nclass = "tank_here:Fair"\n'
+    assert tank(JUDGE.format("LEVEL"), "Gauge", more=more).spec.judge == {
+        "class": "tank_here:Fair"}
+
+
+@pytest.mark.parametrize(("said", "line"), [
+    ("after_s = 0", "$.end.after_s = 0: Expected float > 0.0"),
+    ("after_s = 'x'", "$.end.after_s = 'x': Expected float | null, got str"),
+    ("after = 3", "$.end.after = 3: unknown field; known: after_s")])
+def test_an_end_that_is_none(tank, said, line):
+    assert line_of(tank, "", "Gauge", more=f"[end]\n{said}\n") == line
+
+
+@pytest.mark.parametrize("ftm", [True, False])
+@pytest.mark.parametrize("name", ["osmosis", "paper", "cell"])
+def test_the_shipped_systems_are_sound(name, ftm):
+    plan = RunPlan(system_file=str(SHIPPED / f"{name}.toml"), ftm=ftm)
+    assert Layout(plan, load_system(plan)).members

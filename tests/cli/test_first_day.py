@@ -1,0 +1,181 @@
+"""What a user meets on the first day: ports, names that are none, faults by name, exit codes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from rampart.actors.bus import topics as bus_topics
+from rampart.actors.bus.envelope import Header
+from rampart.actors.ftm import topics as ftm_topics
+from rampart.actors.ftm.messages import ProcessEvent
+from rampart.actors.run.run_plan import RunPlan
+from rampart.cli import output
+from rampart.cli.main import main
+from rampart.sim.runs.record import RunRecorder
+from rampart.testing import RealRun
+from tests import ROOT
+
+
+def refused(capsys, *arguments: str, code: int = 2) -> str:
+    assert main(arguments) == code
+    told = capsys.readouterr()
+    assert told.out == ""
+    return told.err
+
+
+NO_RUN = "rampart: --port 31999: no run there; runs found: "
+
+
+@pytest.mark.parametrize("arguments", [
+    ("adapt", "--port", "31999", "set", "strategy", "guarded-repair"),
+    ("adapt", "--port=31999", "--json", "set", "strategy", "guarded-repair"),
+    ("adapt", "set", "--port", "31999", "strategy", "guarded-repair"),
+    ("adapt", "set", "strategy", "guarded-repair", "--port", "31999"),
+    ("node", "--json", "--port", "31999", "list"), ("topic", "--port", "31999", "echo", "no/such"),
+    ("topic", "hz", "no/such", "--port", "31999"), ("inject", "--port", "31999", "drop:no/such"),
+    ("inject", "kill:nobody", "--port", "31999"), ("status", "--json", "--port", "31999")])
+def test_the_port_may_stand_anywhere_and_no_run_is_said_before_anything_else(capsys, arguments):
+    assert refused(capsys, *arguments).startswith(NO_RUN)
+
+
+def test_the_environment_names_the_run(capsys, monkeypatch):
+    monkeypatch.setenv("RAMPART_PORT", "31999")
+    assert refused(capsys, "status").startswith(NO_RUN)
+    assert refused(capsys, "status", "--port", "31998").startswith("rampart: --port 31998: ")
+    monkeypatch.setenv("RAMPART_PORT", "74x0")
+    assert refused(capsys, "status") == (
+        "rampart: RAMPART_PORT=74x0: a whole number is right, the base port of a run\n")
+
+
+def test_a_name_among_many_is_answered_by_the_nearest_three(capsys):
+    assert refused(capsys, "topic", "info", "control/comand", "--system", "osmosis") == (
+        "rampart: unknown topic 'control/comand'; the nearest of 53: control/command, "
+        "control/standby_command, control/status\n")
+    assert str(output.unknown("topic", "?", map(str, range(20)))) == (
+        "unknown topic '?'; none of 20 is like it")
+    assert str(output.unknown("order", "x", ["a", "b"])) == "unknown order 'x'; known: a, b"
+
+
+@pytest.mark.parametrize(("arguments", "line"), [
+    (("slow:pump",), "slow:pump: only in virtual time: --virtual --fault slow:pump; how slow a "
+     "real process is, is up to the machine"),
+    (("kill:pump@3",), "kill:pump@3: here it is injected now; --duration S says how long"),
+    (("kill:pump", "--duration", "3"), "--duration 3: kill has no end; whoever brings the node "
+     "back says when"),
+    (("kill:pump", "--share", "0.5"), "--share goes with a fault of a topic, not with kill:pump"),
+    (("stop:pump", "--at-once"), "--at-once: a process that is stopped has to be continued by "
+     "somebody; leave it out, or say --duration inf"),
+    (("stop:pump", "--duration", "-1"), "--duration -1: must be seconds above 0, or inf"),
+])
+def test_a_fault_of_a_process_with_what_does_not_go_with_it(capsys, arguments, line):
+    assert refused(capsys, "inject", *arguments) == f"rampart: {line}\n"
+
+
+def test_every_object_says_its_format(capsys):
+    for arguments in (("check", "cell"), ("explain", "cell"), ("decide", "M_CURTAIN", "--system",
+                      "cell"), ("topic", "info", "manager/status", "--system", "cell")):
+        assert main([*arguments, "--json"]) == 0
+        assert next(iter(json.loads(capsys.readouterr().out).items())) == ("format", 1)
+
+
+def test_the_list_of_faults_is_of_the_system_that_is_named(capsys):
+    assert main(["inject", "--list", "--system", "cell"]) == 0
+    told = capsys.readouterr().out
+    nodes = told.splitlines()[-1].strip().split(", ")
+    assert {"supervisor", "camera", "valve", "D_CURTAIN", "R_HOLD"} <= set(nodes)
+    assert "simulator" not in nodes
+    assert "gps" not in told
+    assert main(["inject", "--list", "--system", "osmosis"]) == 0
+    assert "  stuck-wheel:front-left\n" in capsys.readouterr().out
+
+
+# -- a node that fails as soon as it has started --------------------------------------------------
+
+
+def story(*events: tuple[float, str], end_s: float) -> tuple[str, ...]:
+    recorder = RunRecorder(RunPlan())
+    for number, (at_s, what) in enumerate(events):
+        recorder.feed(ftm_topics.PROCESS_EVENT,
+                      ProcessEvent("pump", what, 1, number // 2 + 1, "supervisor", ""),
+                      Header("supervisor", 1, number, at_s))
+    recorder.feed(bus_topics.HELLO, None, Header("pump", 1, 1, 0.0))
+    return recorder.record(end_s).failing
+
+
+LOOP = [(0.1 * n + d, what) for n in range(1, 20) for d, what in ((0.0, "crashed"),
+                                                                  (0.02, "respawned"))]
+
+
+def test_who_fails_as_soon_as_it_has_started_is_failing_and_who_was_hit_once_is_not():
+    assert story(*LOOP, end_s=2.0) == ("pump",)
+    assert story(*LOOP, (1.95, "crashed"), end_s=60.0) == ("pump",)
+    assert story(*LOOP, end_s=3.5) == ()  # the last one has lasted
+    assert story((5.0, "crashed"), (5.1, "respawned"), end_s=5.2) == ()
+    assert story(*[(3.0 * n + d, what) for n in range(9) for d, what in (
+        (0.0, "crashed"), (0.1, "respawned"))], end_s=24.3) == ()
+
+
+SYSTEM = """
+[[node]]
+name = "gauge"
+actor = "first_day_parts:Gauge"
+kind = "control"
+
+[[node]]
+name = "sick"
+actor = "first_day_parts:Sick"
+kind = "control"
+"""
+PARTS = """
+from rampart import Actor, Message, Qos, Topic, every
+
+class Level(Message):
+    level_m: float
+
+LEVEL = Topic("tank/level", Level, Qos.SENSOR, 10, "", "Level.")
+
+class Gauge(Actor):
+    outputs = (LEVEL,)
+
+    @every(0.1)
+    def say(self) -> None:
+        self.publish(LEVEL, Level(1.5))
+
+class Sick(Actor):
+    def on_start(self) -> None:
+        raise RuntimeError("no sensor")
+"""
+
+
+@pytest.mark.processes
+def test_a_real_run_with_a_node_that_never_comes_up_ends_with_1_and_names_it(tmp_path):
+    head = (ROOT / "docs" / "specification.md").read_text(encoding="utf-8").split(
+        "```toml\n")[1].split("[[node]]")[0]
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "first_day_parts.py").write_text(PARTS)
+    (tmp_path / "run" / "day.toml").write_text(
+        head + '[layers]\nftm = false\n[orders.safer]\n[[event]]\nname = "e"\n' + SYSTEM)
+    with RealRun(tmp_path / "run", "day.toml", "--duration", "6") as day:
+        day.sleep_until(1)
+        (tmp_path / "run" / "first_day_parts.py").unlink()
+        elsewhere = subprocess.run(
+            [sys.executable, "-P", "-m", "rampart.cli.main", "topic", "echo", "tank/level", "-n",
+             "1", "--port", str(day.port)], cwd=tmp_path, capture_output=True, text=True,
+            check=False, timeout=30)
+        killed = day.tool("inject", "kill:gauge", "--json")
+        code, result = day.result()
+    assert elsewhere.returncode == 0, elsewhere.stderr
+    assert "No module named 'first_day_parts'" in elsewhere.stderr
+    assert elsewhere.stderr.endswith("; messages are shown as they describe themselves\n")
+    assert elsewhere.stdout.endswith(' gauge#1 tank/level {"level_m":1.5}\n'.replace("gauge#1", (
+        elsewhere.stdout.split()[1])))
+    told = json.loads(killed.stdout)
+    assert (told["format"], told["fault"], told["node"], told["effective"]) == (
+        1, "kill:gauge", "gauge", True)
+    assert result["restarts"]["gauge"] == 1
+    assert (code, result["format"], result["failing"]) == (1, 1, ["sick"])
+    assert "sick ends as soon as it has started, again and again; it was restarted " in day.story

@@ -1,0 +1,140 @@
+"""A stored result stands for a run only while all that went into the run is the same."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from rampart.sim.campaign import content, job
+from rampart.sim.campaign.content import content_of, with_content
+from rampart.sim.campaign.job import Job
+from rampart.systems import SHIPPED
+
+TIMES = ("heartbeat", "command", "localization", "scan", "dead_man", "manager",
+         "detection_silence")
+SPEC = 'name = "tank"\ntitle = "A tank"\n[timing]\n' + "".join(
+    f"{name}_timeout_s = 1.0\n" for name in TIMES) + """
+[layers]
+ftm = false
+[end]
+after_s = 3.0
+[orders.safer]
+[[event]]
+name = "overflow"
+[[node]]
+name = "pump"
+actor = "tank_parts.pump:Pump"
+kind = "control"
+parameters = { curve = "curve.csv" }
+"""
+PUMP = """
+from rampart import Actor, Message, Qos, Topic, every
+from .limits import MOST_M
+
+class Level(Message):
+    level_m: float
+
+LEVEL = Topic("tank/level", Level, Qos.SENSOR, 10, "", "Level.")
+
+class Pump(Actor):
+    class Parameters(Actor.Parameters, frozen=True):
+        curve: str = ""
+
+    outputs = (LEVEL,)
+
+    @every(0.1)
+    def say(self) -> None:
+        self.publish(LEVEL, Level(MOST_M))
+"""
+FILES = {"tank.toml": SPEC, "curve.csv": "1,2\n", "tank_parts/pump.py": PUMP,
+         "tank_parts/limits.py": "import json\nMOST_M = 2.0\n", "tank_parts/__init__.py": "",
+         "notes.txt": "nothing", "tank_parts/unused.py": "X = 1\n"}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    for name, text in FILES.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    yield tmp_path
+    for name in [name for name in sys.modules if name.startswith("tank_parts")]:
+        del sys.modules[name]
+
+
+def digest(folder: Path) -> str:
+    for cached in (job.read_document_of, job._application, content._engine):
+        cached.cache_clear()
+    importlib.invalidate_caches()
+    return content_of(Job(row="", system=str(folder / "tank.toml")))
+
+
+@pytest.mark.parametrize(("name", "counts"), [
+    ("tank.toml", True), ("curve.csv", True), ("tank_parts/pump.py", True),
+    ("tank_parts/limits.py", True), ("tank_parts/__init__.py", True), ("notes.txt", False),
+    ("tank_parts/unused.py", False)])
+def test_what_goes_into_a_run_is_part_of_its_key(folder, name, counts):
+    before = digest(folder)
+    assert digest(folder) == before
+    more = "after_s = 4.0" if name.endswith(".toml") else FILES[name] + "\n# 3\n"
+    (folder / name).write_text(SPEC.replace("after_s = 3.0", more) if name.endswith(".toml")
+                               else more)
+    assert (digest(folder) != before) is counts
+
+
+def test_a_comment_in_the_specification_changes_nothing(folder):
+    before = digest(folder)
+    (folder / "tank.toml").write_text("# a comment\n" + SPEC)
+    assert digest(folder) == before
+
+
+def test_the_engine_is_part_of_it(folder, monkeypatch):
+    before = digest(folder)
+    monkeypatch.setattr(content, "version", lambda _name: "99.0")
+    assert digest(folder) != before
+
+
+def test_the_files_of_the_application_are_part_of_it(tmp_path):
+    airport = tmp_path / "mine.toml"
+    shipped = (SHIPPED / "airports" / "vallombre.toml").read_text()
+    airport.write_text(shipped)
+    one = Job(row="", system="paper", options={"airport": str(airport)})
+    before = content_of(one)
+    airport.write_text(shipped + "# more\n")
+    assert content_of(one) != before
+    assert content_of(msgspec.structs.replace(one, options={})) != before
+
+
+def test_each_system_and_choice_of_options_is_looked_at_once(folder, monkeypatch):
+    asked = []
+    monkeypatch.setattr(content, "content_of", lambda one: asked.append(one) or f"d{len(asked)}")
+    jobs = [Job(row="", seed=seed, options=options) for seed in (1, 2, 3)
+            for options in ({}, {"mission": "A"})]
+    made = with_content(jobs)
+    assert len(asked) == 2
+    assert [one.content for one in made] == ["d1", "d2"] * 3
+    assert len({one.key for one in made}) == 6
+    assert not {one.key for one in made} & {one.key for one in jobs}
+
+
+def test_an_edited_specification_makes_its_runs_anew(folder):
+    def made() -> str:
+        done = subprocess.run(
+            [sys.executable, "-m", "rampart.cli.main", "campaign", "--system", "tank.toml",
+             "--fault", "kill:pump@1", "--jobs", "1", "--out", "out"], cwd=folder,
+            capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return next(line for line in done.stdout.splitlines() if "of them made now" in line)
+
+    assert made() == "1 runs, 1 of them made now"
+    assert made() == "1 runs, 0 of them made now"
+    (folder / "tank.toml").write_text(SPEC.replace("after_s = 3.0", "after_s = 2.0"))
+    assert made() == "1 runs, 1 of them made now"
+    (folder / "tank_parts/limits.py").write_text("MOST_M = 3.0\n")
+    assert made() == "1 runs, 1 of them made now"
