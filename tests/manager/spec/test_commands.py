@@ -29,13 +29,13 @@ def refusal(text: str) -> str:
 COMMAND = 'command = ["./wheels"]'
 BEAT = "heartbeat = { notify = true, timeout_s = 0.5 }"
 WRONG = [
-    (COMMAND, f'{COMMAND}\nactor = "tug:VirtualWheels"', "wheels: command = ['./wheels']: either "
-     "actor or command is right; it has actor = 'tug:VirtualWheels'"),
+    (COMMAND, f'{COMMAND}\nactor = "cart:VirtualWheels"', "wheels: command = ['./wheels']: either "
+     "actor or command is right; it has actor = 'cart:VirtualWheels'"),
     (COMMAND, "", "wheels: heartbeat = {'timeout_s': 0.5, 'key': '', 'notify': True, 'topic': ''}: "
      "of use with a command only, and the node has none"),
-    ('actor = "tug:Driver"', "", "driver: actor: missing; say actor = 'module:Class' or command = "
+    ('actor = "cart:Driver"', "", "driver: actor: missing; say actor = 'module:Class' or command = "
      "['./program', ...]"),
-    ('actor = "tug:Driver"', 'actor = "tug:Driver"\nfolder = "x"', "driver: folder = 'x': of use "
+    ('actor = "cart:Driver"', 'actor = "cart:Driver"\nfolder = "x"', "driver: folder = 'x': of use "
      "with a command only, and the node has none"),
     (COMMAND, "command = ['']", "wheels: command = ['']: the first is the program, and it has no "
      "name"),
@@ -58,7 +58,7 @@ WRONG = [
      "wheels: hears = 'tug/command': listed twice"),
     ('hears = ["tug/command"]', 'hears = ["detection/{name}"]',
      "wheels: hears = 'detection/{name}': name one member of the family"),
-    ('stand_in = "tug:VirtualWheels"', "parameters = { radius_m = 0.1 }", "wheels: parameters: a "
+    ('stand_in = "cart:VirtualWheels"', "parameters = { radius_m = 0.1 }", "wheels: parameters: a "
      "command takes none; they are for the actor that stand_in names"),
     (f'{COMMAND}\nkind = "control"', f'{COMMAND}\nkind = "manager"', "wheels: command = "
      "['./wheels']: the manager has to be an actor"),
@@ -68,7 +68,7 @@ WRONG = [
      "int >= 8"),
     (BEAT, "heartbeat = { notify = true, timeout_s = 0 }", "$.node[1].heartbeat.timeout_s = 0: "
      "Expected float > 0.0"),
-    ("tug:VirtualWheels", "tug.VirtualWheels", "$.node[1].stand_in = 'tug.VirtualWheels': expected "
+    ("cart:VirtualWheels", "cart.VirtualWheels", "$.node[1].stand_in = 'cart.VirtualWheels': expected "
      "'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"),
 ]
 
@@ -95,9 +95,9 @@ def tug(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("old", "new", "line"), [
-    ("tug:VirtualWheels", "tug:Nobody", "$.node[1].stand_in = 'tug:Nobody': no such actor class; "
+    ("cart:VirtualWheels", "cart:Nobody", "$.node[1].stand_in = 'cart:Nobody': no such actor class; "
      "known: Driver, VirtualWheels"),
-    ("tug:Driver", COMMAND_NODE, f"$.node[0].actor = '{COMMAND_NODE}': say command = "
+    ("cart:Driver", COMMAND_NODE, f"$.node[0].actor = '{COMMAND_NODE}': say command = "
      "['./program', ...] instead"),
     ("stand_in", "parameters = { radius_m = 1 }\nstand_in", "$.node[1].parameters.radius_m = 1: "
      "unknown parameter; known: none, its class declares no Parameters")])
@@ -109,7 +109,7 @@ def test_a_stand_in_is_held_to_what_the_file_says_of_it_in_real_runs_too(tug, ol
 
 
 def test_what_only_the_stand_in_declares_is_a_topic(tug):
-    plan = tug("tug:Driver", "rampart.actors.runtime.stub_node:StubNode")
+    plan = tug("cart:Driver", "rampart.actors.runtime.stub_node:StubNode")
     layout = Layout(plan, load_system(plan))
     assert [key for key in layout.topics if key.startswith("tug/")] == ["tug/command", "tug/wheels"]
     assert [t.key for t in system_topics(layout.spec)][-2:] == ["tug/command", "tug/wheels"]
@@ -117,7 +117,7 @@ def test_what_only_the_stand_in_declares_is_a_topic(tug):
 
 @pytest.mark.parametrize(("old", "new", "line"), [
     ("./wheels", "./none", "wheels: command = ['./none']: no such file: {folder}/none"),
-    ("./wheels", "./tug.py", "wheels: command = ['./tug.py']: {folder}/tug.py is not executable; "
+    ("./wheels", "./cart.py", "wheels: command = ['./cart.py']: {folder}/cart.py is not executable; "
      "chmod +x makes it so"),
     ("./wheels", "no-such-program", "wheels: command = ['no-such-program']: no program "
      "'no-such-program' in PATH; one in the folder is './no-such-program'"),
@@ -143,7 +143,7 @@ def test_a_program_is_found_in_its_folder_and_in_path(tug, tmp_path):
 
 
 def test_in_virtual_time_a_command_without_stand_in_is_refused(tug):
-    plan = tug('stand_in = "tug:VirtualWheels"', "", virtual=True)
+    plan = tug('stand_in = "cart:VirtualWheels"', "", virtual=True)
     with pytest.raises(SpecificationError) as refused:
         load_system(plan)
     assert str(refused.value) == (
