@@ -68,8 +68,8 @@ WRONG = [
      "int >= 8"),
     (BEAT, "heartbeat = { notify = true, timeout_s = 0 }", "$.node[1].heartbeat.timeout_s = 0: "
      "Expected float > 0.0"),
-    ("cart:VirtualWheels", "cart.VirtualWheels", "$.node[1].stand_in = 'cart.VirtualWheels': expected "
-     "'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"),
+    ("cart:VirtualWheels", "cart.VirtualWheels", "$.node[1].stand_in = 'cart.VirtualWheels': "
+     "expected 'module:Class', e.g. 'rampart.actors.operator.hmi:Hmi'"),
 ]
 
 
@@ -95,8 +95,8 @@ def tug(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("old", "new", "line"), [
-    ("cart:VirtualWheels", "cart:Nobody", "$.node[1].stand_in = 'cart:Nobody': no such actor class; "
-     "known: Driver, VirtualWheels"),
+    ("cart:VirtualWheels", "cart:Nobody", "$.node[1].stand_in = 'cart:Nobody': no such actor "
+     "class; known: Driver, VirtualWheels"),
     ("cart:Driver", COMMAND_NODE, f"$.node[0].actor = '{COMMAND_NODE}': say command = "
      "['./program', ...] instead"),
     ("stand_in", "parameters = { radius_m = 1 }\nstand_in", "$.node[1].parameters.radius_m = 1: "
@@ -117,8 +117,8 @@ def test_what_only_the_stand_in_declares_is_a_topic(tug):
 
 @pytest.mark.parametrize(("old", "new", "line"), [
     ("./wheels", "./none", "wheels: command = ['./none']: no such file: {folder}/none"),
-    ("./wheels", "./cart.py", "wheels: command = ['./cart.py']: {folder}/cart.py is not executable; "
-     "chmod +x makes it so"),
+    ("./wheels", "./cart.py", "wheels: command = ['./cart.py']: {folder}/cart.py is not "
+     "executable; chmod +x makes it so"),
     ("./wheels", "no-such-program", "wheels: command = ['no-such-program']: no program "
      "'no-such-program' in PATH; one in the folder is './no-such-program'"),
     (COMMAND, f'{COMMAND}\nfolder = "none"', "wheels: folder = 'none': no such folder: "
