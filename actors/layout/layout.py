@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
@@ -98,8 +98,7 @@ class Layout:
         self._check(judge, (*ftm_topics.ALL, *known), file)
         self._partners = partners(self.members.values())
 
-    def _check(self, judge: Any, known: Iterable[Topic[Any]],
-               file: str) -> None:
+    def _check(self, judge: Any, known: Collection[Topic[Any]], file: str) -> None:
         """Check who hears and publishes what; raises as the constructor."""
         members = list(self.members.values())
         others: list[Member] = []
@@ -109,7 +108,7 @@ class Layout:
             others = [load_member(node, self.spec, file) for node in everyone
                       if node.name not in self.members]
             silent = [topic.key for topic in ftm_topics.ALL]
-        said = publishers_of((*members, *others))
+        said = publishers_of(choose_topics((*members, *others), known, file)[0].values())
         declared = check_connections(members, said, known, silent, file)
         if judge is None:
             return
