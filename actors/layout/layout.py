@@ -104,11 +104,12 @@ class Layout:
         others: list[Member] = []
         silent: list[str] = []
         if not self.spec.layers.ftm:  # its modules are not started, and what they say is not missed
-            everyone = msgspec.structs.replace(self.spec, layers=Layers()).actors()
-            others = [load_member(node, self.spec, file) for node in everyone
+            every_node = msgspec.structs.replace(self.spec, layers=Layers()).actors()
+            others = [load_member(node, self.spec, file) for node in every_node
                       if node.name not in self.members]
             silent = [topic.key for topic in ftm_topics.ALL]
-        said = publishers_of(choose_topics((*members, *others), known, file)[0].values())
+        everyone = choose_topics((*members, *others), (*known, *self.topics.values()), file)[0]
+        said = publishers_of(everyone.values())
         declared = check_connections(members, said, known, silent, file)
         if judge is None:
             return

@@ -78,5 +78,5 @@ def test_modules_beside_a_specification_are_found_if_nobody_else_can_put_them_th
         env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True)
     assert done.returncode == code, done.stderr
     assert code == 0 or done.stderr.endswith(
-        "node[0].actor = 'tank:Pump': No module named 'tank'; nothing is imported from there: "
+        "node pump: actor = 'tank:Pump': No module named 'tank'; nothing is imported from there: "
         "others can write ../there (mode 757)\n")

@@ -77,14 +77,14 @@ def test_no_name_of_the_first_system_is_in_the_engine_s_code(room):
      "3 periods of heartbeat_period_s = 0.100 s, is right"),
     ('against = { within_s = 0.45, hazard = "a hand is within the arm\'s reach" }',
      'against = "drift"',
-     "cell.toml: $.mechanism[0].against: 'drift', which it is if left out, needs a [robot]; "
+     "cell.toml: mechanism M_CURTAIN: against: 'drift', which it is if left out, needs a [robot]; "
      "'parent' or { within_s = ..., hazard = '...' } is right"),
     ('against = { within_s = 0.45, hazard = "a hand is within the arm\'s reach" }', "",
-     "cell.toml: $.mechanism[0].against: 'drift', which it is if left out, needs a [robot]; "
+     "cell.toml: mechanism M_CURTAIN: against: 'drift', which it is if left out, needs a [robot]; "
      "'parent' or { within_s = ..., hazard = '...' } is right"),
     ('against = { within_s = 0.45, hazard = "a hand is within the arm\'s reach" }',
      'against = "runaway"',
-     "cell.toml: $.mechanism[0].against = 'runaway': needs a [robot]; 'parent' or "
+     "cell.toml: mechanism M_CURTAIN: against = 'runaway': needs a [robot]; 'parent' or "
      "{ within_s = ..., hazard = '...' } is right"),
     ("within_s = 0.45", "within_s = 0.1",
      "cell.toml: $.timing: the time budget does not fit: M_CURTAIN needs 0.180 s (detection 0.030 "
@@ -94,15 +94,15 @@ def test_no_name_of_the_first_system_is_in_the_engine_s_code(room):
     ('order = ["safer", "autonomy"]', 'order = ["safer", "safer"]',
      "cell.toml: $.order = ['safer', 'safer']: 'safer' is listed twice"),
     ("D_FORCE and D_VISION", "D_FORCE and not D_FORCE",
-     "cell.toml: $.mechanism[2].detect = 'D_FORCE and not D_FORCE': it can never be active"),
+     "cell.toml: mechanism M_CONTACT: detect = 'D_FORCE and not D_FORCE': it can never be active"),
     ("R_HOLD and R_OPEN_GRIPPER", "R_HOLD and R_RETRACT and R_OPEN_GRIPPER",
-     "cell.toml: $.mechanism[2].recover = 'R_HOLD and R_RETRACT and R_OPEN_GRIPPER': R_HOLD and "
-     "R_RETRACT both claim arm; they cannot run together"),
+     "cell.toml: mechanism M_CONTACT: recover = 'R_HOLD and R_RETRACT and R_OPEN_GRIPPER': R_HOLD "
+     "and R_RETRACT both claim arm; they cannot run together"),
     ('title = "Pick and place behind a light curtain"\n',
      'title = "x"\nairport = "vallombre"\n',
      "cell.toml: $.airport = 'vallombre': unknown field; known: name, title, application, judge, "
      "end, robot, strategy, shadow, order, timing, layers, supervision, node, detection, recovery, "
-     "mechanism, event, orders; what an application is told stands in [application]"),
+     "mechanism, event, orders, fault, panel; what an application is told stands in [application]"),
     ('shadow', 'shadow', None),
 ])
 def test_refused(old, new, message):

@@ -32,7 +32,9 @@ from rampart.manager.spec.panels import Panel
 
 
 class OsmosisHmi(Hmi):
-    """The operator's node of Osmosis."""
+    """The operator's node of Osmosis. It shows what there is, and waits for none of it."""
+
+    optional_inputs = topics.ROBOT
 
     class Parameters(Hmi.Parameters, frozen=True):
         """What its page shows.
