@@ -244,7 +244,8 @@ async def _live(of: System, name: str, incarnation: int, shelf: Shelf, stranger:
     task = asyncio.create_task(actor.run())
     await asyncio.sleep(stranger.dice.choice((0.0, 1.0)))
     inputs = [*(topic for topic in actor.inputs() if actor.listens(topic)),
-              *(of.layout.topics[key] for _, key, _ in topics_named(actor.parameters)["heard"])]
+              *(of.layout.topics[key] for key in dict.fromkeys(named.key for named in
+                                             topics_named(actor.parameters)["heard"]))]
     for _ in range(MESSAGES):
         topic = stranger.dice.choice(inputs)
         payload = stranger.payload(topic, stranger.header(clock.now()))
