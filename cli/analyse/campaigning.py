@@ -60,7 +60,7 @@ def campaign(options: argparse.Namespace) -> int:
         with refusing(ValueError):
             bases = with_content(_base_jobs(options, spec))
         return hunt(options, _groups(options, spec), bases, faults_of(spec),
-                    _moments(spec, bases[0]))
+                    _moments(spec, bases[0], searched=True))
     name, chosen = _choose(options, spec)
     with refusing(ValueError):
         jobs = with_content(chosen)
@@ -152,9 +152,9 @@ def _choose(options: argparse.Namespace, spec: SystemSpec) -> tuple[str, list[Jo
     return "faults", cross(jobs, faults, range(options.seed, options.seed + options.seeds))
 
 
-def _moments(spec: SystemSpec, job: Job) -> tuple[float, float]:
+def _moments(spec: SystemSpec, job: Job, *, searched: bool = False) -> tuple[float, float]:
     """Return between which moments faults are drawn: within a run that has none."""
-    if found := trial_class(spec).moments(spec):
+    if found := trial_class(spec).moments(spec, searched=searched):
         return found
     try:
         lasts_s = run_virtually(job).record.duration_s

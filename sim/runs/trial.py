@@ -173,12 +173,12 @@ class Trial:
                        reasons=record.reasons)
 
     @classmethod
-    def moments(cls, spec: SystemSpec) -> tuple[float, float] | None:
-        """Return between which simulated times a campaign injects faults.
+    def moments(cls, spec: SystemSpec, *, searched: bool = False) -> tuple[float, float] | None:
+        """Return between which simulated times a campaign injects faults, or a search does.
 
         None: that follows from how long a run without a fault takes.
         """
-        del spec
+        del spec, searched
         return None
 
     @classmethod

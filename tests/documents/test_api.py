@@ -45,7 +45,7 @@ def test_to_import_rampart_costs_nothing():
 def test_the_names_are_few_and_no_name_is_listed_twice():
     names = [name for name, _ in NAMES]
     assert len(names) == len(set(names))
-    assert 25 <= len(names) <= 60
+    assert 25 <= len(names) <= 52
 
 
 @pytest.mark.parametrize("path", CLASSES)

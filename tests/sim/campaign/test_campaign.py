@@ -35,6 +35,7 @@ from rampart.sim.campaign.statistics import badness, rate, spread, table, total,
 from rampart.sim.campaign.store import Run, Store, StoreError
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
+from rampart.sim.osmosis.trial.mission_trial import MissionTrial
 from rampart.sim.osmosis.trial.paper_tables import (
     AS_THE_PAPER,
     CONDITIONS,
@@ -692,3 +693,9 @@ def test_a_store_of_version_0_6_is_read_and_its_runs_are_repeated(tmp_path, caps
     store.close()
     assert rampart(["campaign", "--replay", key, "--out", str(tmp_path), "--json"]) in {0, 1}
     assert json.loads(capsys.readouterr().out)["job"]["options"]["mission"] == "A"
+
+
+def test_a_search_of_osmosis_goes_further_into_the_mission_than_a_sample():
+    spec = systems.load("osmosis")
+    assert MissionTrial.moments(spec) == (2.0, 120.0)
+    assert MissionTrial.moments(spec, searched=True) == (2.0, 150.0)
