@@ -163,7 +163,7 @@ async def connect(port: int | None = None) -> AsyncIterator[Session]:
     """
     with refusing(NoRunError, BusError):
         run = find_run(port)
-        bus = ZenohBus("", 0, None, run.endpoints, RecorderConnection(run.base_port))
+        bus = ZenohBus("", 0, run.endpoints, recorder=RecorderConnection(run.base_port))
         await bus.open()
     try:
         yield Session(run, bus, Clock(run.origin_s, run.rate))

@@ -50,6 +50,9 @@ class Bus(Protocol):
     def watch(self, node: str, changed: PeerChange) -> None:
         """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
 
+    def gone(self, node: str, incarnation: int) -> None:
+        """Tell those who watch a node that a process of it has ended, before they see it."""
+
     async def close(self) -> None:
         """Leave the bus. Closing twice is harmless."""
 
@@ -92,6 +95,10 @@ class SharedBus:
         """Watch in the owner's session."""
         self._owner.watch(
             node, lambda *change: changed(*change) if self._open else None)
+
+    def gone(self, node: str, incarnation: int) -> None:
+        """Tell it over the owner's session."""
+        self._owner.gone(node, incarnation)
 
     async def close(self) -> None:
         """Hear and say nothing more; the session stays open."""

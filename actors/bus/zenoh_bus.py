@@ -1,14 +1,14 @@
-"""The bus over Zenoh: a partial mesh of peers on unix sockets, no router, no rendezvous.
+"""The bus over Zenoh: two linked routers on unix sockets, and every actor a client of one of them.
 
-Every actor listens on a socket of its own in the folder of the run, which only the run's user can
-enter, and at its start dials the actors that it shares a topic with. The later node dials those
-that are there already, so a respawned actor is connected to all its partners by the time `open`
-returns, and no process is a single point of failure.
+The routers are processes of the run like others (`rampart.actors.supervision.router`); they listen
+in its folder, which only its user can enter. A client knows both: one that starts goes to the
+one that has been there longer, so that a message passes one router as a rule; when that one dies
+Zenoh goes over to the other within some milliseconds, with all that was declared. What is sent
+meanwhile is lost, as on any network.
 
-**No start waits for a partner that does not answer.** Zenoh dials all partners in the
-background and goes on trying; `open` waits until those that are there are linked, and not for one
-that is dead or stopped, nor for one that is slower than `PATIENCE_S`. Such a link comes later, so a
-stopped process that goes on finds its partners again.
+**In that moment the liveliness tokens of all clients vanish and come back.** So a token that
+vanishes says that a node is gone only if it has not come back after `SETTLE_S`. What the kernel
+knows is told at once: `gone`.
 
 Zenoh calls back on threads of its own. They only append to a deque and wake the event loop once
 per burst; everything else happens on the loop.
@@ -17,12 +17,11 @@ per burst; everything else happens on the loop.
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import json
-import secrets
 import socket
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -34,28 +33,30 @@ from rampart.actors.bus.topic import ROOT, Qos, Topic
 from rampart.actors.bus.topics import HELLO
 from rampart.actors.bus.unix_peer import peer, process_state
 
+ROUTERS = ("router_a", "router_b")
+
 LEASE_MS = 2000
 """A link that is silent for so long is closed; a stopped process is found sooner by heartbeat."""
 
-PATIENCE_S = 0.25
-"""Real seconds that a newcomer waits for a partner that runs; the link may come later."""
+PATIENCE_S = 10.0
+"""Real seconds that a client looks for a router when it starts."""
+
+SETTLE_S = 0.2
+"""Real seconds within which the tokens of nodes are back whose router has died."""
 
 HANDSHAKE_MS = 300
 """A handshake that takes longer is given up on either side: what connects and says nothing holds
 one of the hundred places that Zenoh has for handshakes no longer than this."""
 
 _HELLOS_PER_S = 200
-"""From one partner, which publishes one when it starts. Zenoh leaves out what is above, before it
-costs a node anything: for each hello all partners repeat their states, so such a flood is worst."""
+"""From one node, which publishes one when it starts. A router leaves out what is above: for each
+hello all others repeat their states, so such a flood is worst."""
 
-# Not sooner: a second handshake by each partner would meet the one of a node that is coming back.
-_REDIAL_MS = {"period_init_ms": 1000, "period_max_ms": 2000, "period_increase_factor": 2.0}
-_LOOK_S = 0.001
-_FIRST_LOOKS = 5
-"""So many looks, a millisecond each, before a partner that is missing is looked at more closely."""
+_REDIAL_MS = {"period_init_ms": 10, "period_max_ms": 40, "period_increase_factor": 1.5}
+_LOOK_S = 0.002
 
 _PROTOCOL = "unixsock-stream"
-_ALIVE = f"{ROOT}/alive"
+_ALIVE, _GONE = f"{ROOT}/alive", f"{ROOT}/gone"
 _DELIVERY = {
     Qos.SENSOR: (zenoh.Priority.DATA, zenoh.CongestionControl.DROP),
     Qos.STATE: (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.DROP),
@@ -67,15 +68,25 @@ def endpoint(folder: str, name: str) -> str:
     return f"{_PROTOCOL}/{socket_path(folder, name)}"
 
 
+def endpoints(folder: str) -> list[str]:
+    """Return the endpoints of the routers in the folder of a run."""
+    return [endpoint(folder, name) for name in ROUTERS]
+
+
 def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
-    """Return the configuration of a session that finds others only where it is told."""
+    """Return the configuration of a session that finds others only where it is told.
+
+    Args:
+        listen: where a router listens; None for a client.
+        dial: a client goes to the first of these that answers, a router to all, again and again.
+    """
     config = zenoh.Config()
     settings: dict[str, Any] = {
-        "mode": "peer",
+        "mode": "router" if listen else "client",
         "listen/endpoints": [listen] if listen else [],
         "listen/exit_on_failure": True,
         "connect/endpoints": list(dial),
-        "connect/timeout_ms": -1,  # in the background; `open` knows whom to wait for
+        "connect/timeout_ms": -1 if listen else 0,  # in the background, or each once
         "connect/retry": _REDIAL_MS,
         "connect/exit_on_failure": False,
         "open/return_conditions": {"connect_scouted": False, "declares": False},
@@ -85,30 +96,29 @@ def session_config(listen: str | None, dial: Sequence[str]) -> zenoh.Config:
         "transport/shared_memory/enabled": False,  # a SIGKILL would leave its segment behind
         "transport/unicast/open_timeout": HANDSHAKE_MS,
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
-        "transport/link/tx/lease": LEASE_MS,
-        "downsampling": [{"messages": ["put"], "flows": ["ingress"], "rules": [
-            {"key_expr": HELLO.pattern, "freq": _HELLOS_PER_S}]}]}
+        "transport/link/tx/lease": LEASE_MS}
     if listen:
-        settings["id"] = _mark(listen) + secrets.token_hex(8)
+        settings["downsampling"] = [{"messages": ["put"], "flows": ["ingress"], "rules": [
+            {"key_expr": HELLO.pattern, "freq": _HELLOS_PER_S}]}]
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
 
-def _mark(where: str) -> str:
-    """Return how the Zenoh id of the node that listens at an endpoint begins."""
-    return "1" + hashlib.blake2b(where.encode(), digest_size=8).hexdigest()[1:]
-
-
-def _answers(where: str) -> bool:
-    """Whether there is a process at an endpoint, and it is not stopped."""
-    with socket.socket(socket.AF_UNIX) as probe:
-        probe.setblocking(False)
-        try:
-            probe.connect(where.removeprefix(f"{_PROTOCOL}/"))
-            return process_state(peer(probe)[0]) not in "TtX"
-        except OSError:  # none, or so many wait to be let in that none is
-            return False
+def _answering(where: Sequence[str]) -> list[str]:
+    """Return the endpoints at which there is a process that is not stopped, the oldest first."""
+    found = []
+    for one in where:
+        path = one.removeprefix(f"{_PROTOCOL}/")
+        with socket.socket(socket.AF_UNIX) as probe:
+            probe.setblocking(False)
+            try:
+                probe.connect(path)
+                if process_state(peer(probe)[0]) not in "TtX":
+                    found.append((Path(path).stat().st_mtime_ns, one))
+            except OSError:  # none, or so many wait to be let in that none is
+                continue
+    return [one for _, one in sorted(found)]
 
 
 class ZenohBus:
@@ -117,19 +127,19 @@ class ZenohBus:
     Args:
         node: name under which this session announces itself; "" announces nothing (a tool).
         incarnation: of the node.
-        listen: endpoint to listen on, or None.
-        dial: endpoints of the partners.
+        dial: endpoints of the routers; to a router, of the other one.
+        listen: endpoint of a router; None for a client.
         recorder: connection to a recorder of the run; None for none.
     """
 
     bursts = True
 
-    def __init__(self, node: str, incarnation: int, listen: str | None, dial: Iterable[str],
-                 recorder: RecorderConnection | None = None) -> None:
+    def __init__(self, node: str, incarnation: int, dial: Sequence[str],
+                 listen: str | None = None, recorder: RecorderConnection | None = None) -> None:
         self._node = node
         self._incarnation = incarnation
         self._listen = listen
-        self._dial = tuple(dial)
+        self._dial = dial
         self._recorder = recorder
         self._session: zenoh.Session | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -137,40 +147,42 @@ class ZenohBus:
         self._woken = False
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._held: list[Any] = []
+        self._leaving: dict[tuple[str, int, PeerChange], asyncio.TimerHandle] = {}
 
     async def open(self) -> None:
-        """Open the session, link it with the partners that are there, and announce this node.
+        """Open the session, and announce this node.
 
         Raises:
-            BusError: the endpoint is in use or invalid.
+            BusError: the endpoint is in use or invalid, or there is no router.
         """
         self._loop = asyncio.get_running_loop()
         try:
-            self._session = zenoh.open(session_config(self._listen, self._dial))
+            self._session = (await self._joined(self._loop) if self._listen is None
+                             else zenoh.open(session_config(self._listen, self._dial)))
         except zenoh.ZError as error:
             text = " ".join(str(error).split())
             node = f"(node {self._node})"
             raise BusError(f"{self._listen} is in use by another process {node}"
                            if "acquire lock" in text
                            else f"cannot open {self._listen} {node}: {text}") from None
-        await self._linked(self._session)
         if self._node:
             self._held.append(self._session.liveliness().declare_token(
                 f"{_ALIVE}/{self._node}/{self._incarnation}"))
 
-    async def _linked(self, session: zenoh.Session) -> None:
-        """Wait until all partners that answer are linked, `PATIENCE_S` at most."""
-        loop = asyncio.get_running_loop()
-        missing = {_mark(where): where for where in self._dial}
-        deadline_s, looks = loop.time() + PATIENCE_S, 0
+    async def _joined(self, loop: asyncio.AbstractEventLoop) -> zenoh.Session:
+        """Return the session of a client, as soon as there is a router."""
+        until_s = loop.time() + PATIENCE_S
         while True:
-            for zid in session.info.peers_zid():
-                missing.pop(str(zid)[:len(_mark(""))], None)
-            if looks == _FIRST_LOOKS:
-                missing = {mark: where for mark, where in missing.items() if _answers(where)}
-            if not missing or loop.time() > deadline_s:
-                return
-            looks += 1
+            found = _answering(self._dial)
+            try:
+                if found:
+                    both = [*found, *(one for one in self._dial if one not in found)]
+                    return zenoh.open(session_config(None, both))
+            except zenoh.ZError:  # it ended in this moment
+                pass
+            if loop.time() > until_s:
+                raise BusError(f"no router at {' or '.join(self._dial)} "
+                               f"({f'node {self._node}' if self._node else 'tool'})")
             await asyncio.sleep(_LOOK_S)
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes) -> None:
@@ -201,13 +213,42 @@ class ZenohBus:
         """Have `changed` called now if the node is there, and whenever it appears or vanishes."""
 
         def arrived(sample: zenoh.Sample) -> None:  # runs on a Zenoh thread
-            incarnation = str(sample.key_expr).rsplit("/", 1)[1]
+            place, _, incarnation = str(sample.key_expr).rsplit("/", 2)
+            if not incarnation.isdecimal():
+                return
+            if place == _GONE:
+                self._hand_over(lambda: changed(node, int(incarnation), False))
+                return
             alive = sample.kind == zenoh.SampleKind.PUT
-            if incarnation.isdecimal():
-                self._hand_over(lambda: changed(node, int(incarnation), alive))
+            self._hand_over(lambda: self._token(node, int(incarnation), alive, changed))
 
-        self._held.append(self._require().liveliness().declare_subscriber(
+        session = self._require()
+        self._held.append(session.liveliness().declare_subscriber(
             f"{_ALIVE}/{node}/*", arrived, history=True))
+        self._held.append(session.declare_subscriber(f"{_GONE}/{node}/*", arrived))
+
+    def _token(self, node: str, incarnation: int, alive: bool, changed: PeerChange) -> None:
+        assert self._loop is not None  # noqa: S101 for the type checker
+        which = node, incarnation, changed
+        leaving = self._leaving.pop(which, None)
+        if leaving is not None:
+            leaving.cancel()
+        if alive:
+            changed(node, incarnation, True)
+        else:
+            self._leaving[which] = self._loop.call_later(SETTLE_S, self._left, which)
+
+    def _left(self, which: tuple[str, int, PeerChange]) -> None:
+        node, incarnation, changed = which
+        del self._leaving[which]
+        if self._session is not None:
+            changed(node, incarnation, False)
+
+    def gone(self, node: str, incarnation: int) -> None:
+        """Tell those who watch a node that a process of it has ended."""
+        self._require().put(
+            f"{_GONE}/{node}/{incarnation}", b"", priority=zenoh.Priority.INTERACTIVE_HIGH,
+            congestion_control=zenoh.CongestionControl.BLOCK, express=True)
 
     async def close(self) -> None:
         """Close the session."""

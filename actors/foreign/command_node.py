@@ -20,7 +20,7 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.topic import ROOT, Qos, Topic
-from rampart.actors.bus.zenoh_bus import endpoint
+from rampart.actors.bus.zenoh_bus import endpoints
 from rampart.actors.foreign import strays
 from rampart.actors.foreign.channel import Channel
 from rampart.actors.foreign.child import Child, CommandError, environment
@@ -87,7 +87,7 @@ class CommandNode(Actor):
                "RAMPART_ORIGIN_S": repr(self.clock.source_time(0.0)),
                "RAMPART_RATE": repr(self.clock.rate), "RAMPART_SEED": str(plan.seed),
                "RAMPART_SOCKET": str(channel.other.fileno()),
-               "RAMPART_ZENOH": endpoint(plan.folder, self.name)}
+               "RAMPART_ZENOH": ",".join(endpoints(plan.folder))}
         own |= self._watch()
         self._child.start(
             who=f"{self.name} #{self.context.incarnation}",

@@ -1,4 +1,4 @@
-"""Everything that follows from the plan of a run and its system: processes, endpoints, partners."""
+"""Everything that follows from the plan of a run and its system: processes and their actors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 
 from rampart.actors.bus.topic import Topic
-from rampart.actors.bus.zenoh_bus import endpoint
+from rampart.actors.bus.zenoh_bus import ROUTERS
 from rampart.actors.foreign.program import check_programs
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.ftm.messages import AdaptedSystem
@@ -20,7 +20,6 @@ from rampart.actors.layout.wiring import (
     import_class,
     load_class,
     load_member,
-    partners,
     topics_of,
 )
 from rampart.actors.run.application import Application
@@ -33,6 +32,7 @@ from rampart.manager.spec.specification import check_document, check_modules
 from rampart.manager.spec.tables import Layers
 
 SUPERVISOR_CLASS = "rampart.actors.supervision.supervisor:Supervisor"
+ROUTER_CLASS = "rampart.actors.supervision.router:Router"
 
 
 class Unit(msgspec.Struct, frozen=True):
@@ -53,7 +53,7 @@ class Unit(msgspec.Struct, frozen=True):
 
 
 class Layout:
-    """Everything derived from plan and spec: units, endpoints, partners.
+    """Everything derived from plan and spec: units, members, topics.
 
     Args:
         plan: of the run.
@@ -74,6 +74,8 @@ class Layout:
             name: Unit(name, nodes) for name, nodes in spec.processes().items()}
         self.unit_of: dict[str, str] = {
             node.name: unit.name for unit in self.units.values() for node in unit.nodes}
+        self.routers: dict[str, Unit] = {
+            name: Unit(name, (NodeSpec(name, Kind.SUPERVISION, ROUTER_CLASS),)) for name in ROUTERS}
         file = plan.system_file
         supervisor = load_class(SUPERVISOR_CLASS)
         try:
@@ -83,7 +85,7 @@ class Layout:
             judged = judged_topics(spec, observer)
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from None
-        heard = msgspec.convert({"nodes": tuple(self.unit_of)}, supervisor.Parameters)
+        heard = msgspec.convert({"nodes": (*ROUTERS, *self.unit_of)}, supervisor.Parameters)
         own = [Member(SUPERVISOR, supervisor, heard),
                Member(OBSERVER, observer, msgspec.convert(
                    {"judged": [topic.key for topic in judged]}, observer.Parameters))]
@@ -96,7 +98,6 @@ class Layout:
         self.members, self.topics = choose_topics(
             with_panels(own, spec, file), (*known, *judged), file)
         self._check(judge, (*ftm_topics.ALL, *known), file)
-        self._partners = partners(self.members.values())
 
     def _check(self, judge: Any, known: Collection[Topic[Any]], file: str) -> None:
         """Check who hears and publishes what; raises as the constructor."""
@@ -124,13 +125,11 @@ class Layout:
             if topic not in judge.optional_inputs and topic.key not in silent:
                 check_heard(f"{file}: {who}", topic, None, said)
 
-    def listen(self, node: str) -> str:
-        """Return the endpoint on which a node listens."""
-        return endpoint(self.plan.folder, node)
 
-    def dial(self, node: str) -> list[str]:
-        """Return the endpoints that a node connects to when it starts."""
-        return [endpoint(self.plan.folder, p) for p in self._partners[node]]
+def router(name: str) -> Member:
+    """Return a router of the bus, which real runs have."""
+    kind = load_class(ROUTER_CLASS)
+    return Member(name, kind, kind.Parameters())
 
 
 def adapted_system(layout: Layout, run: RunContext,

@@ -1,15 +1,10 @@
-"""Who talks with whom, computed from what the actor classes declare.
-
-Two nodes are partners if one publishes a key that the other hears, or one watches the
-other. A node dials its partners only, so a respawn costs a handful of connections, not one per
-process of the system.
-"""
+"""Who says and hears what, computed from what the actor classes declare."""
 
 from __future__ import annotations
 
 import importlib
 import traceback
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -92,21 +87,6 @@ def _together(declared: dict[str, Members], chosen: Mapping[str, Members]) -> di
         there = declared.get(key, ())
         declared[key] = None if there is None or names is None else (*there, *names)
     return declared
-
-
-def partners(members: Collection[Member]) -> dict[str, tuple[str, ...]]:
-    """Return for each node the nodes it shares a key or a watch with, in the given order."""
-    out = {m.name: published(m) for m in members}
-    into = {m.name: heard(m) for m in members}
-    watched = {m.name: m.actor.watches(m.name, m.parameters) for m in members}
-
-    def feeds(a: str, b: str) -> bool:
-        return b in watched[a] or any(
-            key in into[b] and (names is None or (wanted := into[b][key]) is None
-                                or not set(names).isdisjoint(wanted))
-            for key, names in out[a].items())
-
-    return {a: tuple(b for b in out if b != a and (feeds(a, b) or feeds(b, a))) for a in out}
 
 
 def topics_of(actor: type[Actor]) -> tuple[tuple[Topic[Any], ...], tuple[Topic[Any], ...]]:

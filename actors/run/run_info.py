@@ -15,7 +15,7 @@ import msgspec
 
 from rampart.actors.bus.envelope import UNREADABLE
 from rampart.actors.bus.unix_peer import is_same_user
-from rampart.actors.bus.zenoh_bus import endpoint
+from rampart.actors.bus.zenoh_bus import endpoint, endpoints
 
 REPLAY = "replay"
 """Name of the one socket in the folder of a replay: it plays all nodes."""
@@ -49,8 +49,7 @@ class RunInfo(msgspec.Struct, frozen=True):
     @property
     def endpoints(self) -> list[str]:
         """Where a tool that hears everything connects to."""
-        names = (REPLAY,) if self.replay_of else self.nodes
-        return [endpoint(self.folder, name) for name in names]
+        return [endpoint(self.folder, REPLAY)] if self.replay_of else endpoints(self.folder)
 
 
 class NoRunError(Exception):

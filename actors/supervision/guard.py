@@ -15,6 +15,8 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 
+from rampart.actors.bus.run_folder import issued
+from rampart.actors.bus.zenoh_bus import ROUTERS
 from rampart.actors.run.run_plan import SUPERVISOR, RunPlan
 from rampart.actors.supervision.patience import Patience, usage
 from rampart.actors.supervision.process_title import RunProcess, find_processes, kill
@@ -68,6 +70,7 @@ class Guard:
         self._load_patience = Patience(2 * PERIOD_S)
         self._hung: set[str] = set()
         self._supervisor_due_s: float | None = None
+        self._no_routers = False
         self._trouble = ""
 
     async def start_supervisor(self, within_s: float = PERIOD_S) -> None:
@@ -129,6 +132,7 @@ class Guard:
                 all_there &= await self._bring_spawner_back(name, living)
             else:
                 all_there &= self._judge(name, living[name].pid, turning)
+        await self._bring_routers_back(living)
         supervisor = living.get(SUPERVISOR)
         if supervisor is not None:  # it may be a child of a spawner that died before it answered
             self.supervisor_pid = supervisor.pid
@@ -179,6 +183,14 @@ class Guard:
             self._patience[name].answered()
             kill(pid)
         return False
+
+    async def _bring_routers_back(self, living: Mapping[str, RunProcess]) -> None:
+        """Without any the supervisor, which looks after them, might not even start."""
+        missing = living.keys().isdisjoint(ROUTERS)
+        if missing and self._no_routers:
+            for name in ROUTERS:
+                await self.fork(name, issued(self._spawners.folder).get(name, 0) + 1)
+        self._no_routers = missing
 
     async def _bring_spawner_back(self, name: str, living: Mapping[str, RunProcess]) -> bool:
         if any(n in living and n not in self._hung for n in _SPAWNERS if n != name):

@@ -24,7 +24,7 @@ import msgspec
 from rampart.actors.bus import run_folder
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.unix_peer import is_same_user
-from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.bus.zenoh_bus import ROUTERS, ZenohBus, endpoints
 from rampart.actors.ftm.messages import NodeTable
 from rampart.actors.run import run_info
 from rampart.actors.run.run_plan import OBSERVER, RunPlan
@@ -169,7 +169,8 @@ class Launcher:
         self.plan = msgspec.structs.replace(self.plan, origin_s=time.monotonic() + startup_s)
         try:
             self._spawners.set_origin(self.plan.origin_s)
-            await self.guard.fork(f"spawner_{NAMES[1]}", 1, START_PATIENCE_S)
+            for name in (*ROUTERS, f"spawner_{NAMES[1]}"):
+                await self.guard.fork(name, 1, START_PATIENCE_S)
             await self.guard.start_supervisor(START_PATIENCE_S)
         except SpawnerUnavailableError as error:
             raise LaunchError(str(error)) from None
@@ -198,10 +199,8 @@ class Launcher:
 
     def observers_bus(self) -> ZenohBus:
         """Return the bus of an observer in this process, which hears all nodes; not yet open."""
-        folder = self.plan.folder
-        others = [endpoint(folder, name) for name in self.names if name != OBSERVER]
-        return ZenohBus(OBSERVER, 1, endpoint(folder, OBSERVER), others,
-                        RecorderConnection(self.plan.base_port))
+        return ZenohBus(OBSERVER, 1, endpoints(self.plan.folder),
+                        recorder=RecorderConnection(self.plan.base_port))
 
     # -- tools ----------------------------------------------------------------------------------
 

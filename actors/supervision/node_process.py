@@ -35,8 +35,8 @@ from typing import Any
 from rampart.actors.bus.bus import BusError
 from rampart.actors.bus.recorder_connection import RecorderConnection
 from rampart.actors.bus.run_folder import register_of
-from rampart.actors.bus.zenoh_bus import ZenohBus
-from rampart.actors.layout.layout import Layout
+from rampart.actors.bus.zenoh_bus import ROUTERS, ZenohBus, endpoint, endpoints
+from rampart.actors.layout.layout import Layout, router
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import CheckpointStore, NoCheckpoints
@@ -71,16 +71,18 @@ def make_actor(layout: Layout, name: str, incarnation: int, run: RunContext,
                loop: asyncio.AbstractEventLoop, *,
                failed: Callable[[Exception], None] = lambda _error: None) -> Actor:
     """Build one actor of the system with its bus, not yet running; `failed` is told its error."""
-    member = layout.members[name]
+    member = layout.members.get(name) or router(name)
     clock = Clock(layout.plan.origin_s, layout.plan.rate, loop.time)
-    bus = ZenohBus(name, incarnation, layout.listen(name), layout.dial(name),
+    folder = layout.plan.folder
+    own = endpoint(folder, name) if name in ROUTERS else None
+    bus = ZenohBus(name, incarnation, [one for one in endpoints(folder) if one != own], own,
                    RecorderConnection(layout.plan.base_port))
     return member.actor(Context(
         name, incarnation, clock, bus, member.parameters, run,
         register=register_of(layout.plan.folder),
         checkpoints=make_store(layout, name, incarnation),
         heartbeat_period_s=layout.spec.timing.heartbeat_period_s, failed=failed,
-        members=frozenset(layout.members), topics=layout.topics))
+        members=frozenset((*layout.members, *layout.routers)), topics=layout.topics))
 
 
 def make_store(layout: Layout, name: str, incarnation: int) -> CheckpointStore:

@@ -66,7 +66,13 @@ class ProcessHandle:
 
 
 class Processes(Protocol):
-    """The processes of one run."""
+    """The processes of one run.
+
+    Attributes:
+        has_routers: Whether its bus needs routers.
+    """
+
+    has_routers: bool
 
     def living(self) -> Sequence[Living]:
         """Return those that are there."""
@@ -150,6 +156,8 @@ class OsHandle(ProcessHandle):
 
 class OsProcesses(SpawnerClient):
     """Processes of this machine; the run's spawners fork them."""
+
+    has_routers = True
 
     def living(self) -> list[Living]:
         """Return the processes of this run, found in /proc."""

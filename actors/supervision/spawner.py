@@ -177,7 +177,8 @@ class Spawner:
 
     def _fork(self, request: ForkRequest, connection: socket.socket) -> None:
         for name in request.names:
-            if name not in self._layout.members and name not in {f"spawner_{n}" for n in NAMES}:
+            if name not in {*self._layout.members, *self._layout.routers,
+                            *(f"spawner_{n}" for n in NAMES)}:
                 raise ValueError(f"unknown node {name!r}")
         if os.fork() == 0:
             self._become(request, connection)

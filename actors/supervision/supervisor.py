@@ -58,6 +58,9 @@ STOP_GRACE_S = 0.5
 _CHECK_S = 0.1
 """Simulated seconds between two looks at who is silent."""
 
+_ROUTERS_S = 0.03
+"""Wall seconds between two looks whether a router is stopped."""
+
 _SEARCH_S = 0.05
 """Wall seconds between two looks into /proc on account of one node's messages."""
 
@@ -117,10 +120,11 @@ class Supervisor(Relay):
         self._layout = Layout(self._plan, self._spec)
         self._machine: Processes = processes or OsProcesses(
             self._plan.folder, self._plan.base_port, self._plan.launcher_pid)
+        self._routers = self._layout.routers if self._machine.has_routers else {}
         self._processes = {
             name: _Process(unit, RestartPolicy(self._spec.supervision),
                            Patience(2 * _CHECK_S / self._plan.rate))
-            for name, unit in self._layout.units.items()}
+            for name, unit in {**self._routers, **self._layout.units}.items()}
         for node, incarnation in run.known_incarnations.items():
             if (process := self._process_of(node)) is not None:
                 process.incarnation = process.highest = incarnation
@@ -137,7 +141,8 @@ class Supervisor(Relay):
         return parameters.nodes if topic is bus_topics.HEARTBEAT else None
 
     def _process_of(self, node: str) -> _Process | None:
-        return self._processes.get(self._layout.unit_of.get(node, ""))
+        return self._processes.get(
+            node if node in self._routers else self._layout.unit_of.get(node, ""))
 
     # -- start and stop -------------------------------------------------------------------------
 
@@ -149,6 +154,8 @@ class Supervisor(Relay):
                     self._incarnation == 1 or self._owns(process)):
                 self._on(process, Event.START)
         self._publish_table()
+        if self._routers:
+            self._look_at_routers()
 
     def on_stop(self) -> None:
         """End all processes in reverse order: SIGTERM, then SIGKILL for those that linger.
@@ -253,6 +260,14 @@ class Supervisor(Relay):
                 self._on(process, Event.SILENT_STOPPED if stopped else Event.SILENT,
                          detail=silence)
 
+    def _look_at_routers(self) -> None:
+        """Find routers that are stopped at once: who is linked to one hears and says nothing."""
+        for name in self._routers:
+            process = self._processes[name]
+            if process.state is State.RUNNING and process.handle.stopped():
+                self._on(process, Event.SILENT_STOPPED, detail="stopped")
+        self.call_later(_ROUTERS_S * self.clock.rate, self._look_at_routers)
+
     @every(0.5)
     def repeat(self) -> None:
         """Repeat the node table for those who joined late."""
@@ -262,13 +277,16 @@ class Supervisor(Relay):
     def _ended(self, process: _Process, pid: int, detail: str = "") -> None:
         if process.pid == pid:  # else it was replaced while the news waited in the mailbox
             process.let_go()
+            for name in process.names:
+                self._bus.gone(name, process.incarnation)
             self._on(process, Event.ENDED, detail=detail)
 
     def _owns(self, process: _Process) -> bool:
         """Whether the supervisor itself brings the process back."""
-        return (self._spec.layers.supervisor_respawn
-                and process.unit.respawn == self.name
-                and process.unit.kind != Kind.WORLD.value)
+        return process.unit.name in self._routers or (
+            self._spec.layers.supervisor_respawn
+            and process.unit.respawn == self.name
+            and process.unit.kind != Kind.WORLD.value)
 
     # -- acting ---------------------------------------------------------------------------------
 

@@ -155,6 +155,9 @@ class VirtualBus:
         for incarnation in sorted(self._hub.alive.get(node, ())):
             self.soon(lambda i=incarnation: changed(node, i, True))  # type: ignore[misc]
 
+    def gone(self, node: str, incarnation: int) -> None:
+        """Nothing to do: watchers are told when it is cut off."""
+
     def cut(self) -> None:
         """Send and receive nothing any more, as when the process is killed; none is told yet."""
         self._open = False

@@ -104,6 +104,8 @@ class VirtualMachine:
         shelves: What the nodes have kept; it outlives their processes.
     """
 
+    has_routers = False
+
     def __init__(self, layout: Layout, run: RunContext, hub: Hub, clock: Clock, seed: Any) -> None:
         self.failures: list[tuple[str, BaseException]] = []
         self.on_restart: Callable[[str], None] = lambda _name: None
