@@ -7,6 +7,7 @@ import os
 import pytest
 
 from rampart.actors.bus import run_folder
+from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
 from tests.actors.operator.browser import CHROMIUM
 
 HOW_TO_GET_CHROMIUM = "no Chromium: `apt-get install chromium` brings it"
@@ -43,6 +44,15 @@ def sockets():
     folder = run_folder.make(0, os.getpid())
     yield folder
     run_folder.remove(folder)
+
+
+@pytest.fixture
+async def bus_folder(sockets):
+    """The folder of a run that has a router, by which sessions of `ZenohBus` hear each other."""
+    router = ZenohBus("router_a", 1, [], endpoint(sockets, "router_a"))
+    await router.open()
+    yield sockets
+    await router.close()
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from rampart.actors.bus import messages as bm
-from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.bus.zenoh_bus import ZenohBus, endpoints
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
@@ -108,19 +108,18 @@ class Run:
 
 
 @pytest.fixture
-async def run(monkeypatch, sockets):
+async def run(monkeypatch, bus_folder):
     loop = asyncio.get_running_loop()
     clock = Clock(loop.time(), RATE, loop.time)
     names = ("simulator", "DM1")
-    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), sockets, names,
+    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), bus_folder, names,
                    "r1", 0, "test run", plan={"mission": "AB"})
     monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: info)
     monkeypatch.setattr("rampart.actors.run.run_info.find_runs", list)  # those of others
     async with AsyncExitStack() as stack:
         nodes = []
         for name, cls in (("simulator", Everything), ("DM1", Bystander)):
-            bus = ZenohBus(name, 1, endpoint(sockets, name),
-                           [endpoint(sockets, n) for n in names if n != name])
+            bus = ZenohBus(name, 1, endpoints(bus_folder))
             node = cls(Context(name, 1, clock, bus))
             task = asyncio.create_task(node.run())
             stack.push_async_callback(asyncio.wait_for, task, 5)

@@ -16,9 +16,9 @@ import pytest
 
 from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
-from rampart.actors.bus.bus import Bus, BusError
+from rampart.actors.bus.bus import Bus
 from rampart.actors.bus.envelope import ArrivalGuard, encode
-from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.bus.zenoh_bus import ZenohBus, endpoints
 from rampart.actors.detection.module import DetectionModule
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
@@ -81,14 +81,11 @@ MakeBus = Callable[[str, int], Bus]
 
 
 @pytest.fixture(params=["virtual", "zenoh"])
-def make_bus(request: pytest.FixtureRequest, sockets: str) -> MakeBus:
+def make_bus(request: pytest.FixtureRequest, bus_folder: str) -> MakeBus:
     if request.param == "virtual":
         hub = Hub()
         return lambda name, incarnation: VirtualBus(hub, name, incarnation)
-    names = ("talker", "listener", "impostor", "third")
-    return lambda name, incarnation: ZenohBus(
-        name, incarnation, endpoint(sockets, name),
-        [endpoint(sockets, n) for n in names if n != name])
+    return lambda name, incarnation: ZenohBus(name, incarnation, endpoints(bus_folder))
 
 
 @asynccontextmanager
@@ -220,16 +217,6 @@ async def test_timers_run_at_the_rate_of_simulated_time(make_bus):
         elapsed, ticked = fast.clock.now() - start, fast.ticks - ticks
         assert elapsed > 0.9
         assert ticked == pytest.approx(elapsed / 0.02, rel=0.5)
-
-
-async def test_a_socket_in_use_is_one_clear_line(sockets):
-    first = ZenohBus("talker", 1, endpoint(sockets, "talker"), [])
-    await first.open()
-    try:
-        with pytest.raises(BusError, match=f"{sockets}/talker is in use by another process"):
-            await ZenohBus("talker", 2, endpoint(sockets, "talker"), []).open()
-    finally:
-        await first.close()
 
 
 @pytest.mark.parametrize(("mode", "expected"), [

@@ -9,7 +9,7 @@ import json
 import msgspec
 import pytest
 
-from rampart.actors.bus.zenoh_bus import ZenohBus, endpoint
+from rampart.actors.bus.zenoh_bus import ZenohBus, endpoints
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
@@ -39,18 +39,17 @@ class Planner(Actor):
 
 
 @pytest.fixture
-async def run(monkeypatch, sockets):
+async def run(monkeypatch, bus_folder):
     loop = asyncio.get_running_loop()
     clock = Clock(loop.time(), RATE, loop.time)
     names = ("mission_manager", "planner")
-    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), sockets, names,
+    info = RunInfo(1, 7450, RATE, clock.source_time(0.0), str(systems.DEFAULT), bus_folder, names,
                    "r1", 0, "test run")
     monkeypatch.setattr("rampart.cli.session.find_run", lambda _port: info)
     nodes, tasks = [], []
     for name, cls, parameters in (
             ("mission_manager", MissionManager, {"held_by": ["RM2"]}), ("planner", Planner, {})):
-        bus = ZenohBus(name, 1, endpoint(sockets, name),
-                       [endpoint(sockets, n) for n in names if n != name])
+        bus = ZenohBus(name, 1, endpoints(bus_folder))
         node = cls(Context(name, 1, clock, bus, parameters,
                            run=RunContext(application=Osmosis.on_map(load_airport("vallombre")))))
         tasks.append(asyncio.create_task(node.run()))

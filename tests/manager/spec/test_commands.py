@@ -164,12 +164,6 @@ def test_a_topic_that_nobody_declares_is_one_line(tug):
                                   "'tug/comand'; the nearest: tug/command")
 
 
-def test_who_publishes_by_a_command_shares_a_link_with_who_hears_it(tug):
-    plan = tug()
-    layout = Layout(plan, load_system(plan))
-    assert any(where.endswith("/wheels") for where in layout.dial("driver"))
-
-
 @pytest.mark.parametrize(("old", "new", "field"), [
     ("./wheels", "./other", "command"), (COMMAND, f'{COMMAND}\nfolder = "/tmp"', "folder"),
     (COMMAND, f'{COMMAND}\nenv = {{ LD_PRELOAD = "/tmp/x.so" }}', "env"),

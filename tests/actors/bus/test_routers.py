@@ -1,0 +1,213 @@
+"""Two routers: a client needs one that answers, and goes over to the other when its own is gone."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import multiprocessing
+import os
+import signal
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from itertools import pairwise
+
+import pytest
+
+from rampart.actors.bus import zenoh_bus
+from rampart.actors.bus.bus import BusError
+from rampart.actors.bus.run_folder import socket_path
+from rampart.actors.bus.zenoh_bus import ROUTERS, ZenohBus, endpoint, endpoints
+from rampart.actors.osmosis import topics
+from rampart.testing import eventually
+
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload([__name__])  # a process of its own that has no session yet
+
+
+def be_router(folder: str, name: str, ready) -> None:
+    """Be a router, in a process of its own."""
+
+    async def main() -> None:
+        own = endpoint(folder, name)
+        bus = ZenohBus(name, 1, [one for one in endpoints(folder) if one != own], own)
+        await bus.open()
+        ready.set()
+        await asyncio.sleep(1000)
+
+    asyncio.run(main())
+
+
+class Routers:
+    """The routers of a test, by name."""
+
+    def __init__(self, folder: str) -> None:
+        self.folder = folder
+        self.processes = {}
+
+    async def start(self, *names: str) -> None:
+        for name in names:
+            ready = FORKS.Event()
+            process = FORKS.Process(target=be_router, args=(self.folder, name, ready), daemon=True)
+            process.start()
+            self.processes[name] = process
+            assert await asyncio.to_thread(ready.wait, 20)
+
+    def send(self, name: str, number: signal.Signals) -> None:
+        os.kill(self.processes[name].pid, number)
+
+
+@pytest.fixture
+def routers(sockets):
+    made = Routers(sockets)
+    yield made
+    for process in made.processes.values():
+        process.kill()
+        process.join()
+
+
+@asynccontextmanager
+async def client(folder: str, name: str = "", incarnation: int = 1) -> AsyncIterator[ZenohBus]:
+    bus = ZenohBus(name, incarnation, endpoints(folder))
+    await bus.open()
+    try:
+        yield bus
+    finally:
+        await bus.close()
+
+
+def hear(bus: ZenohBus) -> list[bytes]:
+    heard: list[bytes] = []
+    bus.subscribe(topics.POSE, topics.POSE.at(), lambda _key, payload: heard.append(payload))
+    return heard
+
+
+async def send_until(bus: ZenohBus, reached, count: int = 1000) -> None:
+    """Publish numbers, a hundred a second, until something is so."""
+    for number in range(count):
+        bus.publish(topics.POSE, topics.POSE.at(), b"%d" % number)
+        await asyncio.sleep(0.01)
+        if reached():
+            return
+    raise AssertionError("it did not happen in time")
+
+
+async def test_what_is_sent_first_arrives(routers, sockets):
+    await routers.start(*ROUTERS)
+    async with client(sockets) as reader:
+        heard = hear(reader)
+        await asyncio.sleep(0.2)
+        async with client(sockets, "node") as writer:
+            writer.publish(topics.POSE, topics.POSE.at(), b"first")
+            await eventually(lambda: heard == [b"first"])
+
+
+@pytest.mark.parametrize("stopped", ROUTERS)
+async def test_a_stopped_router_is_not_waited_for(routers, sockets, stopped):
+    await routers.start(*ROUTERS)
+    routers.send(stopped, signal.SIGSTOP)
+    async with client(sockets) as one, client(sockets) as other:
+        heard = hear(one)
+        await send_until(other, lambda: heard)
+
+
+async def test_who_starts_before_the_routers_waits_for_one(routers, sockets):
+    async with asyncio.TaskGroup() as group:
+        group.create_task(routers.start("router_b"))
+        async with client(sockets) as one, client(sockets) as other:
+            heard = hear(one)
+            await send_until(other, lambda: heard)
+
+
+async def test_without_routers_it_is_told_in_one_line(sockets, monkeypatch):
+    monkeypatch.setattr(zenoh_bus, "PATIENCE_S", 0.05)
+    with pytest.raises(BusError, match=rf"^no router at \S+{sockets}/router_a or \S+/router_b "
+                                       r"\(node talker\)$"):
+        await ZenohBus("talker", 1, endpoints(sockets)).open()
+
+
+async def test_who_connects_and_says_nothing_holds_no_place_for_long(routers, sockets):
+    await routers.start("router_a")
+    with contextlib.ExitStack() as stack:
+        for _ in range(120):  # Zenoh has a hundred places for handshakes
+            idle = stack.enter_context(socket.socket(socket.AF_UNIX))
+            idle.connect(socket_path(sockets, "router_a"))
+        async with client(sockets) as one, client(sockets) as other:
+            heard = hear(one)
+            await send_until(other, lambda: heard)
+
+
+async def test_a_second_router_of_a_name_is_refused_in_one_line(routers, sockets):
+    await routers.start("router_a")
+    with pytest.raises(BusError, match=r"^\S+/router_a is in use by another process \(node "):
+        await ZenohBus("router_a", 2, [], endpoint(sockets, "router_a")).open()
+
+
+async def test_when_a_router_dies_all_go_over_to_the_other_and_none_counts_as_gone(
+        routers, sockets):
+    await routers.start(*ROUTERS)
+    changes = []
+    async with client(sockets, "node") as writer, client(sockets) as reader:
+        heard = hear(reader)
+        reader.watch("node", lambda *change: changes.append(change))
+        for killed in (*ROUTERS, *ROUTERS):
+            await send_until(writer, lambda: len(heard) > 20)
+            routers.send(killed, signal.SIGKILL)
+            await asyncio.sleep(0)
+            before = len(heard)
+            await send_until(writer, lambda: len(heard) > before + 20)  # noqa: B023 called here
+            await routers.start(killed)
+            heard.clear()
+        assert changes
+        assert set(changes) == {("node", 1, True)}
+
+
+async def test_when_both_die_all_come_back_to_the_next_ones(routers, sockets):
+    await routers.start(*ROUTERS)
+    changes = []
+    async with client(sockets, "node") as writer, client(sockets) as reader:
+        heard = hear(reader)
+        reader.watch("node", lambda *change: changes.append(change))
+        await send_until(writer, lambda: heard)
+        for name in ROUTERS:
+            routers.send(name, signal.SIGKILL)
+        await eventually(lambda: changes[-1:] == [("node", 1, False)], 5)
+        await routers.start(*ROUTERS)
+        heard.clear()
+        await send_until(writer, lambda: heard)
+        await eventually(lambda: changes[-1] == ("node", 1, True), 5)
+
+
+async def test_who_dies_with_its_router_is_gone_all_the_same(routers, sockets):
+    await routers.start(*ROUTERS)
+    changes = []
+    async with client(sockets) as reader:
+        reader.watch("node", lambda *change: changes.append(change))
+        async with client(sockets, "node"):
+            await eventually(lambda: changes == [("node", 1, True)])
+            routers.send("router_a", signal.SIGKILL)
+        await eventually(lambda: changes[-1] == ("node", 1, False))
+
+
+async def test_what_the_kernel_knows_is_told_at_once(routers, sockets, monkeypatch):
+    monkeypatch.setattr(zenoh_bus, "SETTLE_S", 1000.0)
+    await routers.start(*ROUTERS)
+    changes = []
+    async with client(sockets) as reader, client(sockets) as supervisor:
+        reader.watch("node", lambda *change: changes.append(change))
+        async with client(sockets, "node", 7):
+            await eventually(lambda: changes == [("node", 7, True)])
+            supervisor.gone("node", 7)
+            await eventually(lambda: changes[1:] == [("node", 7, False)])
+
+
+async def test_numbers_of_one_client_arrive_in_their_sequence_over_a_change(routers, sockets):
+    await routers.start(*ROUTERS)
+    async with client(sockets) as writer, client(sockets) as reader:
+        heard = hear(reader)
+        await send_until(writer, lambda: heard)
+        heard.clear()
+        asyncio.get_running_loop().call_later(
+            0.3, routers.send, "router_a", signal.SIGKILL)
+        await send_until(writer, lambda: len(heard) > 80)
+        assert all(int(one) < int(other) for one, other in pairwise(heard))
