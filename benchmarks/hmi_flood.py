@@ -35,7 +35,7 @@ import websockets
 
 from rampart.actors.run.run_info import find_runs
 from rampart.actors.supervision.process_title import find_processes
-from rampart.actors.supervision.process_usage import read_count
+from rampart.actors.runtime.process_usage import read_count
 
 ROOT = Path(__file__).resolve().parents[1]
 PORT, PAGE_PORT = 8660, 8760

@@ -29,6 +29,7 @@ import signal
 import socket
 import sys
 import time
+from collections.abc import Callable
 
 LOG_BYTES = 5_000_000
 LOG_BYTES_PER_S = 1_000_000
@@ -133,11 +134,11 @@ def descendants(of: int) -> list[int]:
     return found
 
 
-def end_all(within_s: float = END_S) -> bool:
-    """Kill everything below this process and wait for its end; False if something is left."""
+def kill_all(find: Callable[[], list[int]], within_s: float) -> bool:
+    """Kill what is found until nothing is; False if something is left after so many seconds."""
     until_s = time.monotonic() + within_s
     while True:
-        left = descendants(os.getpid())
+        left = find()
         for pid in left:
             with contextlib.suppress(OSError):
                 os.kill(pid, signal.SIGKILL)
@@ -172,7 +173,7 @@ class Keeper:
         self._log.note(f"{self._order['who']} is process {pid}")
         self._tell({"started": pid})
         status = self._keep(pid, wake)
-        end_all()
+        kill_all(lambda: descendants(os.getpid()), END_S)
         self._read_output()
         if status is not None:
             self._log.note(f"{self._order['who']} ended: {in_words(status)}")
