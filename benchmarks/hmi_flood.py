@@ -34,8 +34,8 @@ import httpx
 import websockets
 
 from rampart.actors.run.run_info import find_runs
-from rampart.actors.supervision.process_title import find_processes
 from rampart.actors.runtime.process_usage import read_count
+from rampart.actors.supervision.process_title import find_processes
 
 ROOT = Path(__file__).resolve().parents[1]
 PORT, PAGE_PORT = 8660, 8760

@@ -81,8 +81,9 @@ def find_topic(key: str, known: Iterable[Topic[Any]]) -> Topic[Any] | None:
 
 def _actors(spec: SystemSpec) -> Iterator[str]:
     """Return the paths of all actor classes of a system."""
-    rows = (*spec.nodes, *spec.detections, *spec.recoveries)
-    return filter(None, [*(row.actor for row in rows), *(node.stand_in for node in spec.nodes)])
+    tables = (spec.nodes, spec.detections, spec.recoveries)
+    return filter(None, [*(row.actor for table in tables for row in table),
+                         *(node.stand_in for node in spec.nodes)])
 
 
 def _beyond(known: Iterable[Topic[Any]], paths: Iterable[str]) -> tuple[Topic[Any], ...]:

@@ -23,8 +23,8 @@ from rampart.actors.osmosis.page.requests import OSMOSIS_REQUESTS
 from rampart.actors.recording.message_form import Forms
 from rampart.actors.run.run_info import RunInfo, read_info
 from rampart.actors.runtime.checkpoint import StateError
-from rampart.actors.supervision.process_title import parse_title
 from rampart.actors.runtime.process_usage import parse_stat
+from rampart.actors.supervision.process_title import parse_title
 from rampart.actors.supervision.spawner import Adapt, ForkRequest, Ping, Reply, Request, SetOrigin
 from rampart.actors.web.access import Access, page_url, shown_token
 from rampart.manager.actor import MANAGER_STATE

@@ -71,7 +71,7 @@ class OsmosisControl(Actor):
         self.core = RouteControl(
             system, airport, self.report_diagnostic, context.clock.now(),
             RowLimits(pass_after_s=parameters.pass_after_s or math.inf),
-            self._lights, check=RouteCheck(airport) if parameters.check_route else None,
+            lights=self._lights, check=RouteCheck(airport) if parameters.check_route else None,
             bridge=DeadReckoning(parameters.bridge_m) if parameters.bridge_m else None,
             loop=MotionLoop(system.robot.top_turn_rate_radps) if parameters.yaw_loop else None,
             has_standby=parameters.has_standby)

@@ -115,7 +115,7 @@ class RouteControl:
 
     def __init__(
         self, system: SystemSpec, airport: Airport, tell: Callable[[str, str, str], None],
-        now_s: float, row: RowLimits, lights: RowInspection, *,
+        now_s: float, row: RowLimits, *, lights: RowInspection,
         check: RouteCheck | None = None, bridge: DeadReckoning | None = None,
         loop: MotionLoop | None = None, has_standby: bool = False,
     ) -> None:

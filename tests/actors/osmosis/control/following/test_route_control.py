@@ -32,7 +32,7 @@ class Bench:
         self.told: list[tuple[str, str, str]] = []
         self.core = RouteControl(
             SYSTEM, AIRPORT, lambda *what: self.told.append(what), 0.0, RowLimits(),
-            RowInspection((), goes_back=False), **parts)
+            lights=RowInspection((), goes_back=False), **parts)
         self.now_s = 0.0
 
     def drive(self, seconds: float, *, localized: bool = True) -> list[m.Twist]:
