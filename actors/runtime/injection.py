@@ -84,7 +84,7 @@ class FaultGate:
 
     in_force: dict[str, _Active] = field(default_factory=dict)
     last: dict[str, tuple[Any, float]] = field(default_factory=dict)
-    _news: list[tuple[_Active, str]] = field(default_factory=list)
+    _news: list[tuple[Injection, int, str]] = field(default_factory=list)
 
     def order(self, injection: Injection, now_s: float, kind: type[Any] | None = None) -> str:
         """Put an injection in force; return the reason if it cannot be, else an empty text.
@@ -122,19 +122,19 @@ class FaultGate:
                 changed = self._disturb(active, out, now_s)
             except InjectionError as error:
                 del self.in_force[active.order.injection]
-                self._news.append((active, str(error)))
+                self._news.append((active.order, active.affected, str(error)))
                 continue
             if changed is None or changed != out:
                 active.affected += 1
                 if active.affected == 1:
-                    self._news.append((active, ""))
+                    self._news.append((active.order, active.affected, ""))
             if changed is None:
                 return None
             out = changed
         return out
 
-    def take_news(self) -> list[tuple[_Active, str]]:
-        """Return which injections had their first effect since, or ended early, and why."""
+    def take_news(self) -> list[tuple[Injection, int, str]]:
+        """Return what had its first effect since, or ended early: with its count, and why."""
         news, self._news = self._news, []
         return news
 
@@ -277,12 +277,11 @@ class InjectedFaults:
                 topic, key, out.body, out.stamp, out.copies))
         elif out is not None:
             publisher.send(topic, key, out.body, out.stamp, out.copies)
-        for active, reason in self.gate.take_news():
-            order = active.order
+        for order, affected, reason in self.gate.take_news():
             if reason:
                 self._forget_end(order.injection)
                 publisher.report_diagnostic("fault injection", reason, order.topic)
-            self._report(order.injection, active.affected, bool(reason), reason)
+            self._report(order.injection, affected, bool(reason), reason)
 
     def _send_later(self, delay_s: float, send: Callable[[], None]) -> None:
         if self._delayed >= MAX_DELAYED:
