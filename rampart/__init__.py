@@ -10,98 +10,57 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rampart.actors.bus.envelope import Header
-    from rampart.actors.bus.messages import InjectionReport, Message
-    from rampart.actors.bus.topic import Qos, Topic
-    from rampart.actors.bus.topics import INJECTION_REPORT
-    from rampart.actors.detection.module import DetectionModule, Monitor
-    from rampart.actors.detection.watchdog import Watchdog
-    from rampart.actors.ftm.messages import DetectionState, RecoveryCommand
-    from rampart.actors.operator.hmi import Hmi
-    from rampart.actors.recovery.holding import HeldOrder
-    from rampart.actors.recovery.module import RecoveryModule
-    from rampart.actors.recovery.respawn import Respawn
-    from rampart.actors.run.application import Application
-    from rampart.actors.run.run_context import RunContext
-    from rampart.actors.runtime.actor import Actor, Context, every, on
-    from rampart.actors.runtime.checkpoint import StateFormat
-    from rampart.actors.runtime.fault_watch import Order
-    from rampart.actors.runtime.parameters import FieldName, Suspects
-    from rampart.actors.runtime.timer import Timer
-    from rampart.manager.analysis.verification import verify
-    from rampart.manager.arbitration.arbiter import Arbiter, build_arbiter
-    from rampart.manager.arbitration.arbiter_state import (
-        DecisionMade,
-        DetectionHeard,
-        RecoveryHeard,
-        ResetAsked,
-        Tick,
-    )
-    from rampart.manager.arbitration.recovery_track import Command
-    from rampart.manager.spec.panels import Panel
-    from rampart.manager.spec.schema import SystemSpec
-    from rampart.manager.spec.specification import parse_specification
-    from rampart.manager.spec.tables import NonNegative, Positive, SpecificationError
-    from rampart.manager.strategies.decision import Decision, Strategy
-    from rampart.manager.strategies.registry import STRATEGIES, decide
-    from rampart.sim.faults.disturbance import Disturbance, Fault
-    from rampart.sim.faults.faults import Faults
-    from rampart.sim.faults.scenario import ScenarioError
-    from rampart.sim.runs.judge import Judge, Verdict
-
-__all__ = [
-    "INJECTION_REPORT",
-    "STRATEGIES",
-    "Actor",
-    "Application",
-    "Arbiter",
-    "Command",
-    "Context",
-    "Decision",
-    "DecisionMade",
-    "DetectionHeard",
-    "DetectionModule",
-    "DetectionState",
-    "Disturbance",
-    "Fault",
-    "Faults",
-    "FieldName",
-    "Header",
-    "HeldOrder",
-    "Hmi",
-    "InjectionReport",
-    "Judge",
-    "Message",
-    "Monitor",
-    "NonNegative",
-    "Order",
-    "Panel",
-    "Positive",
-    "Qos",
-    "RecoveryCommand",
-    "RecoveryHeard",
-    "RecoveryModule",
-    "ResetAsked",
-    "Respawn",
-    "RunContext",
-    "ScenarioError",
-    "SpecificationError",
-    "StateFormat",
-    "Strategy",
-    "Suspects",
-    "SystemSpec",
-    "Tick",
-    "Timer",
-    "Topic",
-    "Verdict",
-    "Watchdog",
-    "build_arbiter",
-    "decide",
-    "every",
-    "on",
-    "parse_specification",
-    "verify",
-]
+    from rampart.actors.bus.envelope import Header as Header
+    from rampart.actors.bus.messages import InjectionReport as InjectionReport
+    from rampart.actors.bus.messages import Message as Message
+    from rampart.actors.bus.topic import Qos as Qos
+    from rampart.actors.bus.topic import Topic as Topic
+    from rampart.actors.bus.topics import INJECTION_REPORT as INJECTION_REPORT
+    from rampart.actors.detection.module import DetectionModule as DetectionModule
+    from rampart.actors.detection.module import Monitor as Monitor
+    from rampart.actors.detection.watchdog import Watchdog as Watchdog
+    from rampart.actors.ftm.messages import DetectionState as DetectionState
+    from rampart.actors.ftm.messages import RecoveryCommand as RecoveryCommand
+    from rampart.actors.operator.hmi import Hmi as Hmi
+    from rampart.actors.recovery.holding import HeldOrder as HeldOrder
+    from rampart.actors.recovery.module import RecoveryModule as RecoveryModule
+    from rampart.actors.recovery.respawn import Respawn as Respawn
+    from rampart.actors.run.application import Application as Application
+    from rampart.actors.run.run_context import RunContext as RunContext
+    from rampart.actors.runtime.actor import Actor as Actor
+    from rampart.actors.runtime.actor import Context as Context
+    from rampart.actors.runtime.actor import every as every
+    from rampart.actors.runtime.actor import on as on
+    from rampart.actors.runtime.checkpoint import StateFormat as StateFormat
+    from rampart.actors.runtime.fault_watch import Order as Order
+    from rampart.actors.runtime.parameters import FieldName as FieldName
+    from rampart.actors.runtime.parameters import Suspects as Suspects
+    from rampart.actors.runtime.timer import Timer as Timer
+    from rampart.manager.analysis.verification import verify as verify
+    from rampart.manager.arbitration.arbiter import Arbiter as Arbiter
+    from rampart.manager.arbitration.arbiter import build_arbiter as build_arbiter
+    from rampart.manager.arbitration.arbiter_state import DecisionMade as DecisionMade
+    from rampart.manager.arbitration.arbiter_state import DetectionHeard as DetectionHeard
+    from rampart.manager.arbitration.arbiter_state import RecoveryHeard as RecoveryHeard
+    from rampart.manager.arbitration.arbiter_state import ResetAsked as ResetAsked
+    from rampart.manager.arbitration.arbiter_state import Tick as Tick
+    from rampart.manager.arbitration.recovery_track import Command as Command
+    from rampart.manager.spec.panels import Panel as Panel
+    from rampart.manager.spec.schema import SystemSpec as SystemSpec
+    from rampart.manager.spec.specification import parse_specification as parse_specification
+    from rampart.manager.spec.tables import NonNegative as NonNegative
+    from rampart.manager.spec.tables import Positive as Positive
+    from rampart.manager.spec.tables import SpecificationError as SpecificationError
+    from rampart.manager.strategies.decision import Decision as Decision
+    from rampart.manager.strategies.decision import Strategy as Strategy
+    from rampart.manager.strategies.registry import STRATEGIES as STRATEGIES
+    from rampart.manager.strategies.registry import decide as decide
+    from rampart.sim.faults.disturbance import Disturbance as Disturbance
+    from rampart.sim.faults.disturbance import Fault as Fault
+    from rampart.sim.faults.faults import Faults as Faults
+    from rampart.sim.faults.scenario import ScenarioError as ScenarioError
+    from rampart.sim.runs.judge import Judge as Judge
+    from rampart.sim.runs.judge import Verdict as Verdict
 
 _HOMES = {
     "actors.bus.envelope": ("Header",),
@@ -141,6 +100,7 @@ _HOMES = {
 """Modules below `rampart`, and what is taken from each."""
 
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+__all__ = list(_HOME_OF)
 
 
 def __getattr__(name: str) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import math
 import sys
 from typing import Any
@@ -23,8 +22,9 @@ from rampart.cli import systems
 from rampart.cli.following import is_over, stopped_by_signals
 from rampart.cli.osmosis.keyboard_stick import KeyboardStick
 from rampart.cli.output import NoEffectError, UsageError, say
-from rampart.cli.session import Latest, Session, connect
+from rampart.cli.session import Latest, Session, connect, pause
 from rampart.cli.terminal import END, keys
+from rampart.cli.verbs import PORT, add_verb, number, option
 from rampart.files.plain_text import printable
 
 _PERIOD_S = 0.05
@@ -38,30 +38,34 @@ _ANSWER_S = 1.0
 _RELEASES = 3
 
 
-def add(verbs: Any, formatter: Any, common: argparse.ArgumentParser) -> None:
+def add(verbs: Any, _formatter: Any, _common: Any) -> None:
     """Add the verb to the parser."""
-    parser = verbs.add_parser(
-        "joystick", parents=[common], formatter_class=formatter,
-        help="drive from the keyboard, or with a joystick",
-        description="Drive the robot by the arrow keys, or by u i o j l m , . as ROS users know.\n"
-                    "Space or k lets go, + and - change the speed, q or Ctrl-C quits.\n\n"
-                    "The dead man: hold the key. A terminal tells no letting go, so the robot\n"
-                    "drives while the key repeats and stops within 0.6 s when it does not. If the\n"
-                    "robot stops once after the first moment, make the keyboard repeat sooner\n"
-                    "(X11: xset r rate 250).\n\n"
-                    "One stick is followed at a time: who holds first, drives; others are told.",
-        epilog="examples:\n  rampart joystick\n  rampart joystick --speed 0.2\n"
-               "  rampart joystick --device            the first joystick plugged in here\n"
-               "  rampart joystick --device /dev/input/js1")
-    parser.add_argument("--speed", type=float, default=0.5, metavar="SHARE",
-                        help="share of full speed to begin with, 0.1 to 1 (default 0.5)")
-    parser.add_argument("--device", nargs="?", const=AUTO, metavar="DEVICE",
-                        help="a joystick instead of the keyboard; hold its dead-man button")
-    parser.set_defaults(run=lambda options: asyncio.run(joystick(options)))
+    add_verb(verbs, "joystick", "drive from the keyboard, or with a joystick", joystick, PORT,
+             number("--speed", "SHARE", "share of full speed to begin with, 0.1 to 1 (default 0.5)",
+                    0.5),
+             option("--device", nargs="?", const=AUTO, metavar="DEVICE",
+                    help="a joystick instead of the keyboard; hold its dead-man button"))
 
 
 async def joystick(options: argparse.Namespace) -> int:
-    """Drive until the user has had enough, or the run ends."""
+    """Drive by hand until told to stop, or until run or joystick end.
+
+    Drive the robot by the arrow keys, or by u i o j l m , . as ROS users know.
+    Space or k lets go, + and - change the speed, q or Ctrl-C quits.
+
+    The dead man: hold the key. A terminal tells no letting go, so the robot
+    drives while the key repeats and stops within 0.6 s when it does not. If the
+    robot stops once after the first moment, make the keyboard repeat sooner
+    (X11: xset r rate 250).
+
+    One stick is followed at a time: who holds first, drives; others are told.
+
+    Examples:
+      rampart joystick
+      rampart joystick --speed 0.2
+      rampart joystick --device            the first joystick plugged in here
+      rampart joystick --device /dev/input/js1
+    """
     if not 0.1 <= options.speed <= 1.0:
         raise UsageError(f"--speed {options.speed:g}: must be between 0.1 and 1")
     if options.device is None and not sys.stdin.isatty():
@@ -166,8 +170,7 @@ class _Drive:
             if self._loop.time() - shown_s >= _SHOW_EVERY_S:
                 shown_s = self._loop.time()
                 self._show()
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._stop.wait(), period_s)
+            await pause(self._stop, period_s)
 
     async def let_go(self) -> None:
         """Tell that nobody holds the stick any more."""
