@@ -29,7 +29,7 @@ from rampart.cli.output import (
     warn,
 )
 from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.strategies.registry import STRATEGIES
+from rampart.manager.strategies.registry import find_strategy
 from rampart.sim.campaign.content import content_of, with_content
 from rampart.sim.campaign.execute import BackendError, JobError, execute
 from rampart.sim.campaign.job import Job, RunResult, run_virtually, virtual_run
@@ -43,7 +43,7 @@ from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import PlannedFault, ScenarioError, action_of, parse_fault
 from rampart.sim.runs.report import in_words
 from rampart.sim.runs.trial import trial_class
-from rampart.sim.virtual.network import NETWORKS
+from rampart.sim.virtual.network import find_network
 
 
 def campaign(options: argparse.Namespace) -> int:
@@ -66,20 +66,18 @@ def campaign(options: argparse.Namespace) -> int:
         jobs = with_content(chosen)
     named: NamedCampaign | None = options.named[0] if options.named else None
     directory = Path(options.out) if options.out else Path("reports") / f"campaign-{name}"
-    try:
+    with refusing(StoreError):
         store = Store(directory)
-    except StoreError as error:
-        raise UsageError(str(error)) from None
     try:
-        made = _execute(options, jobs, store)
-        keys = {job.key for job in jobs}
-        runs = _in_order(store.runs(keys), jobs)
+        with refusing(BackendError):
+            made = _execute(options, jobs, store)
+        results = {run.job.key: run.result for run in store.runs({job.key for job in jobs})}
         store.close()
-    except BackendError as error:
-        raise UsageError(str(error)) from None
     except (StoreError, JobError) as error:
         raise UsageError(f"{error}; what was finished is in {directory}, and the same command "
                          "goes on from there") from None
+    # Those of the campaign: a stored row may have been named by an earlier one.
+    runs = [Run(job, results[job.key]) for job in jobs if job.key in results]
     show_runs(spec, runs, made, named, as_json=options.json)
     try:
         page = _write_report(options, spec, directory, runs, named)
@@ -110,11 +108,10 @@ def _check(options: argparse.Namespace) -> None:
             raise UsageError(f"{name} {value}: must be {least} or more")
     if not options.patience > 0:
         raise UsageError(f"--patience {options.patience:g}: must be above 0")
-    if options.network not in NETWORKS:
-        raise unknown("network", options.network, NETWORKS)
-    for strategy in options.strategy:
-        if strategy not in STRATEGIES:
-            raise unknown("strategy", strategy, STRATEGIES)
+    with refusing(ValueError):
+        find_network(options.network)
+        for strategy in options.strategy:
+            find_strategy(strategy)
 
 
 def _base_jobs(options: argparse.Namespace, spec: SystemSpec) -> list[Job]:
@@ -126,10 +123,8 @@ def _base_jobs(options: argparse.Namespace, spec: SystemSpec) -> list[Job]:
     ftm = {"on": (True,), "off": (False,), "both": (False, True)}[options.ftm]
     chosen = application_options.alternatives(options, application_class(spec))
     for each in chosen:
-        try:
+        with refusing(ValueError):
             load_application(RunPlan(system_file=options.system, options=each), spec)
-        except ValueError as error:
-            raise UsageError(" ".join(str(error).split())) from None
     return [Job(row="", system=options.system, strategy=strategy, options=each, ftm=with_ftm,
                 network=options.network, seed=options.seed, patience_s=options.patience,
                 duration_s=options.duration)
@@ -156,10 +151,8 @@ def _moments(spec: SystemSpec, job: Job, *, searched: bool = False) -> tuple[flo
     """Return between which moments faults are drawn: within a run that has none."""
     if found := trial_class(spec).moments(spec, searched=searched):
         return found
-    try:
+    with refusing(ValueError):
         lasts_s = run_virtually(job).record.duration_s
-    except ValueError as error:
-        raise UsageError(" ".join(str(error).split())) from None
     return round(min(2.0, 0.1 * lasts_s), 2), round(0.9 * lasts_s, 2)
 
 
@@ -175,16 +168,8 @@ def _groups(options: argparse.Namespace, spec: SystemSpec) -> dict[str, tuple[st
     return {kind: groups[kind] for kind in wanted}
 
 
-def all_groups(spec: SystemSpec) -> dict[str, tuple[str, ...]]:
-    """Return the faults that there are, by kind.
-
-    Raises:
-        UsageError: the spec names actors or topics that make no sense.
-    """
-    try:
-        return fault_groups(spec)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
+all_groups = refusing(ValueError)(fault_groups)
+"""The names of all faults of a system, by kind; users are told what it lacks."""
 
 
 def _planned(texts: Iterable[str], spec: SystemSpec, groups: dict[str, tuple[str, ...]]
@@ -268,24 +253,16 @@ class ProgressLog:
         return f"{self._done} of {self._total} runs, {unsafe} unsafe with FTM{more}"
 
 
-def _in_order(runs: Iterable[Run], jobs: Sequence[Job]) -> list[Run]:
-    """Return the runs in the order of their jobs, with the rows that these name."""
-    results = {run.job.key: run.result for run in runs}
-    return [Run(job, results[job.key]) for job in jobs if job.key in results]
-
-
 def _replay(options: argparse.Namespace) -> int:
     if not options.out:
         raise UsageError("--replay RUN: --out DIR is missing: the campaign that the run is of")
     directory = Path(options.out)
     if not directory.is_dir():
         raise UsageError(f"--out {options.out}: no such directory")
-    try:
+    with refusing(StoreError):
         store = Store(directory)
         found = store.find(options.replay)
         store.close()
-    except StoreError as error:
-        raise UsageError(str(error)) from None
     if found is None:
         raise UsageError(f"--replay {options.replay}: no run, or several, of this key in "
                          f"{directory}")

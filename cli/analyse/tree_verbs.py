@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from rampart.cli import systems
-from rampart.cli.analyse.tree_dot import to_dot
+from rampart.cli.analyse.tree_text import to_dot
 from rampart.cli.analyse.tree_svg import to_svg
 from rampart.cli.analyse.tree_text import to_text
 from rampart.cli.output import UsageError, refusing, say, unknown, using

@@ -18,7 +18,7 @@ from rampart.actors.run.run_info import NoRunError, find_run
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import BASE_INPUTS, BASE_OUTPUTS
 from rampart.cli import systems
-from rampart.cli.output import UsageError, unknown
+from rampart.cli.output import UsageError, refusing, unknown
 from rampart.manager.spec.specification import SystemSpec
 
 MAILBOX = {
@@ -44,10 +44,8 @@ def uses(spec: SystemSpec) -> list[TopicUse]:
         UsageError: the spec names an actor class that does not exist, or one of them declares a
             topic that makes no sense.
     """
-    try:
+    with refusing(ValueError):
         members = Layout(RunPlan(system_file=spec.name), spec).members.values()
-    except ValueError as error:
-        raise UsageError(str(error)) from None
     inputs = {member.name: heard(member) for member in members}
     outputs = {member.name: published(member) for member in members}
     return [TopicUse(topic, _who(topic, BASE_OUTPUTS, outputs) or ("tools",),

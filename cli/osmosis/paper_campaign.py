@@ -12,7 +12,7 @@ from rampart.sim.campaign.job import Job
 from rampart.sim.campaign.named import NamedCampaign, Section
 from rampart.sim.campaign.statistics import Row
 from rampart.sim.campaign.store import Run
-from rampart.sim.osmosis.trial.paper_section import section
+from rampart.sim.osmosis.trial.paper_tables import section
 from rampart.sim.osmosis.trial.paper_tables import (
     FULL_SYSTEM,
     PAPER_SYSTEM,

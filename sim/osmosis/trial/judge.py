@@ -9,28 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from rampart.actors.osmosis.airport.model import MissionGoal
 from rampart.actors.osmosis.messages import GroundTruth
+from rampart.sim.runs.judge import Verdict
 
 ARRIVAL_RADIUS_M = 1.1
 """A point counts as reached at this distance (the authors' code)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What follows from all that the judge has seen.
-
-    Args:
-        success: all points reached, in order and in the right mode.
-        safe: no collision, never in the prohibited area; None if no ground truth ever came.
-        reasons: why not success and why unsafe, one sentence each; empty if all is well.
-    """
-
-    success: bool
-    safe: bool | None
-    reasons: tuple[str, ...]
 
 
 class Judge:
@@ -118,4 +103,5 @@ class Judge:
             reasons.append(f"{self.collisions} collision{'s' if self.collisions > 1 else ''}")
         if self.prohibited_s > 0:
             reasons.append(f"{self.prohibited_s:.2f} s in the prohibited area")
-        return Verdict(visited == points, self._safe if self._has_seen else None, tuple(reasons))
+        return Verdict(success=visited == points, safe=self._safe if self._has_seen else None,
+                       reasons=tuple(reasons))

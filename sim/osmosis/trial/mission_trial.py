@@ -21,12 +21,11 @@ from rampart.sim.osmosis.trial.report import render
 from rampart.sim.osmosis.trial.run_end import RunEnd
 from rampart.sim.runs.judge import Verdict
 from rampart.sim.runs.observer import Sink
-from rampart.sim.runs.record import RunRecord, Safety
+from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.report import Written, try_report
 from rampart.sim.runs.trial import Trial
 
 _PATIENCE_S = 60.0
-_SAFETY: dict[bool | None, Safety] = {True: "safe", False: "unsafe", None: "not known"}
 
 
 class MissionTrial(Trial):
@@ -69,13 +68,9 @@ class MissionTrial(Trial):
         """Return why the run is over, or None while it goes on."""
         return self._end.ended(now_s)
 
-    def conclude(self, now_s: float, why: str) -> MissionRecord:
+    def conclude(self, now_s: float, why: str) -> RunRecord:
         """Return the record of the run with the judge's verdict, and what became of faults."""
-        verdict = self.recorder.judge.verdict()
-        return self.recorder.record(
-            now_s, faults=self.outcomes(), mission="success" if verdict.success else "fail",
-            safety=_SAFETY[verdict.safe],
-            reasons=() if verdict.success and verdict.safe else (*verdict.reasons, f"ended: {why}"))
+        return self.concluded(self.recorder.judge.verdict(), now_s, why)
 
     def summary(self, record: RunRecord) -> dict[str, Any]:
         """Return what scripts rely on, the lights too."""

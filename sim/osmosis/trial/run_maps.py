@@ -10,7 +10,7 @@ from markupsafe import Markup
 from rampart.actors.osmosis.airport.drawing import AirportDrawing
 from rampart.sim.osmosis.trial.record import MissionRecord
 from rampart.sim.osmosis.trial.report import points
-from rampart.sim.runs.pictures import Moment, RunPictures
+from rampart.sim.runs.report import Moment, RunPictures
 from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.report import environment
 

@@ -29,11 +29,11 @@ from rampart.sim.campaign.report import (
 )
 from rampart.sim.campaign.statistics import badness, rate
 from rampart.sim.campaign.store import Run
-from rampart.sim.campaign.wording import interval, percent, seconds
+from rampart.sim.campaign.statistics import interval, percent, seconds
 from rampart.sim.faults.scenario import FaultOutcome, PlannedFault
 from rampart.sim.osmosis.trial import paper_tables
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
-from rampart.sim.osmosis.trial.paper_section import section
+from rampart.sim.osmosis.trial.paper_tables import section
 from rampart.sim.osmosis.trial.paper_tables import Decided
 from rampart.sim.osmosis.trial.record import MissionRecord, ObstacleSeen, StepResult
 from rampart.sim.runs.judge import Verdict
