@@ -132,11 +132,8 @@ def check_member(key: str, nodes: Collection[str]) -> None:
         UsageError: there is no such node.
     """
     topic = find_topic(key, topics.ALL)
-    if topic is not None and topic.is_family:
-        head, tail = topic.key.split("{name}")
-        member = key[len(head):len(key) - len(tail)]
-        if member not in nodes:
-            raise unknown("node", member, nodes)
+    if topic is not None and (member := topic.member(key)) and member not in nodes:
+        raise unknown("node", member, nodes)
 
 
 def fields(kind: type[msgspec.Struct]) -> list[tuple[str, str]]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rampart.sim.virtual.network import NETWORKS, NetworkModel, SeededNetwork, find_network
-from rampart.sim.virtual.timing import Timing, drawer, measured
+from rampart.sim.virtual.network import Timing, drawer, measured
 
 EVEN = Timing((0.0, 10.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
 
