@@ -15,6 +15,7 @@ from typing import Any
 
 import msgspec
 
+from rampart.cli.output import rendered
 from rampart.manager.drawing.diagram import Box, Diagram, clean
 from rampart.manager.drawing.placing import place
 
@@ -38,8 +39,6 @@ TAGS = 124.0
 
 def to_svg(diagrams: Sequence[Diagram]) -> str:
     """Return diagrams as one SVG document, one below the other."""
-    import jinja2  # noqa: PLC0415 the other formats need none
-
     pictures = []
     y, width = MARGIN, 0.0
     for number, diagram in enumerate(diagrams):
@@ -50,13 +49,10 @@ def to_svg(diagrams: Sequence[Diagram]) -> str:
         y += top + placing.height + 2 * MARGIN
         width = max(width, placing.width, text_width(diagram.title) * 17 / FONT,
                     *map(text_width, notes), 0)
-    pages = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
-        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-        finalize=lambda value: f"{value:g}" if isinstance(value, float) else value)
-    return pages.get_template("tree_svg.xml").render(
-        pictures=pictures, width=width + 2 * MARGIN, height=y - MARGIN, MARGIN=MARGIN, LINE=LINE,
-        SYMBOL=SYMBOL, tooltip=_tooltip, in_words=_in_words)
+    return rendered(
+        Path(__file__).with_name("tree.svg.jinja"), escaped=True, pictures=pictures,
+        width=width + 2 * MARGIN, height=y - MARGIN, MARGIN=MARGIN, LINE=LINE, SYMBOL=SYMBOL,
+        tooltip=_tooltip, in_words=_in_words)
 
 
 def text_width(text: str) -> float:

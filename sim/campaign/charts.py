@@ -17,7 +17,7 @@ from rampart.sim.campaign.statistics import count, seconds
 from rampart.sim.runs.report import MINUS, margin_text
 import math
 from collections.abc import Sequence
-from rampart.sim.campaign.grouping import by_kind
+from rampart.sim.campaign.statistics import by_kind
 from rampart.sim.campaign.store import Run
 from rampart.sim.campaign.statistics import count
 from rampart.sim.runs.trial import Trial

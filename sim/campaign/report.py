@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from rampart.actors.layout.wiring import import_class
 from rampart.sim.campaign.charts import distributions
-from rampart.sim.campaign.grouping import Condition, by_kind, conditions, in_common
+from rampart.sim.campaign.statistics import Condition, by_kind, conditions, in_common
 from rampart.sim.campaign.job import trial_of_system
 from rampart.sim.campaign.named import Section
 from rampart.sim.campaign.statistics import Row, Spread, rate, table, total
@@ -30,7 +30,7 @@ from rampart.sim.runs.trial import Trial
 from rampart.sim.runs.virtual_run import VirtualResult
 from collections.abc import Sequence
 from typing import Any
-from rampart.sim.campaign.grouping import kind_of
+from rampart.sim.campaign.statistics import kind_of
 from rampart.sim.campaign.statistics import badness
 from rampart.sim.campaign.store import Run
 from rampart.sim.runs.report import Moment

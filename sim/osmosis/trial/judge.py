@@ -103,5 +103,18 @@ class Judge:
             reasons.append(f"{self.collisions} collision{'s' if self.collisions > 1 else ''}")
         if self.prohibited_s > 0:
             reasons.append(f"{self.prohibited_s:.2f} s in the prohibited area")
-        return Verdict(success=visited == points, safe=self._safe if self._has_seen else None,
-                       reasons=tuple(reasons))
+        return Verdict(
+            success=visited == points, safe=self._safe if self._has_seen else None,
+            reasons=tuple(reasons), severity=severity(self.prohibited_s, self.collisions),
+            margins={"obstacle_m": _metres(self.obstacle_m),
+                     "prohibited_m": _metres(self.prohibited_m)},
+            unsafe_s=self.first_unsafe_s, narrowest_s=self.narrowest_s)
+
+
+def severity(prohibited_s: float, collisions: int) -> float:
+    """Return how bad an unsafe run was: seconds in the prohibited area, and collisions."""
+    return round(prohibited_s, 3) + collisions
+
+
+def _metres(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None

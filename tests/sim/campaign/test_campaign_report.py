@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from rampart.actors.osmosis.airport.drawing import draw
 from rampart.actors.osmosis.airport.formats import load_airport
 from rampart.sim.campaign import charts
-from rampart.sim.campaign.grouping import by_kind, conditions, in_common, kind_of
+from rampart.sim.campaign.statistics import by_kind, conditions, in_common, kind_of
 from rampart.sim.campaign.job import DecisionTaken, Job, RunResult
 from rampart.sim.campaign.report import (
     Campaign,
