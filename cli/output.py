@@ -126,8 +126,9 @@ def rendered(template: Path, *, escaped: bool = False, **values: Any) -> str:
     """
     import jinja2  # noqa: PLC0415 few verbs need it
 
-    pages = jinja2.Environment(  # noqa: S701 Markdown needs no escapes
-        loader=jinja2.FileSystemLoader(template.parent), autoescape=escaped,
+    pages = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(template.parent),
+        autoescape=escaped,  # noqa: S701 Markdown needs no escapes
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         finalize=lambda value: f"{value:g}" if isinstance(value, float) else value)
     return pages.get_template(template.name).render(values)

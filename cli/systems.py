@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Iterator
 
 from rampart import systems
 from rampart.actors.layout.layout import Layout, application_class, load_application

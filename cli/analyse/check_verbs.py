@@ -12,17 +12,12 @@ from rampart.actors.layout.layout import Layout, Unit
 from rampart.actors.run.run_plan import OBSERVER, SUPERVISOR
 from rampart.cli import systems
 from rampart.cli.look import topic_catalogue as catalogue
-from rampart.cli.output import print_json, print_table, say
+from rampart.cli.output import UsageError, print_json, print_table, say
 from rampart.cli.verbs import JSON, add_verb
 from rampart.manager.spec.schema import Kind, SystemSpec
 from rampart.manager.strategies.arrangement import arrange
 from rampart.manager.strategies.escalation import succession
 from rampart.manager.strategies.registry import decide
-import argparse
-from typing import Any
-from rampart.cli import systems
-from rampart.cli.output import UsageError, print_json, say
-from rampart.cli.verbs import JSON, add_verb
 
 _LAUNCHER, _SPAWNERS = "launcher", ("spawner_a", "spawner_b")
 

@@ -6,10 +6,8 @@ A barrier stands on the branch that it bars: `├─‖ event`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from rampart.manager.drawing.diagram import Box, Diagram
 from collections.abc import Iterator, Sequence
+
 from rampart.manager.drawing.diagram import Box, Diagram
 
 ACTIVE = "●"

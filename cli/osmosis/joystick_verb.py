@@ -17,6 +17,7 @@ from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.application import TELEOPERATION
 from rampart.actors.osmosis.control.teleoperation.joystick_device import AUTO, JoystickDevice
 from rampart.actors.osmosis.control.teleoperation.teleoperation import Teleoperation
+from rampart.actors.osmosis.messages import Joystick
 from rampart.actors.runtime.parameters import read_parameters
 from rampart.cli import systems
 from rampart.cli.following import is_over, stopped_by_signals
@@ -25,7 +26,6 @@ from rampart.cli.session import Latest, Session, connect, pause
 from rampart.cli.terminal import END, keys
 from rampart.cli.verbs import PORT, add_verb, number, option
 from rampart.files.plain_text import printable
-from rampart.actors.osmosis.messages import Joystick
 
 _PERIOD_S = 0.05
 """Simulated seconds between two positions; not less than `_SHORTEST_S` real ones."""

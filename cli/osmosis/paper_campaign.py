@@ -12,7 +12,6 @@ from rampart.sim.campaign.job import Job
 from rampart.sim.campaign.named import NamedCampaign, Section
 from rampart.sim.campaign.statistics import Row
 from rampart.sim.campaign.store import Run
-from rampart.sim.osmosis.trial.paper_tables import section
 from rampart.sim.osmosis.trial.paper_tables import (
     FULL_SYSTEM,
     PAPER_SYSTEM,
@@ -20,6 +19,7 @@ from rampart.sim.osmosis.trial.paper_tables import (
     cells,
     full_jobs,
     paper_jobs,
+    section,
     table_iii,
 )
 

@@ -25,8 +25,7 @@ import msgspec
 from oxidd.bdd import BDDFunction, BDDManager
 from oxidd.util import DDMemoryError
 
-from rampart.manager.analysis.formula import Connective, Formula, search
-from rampart.manager.analysis.formula import prepare
+from rampart.manager.analysis.formula import Connective, Formula, prepare, search
 from rampart.manager.analysis.zbdd import (
     EMPTY,
     UNIT,

@@ -7,6 +7,7 @@ holds when the number of its inputs that hold lies between two bounds, or when i
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import TypeVar
 
@@ -14,8 +15,6 @@ import msgspec
 
 from rampart.manager.model.fault_tree import FaultTree
 from rampart.manager.model.order import find_cycle
-from collections import Counter
-import msgspec
 
 Node = TypeVar("Node", bound=Hashable)
 

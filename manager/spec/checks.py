@@ -7,22 +7,16 @@ sequence and the first finding is the one reported, so a validator may rely on t
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator
-from itertools import chain, product
-
-from rampart.manager.model.gates import WORDS, GateError, detection_gate, recovery_gate
-from rampart.manager.model.order import find_cycle
-from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
-from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
-from rampart.manager.spec.panels import problem_of
-from rampart.manager.spec.schema import SystemSpec
-from rampart.manager.spec.tables import Finding, find_wrong_names, numbered, unknown
-from collections.abc import Iterator
 from functools import reduce
 from itertools import chain, permutations, product
 from operator import or_
+
 from rampart.manager.model.fault_tree import FaultTreeError
-from rampart.manager.model.gates import recovery_gate
-from rampart.manager.model.order import CycleError
+from rampart.manager.model.gates import WORDS, GateError, detection_gate, recovery_gate
+from rampart.manager.model.order import CycleError, find_cycle
+from rampart.manager.spec.budget import find_wrong_budget, find_wrong_times
+from rampart.manager.spec.nodes import NODE_KINDS, Kind, find_wrong_commands
+from rampart.manager.spec.panels import problem_of
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.spec.tables import Finding, find_wrong_names, numbered, unknown
 from rampart.manager.strategies.registry import STRATEGIES
@@ -60,9 +54,10 @@ def modules(spec: SystemSpec) -> Iterator[tuple[str, str, str, str]]:
     """Yield path, name, process and respawner of all nodes, detection and recovery modules."""
     for path, node in numbered("node", spec.nodes):
         yield path, node.name, node.process, node.respawn
-    for path, module in (*numbered("detection", spec.detections),
-                         *numbered("recovery", spec.recoveries)):
-        yield path, module.name, module.process, SUPERVISOR
+    for path, detection in numbered("detection", spec.detections):
+        yield path, detection.name, detection.process, SUPERVISOR
+    for path, recovery in numbered("recovery", spec.recoveries):
+        yield path, recovery.name, recovery.process, SUPERVISOR
 
 
 def _names(spec: SystemSpec) -> Iterator[Finding]:

@@ -25,17 +25,11 @@ from rampart.actors.runtime.actor import Actor, Context
 from rampart.actors.runtime.checkpoint import MemoryCheckpoints, NoCheckpoints, Shelf
 from rampart.actors.runtime.clock import Clock
 from rampart.files import working_folder
-from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
-from rampart.sim.virtual.virtual_loop import VirtualLoop
-from pathlib import Path
-from typing import Any
-from rampart import systems
-from rampart.actors.layout.layout import load_run
-from rampart.actors.run.run_plan import RunPlan, load_system
-from rampart.files import working_folder
 from rampart.sim.faults.scenario import parse_fault
 from rampart.sim.runs.trial import trial_class
 from rampart.sim.runs.virtual_run import VirtualResult, VirtualRun
+from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
+from rampart.sim.virtual.virtual_loop import VirtualLoop
 
 A = TypeVar("A", bound=Actor)
 M = TypeVar("M", bound=msgspec.Struct)

@@ -13,13 +13,9 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from rampart.sim.campaign.statistics import count, seconds
-from rampart.sim.runs.report import MINUS, margin_text
-import math
-from collections.abc import Sequence
-from rampart.sim.campaign.statistics import by_kind
+from rampart.sim.campaign.statistics import by_kind, count, seconds
 from rampart.sim.campaign.store import Run
-from rampart.sim.campaign.statistics import count
+from rampart.sim.runs.report import MINUS, margin_text
 from rampart.sim.runs.trial import Trial
 
 WIDTH = 520.0

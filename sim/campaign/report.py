@@ -18,23 +18,37 @@ from markupsafe import Markup
 
 from rampart.actors.layout.wiring import import_class
 from rampart.sim.campaign.charts import distributions
-from rampart.sim.campaign.statistics import Condition, by_kind, conditions, in_common
 from rampart.sim.campaign.job import trial_of_system
 from rampart.sim.campaign.named import Section
-from rampart.sim.campaign.statistics import Row, Spread, rate, table, total
+from rampart.sim.campaign.statistics import (
+    Condition,
+    Row,
+    Spread,
+    badness,
+    by_kind,
+    conditions,
+    count,
+    in_common,
+    interval,
+    kind_of,
+    percent,
+    rate,
+    seconds,
+    table,
+    total,
+)
 from rampart.sim.campaign.store import Run
-from rampart.sim.campaign.statistics import count, interval, percent, seconds
-from rampart.sim.runs.report import RunPictures
-from rampart.sim.runs.report import NONE, environment, margin_text, write_atomically
+from rampart.sim.runs.record import RunRecord
+from rampart.sim.runs.report import (
+    NONE,
+    Moment,
+    RunPictures,
+    environment,
+    margin_text,
+    write_atomically,
+)
 from rampart.sim.runs.trial import Trial
 from rampart.sim.runs.virtual_run import VirtualResult
-from collections.abc import Sequence
-from typing import Any
-from rampart.sim.campaign.statistics import kind_of
-from rampart.sim.campaign.statistics import badness
-from rampart.sim.campaign.store import Run
-from rampart.sim.runs.report import Moment
-from rampart.sim.runs.record import RunRecord
 
 __all__ = ["Campaign", "headline", "render", "worth_showing", "write_campaign_report"]
 

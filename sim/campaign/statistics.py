@@ -5,17 +5,11 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 
-from rampart.sim.campaign.job import Job
-from rampart.sim.campaign.store import Run
-import math
-from rampart.sim.runs.report import NONE
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-import msgspec
 from rampart.sim.campaign.job import (
     Job,
     application_of_system,
@@ -23,6 +17,7 @@ from rampart.sim.campaign.job import (
     trial_of_system,
 )
 from rampart.sim.campaign.store import Run
+from rampart.sim.runs.report import NONE
 
 CONFIDENCE_Z = 1.959963984540054
 """Two-sided 95 %."""

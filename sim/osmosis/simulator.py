@@ -7,7 +7,8 @@ on the way, each message with the stamp of its reading.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from heapq import heapreplace
 from typing import Annotated, Any
 
 import msgspec
@@ -31,8 +32,6 @@ from rampart.sim.osmosis.actuator_faults import FaultNews
 from rampart.sim.osmosis.scene import WorldError
 from rampart.sim.osmosis.sensors import LaserSpec
 from rampart.sim.osmosis.world import World
-from collections.abc import Iterator, Mapping
-from heapq import heapreplace
 
 WAKE_UP_S = 0.02
 MAX_CATCH_UP_S = 1.0

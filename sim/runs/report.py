@@ -16,12 +16,9 @@ from typing import Any, NamedTuple
 
 import jinja2
 import msgspec
+from markupsafe import Markup
 
 from rampart.sim.runs.record import Interval, RunRecord
-from collections.abc import Sequence
-from typing import Any, NamedTuple
-from markupsafe import Markup
-from rampart.sim.runs.record import RunRecord
 
 _LANES = {"injection": "Injected", "down": "Node down", "detection": "Detected",
           "recovery": "Recovery", "stop": "Stopped"}

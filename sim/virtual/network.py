@@ -12,20 +12,17 @@ what the controller makes of worse ones.
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping, Sequence
-from typing import Any
-
-import msgspec
-
-from rampart.sim.virtual.virtual_bus import Link
-import random
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
+
 import msgspec
 import numpy as np
+
+from rampart.sim.virtual.virtual_bus import Link
 
 
 class NetworkModel(msgspec.Struct, frozen=True):

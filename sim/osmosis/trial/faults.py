@@ -19,8 +19,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
+from msgspec.structs import replace
+
+from rampart.actors.bus.topic import Topic
 from rampart.actors.osmosis import topics
 from rampart.actors.osmosis.messages import ActuatorFault, ActuatorFaultKind
 from rampart.actors.runtime.fault_watch import Order
@@ -29,13 +33,6 @@ from rampart.sim.faults.faults import Faults
 from rampart.sim.faults.scenario import ScenarioError, number
 from rampart.sim.faults.wrong_numbers import Sizes
 from rampart.sim.osmosis.robot import WHEEL_NAMES
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
-from msgspec.structs import replace
-from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import topics
-from rampart.sim.faults.disturbance import Disturbance, Fault
 
 OBSTACLE = "obstacle-ahead"
 

@@ -1,4 +1,4 @@
-"""What the launcher runs of Osmosis: an observer, and an injector that puts obstacles on the way."""
+"""The observer of Osmosis, and its injector, which puts obstacles on the way."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Header, on
 from rampart.sim.faults.injector import Injector, PlannedAction
 from rampart.sim.osmosis.trial.faults import SuddenObstacle
-from typing import Any
-from rampart.actors.osmosis import topics
-from rampart.actors.runtime.actor import Header, on
 from rampart.sim.runs.observer import Observer
 
 

@@ -7,7 +7,10 @@ from typing import Any, TextIO
 
 import msgspec
 
+from rampart.actors.bus.bounds import MOST
+from rampart.actors.bus.limits import Remembered
 from rampart.actors.bus.topic import Topic
+from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis.application import Osmosis
 from rampart.actors.run.run_context import RunContext
 from rampart.actors.runtime.actor import Header
@@ -17,24 +20,14 @@ from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
 from rampart.sim.osmosis.trial.judge import severity
 from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
-from rampart.sim.osmosis.trial.report import render
+from rampart.sim.osmosis.trial.report import headline, render
 from rampart.sim.osmosis.trial.run_end import RunEnd
+from rampart.sim.runs.console import Console
 from rampart.sim.runs.judge import Verdict
 from rampart.sim.runs.observer import Sink
 from rampart.sim.runs.record import RunRecord
 from rampart.sim.runs.report import Written, try_report
 from rampart.sim.runs.trial import Trial
-from pathlib import Path
-from typing import Any, TextIO
-from rampart.actors.bus.bounds import MOST
-from rampart.actors.bus.limits import Remembered
-from rampart.actors.bus.topic import Topic
-from rampart.actors.osmosis import messages as m
-from rampart.actors.runtime.actor import Header
-from rampart.sim.osmosis.trial.record import MissionRecord
-from rampart.sim.osmosis.trial.report import headline
-from rampart.sim.runs.console import Console
-from rampart.sim.runs.record import RunRecord
 
 _PATIENCE_S = 60.0
 

@@ -18,22 +18,21 @@ strategy. The paper's verdicts are not what is expected of it: no fault may cost
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import product
+from typing import Any
 
 import msgspec
+from markupsafe import Markup
 
 from rampart.manager.spec.schema import SystemSpec
 from rampart.manager.strategies.registry import decide
 from rampart.sim.campaign.job import Job
+from rampart.sim.campaign.named import Section
 from rampart.sim.campaign.statistics import NO_EFFECT, verdict, worst
 from rampart.sim.campaign.store import Run
 from rampart.sim.faults.scenario import PlannedFault
 from rampart.sim.osmosis.trial.mission_trial import MissionTrial
-from collections.abc import Callable, Sequence
-from typing import Any
-from markupsafe import Markup
-from rampart.sim.campaign.named import Section
 from rampart.sim.runs.report import environment
 
 (AS_THE_PAPER,) = MissionTrial.retunings.values()

@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 
+from markupsafe import Markup
+
+from rampart.actors.osmosis.airport.drawing import AirportDrawing
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.record import LightResult, MissionRecord
-from rampart.sim.runs.report import clock, environment, lanes_of, ticks_of
-from collections.abc import Sequence
-from pathlib import Path
-from markupsafe import Markup
-from rampart.actors.osmosis.airport.drawing import AirportDrawing
-from rampart.sim.osmosis.trial.record import MissionRecord
-from rampart.sim.runs.report import Moment, RunPictures
 from rampart.sim.runs.record import RunRecord
-from rampart.sim.runs.report import environment
+from rampart.sim.runs.report import Moment, RunPictures, clock, environment, lanes_of, ticks_of
 
 BELIEVED_APART_M = 1.0
 """Where localization reported the robot is drawn too if it was this far from the truth."""
