@@ -18,8 +18,7 @@ from rampart.actors.runtime.clock import Clock
 from rampart.manager.spec.schema import SystemSpec
 from rampart.sim.osmosis.clearance import EXACT_BELOW_M
 from rampart.sim.osmosis.trial.injector import OsmosisInjector
-from rampart.sim.osmosis.trial.judge import severity
-from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder
+from rampart.sim.osmosis.trial.record import MissionRecord, MissionRecorder, severity
 from rampart.sim.osmosis.trial.report import headline, render
 from rampart.sim.osmosis.trial.run_end import RunEnd
 from rampart.sim.runs.console import Console
