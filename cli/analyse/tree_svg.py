@@ -52,7 +52,7 @@ def to_svg(diagrams: Sequence[Diagram]) -> str:
     return rendered(
         Path(__file__).with_name("tree.svg.jinja"), escaped=True, pictures=pictures,
         width=width + 2 * MARGIN, height=y - MARGIN, MARGIN=MARGIN, LINE=LINE, SYMBOL=SYMBOL,
-        tooltip=_tooltip, in_words=_in_words)
+        tooltip=_tooltip, in_words=_in_words) + "\n"
 
 
 def text_width(text: str) -> float:
