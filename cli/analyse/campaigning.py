@@ -41,7 +41,6 @@ from rampart.sim.campaign.job import (
     RunResult,
     run_job,
     run_virtually,
-    trial_of_system,
     virtual_run,
 )
 from rampart.sim.campaign.named import NamedCampaign
@@ -50,7 +49,7 @@ from rampart.sim.campaign.report import Campaign, worth_showing, write_campaign_
 from rampart.sim.campaign.search import Space, margin, search, shrink
 from rampart.sim.campaign.store import Run, Store, StoreError
 from rampart.sim.faults.disturbance import UnknownFaultError
-from rampart.sim.faults.faults import Faults, faults_of
+from rampart.sim.faults.faults import faults_of
 from rampart.sim.faults.injector import can_be_hit
 from rampart.sim.faults.scenario import PlannedFault, ScenarioError, action_of, parse_fault
 from rampart.sim.runs.report import in_words
@@ -67,12 +66,7 @@ def campaign(options: argparse.Namespace) -> int:
         return _replay(options)
     _check(options)
     if options.search is not None:
-        if not trial_class(spec).margins:
-            raise UsageError(f"--search: {spec.name} has no judge that measures margins")
-        with refusing(ValueError):
-            bases = with_content(_base_jobs(options, spec))
-        return hunt(options, _groups(options, spec), bases, faults_of(spec),
-                    _moments(spec, bases[0], searched=True))
+        return _hunt(options, spec)
     name, chosen = _choose(options, spec)
     with refusing(ValueError):
         jobs = with_content(chosen)
@@ -322,13 +316,21 @@ def _write_report(options: argparse.Namespace, spec: SystemSpec, directory: Path
 _SHRUNK_AT_MOST = 3
 
 
-def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases: Sequence[Job],
-         faults: Faults, moments: tuple[float, float]) -> int:
-    """Search among the faults in `groups`, shrink what was found, and keep it."""
+# -- the optimiser's hunt for the smallest safety margin ----------------------------------------
+
+
+def _hunt(options: argparse.Namespace, spec: SystemSpec) -> int:
+    """Search among the faults of a system, shrink what was found, and keep it."""
+    if not trial_class(spec).margins:
+        raise UsageError(f"--search: {spec.name} has no judge that measures margins")
+    with refusing(ValueError):
+        bases = with_content(_base_jobs(options, spec))
+    space = Space(tuple(bases), _groups(options, spec), faults_of(spec).intruder,
+                  _moments(spec, bases[0], searched=True))
     directory = Path(options.out or "reports/campaign-search")
     with refusing(StoreError):
         store = Store(directory)
-    unit = trial_of_system(options.system).margin_unit
+    unit = trial_class(spec).margin_unit
     workers = options.jobs or os.cpu_count() or 1
     with joblib.Parallel(n_jobs=workers, batch_size=1) as pool, tqdm(
             total=options.search, unit="run", file=sys.stderr,
@@ -351,7 +353,6 @@ def hunt(options: argparse.Namespace, groups: dict[str, tuple[str, ...]], bases:
             bar.update()
 
         try:
-            space = Space(tuple(bases), groups, faults.intruder, moments)
             made = search(space, options.search, run, seed=options.seed, at_once=workers, seen=seen)
         except ImportError:
             raise UsageError("--search: Optuna is not installed; pip install 'rampart[search]'"

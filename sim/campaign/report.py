@@ -50,8 +50,6 @@ from rampart.sim.runs.report import (
 from rampart.sim.runs.trial import Trial
 from rampart.sim.runs.virtual_run import VirtualResult
 
-__all__ = ["Campaign", "headline", "render", "worth_showing", "write_campaign_report"]
-
 FILE_NAME = "report.html"
 
 SHOWN_AT_ONCE = 12
@@ -143,11 +141,11 @@ def headline(runs: Sequence[Run]) -> str:
     if not all(run.result.judged for run in runs):
         detected = sum(run.result.detected_after_s is not None for run in faulty)
         restarts = sum(run.result.restarts for run in runs)
-        return (f"{_runs(len(runs))} without a judge: of {len(faulty):,} with a fault "
+        return (f"{count(len(runs), 'run')} without a judge: of {len(faulty):,} with a fault "
                 f"{sum(run.result.effective for run in faulty):,} had an effect and {detected:,} "
                 f"were detected; {count(restarts, 'restart')}.")
     if not faulty:
-        return (f"{_runs(len(runs))} without a fault: {_many(runs, 'unsafe')}, "
+        return (f"{count(len(runs), 'run')} without a fault: {_many(runs, 'unsafe')}, "
                 f"{_many(runs, 'complete')}.")
     odd = sum(run.result.counts and not run.result.effective for run in faulty)
     parts: list[str] = []
@@ -161,17 +159,13 @@ def headline(runs: Sequence[Run]) -> str:
         parts.append(f"In {odd:,} of these the fault had no effect; what ends badly counts all "
                      "the same.")
     if lost := sum(not run.result.counts for run in faulty):
-        parts.append(f"In {_runs(lost)}{' more' if parts else ''} the fault had no effect.")
+        parts.append(f"In {count(lost, 'run')}{' more' if parts else ''} the fault had no effect.")
     return " ".join(parts).replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def _breakable(text: str) -> Markup:
     """Return a name, escaped, that may be broken behind its separators."""
     return Markup("<wbr>").join(re.split(r"(?<=[:/_])", text))
-
-
-def _runs(number: int) -> str:
-    return count(number, "run")
 
 
 def _many(runs: Sequence[Run], what: str, more: str = "") -> str:
@@ -181,8 +175,8 @@ def _many(runs: Sequence[Run], what: str, more: str = "") -> str:
     found = rate(sum(not run.result.safe for run in runs), len(runs))
     number = f"{found.count:,}" if found.count else "none"
     sure = interval(found) if found.count else f"at most {percent(found.high)} %"
-    return (f"{number} of {_runs(found.of)} {more}{'was' if found.count == 1 else 'were'} unsafe "
-            f"(95 % interval: {sure})")
+    return (f"{number} of {count(found.of, 'run')} {more}"
+            f"{'was' if found.count == 1 else 'were'} unsafe (95 % interval: {sure})")
 
 
 # -- tables ------------------------------------------------------------------------------------
