@@ -52,7 +52,7 @@ class Osmosis(Application):
     views = "rampart.actors.osmosis.recording.views:OsmosisViews"
     lines = "rampart.cli.osmosis.lines:OsmosisLines"
     faults = "rampart.sim.osmosis.trial.faults:OsmosisFaults"
-    observer = "rampart.sim.osmosis.trial.observer:OsmosisObserver"
+    observer = "rampart.sim.osmosis.trial.injector:OsmosisObserver"
     trial = "rampart.sim.osmosis.trial.mission_trial:MissionTrial"
     examples = (
         ("--mission A --obstacles 2", "two obstacles on the way"),

@@ -33,7 +33,7 @@ from rampart.actors.supervision.processes import (
 )
 from rampart.actors.supervision.supervised_process import RestartPolicy
 from rampart.actors.supervision.supervisor import Supervisor
-from rampart.sim.virtual.timing import drawer, measured
+from rampart.sim.virtual.network import drawer, measured
 from rampart.sim.virtual.virtual_bus import Hub, VirtualBus
 
 FIRST_PID = 1000

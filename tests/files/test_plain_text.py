@@ -22,7 +22,7 @@ from rampart.cli.output import print_json, print_table, say, say_text, warn
 from rampart.cli.run_picture import DECODED, RunPicture
 from rampart.files.plain_text import one_line, printable
 from rampart.files.streams import complain
-from rampart.sim.osmosis.trial.console import MissionConsole
+from rampart.sim.osmosis.trial.mission_trial import MissionConsole
 from rampart.sim.runs.console import LINES_PER_S, REPORTS_PER_S
 from tests.fuzz.handler_fuzz import system
 from tests.fuzz.message_extremes import TEXTS, all_topics

@@ -13,7 +13,7 @@ import pytest
 from rampart.actors.osmosis.airport.formats import load_airport, load_with_truth
 from rampart.actors.osmosis.airport.photometry import illuminance_per_candela, sensor_position
 from rampart.sim.osmosis.sensors import LightSensor
-from rampart.sim.osmosis.trial.judge import Judge
+from rampart.sim.osmosis.trial.record import Judge
 from rampart.sim.osmosis.world import World
 
 AIRPORT = load_airport("vallombre")
