@@ -9,9 +9,9 @@ import pytest
 
 from rampart.manager.spec.panels import Panel
 from rampart.testing import eventually
-from tests.actors.operator.browser import browser
+from tests.actors.operator.browser import browser, mouse
 from tests.actors.operator.page import LIVE
-from tests.actors.operator.test_page_operating import key, mouse
+from tests.actors.operator.test_page_operating import key
 from tests.actors.operator.test_stick_panel import AT_REST, DRIVE, driven, rests
 from tests.tank import Hand
 
