@@ -55,9 +55,9 @@ def moved(world) -> bool:
     return any(stick != RELEASED for stick in world.others.stick)
 
 
-async def hand_on_the_pad(tab) -> tuple[float, float, float]:
-    """Give the middle of the pad and its radius, when nothing moves it any more."""
-    where = (f"(() => {{ const b = {PAD}.getBoundingClientRect(); return JSON.stringify("
+async def hand_on_the_pad(tab, pad: str = PAD) -> tuple[float, float, float]:
+    """Give the middle of a pad and its radius, when nothing moves it any more."""
+    where = (f"(() => {{ const b = {pad}.getBoundingClientRect(); return JSON.stringify("
              "[b.left + b.width / 2, b.top + b.height / 2, b.width / 2]); })()")
     last, seen = None, await tab.value(where)
     while seen != last:

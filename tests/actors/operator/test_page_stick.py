@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import asynccontextmanager
 
 import pytest
@@ -11,7 +10,7 @@ from rampart.manager.spec.panels import Panel
 from rampart.testing import eventually
 from tests.actors.operator.browser import browser, mouse
 from tests.actors.operator.page import LIVE
-from tests.actors.operator.test_page_operating import key
+from tests.actors.operator.test_page_operating import hand_on_the_pad, key
 from tests.actors.operator.test_stick_panel import AT_REST, DRIVE, driven, rests
 from tests.tank import Hand
 
@@ -37,21 +36,14 @@ async def opened(at: str, **look):
         assert tab.errors == []
 
 
-async def middle(tab, panel: str = "Drive") -> tuple[float, float, float]:
-    """Return where a stick is on the screen: its middle and its radius, pixels."""
-    await tab.value(f"{of(panel, '.stick')}.scrollIntoView({{block: 'center'}})")
-    return tuple(json.loads(await tab.value(
-        f"(() => {{ const b = {of(panel, '.stick')}.getBoundingClientRect(); return JSON.stringify("
-        "[b.left + b.width / 2, b.top + b.height / 2, b.width / 2]); })()")))
-
-
 async def is_told(robot, hand: Hand) -> None:
     await eventually(lambda: robot.hands[-1] == hand)
 
 
 async def test_by_mouse_and_by_key_the_robot_is_told_while_it_is_held(world):
     async with driven(world) as (robot, _, at), opened(at) as tab:
-        x, y, radius = await middle(tab)
+        await tab.value(f"{of('Drive', '.stick')}.scrollIntoView({{block: 'center'}})")
+        x, y, radius = await hand_on_the_pad(tab)
         await mouse(tab, "mousePressed", x, y)
         await mouse(tab, "mouseMoved", x, y - 2 * radius)
         await is_told(robot, Hand(0.25, 0.0, True))  # at half speed
