@@ -132,7 +132,7 @@ async def stick(until_s: float, waits: list[float], failed: list[str]) -> None:
         try:
             async with websockets.connect(f"ws://{AT}/ws", additional_headers=BEARER) as page:
                 while (sent := time.monotonic()) < until_s:
-                    await page.send('{"type":"stick","held":false}')
+                    await page.send('{"type":"stick","panel":"Drive","held":false}')
                     while json.loads(await page.recv())["type"] != "stick":
                         pass
                     waits.append(1000 * (time.monotonic() - sent))

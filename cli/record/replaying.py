@@ -277,7 +277,8 @@ class Replay:
         kind = page_of(self._known.system)
         page: type[Hmi] = ReplayPage if kind is Hmi else type("ReplayPage", (ReplayPage, kind), {})
         return page(Context(
-            PAGE, 1, clock, SharedBus(bus), {"panels": (*kind.panels, *run.system.panels)}, run,
+            PAGE, 1, clock, SharedBus(bus), {"panels": tuple(
+                panel for panel in (*kind.panels, *run.system.panels) if not panel.stick)}, run,
             topics={topic.key: topic for topic in self._known.topics}))
 
 

@@ -119,7 +119,7 @@ _READER = RequestReader(OSMOSIS_REQUESTS)
 
 @target("page-request", refuses=(RequestError,), kind="json", samples=lambda: [
         b'{"type":"reset","recovery":"RM1"}', b'{"type":"order","action":"pause","reason":"x"}',
-        b'{"type":"stick","held":true,"ticket":3,"forward":0.5,"left":-1}',
+        b'{"type":"stick","panel":"Drive","held":true,"ticket":3,"forward":0.5,"left":-1}',
         b'{"type":"inject","fault":"gps-bias","duration_s":5,"permanent":false}',
         b'{"type":"signal","node":"hmi","signal":"KILL"}', b'{"type":"strategy","name":"x"}'])
 def page_request(data: bytes) -> None:
