@@ -10,10 +10,10 @@ from typing import Any
 
 import msgspec
 
-from rampart.actors.bus.fields import Field
+from rampart.actors.bus.fields import Field, Steered
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import topics
-from rampart.actors.layout.wiring import Member, shows_panels
+from rampart.actors.layout.wiring import Member, panels_of, shows_panels
 from rampart.actors.runtime.actor import BASE_OUTPUTS
 from rampart.actors.runtime.parameters import Named, messages_said, topics_named
 from rampart.manager.spec.panels import NUMBER, Panel
@@ -58,6 +58,7 @@ def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: 
                 there = ways[way].get(topic.key, ())
                 ways[way][topic.key] = (*(there or ()), name) if name else None
         _check_messages(member, found, file)
+        _check_sticks(member, found, file)
         chosen[member.name] = replace(member, hears=ways["heard"], publishes=ways["published"])
     return chosen, found
 
@@ -76,7 +77,7 @@ def with_panels(members: Iterable[Member], spec: SystemSpec, file: str) -> list[
     nodes = {node.name for node in spec.nodes}
     plots = tuple(plots_of([m for m in everyone if m.name in nodes and m not in pages]))
     return [replace(member, parameters=msgspec.structs.replace(member.parameters, panels=plots))
-            if member in pages and not getattr(member.parameters, "panels", ()) else member
+            if member in pages and not panels_of(member.parameters) else member
             for member in everyone]
 
 
@@ -125,6 +126,27 @@ def _check_messages(member: Member, chosen: Mapping[str, Topic[Any]], file: str)
         except ValueError as error:
             raise ValueError(f"{file}: {member.name}: parameters.{name}: topic {topic.key}: "
                              f"{error}") from None
+
+
+def _check_sticks(member: Member, chosen: Mapping[str, Topic[Any]], file: str) -> None:
+    for panel in panels_of(member.parameters):
+        if panel.stick:
+            try:
+                steered(panel, chosen[panel.topic])
+            except ValueError as error:
+                raise ValueError(f"{file}: {member.name}: panel {panel.title!r}: stick: topic "
+                                 f"{panel.topic}: {error}") from None
+
+
+def steered(panel: Panel, topic: Topic[Any]) -> Steered:
+    """Return what makes the messages of a panel's stick.
+
+    Raises:
+        ValueError: none can be made.
+    """
+    names = [shown.field.partition(":")[2] for shown in panel.fields()]
+    count = len(panel.stick or ())
+    return Steered(topic.type, names[:count], "".join(names[count:]), panel.scale)
 
 
 def _check_field(topic: Topic[Any], named: Named, where: str) -> None:

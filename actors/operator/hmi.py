@@ -78,6 +78,7 @@ class Hmi(Actor):
         super().__init__(context)
         run, plan = context.run, context.run.plan
         self._port: int = plan.hmi_port
+        self._panels = self.parameters.panels
         self._state = self._make_state()
         self._operating = self._make_operating()
         self._camera = self._make_camera()
@@ -86,7 +87,6 @@ class Hmi(Actor):
         self._observer = ProcessObserver(plan.base_port, plan.launcher_pid)
         self._version = -1
         self._unheard: list[str] = []
-        self._panels = self.parameters.panels or self.panels
         if self._port:
             self._hear_panels()
         self._show_system(run.system, run.adapted.version if run.adapted else 0)
@@ -97,7 +97,7 @@ class Hmi(Actor):
         return HmiState()
 
     def _make_operating(self) -> Operating:
-        return Operating(self, self._state)
+        return Operating(self, self._state, self._panels)
 
     def _make_camera(self) -> CameraEye | None:
         return None
@@ -133,7 +133,7 @@ class Hmi(Actor):
         """Hear what the panels show, each field once."""
         kept_s: dict[str, float] = {}
         for panel in self._panels:
-            for shown in panel.fields():
+            for shown in (field for field in panel.fields() if not field.is_said):
                 kept_s[shown.field] = max(panel.kept_s, kept_s.get(shown.field, 0.0))
         for field, past_s in kept_s.items():
             try:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rampart.actors.osmosis.airport.formats import load_world
+from rampart.actors.osmosis.airport.formats import load_with_truth
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun, free_base_port
 from tests import ROOT
@@ -27,7 +27,7 @@ EVERYBODY_BUT_THE_MISSION_MANAGER = (
 
 
 def test_the_world_of_the_tests_is_the_one_they_think():
-    truth = load_world("vallombre").light_factors
+    truth = load_with_truth("vallombre")[1].light_factors
     assert {n for n, f in truth.items() if n.startswith("A") and f < 0.5} == set(BROKEN_A)
 
 

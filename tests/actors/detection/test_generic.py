@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
 from dataclasses import replace
 from typing import Any
 
@@ -14,11 +13,12 @@ from rampart.actors.bus import messages as bm
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.detection.disagreement import Disagreement, Vote, agreeing, apart
 from rampart.actors.detection.finding import Sustained
-from rampart.actors.detection.process_usage import ProcessUsage, Usage, read_usage
+from rampart.actors.detection.process_usage import ProcessUsage
 from rampart.actors.detection.progress import Progress, ProgressMonitor, Step
 from rampart.actors.detection.rate import Rate, RateMonitor
 from rampart.actors.detection.threshold import Threshold
 from rampart.actors.runtime.parameters import read_parameters
+from rampart.actors.runtime.process_usage import ProcessCount
 from rampart.testing import Ear, VirtualSystem, play, run, table
 from tests.tank import LEVEL, PUMP, SECOND, THIRD, TOPICS, Level, Phase, Pump
 
@@ -292,7 +292,7 @@ def test_a_node_that_takes_too_much_is_named():
             context = system.context("D", {"watch": ["a"], "processor_share": 0.5,
                                            "memory_mb": 50, "for_s": 1.0, "clear_s": 1.0})
             context = replace(
-                context, usage=lambda pid: Usage(used["busy"], int(used["memory"])))
+                context, usage=lambda pid: ProcessCount(used["busy"], int(used["memory"]), 0.0))
             module = ProcessUsage(context, system.clock.now)
             task = asyncio.create_task(module.run())
             for _ in range(20):
@@ -315,12 +315,4 @@ def test_a_node_that_takes_too_much_is_named():
             await task
 
     run(scenario)
-
-
-def test_the_kernel_is_asked_what_a_process_uses():
-    usage = read_usage(os.getpid())
-    assert usage is not None
-    assert usage.memory_bytes > 1_000_000
-    assert usage.processor_s > 0
-    assert read_usage(2**22 + 1) is None
 

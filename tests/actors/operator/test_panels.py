@@ -185,8 +185,8 @@ def test_a_panel_that_names_something_wrong_is_refused_in_one_line(panels, line)
 
 
 @pytest.mark.parametrize(("rest", "words"), [
-    ("", "'Level' gives nothing to show; one of gauge, plot, table, states, text, map, script is "
-     "right"),
+    ("", "'Level' gives nothing to show; one of gauge, plot, table, states, text, map, stick, "
+     "script is right"),
     ('gauge = "a:b"\ntext = "a:b"', "'Level' gives gauge and text; one of "),
     ('gauge = "a:b"\nseconds = 3', "'Level': seconds means nothing to a gauge; it takes max, min, "
      "unit"),

@@ -18,9 +18,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rampart.cli import systems
-from rampart.cli.analyse.tree_dot import quote, to_dot
 from rampart.cli.analyse.tree_svg import to_svg
-from rampart.cli.analyse.tree_text import to_text
+from rampart.cli.analyse.tree_text import quote, to_dot, to_text
 from rampart.cli.main import main
 from rampart.manager.drawing.diagram import Box, Diagram, Situation, clean, covers, draw
 from rampart.manager.drawing.placing import place

@@ -12,7 +12,7 @@ from rampart.actors.ftm import topics
 from rampart.actors.run.run_plan import RunPlan
 from rampart.actors.runtime.actor import Header
 from rampart.manager.spec.specification import parse_specification
-from rampart.sim.osmosis.trial.console import MissionConsole
+from rampart.sim.osmosis.trial.mission_trial import MissionConsole
 from rampart.sim.runs.console import Console
 from tests import ROOT
 
