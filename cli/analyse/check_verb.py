@@ -26,7 +26,7 @@ def run(options: argparse.Namespace) -> int:
     Examples:
       rampart check
       rampart check my_system.toml && rampart run --system my_system.toml
-      rampart check cell --json
+      rampart check paper --json
 
     exit code: 0 sound, 2 not sound (one line says where) or bad usage
     """

@@ -102,7 +102,7 @@ def run(options: argparse.Namespace) -> int:
     Examples:
       rampart explain
       rampart explain my_system.toml
-      rampart explain cell --json
+      rampart explain paper --json
 
     exit code: 0, 2 a system that `rampart check` refuses, or bad usage
     """
