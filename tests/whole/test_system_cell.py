@@ -181,5 +181,6 @@ def test_the_verbs_take_it():
 def test_under_its_own_strategy_every_property_holds():
     done = subprocess.run(
         [sys.executable, "-m", "rampart.cli.main", "verify", str(FILE), "--strict",
-         "--strategy", CELL.strategy], cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
+         "--strategy", CELL.strategy], cwd=ROOT, capture_output=True, text=True, check=False,
+        timeout=60)
     assert done.returncode == 0, done.stdout

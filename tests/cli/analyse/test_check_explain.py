@@ -21,7 +21,8 @@ def said(capsys, *arguments: str, code: int = 0) -> tuple[str, str]:
     ("cell", "22 processes, 9 nodes, 8 detection modules, 6 recovery modules, 6 mechanisms"),
     ("paper", "21 processes, 9 nodes, 7 detection modules, 5 recovery modules, 7 mechanisms")])
 def test_a_sound_system(capsys, name, sizes):
-    assert said(capsys, "check", str(system_file(name)))[0] == f"{system_file(name)}: sound: {sizes}\n"
+    file = str(system_file(name))
+    assert said(capsys, "check", file)[0] == f"{file}: sound: {sizes}\n"
 
 
 def test_a_sound_system_for_scripts(capsys):

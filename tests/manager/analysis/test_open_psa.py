@@ -13,7 +13,7 @@ from rampart.manager.analysis.cut_sets import CutSets
 from rampart.manager.analysis.formula import formula_of
 from rampart.manager.analysis.open_psa import OpenPsaError, read_open_psa, write_open_psa
 from rampart.manager.spec.specification import parse_specification
-from tests import ROOT, system_file
+from tests import system_file
 from tests.manager.bench import paper
 
 
