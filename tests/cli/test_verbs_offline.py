@@ -145,6 +145,10 @@ def test_a_table_of_another_system_comes_from_its_file(capsys, tmp_path):
     (["inject", "drop:detection/{name}"], ["no topic"]),
     (["inject", "wrong-graph", "--add", "x_m=1"], ["--add", "--topic"]),
     (["inject", "wrong-graph", "--system", "osmosis"], ["--system osmosis: goes with --list"]),
+    (["inject", "obstacle-ahead"], ["beside a run; start one with --fault obstacle-ahead@"]),
+    (["inject", "weak-wheel:nose"], ["no wheel 'nose'; there are: front-left"]),
+    (["inject", "stuck-wheel", "--share", "0.5"], ["--share goes with a fault of a topic"]),
+    (["inject", "stuck-wheel", "--mode", "drop"], ["--mode goes with a fault of a topic"]),
     (["inject", "wrong-graph", "--share", "0"], ["--share 0"]),
     (["inject", "wrong-graph", "--share", "1.5"], ["--share 1.5"]),
     (["inject", "wrong-graph", "--share", "nan"], ["--share nan"]),
@@ -220,6 +224,7 @@ def test_the_list_has_a_part_for_each_group_and_a_line_for_each_topic(capsys):
     text = told(capsys)
     lines = {line.split()[0]: line for line in text.splitlines() if line}
     assert {"command-not-updated", "laser-dropout", "localization/pose"} <= set(lines)
+    assert lines["brake-failure"].split(maxsplit=1)[1] == "30  the brakes do not brake"
     assert lines["summit_xl/brake"].endswith("all but corrupt")
     assert "world/truth" not in lines
     assert "inject/report" not in lines
