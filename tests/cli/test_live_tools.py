@@ -209,7 +209,9 @@ def test_prometheus_is_given_the_figures_of_the_run(run):
             return (found["rampart_up"][0].value == 1 and bool(found.get("rampart_node_up"))
                     and {"rampart_obstacle_clearance_meters",
                          "rampart_mission_phase"} <= found.keys()
-                    and bool(found.get("rampart_message_rate_hertz")))
+                    and bool(found.get("rampart_message_rate_hertz"))
+                    and any(s.labels["process"] == "launch.py" for s in found.get(
+                        "rampart_process_resident_memory_bytes", ())))  # a look of its own
 
         run.wait_until(complete, 20, "the figures did not come")
         found = scrape(url)

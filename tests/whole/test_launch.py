@@ -31,6 +31,13 @@ def test_the_world_of_the_tests_is_the_one_they_think():
     assert {n for n, f in truth.items() if n.startswith("A") and f < 0.5} == set(BROKEN_A)
 
 
+def near(directory: Path) -> str:
+    """Write a mission whose first goal is reached after 23 s."""
+    file = directory / "NEAR.miss"
+    file.write_text("x=-27,y=-8,taxi=1\nx=-22,y=-18.5,taxi=1\n")
+    return str(file)
+
+
 @pytest.mark.slow
 def test_mission_a_succeeds_although_every_other_node_is_killed_once(tmp_path):
     with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "3") as run:
@@ -64,15 +71,15 @@ def test_a_killed_mission_manager_loses_the_mission_and_leaves_the_robot_safe(tm
 
 
 def test_stopped_and_wedged_control_nodes_are_replaced_and_the_mission_goes_on(tmp_path):
-    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2") as run:
-        run.wait_for("goal 1/3")
+    with RealRun(tmp_path, "paper", "--mission", near(tmp_path), "--rate", "2") as run:
+        run.wait_for("goal 1/2")
         for at_s, number in ((6, signal.SIGSTOP), (10, signal.SIGUSR2)):  # SIGUSR2: wedge
             run.sleep_until(at_s)
             old = run.kill("osmosis_control", number)
             run.wait_until(lambda o=old: run.pid("osmosis_control") not in {None, o}, 10,
                            f"osmosis_control did not come back after {number.name}")
         before = run.story.count("goal")
-        run.wait_for("goal 2/3", 60)
+        run.wait_for("goal 2/2", 60)
         assert run.story.count("goal") > before
         assert "decision 1: RM3, block 1 for FTM4" in run.story
         assert run.story.count(": RM3, block 1 for FTM4") == 2
@@ -113,6 +120,7 @@ def stopped_when_unsafe(run: RealRun):
     return run.result()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["command-out-of-bounds", "localization-not-updated"])
 def test_without_ftm_the_same_fault_is_unsafe(tmp_path, fault):
     # The others in virtual time: test_virtual_run.py.
@@ -171,13 +179,13 @@ def test_garbage_on_every_key_does_not_disturb_the_mission(tmp_path):
         "                s.put(key, junk)\n"
         "    time.sleep(0.2)\n"
         "s.close()\n")
-    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2") as run:
-        run.wait_for("goal 1/3")
+    with RealRun(tmp_path, "paper", "--mission", near(tmp_path), "--rate", "2") as run:
+        run.wait_for("goal 1/2")
         run.sleep_until(5)
         done = subprocess.run([sys.executable, "-c", script, *run.info.endpoints], cwd=ROOT,
                               timeout=60, check=False, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
-        run.wait_for("goal 2/3", 60)
+        run.wait_for("goal 2/2", 60)
         assert "payload rejected" in run.story
         assert "decision 1:" not in run.story
         assert "crashed" not in run.story

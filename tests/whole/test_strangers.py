@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.processes, pytest.mark.skipif(
 
 
 def test_a_stranger_hears_nothing_and_is_not_heard(tmp_path):
-    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "2") as run:
+    with RealRun(tmp_path, "paper", "--mission", "A", "--rate", "3") as run:
         run.wait_for("goal 1/3")
         info = run.info
         names = ",".join((*info.nodes, "spawner_a", "spawner_b"))

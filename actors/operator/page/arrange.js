@@ -4,7 +4,8 @@
 // a wide screen each panel is put where there is room first; what a wide one leaves free is filled
 // by a later one that fits, or by making those above it higher. `data-columns` of a panel says how
 // wide it wants to be: a number, "most", "all", or "natural" (as its diagram); one with `data-grows`
-// can be of any height from so many pixels.
+// can be of any height from so many pixels. What grows by itself moves nothing under a hand that is
+// about to press: it waits until the pointer rests or has clicked.
 
 import { $, element } from "./dom.js";
 
@@ -13,6 +14,7 @@ const COLUMN = 340;  // pixels at least
 const MOST_COLUMNS = 6;
 const SLACK = 24;    // so much higher a place has to be to be better than one further left
 const KEPT = "rampart-panels:";
+const RESTS_MS = 1000;  // a pointer that has not moved for so long is not on its way to a button
 
 const wanted = (panel, columns, width) => {
   const said = panel.dataset.columns || "1";
@@ -99,9 +101,13 @@ export class Arrangement {
     this.key = null;
     this.delivered = [];
     this.frame = 0;
-    this.watch = new ResizeObserver(() => this.soon());
+    this.pressed = false;
+    this.restsAt = 0;
+    this.later = 0;
+    this.watch = new ResizeObserver(() => this.grown());
     this.watch.observe(main);
     addEventListener("resize", () => this.soon());
+    this.mindTheHand();
     for (const panel of [...main.children]) this.adopt(panel);
     $("arrange-reset").addEventListener("click", () => this.reset());
   }
@@ -235,6 +241,22 @@ export class Arrangement {
   }
 
   // ---- laying out --------------------------------------------------------------------------------
+
+  mindTheHand() {
+    const aims = () => { this.restsAt = performance.now() + RESTS_MS; };
+    this.main.addEventListener("pointermove", aims);
+    this.main.addEventListener("pointerdown", () => { this.pressed = true; });
+    for (const over of ["pointerup", "pointercancel", "blur"]) {
+      addEventListener(over, () => { this.pressed = false; this.restsAt = 0; });
+    }
+  }
+
+  /** Lay out what has grown, but not while a pointer is pressed or on its way. */
+  grown() {
+    const wait = this.pressed ? RESTS_MS : this.restsAt - performance.now();
+    if (wait <= 0) this.soon();
+    else this.later ||= setTimeout(() => { this.later = 0; this.grown(); }, wait);
+  }
 
   soon() {
     if (!this.frame) this.frame = requestAnimationFrame(() => { this.frame = 0; this.layOut(); });

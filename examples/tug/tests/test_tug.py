@@ -5,13 +5,18 @@ from __future__ import annotations
 import ast
 import asyncio
 import math
+import random
+import re
+import socket
+import subprocess
 from functools import cache
 from pathlib import Path
 
+import msgspec
 import pytest
 from tug import floor, topics
 from tug.judge import Deliveries
-from tug.topics import Free, Motion, Place, Truth
+from tug.topics import Free, Goal, Motion, Place, Truth
 
 from rampart import DetectionState, Header, parse_specification, verify
 from rampart.actors.ftm.topics import DETECTION
@@ -164,7 +169,63 @@ def test_its_specification_is_proved():
     assert [p.name for p in report.properties if not p.holds] == []
 
 
+@pytest.fixture(scope="module")
+def controller():
+    subprocess.run(["make", "--silent", "-C", str(HERE)], check=True)
+    return HERE / "controller"
+
+
+def told_in_c(controller, said):
+    """Have the program hear messages, and return what it says: stamp and motion."""
+    ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, its:
+        ours.settimeout(10)
+        node = subprocess.Popen([str(controller)], pass_fds=[its.fileno()],
+                                env={"RAMPART_SOCKET": str(its.fileno())})
+        heard = []
+        for topic, body, stamp in said:
+            ours.send(f"{topic.key} {stamp!r} who 1\n".encode() + msgspec.json.encode(body))
+            if topic is topics.POSE:
+                heard.append(ours.recv(1000).split(b"\n", 1))
+        ours.shutdown(socket.SHUT_RDWR)
+        assert node.wait(10) == 0
+    return [(float(head.split()[1]), msgspec.json.decode(body, type=Motion))
+            for head, body in heard]
+
+
 @pytest.mark.processes
+def test_the_controller_in_c_says_what_its_stand_in_says(controller):
+    chance = random.Random(7)
+
+    def place():
+        return chance.uniform(0, 8), chance.uniform(0, 6)
+
+    said = []
+    for i in range(300):
+        if chance.random() < 0.3:
+            said.append((topics.GOAL, Goal(i, *place(), chance.random() < 0.5), i * 0.1))
+        said.append((topics.POSE, Place(*place(), chance.uniform(-4, 4), 0.5), i * 0.1))
+
+    async def scenario():
+        async with VirtualSystem.load(SYSTEM) as system:
+            heard = system.hear(topics.MOTION)
+            system.start_node("controller")
+            await system.settle()
+            for topic, body, stamp in said:
+                await asyncio.sleep(max(0.0, stamp - system.clock.now()))
+                system.say(topic, body, source="tests", stamp_s=stamp)
+                await system.settle()
+            return [(one.header.stamp, one.message) for one in heard]
+
+    for (stamp, motion), (stamp_in_c, in_c) in zip(
+            run(scenario), told_in_c(controller, said), strict=True):
+        assert stamp_in_c == pytest.approx(stamp, abs=1e-8)
+        assert in_c.speed_mps == pytest.approx(motion.speed_mps, abs=1e-8)
+        assert in_c.turn_radps == pytest.approx(motion.turn_radps, abs=1e-8)
+
+
+@pytest.mark.processes
+@pytest.mark.usefixtures("controller")
 def test_on_processes_the_controller_is_back(tmp_path):
     with RealRun(tmp_path, SYSTEM, "--duration", "30") as real:
         real.sleep_until(3)
@@ -187,6 +248,9 @@ def test_it_is_as_small_as_the_page_says():
                  for file in (HERE / "tug").glob("*.py"))
     said = [line for line in SYSTEM.read_text(encoding="utf-8").splitlines()
             if line.strip() and not line.startswith("#")]
+    in_c = re.sub(r"/\*.*?\*/", "", (HERE / "controller.c").read_text(encoding="utf-8"),
+                  flags=re.DOTALL)
     assert python < 300
+    assert f"{sum(1 for line in in_c.splitlines() if line.strip())} lines more" in page
     assert f"{python} lines of Python" in page
     assert f"{len(said)} lines of specification" in page

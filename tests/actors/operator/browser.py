@@ -87,6 +87,12 @@ class Browser:
         self._reader.cancel()
 
 
+async def mouse(tab: Browser, kind: str, x: float, y: float) -> None:
+    """Have the left button pressed, moved or released at a point of the page."""
+    await tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1,
+                   clickCount=1)
+
+
 @contextlib.asynccontextmanager
 async def browser() -> AsyncIterator[Browser]:
     """Start Chromium, open a tab, and end everything afterwards."""

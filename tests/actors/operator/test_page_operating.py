@@ -19,7 +19,7 @@ from rampart.actors.osmosis.page.stick import Grip
 from rampart.actors.supervision.process_title import RunProcess
 from rampart.sim.osmosis.trial.faults import OsmosisFaults
 from rampart.testing import eventually, free_port
-from tests.actors.operator.browser import browser
+from tests.actors.operator.browser import browser, mouse
 from tests.actors.operator.world import World, hear, repeated, served
 from tests.osmosis_system import shipped_system
 
@@ -55,9 +55,16 @@ def moved(world) -> bool:
     return any(stick != RELEASED for stick in world.others.stick)
 
 
-async def mouse(tab, kind: str, x: float, y: float) -> None:
-    await tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1,
-                   clickCount=1)
+async def hand_on_the_pad(tab) -> tuple[float, float, float]:
+    """Give the middle of the pad and its radius, when nothing moves it any more."""
+    where = (f"(() => {{ const b = {PAD}.getBoundingClientRect(); return JSON.stringify("
+             "[b.left + b.width / 2, b.top + b.height / 2, b.width / 2]); })()")
+    last, seen = None, await tab.value(where)
+    while seen != last:
+        x, y, radius = json.loads(seen)
+        await mouse(tab, "mouseMoved", x, y)
+        last, seen = seen, await tab.value(where)
+    return x, y, radius
 
 
 async def drives(tab, world, **position: float) -> None:
@@ -218,9 +225,7 @@ async def test_the_stick_on_the_screen_and_a_gamepad_drive(world):
         await tab.until(FREE)
         await tab.value(f"{PAD}.scrollIntoView({{block: 'center'}})")
         await tab.value("document.getElementById('stick-share').value = 100")
-        x, y, radius = json.loads(await tab.value(
-            f"(() => {{ const b = {PAD}.getBoundingClientRect(); return JSON.stringify("
-            "[b.left + b.width / 2, b.top + b.height / 2, b.width / 2]); })()"))
+        x, y, radius = await hand_on_the_pad(tab)
         await mouse(tab, "mousePressed", x, y)
         await mouse(tab, "mouseMoved", x, y - 3 * radius)  # outside: full ahead, no more
         await drives(tab, world, forward=1.0)

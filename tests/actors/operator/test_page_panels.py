@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from rampart.manager.spec.panels import Panel
-from tests.actors.operator.browser import browser
+from tests.actors.operator.browser import browser, mouse
 from tests.actors.operator.extremes import MARKUP
 from tests.actors.operator.page import LIVE, events, page, speaking_world
 from tests.actors.operator.test_panels import PANELS, Speaks, hmi
@@ -151,6 +151,32 @@ async def test_by_keyboard_a_panel_is_moved_and_folded_and_the_page_remembers(wo
         assert await tab.value(folded) is True
 
 
+async def test_what_grows_by_itself_moves_nothing_under_a_hand_that_is_about_to_press(world):
+    async with tank(world, width=1100, height=700) as (tab, _):
+        await tab.until(f"{HOLES} === ''", 5)
+        below = await tab.value(
+            "(() => { const top = (p) => p.getBoundingClientRect();"
+            " const level = top(document.querySelector('[data-name=Level]'));"
+            " return [...document.querySelectorAll('main > .panel')].find((p) => !p.hidden"
+            " && top(p).left === level.left && top(p).top > level.top).dataset.name; })()")
+        fold = f"document.querySelector('[data-name=\"{below}\"] .tool.fold')"
+        where = (f"JSON.stringify((() => {{ const b = {fold}.getBoundingClientRect();"
+                 " return [b.left + b.width / 2, b.top + b.height / 2]; })())")
+        frames = ("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame("
+                  "() => requestAnimationFrame(() => done(true)))))")
+        before = await tab.value(where)
+        x, y = json.loads(before)
+        await mouse(tab, "mouseMoved", x, y)
+        await mouse(tab, "mousePressed", x, y)
+        await tab.value(f"{BODY.format('Level')}.append(Object.assign("
+                        "document.createElement('div'), {style: 'height: 300px'}))")
+        await tab.call("Runtime.evaluate", expression=frames, awaitPromise=True)
+        assert await tab.value(where) == before
+        await mouse(tab, "mouseReleased", x, y)
+        assert await tab.value(f"{fold}.closest('.panel').classList.contains('folded')")
+        await tab.until(f"{where} !== {json.dumps(before)} && {HOLES} === ''", 5)
+
+
 async def test_by_mouse_a_panel_is_dragged_to_where_another_one_is(world):
     async with tank(world, width=1920, height=1080) as (tab, _):
         await tab.until(f"{HOLES} === ''", 5)
@@ -158,9 +184,8 @@ async def test_by_mouse_a_panel_is_dragged_to_where_another_one_is(world):
               ".getBoundingClientRect(); return [b.left + b.width / 2, b.top + 8]; }})())")
         fro = json.loads(await tab.value(at.format("Level", ".tool.move")))
         to = json.loads(await tab.value(at.format("Pump", "h2")))
-        for kind, (x, y) in (("mousePressed", fro), ("mouseMoved", to), ("mouseReleased", to)):
-            await tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left",
-                           buttons=1, clickCount=1)
+        for kind, at in (("mousePressed", fro), ("mouseMoved", to), ("mouseReleased", to)):
+            await mouse(tab, kind, *at)
         await tab.until(f"{NAMES}[2] === 'Level'")
 
 
