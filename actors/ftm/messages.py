@@ -227,8 +227,8 @@ _Injections = Annotated[tuple[Injection, ...], msgspec.Meta(max_length=64)]
 class FaultOrder(Message, frozen=True):
     """A fault that is no disturbance of a topic: a message on `topic`, as a JSON object.
 
-    Its type has the fields `injection`, filled in when it is ordered, and `duration_s`, of which 0
-    ends it. The node that carries it out reports on it as on an injection.
+    Its type has the fields `injection` and `duration_s`, filled in when it is ordered; a duration
+    of 0 ends it. The node that carries it out reports on it as on an injection.
     """
 
     topic: Name
@@ -241,12 +241,12 @@ _FaultOrders = Annotated[tuple[FaultOrder, ...], msgspec.Meta(max_length=64)]
 class NamedFault(Message, frozen=True):
     """A fault that can be ordered by its name: what the launcher offers to the operator's page.
 
-    `duration_s` is how long it lasts unless told otherwise, simulated seconds.
+    `duration_s` is how long it lasts unless told otherwise, simulated seconds; None for ever.
     """
 
     name: Name
     title: Text
     group: Name
-    duration_s: Lasting
+    duration_s: Lasting | None
     injections: _Injections = ()
     orders: _FaultOrders = ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -14,7 +14,7 @@ from rampart.actors.bus.fields import Field, Steered
 from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import topics
 from rampart.actors.layout.wiring import Member, panels_of, shows_panels
-from rampart.actors.runtime.actor import BASE_OUTPUTS
+from rampart.actors.runtime.actor import BASE_OUTPUTS, Actor
 from rampart.actors.runtime.parameters import Named, messages_said, topics_named
 from rampart.manager.spec.panels import NUMBER, Panel
 from rampart.manager.spec.schema import SystemSpec
@@ -63,8 +63,17 @@ def choose_topics(members: Iterable[Member], known: Iterable[Topic[Any]], file: 
     return chosen, found
 
 
-def with_panels(members: Iterable[Member], spec: SystemSpec, file: str) -> list[Member]:
-    """Return the members; a page without panels gets plots of the numbers that the nodes publish.
+def with_pages(members: Iterable[Member], spec: SystemSpec, orders: Collection[str], file: str
+               ) -> list[Member]:
+    """Return the members, pages with what they show and order.
+
+    A page without panels gets plots of the numbers that the nodes publish.
+
+    Args:
+        members: all of a system.
+        spec: the system.
+        orders: keys of the topics on which the faults are ordered that a page offers.
+        file: name of the spec, for messages.
 
     Raises:
         ValueError: the spec has panels, and no node shows them.
@@ -76,8 +85,13 @@ def with_panels(members: Iterable[Member], spec: SystemSpec, file: str) -> list[
                          "rampart.actors.operator.hmi:Hmi does")
     nodes = {node.name for node in spec.nodes}
     plots = tuple(plots_of([m for m in everyone if m.name in nodes and m not in pages]))
-    return [replace(member, parameters=msgspec.structs.replace(member.parameters, panels=plots))
-            if member in pages and not panels_of(member.parameters) else member
+
+    def page(said: Actor.Parameters) -> Actor.Parameters:
+        more = {"panels": panels_of(said) or plots, "fault_orders": tuple(orders)}
+        return msgspec.structs.replace(
+            said, **{name: value for name, value in more.items() if hasattr(said, name)})
+
+    return [replace(member, parameters=page(member.parameters)) if member in pages else member
             for member in everyone]
 
 

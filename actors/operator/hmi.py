@@ -31,7 +31,7 @@ from rampart.actors.operator.state import STALE_S, HmiState
 from rampart.actors.operator.system import draw_system
 from rampart.actors.run.run_context import NO_SYSTEM
 from rampart.actors.runtime.actor import Actor, Context, Header, every, on
-from rampart.actors.runtime.parameters import Panels
+from rampart.actors.runtime.parameters import Panels, TopicsPublished
 from rampart.actors.web.access import AccessError
 from rampart.manager.spec.panels import MAX_PANELS, Panel
 from rampart.manager.spec.specification import SystemSpec, check_document
@@ -53,9 +53,15 @@ class Hmi(Actor):
     """
 
     class Parameters(Actor.Parameters, frozen=True):
-        """panels: of its class and of the specification, which the loader puts together."""
+        """What the loader puts together.
+
+        Attributes:
+            panels: of its class and of the specification.
+            fault_orders: topics on which the page orders faults of the robot.
+        """
 
         panels: Panels = ()
+        fault_orders: TopicsPublished = ()
 
     parameters: Parameters
     panels: ClassVar[tuple[Panel, ...]] = ()

@@ -53,7 +53,8 @@ class Operating:
         overhead_s = OVERHEAD_S * actor.clock.rate
         self._choice = StrategyChoice(f"{prefix}.s", "operator", tuple(STRATEGIES), overhead_s)
         self._injections = Injections(f"{prefix}.f", run.plan.faults, places_of(run.system),
-                                      run.application.topics, overhead_s)
+                                      (*run.application.topics, *actor.context.topics.values()),
+                                      overhead_s)
         self._has_processes = run.plan.launcher_pid > 0  # a replay has none
         self._strategy = ""
         self._sticks = {panel.title: Stick(actor, panel, partial(self._stick_changed, panel.title))

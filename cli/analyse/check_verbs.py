@@ -104,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
     Examples:
       rampart explain
       rampart explain my_system.toml
-      rampart explain cell --json
+      rampart explain paper --json
 
     exit code: 0, 2 a system that `rampart check` refuses, or bad usage
     """
@@ -232,7 +232,7 @@ def check(options: argparse.Namespace) -> int:
     Examples:
       rampart check
       rampart check my_system.toml && rampart run --system my_system.toml
-      rampart check cell --json
+      rampart check paper --json
 
     exit code: 0 sound, 2 not sound (one line says where) or bad usage
     """

@@ -15,7 +15,7 @@ import pytest
 from rampart.actors.osmosis.airport.formats import load_with_truth
 from rampart.actors.supervision.process_title import find_processes
 from rampart.testing import RealRun, free_base_port
-from tests import ROOT
+from tests import CELL, ROOT
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(240)]
 
@@ -239,7 +239,7 @@ BAD_USAGE = [
     (["--report", __file__], f"--report {__file__}: no directory that can be written (File exists"),
     (["--system", "/tmp"], "--system /tmp: is a directory; a spec is right, or the name of a"),
     (["--system", sys.executable], f"{sys.executable}: $: not UTF-8 text"),
-    (["--airport", str(ROOT / "systems" / "cell.toml")], "cell.toml: title: 'Pick and place behi"),
+    (["--airport", str(CELL)], "cell.toml: title: 'Pick and place behi"),
     (["--fault", "gps-bias@goal99"], "--fault gps-bias@goal99: mission AB has 5 goals"),
 ]
 
