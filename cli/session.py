@@ -1,4 +1,4 @@
-"""A tool's way into a run: it dials every node, announces nothing, and leaves no trace.
+"""A tool's way into a run: it joins a router, announces nothing, and leaves no trace.
 
 Whoever listens only to commands cannot tell whether one arrived: so a command is sent with a
 check of its effect, and repeated as the identical message until the effect shows. Receivers drop

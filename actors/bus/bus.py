@@ -60,7 +60,7 @@ class Bus(Protocol):
 class SharedBus:
     """Passes everything on to a bus that another actor opens and closes.
 
-    For an actor that has no address: a node that is respawned dials the owner of the session.
+    For an actor that is not announced: it is there as long as the owner of the session.
 
     Args:
         owner: The bus; opened before this one.

@@ -2,7 +2,7 @@
 
 For the rest of the system this actor is the node: it has the heartbeat, the liveliness token, the
 incarnation, and publishes what the command says on its socket, so that faults can be injected into
-it and recorders and partners find it. The command lives below a keeper
+it and recorders and other nodes find it. The command lives below a keeper
 (`rampart.actors.foreign.keeper`). When the command ends, this actor fails; when the command is
 silent for too long, the heartbeat of this actor stops; when this actor ends, however it does, so
 does the command with all that it has forked.

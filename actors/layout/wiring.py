@@ -74,7 +74,7 @@ def published(member: Member) -> dict[str, Members]:
 def heard(member: Member) -> dict[str, Members]:
     """Return topic key → names of the family members heard (None: all, or not a family).
 
-    Without what every actor hears: tools dial for themselves, and hellos use the links there are.
+    Without what every actor hears.
     """
     actor = member.actor
     return _together({

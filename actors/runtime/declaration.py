@@ -22,7 +22,7 @@ BASE_OUTPUTS: tuple[Topic[Any], ...] = (HEARTBEAT, HELLO, DIAGNOSTIC, INJECTION_
 """What every actor publishes besides its own outputs."""
 
 BASE_INPUTS: tuple[Topic[Any], ...] = (INJECT, HELLO)
-"""What every actor hears besides its own inputs: injections from tools, hellos from partners."""
+"""What every actor hears besides its own inputs: injections from tools, hellos from newcomers."""
 
 
 def on(topic: Topic[Any]) -> Callable[[F], F]:

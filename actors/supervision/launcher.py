@@ -48,9 +48,8 @@ long the machine took to load the first process."""
 STOP_TIMEOUT_S = 1.2
 _PR_SET_CHILD_SUBREAPER = 36
 
-# A process of a run holds a socket for each partner. The supervisor and the observer have every
-# process for a partner, and the supervisor holds each by a descriptor besides. With too few of them
-# nothing fails at once, and everything fails later.
+# A router holds a socket for each process of a run, and the supervisor a descriptor. With too few
+# of them nothing fails at once, and everything fails later.
 _DESCRIPTORS_EACH = 4
 _DESCRIPTORS_BESIDES = 40
 

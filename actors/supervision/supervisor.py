@@ -25,7 +25,6 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 from rampart.actors.bus import topics as bus_topics
@@ -36,7 +35,7 @@ from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import Layout, adapted_system
 from rampart.actors.runtime.actor import Context, Header, every, on
-from rampart.actors.runtime.timer import Timer
+from rampart.actors.supervision.held_process import HeldProcess
 from rampart.actors.supervision.patience import Patience
 from rampart.actors.supervision.processes import OsProcesses, Processes, ProcessHandle, RunProcess
 from rampart.actors.supervision.relay import Relay
@@ -47,7 +46,6 @@ from rampart.actors.supervision.supervised_process import (
     Event,
     RestartPolicy,
     State,
-    SupervisedProcess,
 )
 from rampart.manager.spec.adaptation import changed_actors
 from rampart.manager.spec.schema import Kind
@@ -71,37 +69,6 @@ _RETRY_S = 0.05
 _ASK_AGAIN_S = 0.01
 
 
-@dataclass
-class _Process(SupervisedProcess):
-    """A process, and what the supervisor has in hand of it.
-
-    Attributes:
-        handle: On the process that is there.
-        next_step: Towards its fork, while that is under way; there is never more than one.
-    """
-
-    handle: ProcessHandle = field(default_factory=ProcessHandle)
-    next_step: Timer | None = None
-
-    def take(self, pid: int, incarnation: int) -> None:
-        self.forget_step()
-        self.let_go()
-        super().take(pid, incarnation)
-
-    def let_go(self) -> None:
-        self.handle.close()
-        self.handle = ProcessHandle()
-
-    def kill(self) -> None:
-        """End it at once, and do not hear of that."""
-        self.handle.ignore()
-        self.handle.kill()
-
-    def forget_step(self) -> None:
-        if self.next_step is not None:
-            self.next_step.cancel()
-
-
 class Supervisor(Relay):
     """Keeps the processes of the run running."""
 
@@ -122,7 +89,7 @@ class Supervisor(Relay):
             self._plan.folder, self._plan.base_port, self._plan.launcher_pid)
         self._routers = self._layout.routers if self._machine.has_routers else {}
         self._processes = {
-            name: _Process(unit, RestartPolicy(self._spec.supervision),
+            name: HeldProcess(unit, RestartPolicy(self._spec.supervision),
                            Patience(2 * _CHECK_S / self._plan.rate))
             for name, unit in {**self._routers, **self._layout.units}.items()}
         for node, incarnation in run.known_incarnations.items():
@@ -140,7 +107,7 @@ class Supervisor(Relay):
         """Hear the heartbeats of the nodes that it starts."""
         return parameters.nodes if topic is bus_topics.HEARTBEAT else None
 
-    def _process_of(self, node: str) -> _Process | None:
+    def _process_of(self, node: str) -> HeldProcess | None:
         return self._processes.get(
             node if node in self._routers else self._layout.unit_of.get(node, ""))
 
@@ -274,14 +241,14 @@ class Supervisor(Relay):
         self._publish_table()
         self.report_left_out()
 
-    def _ended(self, process: _Process, pid: int, detail: str = "") -> None:
+    def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
         if process.pid == pid:  # else it was replaced while the news waited in the mailbox
             process.let_go()
             for name in process.names:
                 self._bus.gone(name, process.incarnation)
             self._on(process, Event.ENDED, detail=detail)
 
-    def _owns(self, process: _Process) -> bool:
+    def _owns(self, process: HeldProcess) -> bool:
         """Whether the supervisor itself brings the process back."""
         return process.unit.name in self._routers or (
             self._spec.layers.supervisor_respawn
@@ -290,7 +257,7 @@ class Supervisor(Relay):
 
     # -- acting ---------------------------------------------------------------------------------
 
-    def _on(self, process: _Process, event: Event, by: str = "", detail: str = "") -> None:
+    def _on(self, process: HeldProcess, event: Event, by: str = "", detail: str = "") -> None:
         """Take a process's transition, and do what follows from it."""
         step, by = process.step(event), by or self.name
         if step is None:
@@ -318,18 +285,18 @@ class Supervisor(Relay):
                 case Action.HOLD:
                     self._hold(process, process.pid)
 
-    def _recover(self, process: _Process) -> None:
+    def _recover(self, process: HeldProcess) -> None:
         if self._owns(process) or process.policy.attempts or process.requested_by:
             self._restart(process, process.requested_by or self.name)
 
-    def _restart(self, process: _Process, by: str) -> None:
+    def _restart(self, process: HeldProcess, by: str) -> None:
         event, why_not = process.ask(self._loop.time())
         self._on(process, event, by, why_not)
 
-    def _fork_in(self, process: _Process, delay_s: float, step: Callable[[], None]) -> None:
+    def _fork_in(self, process: HeldProcess, delay_s: float, step: Callable[[], None]) -> None:
         process.next_step = self.call_later(delay_s * self.clock.rate, step)
 
-    def _fork_when_gone(self, process: _Process, by: str, delay_s: float = 0.0) -> None:
+    def _fork_when_gone(self, process: HeldProcess, by: str, delay_s: float = 0.0) -> None:
         # The socket is free only when the old process is gone: a few more milliseconds.
         if delay_s > 0 or not process.handle.gone():
             self._fork_in(process, max(delay_s, _GONE_S),
@@ -338,7 +305,7 @@ class Supervisor(Relay):
         process.policy.restarted(self._loop.time())
         self._fork(process, by)
 
-    def _fork(self, process: _Process, by: str) -> None:
+    def _fork(self, process: HeldProcess, by: str) -> None:
         incarnation = process.highest + 1
         try:
             pid = self._machine.fork(process.names, incarnation)
@@ -355,7 +322,7 @@ class Supervisor(Relay):
         attempt = process.policy.attempts
         self._on(process, event, by, f"attempt {attempt} since it was given up" if attempt else "")
 
-    def _look_for(self, process: _Process) -> None:
+    def _look_for(self, process: HeldProcess) -> None:
         """Adopt what runs and was not known, as the kernel knows it: a message may name any pid."""
         now = self._loop.time()
         if now - process.searched_s < _SEARCH_S:
@@ -366,7 +333,7 @@ class Supervisor(Relay):
         except OSError as error:  # no descriptor left to look with
             self.report_diagnostic("search", str(error), process.unit.name)
 
-    def _adopt_living(self, process: _Process, living: Sequence[RunProcess]) -> bool:
+    def _adopt_living(self, process: HeldProcess, living: Sequence[RunProcess]) -> bool:
         """Adopt the highest incarnation that is there and end the others; False without any."""
         found = sorted((p for p in living if p.names == process.names),
                        key=lambda p: -p.incarnation)
@@ -381,7 +348,7 @@ class Supervisor(Relay):
             self._on(process, Event.ADOPTED)
         return bool(found)
 
-    def _hold(self, process: _Process, pid: int) -> None:
+    def _hold(self, process: HeldProcess, pid: int) -> None:
         if process.pid != pid:  # it was replaced while this waited
             return
         process.handle = ProcessHandle(is_gone=False)
@@ -399,7 +366,7 @@ class Supervisor(Relay):
 
     # -- what it says ---------------------------------------------------------------------------
 
-    def _tell(self, process: _Process, event: str, by: str, detail: str = "") -> None:
+    def _tell(self, process: HeldProcess, event: str, by: str, detail: str = "") -> None:
         for node in process.unit.nodes:
             self.publish(topics.PROCESS_EVENT, fm.ProcessEvent(
                 node.name, event, process.pid, process.incarnation, by, clip(detail)))

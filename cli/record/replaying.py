@@ -1,7 +1,7 @@
 """Plays a recording back onto a bus of its own, where tools and an operator's page can read it.
 
-A replay must never reach a robot. It dials nobody; it listens on one socket, in a folder of its
-own; nodes of a run dial only what is in the folder of their run. Tools find it as they find a run,
+A replay must never reach a robot. It is a router of its own, on a socket in a folder of its own;
+nodes of a run know only the routers in the folder of their run. Tools find it as they find a run,
 and are told that it is none: they give it no orders, and prefer a run to it.
 """
 

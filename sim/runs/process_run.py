@@ -22,9 +22,8 @@ from rampart.sim.runs.trial import Trial
 _LOOK_S = 0.05
 _STALL_S = 0.5
 
-_RELINK_S = 4.0
-"""Wall seconds in which a launcher that was stopped has its links again: those that it has lost are
-dialled after one second, and after two more."""
+_RELINK_S = 1.0
+"""Wall seconds in which a launcher that was stopped is linked to a router again."""
 
 _SIGNALS = {"kill": "KILL", "stop": "STOP", "resume": "CONT", "wedge": "WEDGE"}
 """As `kill-node` sends them. How slow a process is, is up to the machine."""
@@ -44,8 +43,8 @@ def excused_s(late_s: float) -> float:
 
     Args:
         late_s: how much too late the launcher looked again. It was stopped (ctrl-Z) if that is
-            more than a loaded machine does; then what was sent meanwhile comes now, or after its
-            links have been dialled again.
+            more than a loaded machine does; then what was sent meanwhile comes now, or after it has
+            joined a router again.
     """
     return late_s + _RELINK_S if late_s > _STALL_S else 0.0
 
