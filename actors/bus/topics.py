@@ -15,11 +15,6 @@ DIAGNOSTIC = Topic("diagnostic/{name}", Diagnostic, Qos.COMMAND, 0, "",
                    "Error report of node {name}.")
 INJECT = Topic("inject/order", Injection, Qos.COMMAND, 0, "",
                "A fault to inject on a topic; tools send it too.")
-INJECTION_REQUEST = Topic("inject/request", Injection, Qos.COMMAND, 0, "",
-                          "A fault that the operator's page asks for; the supervisor, which has a "
-                          "link to everybody, orders it.")
-INJECTION_RESULT = Topic("inject/result", InjectionReport, Qos.COMMAND, 0, "",
-                         "How an injection took hold, passed on: who shows it needs one link only.")
 INJECTION_REPORT = Topic("inject/report", InjectionReport, Qos.COMMAND, 0, "",
                          "How an injection took hold.")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from rampart.actors.bus import messages as bus_messages
 from rampart.actors.bus import topics as bus_topics
 from rampart.actors.bus.topic import Qos, Topic
 from rampart.actors.ftm import messages as m
@@ -38,8 +37,6 @@ RESET = Topic("manager/reset", m.Reset, Qos.COMMAND, 0, "", "Release a latched r
 NODES = Topic("supervisor/nodes", m.NodeTable, Qos.STATE, 2, "", "The supervisor's node table.")
 RESPAWN = Topic("supervisor/respawn", m.RespawnRequest, Qos.COMMAND, 0, "",
                 "Ask for a node to be respawned.")
-ERROR_REPORT = Topic("supervisor/error", bus_messages.Diagnostic, Qos.COMMAND, 0, "",
-                     "Diagnostics of all nodes, passed on: who shows them needs one link only.")
 PROCESS_EVENT = Topic("supervisor/event", m.ProcessEvent, Qos.COMMAND, 0, "",
                       "What happened to processes.")
 

@@ -67,11 +67,11 @@ class Hmi(Actor):
     panels: ClassVar[tuple[Panel, ...]] = ()
     files: ClassVar[Path | None] = None
     outputs: ClassVar[tuple[Topic[Any], ...]] = (
-        ftm_topics.RESET, ftm_topics.ADAPT, bus_topics.INJECTION_REQUEST)
+        ftm_topics.RESET, ftm_topics.ADAPT, bus_topics.INJECT)
     requests: ClassVar[tuple[type[Request], ...]] = REQUESTS
     shown: ClassVar[tuple[Topic[Any], ...]] = (
-        ftm_topics.ADAPTED_SYSTEM, ftm_topics.PROCESS_EVENT, ftm_topics.ERROR_REPORT,
-        ftm_topics.ADAPTATION, bus_topics.INJECTION_RESULT)
+        ftm_topics.ADAPTED_SYSTEM, ftm_topics.PROCESS_EVENT, bus_topics.DIAGNOSTIC,
+        ftm_topics.ADAPTATION, bus_topics.INJECTION_REPORT)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -228,7 +228,7 @@ class Hmi(Actor):
     def _process_event(self, message: fm.ProcessEvent, header: Header) -> None:
         self._state.process_event(message, header.stamp)
 
-    @on(ftm_topics.ERROR_REPORT)
+    @on(bus_topics.DIAGNOSTIC)
     def _diagnostic(self, message: bm.Diagnostic, header: Header) -> None:
         self._state.diagnostic(message, header.stamp)
         self._operating.diagnostic(message)
@@ -237,6 +237,6 @@ class Hmi(Actor):
     def _adaptation(self, message: fm.AdaptationAnswer, _header: Header) -> None:
         self._operating.answered(message)
 
-    @on(bus_topics.INJECTION_RESULT)
+    @on(bus_topics.INJECTION_REPORT)
     def _injection(self, message: bm.InjectionReport, _header: Header) -> None:
         self._operating.injected(message)

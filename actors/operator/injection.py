@@ -168,11 +168,11 @@ class Injections:
                              stamp_s=STAMP_S if mode == "restamp" else 0.0)
         if reason := flaw(order):
             raise RefusedError(reason)
-        return [Order(bus_topics.INJECTION_REQUEST, order)], OWN_DURATION_S
+        return [Order(bus_topics.INJECT, order)], OWN_DURATION_S
 
     def _orders(self, named: NamedFault) -> Iterator[Order]:
         for injection in named.injections:
-            yield Order(bus_topics.INJECTION_REQUEST, injection)
+            yield Order(bus_topics.INJECT, injection)
         for order in named.orders:
             topic = self._robots[order.topic]
             yield Order(topic, msgspec.json.decode(order.document, type=topic.type))
@@ -221,7 +221,7 @@ class Injections:
     def _conclude(self, o: Ordered) -> str:
         o.effective = o.affected > 0
         reason = next(iter(o.refused.values()), o.reason)
-        of_topics = all(x.topic is bus_topics.INJECTION_REQUEST for x in o.orders)
+        of_topics = all(x.topic is bus_topics.INJECT for x in o.orders)
         if o.effective:
             unit = "messages" if of_topics else "ticks"
             o.outcome = f"over, {o.affected} {unit} changed" + (f"; {reason}" if reason else "")

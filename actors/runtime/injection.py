@@ -25,7 +25,7 @@ import msgspec
 from rampart.actors.bus.bounds import clip
 from rampart.actors.bus.messages import Injection, InjectionReport
 from rampart.actors.bus.topic import ROOT, Topic
-from rampart.actors.bus.topics import INJECT, INJECTION_REPORT, INJECTION_REQUEST, INJECTION_RESULT
+from rampart.actors.bus.topics import INJECT, INJECTION_REPORT
 from rampart.actors.runtime.clock import Clock
 from rampart.actors.runtime.corruption import InjectionError, check_fields, corrupt
 from rampart.actors.runtime.timer import Timer
@@ -38,7 +38,7 @@ MAX_IN_FORCE = 64
 MAX_DELAYED = 10_000
 """Messages of one actor that an injection may hold back at a time; more are lost, and reported."""
 
-UNTOUCHED = (INJECT.key, INJECTION_REPORT.key, INJECTION_REQUEST.key, INJECTION_RESULT.key)
+UNTOUCHED = (INJECT.key, INJECTION_REPORT.key)
 """Keys that carry injections and their results, and therefore cannot be disturbed."""
 
 

@@ -34,11 +34,10 @@ from rampart.actors.bus.topic import Members, Topic
 from rampart.actors.ftm import messages as fm
 from rampart.actors.ftm import topics
 from rampart.actors.layout.layout import Layout, adapted_system
-from rampart.actors.runtime.actor import Context, Header, every, on
+from rampart.actors.runtime.actor import Actor, Context, Header, every, on
 from rampart.actors.supervision.held_process import HeldProcess
 from rampart.actors.supervision.patience import Patience
 from rampart.actors.supervision.processes import OsProcesses, Processes, ProcessHandle, RunProcess
-from rampart.actors.supervision.relay import Relay
 from rampart.actors.supervision.spawner_client import SpawnerBusyError, SpawnerUnavailableError
 from rampart.actors.supervision.supervised_process import (
     STATUS,
@@ -69,16 +68,16 @@ _RETRY_S = 0.05
 _ASK_AGAIN_S = 0.01
 
 
-class Supervisor(Relay):
+class Supervisor(Actor):
     """Keeps the processes of the run running."""
 
-    class Parameters(Relay.Parameters, frozen=True):
+    class Parameters(Actor.Parameters, frozen=True):
         """Whom it hears: the names of all nodes."""
 
         nodes: tuple[str, ...] = ()
 
     parameters: Parameters
-    outputs = (topics.NODES, topics.PROCESS_EVENT, *Relay.outputs)
+    outputs = (topics.NODES, topics.PROCESS_EVENT)
 
     def __init__(self, context: Context, processes: Processes | None = None) -> None:
         super().__init__(context)
@@ -239,7 +238,6 @@ class Supervisor(Relay):
     def repeat(self) -> None:
         """Repeat the node table for those who joined late."""
         self._publish_table()
-        self.report_left_out()
 
     def _ended(self, process: HeldProcess, pid: int, detail: str = "") -> None:
         if process.pid == pid:  # else it was replaced while the news waited in the mailbox

@@ -10,8 +10,8 @@ from msgspec import convert, inspect
 from rich.console import Console as RichConsole
 
 from rampart.actors.bus import messages as bm
+from rampart.actors.bus import topics as bus_topics
 from rampart.actors.ftm import messages as fm
-from rampart.actors.ftm import topics as ftm_topics
 from rampart.actors.osmosis import messages as m
 from rampart.actors.osmosis import topics
 from rampart.actors.runtime.actor import Header
@@ -120,7 +120,7 @@ def test_a_flood_of_reports_is_some_clipped_lines_and_a_count_and_other_news_com
     stream, now = io.StringIO(), [0.0]
     console = MissionConsole(stream, lambda: now[0])
     for number in range(10_000):
-        console.take(ftm_topics.ERROR_REPORT, report(number), Header("x", 1, number, 1.0))
+        console.take(bus_topics.DIAGNOSTIC, report(number), Header("x", 1, number, 1.0))
     console.line(1.0, "news")
     lines = stream.getvalue().splitlines()
     assert (len(lines), lines[-1]) == (REPORTS_PER_S + 1, "[   1.00 s] news")

@@ -312,25 +312,3 @@ def test_actuator_faults_at_a_time_are_bounded():
     with pytest.raises(WorldError, match="64 faults are in force"):
         faults.order(fault(64), 0.0)
     faults.order(fault(63), 0.0)  # known already
-
-
-def test_the_supervisor_passes_on_a_bounded_number_of_reports_and_says_what_it_left_out():
-    of = system("paper")
-
-    async def scenario():
-        async with VirtualSystem(of.run, of.layout) as living:
-            sent = living.overhear(SUPERVISOR)
-            living.start_node(SUPERVISOR, Machine())
-            await asyncio.sleep(0.1)
-            for number in range(1000):
-                living.say(bus_topics.DIAGNOSTIC, bm.Diagnostic("x", "c", "r", f"{number}", 1),
-                           "x", stamp_s=0.0)
-            await asyncio.sleep(2.0)
-            await living.stop(SUPERVISOR)
-            return sent
-
-    sent = run(scenario)
-    told = [body["node"] for key, body in sent if key == ftm_topics.ERROR_REPORT.key]
-    assert told.count("x") == 200
-    assert [body["reason"] for key, body in sent if key == "diagnostic/supervisor"] == [
-        "800 more messages were not passed on"]

@@ -52,7 +52,7 @@ def test_a_fault_is_sent_until_its_publisher_reports_and_its_effect_is_told_once
     faults = injections()
     ordered = faults.order("localization-not-updated", 0.0, None, 5.0)
     (order,) = faults.due(5.0)
-    assert order.topic is bus_topics.INJECTION_REQUEST
+    assert order.topic is bus_topics.INJECT
     assert (order.message.topic, order.message.mode, order.message.duration_s) == (
         "localization/pose", "freeze", 10.0)
     assert faults.due(5.5) == [order]

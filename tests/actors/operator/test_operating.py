@@ -257,7 +257,7 @@ async def test_a_fault_is_injected_from_the_page_and_its_effect_shown(world):
             order = world.others.injections[0]
             assert (order.topic, order.set_fields["linear_mps"], order.duration_s) == (
                 "control/command", 3.0, 3.0)
-            world.others.publish(bus_topics.INJECTION_RESULT, bm.InjectionReport(
+            world.others.publish(bus_topics.INJECTION_REPORT, bm.InjectionReport(
                 order.injection, "osmosis_control", 60, True, ""))
             shown = await operating(page, lambda o: o["faults"] and o["faults"][0]["ended"])
             assert shown["faults"][0]["state"] == "over, 60 messages changed"

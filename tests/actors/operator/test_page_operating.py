@@ -167,7 +167,7 @@ async def test_a_connection_that_is_too_slow_is_told_so_and_not_flooded(world, m
 async def test_the_page_says_why_teleoperation_does_not_follow_it(world):
     async with browser() as tab, alive(world), world.hmi(hmi_port=free_port()) as hmi:
         await drive_ahead(tab, world, hmi)
-        world.others.publish(ftm_topics.ERROR_REPORT, bm.Diagnostic(
+        world.others.publish(bus_topics.DIAGNOSTIC, bm.Diagnostic(
             "teleoperation", "joystick", "not followed: /dev/input/js0 has the stick", "hmi", 1))
         await tab.until("document.querySelector('.stick-state').textContent === 'not followed'")
         assert "/dev/input/js0 has the stick" in await tab.value(WORDS)
@@ -362,7 +362,7 @@ async def test_a_strategy_is_chosen_and_a_fault_injected_on_the_page(world):
                 o.topic == topic for o in world.others.injections))
             order = next(o for o in world.others.injections if o.topic == topic)
             assert order.duration_s == 4.0
-            world.others.publish(bus_topics.INJECTION_RESULT, bm.InjectionReport(
+            world.others.publish(bus_topics.INJECTION_REPORT, bm.InjectionReport(
                 order.injection, "simulator", 12, True, ""))
             await tab.until("document.querySelector('#faults li').textContent"
                             f".startsWith('{chosen}')")

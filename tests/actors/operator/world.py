@@ -30,8 +30,8 @@ class Others(Actor):
 
     outputs = (topics.MISSION_STATUS, ftm_topics.MANAGER_STATUS, topics.POSE, ftm_topics.DETECTION,
                topics.MISSION_ORDER_ANSWER, topics.PILOT_STATUS, ftm_topics.NODES,
-               topics.BASE_STATUS, ftm_topics.ADAPTATION, bus_topics.INJECTION_RESULT,
-               ftm_topics.ERROR_REPORT)
+               topics.BASE_STATUS, ftm_topics.ADAPTATION, bus_topics.INJECTION_REPORT,
+               bus_topics.DIAGNOSTIC)
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -64,7 +64,7 @@ class Others(Actor):
     def adapt(self, message: fm.AdaptationRequest, _header: Header) -> None:
         self.adaptations.append(message)
 
-    @on(bus_topics.INJECTION_REQUEST)
+    @on(bus_topics.INJECT)
     def injection(self, message: bm.Injection, _header: Header) -> None:
         self.injections.append(message)
 

@@ -59,7 +59,7 @@ class Witness(Actor):
     def event(self, message: ProcessEvent, header: Header) -> None:
         self.events.append(message)
 
-    @on(topics.ERROR_REPORT)
+    @on(bus_topics.DIAGNOSTIC)
     def error(self, message: Diagnostic, header: Header) -> None:
         self.errors.append(message)
 
@@ -161,7 +161,7 @@ async def test_a_request_for_an_unknown_node_is_refused(tmp_path):
         await eventually(lambda: witness.saw("nobody", "refused"))
 
 
-async def test_error_reports_of_all_nodes_and_its_own_are_passed_on_by_the_supervisor(tmp_path):
+async def test_an_observer_hears_the_error_reports_of_all_nodes(tmp_path):
     async with running(tmp_path) as (_, witness):
         witness.context.bus.publish(bus_topics.INJECT, bus_topics.INJECT.at(), b"garbage")
         names = {r.name for r in witness.table.nodes}
