@@ -119,6 +119,8 @@ def system(name: str) -> System:
 class Machine:
     """`Processes` whose processes are numbers."""
 
+    has_routers = False
+
     def __init__(self) -> None:
         self._pid = 100
 

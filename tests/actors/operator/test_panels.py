@@ -113,7 +113,7 @@ def test_the_page_hears_what_the_panels_of_class_and_specification_show():
                    PAGE.replace("rampart.actors.operator.hmi:Hmi", f"{__name__}:OwnHmi"))
     assert shown(found) == [("Own", "gauge"), ("Pump", "states")]
     assert found.topics == {"tank/level": LEVEL, "tank/pump": PUMP}
-    assert "pump" in found._partners["page"]
+    assert found.members["page"].hears.keys() == {"tank/level", "tank/pump"}
 
 
 def test_a_page_without_panels_plots_the_numbers_of_what_comes_regularly():

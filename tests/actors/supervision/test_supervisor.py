@@ -75,6 +75,8 @@ class Handle:
 class Machine:
     """`Processes` on which forks and holds fail when a test says so."""
 
+    has_routers = False
+
     def __init__(self) -> None:
         self.processes: dict[int, Process] = {}
         self.forks: list[tuple[str, int]] = []
