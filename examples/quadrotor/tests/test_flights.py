@@ -8,7 +8,8 @@ SENSORS = ("gps-bias@10", "gps-drift@8", "gps-dropout@10", "barometer-bias@10",
            "barometer-stuck@4", "imu-bias@8", "imu-noise@8", "imu-stuck@8", "heading-bias@9")
 PROCESSES = ("kill:pilot@10", "stop:pilot@11", "wedge:pilot@6.2", "kill:reserve@10",
              "kill:estimator@10", "wedge:estimator@10", "kill:flight_controller@10",
-             "stop:flight_controller@10", "kill:mission@10", "wedge:mission@10", "kill:ftm_manager@10")
+             "stop:flight_controller@10", "kill:mission@10", "wedge:mission@10",
+             "kill:ftm_manager@10")
 TOPICS = ("drop:rotors/pilot@10", "stuck:rotors/pilot@10", "delay:rotors/pilot@10",
           "stuck:rotors/reserve@10", "drop:setpoint@10",
           "stuck:setpoint@10", "corrupt:setpoint@10", "freeze:estimate@10", "stuck:estimate@10",
