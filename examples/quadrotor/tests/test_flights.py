@@ -86,7 +86,7 @@ def test_a_short_loss_of_the_gps_costs_a_pause_and_no_more():
 
 
 def test_two_pilots_that_die_together_are_replaced_before_the_rotors_idle():
-    assert sound(fly("kill:pilot@10", "kill:reserve@10")).safe
+    assert sound(fly("kill:pilot@10", "kill:reserve@10", seconds=14.0)).safe
 
 
 @pytest.mark.slow
